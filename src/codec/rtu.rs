@@ -1,0 +1,277 @@
+//! Modbus RTU frames: address, PDU, CRC-16 low byte first (drives.md 1.2, worked frames section 7).
+
+use super::checksum::crc16;
+use super::modbus::{MAX_PDU, Reply, RequestPdu};
+use super::{Decoded, Request};
+
+/// Characters that a frame adds to its PDU: address and two of CRC.
+pub const OVERHEAD: usize = 3;
+
+/// Appends `address`, `pdu` and CRC to `out` as one frame.
+pub fn encode_frame(address: u8, pdu: &[u8], out: &mut Vec<u8>) {
+    let start = out.len();
+    out.push(address);
+    out.extend_from_slice(pdu);
+    let crc = crc16(out.get(start..).unwrap_or_default());
+    out.extend_from_slice(&crc.to_le_bytes());
+}
+
+/// Appends the request's frame to `out`.
+pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
+    let mut pdu = Vec::with_capacity(request.pdu.encoded_len());
+    request.pdu.encode(&mut pdu);
+    encode_frame(request.address, &pdu, out);
+}
+
+/// The address and PDU of a whole frame whose CRC is right.
+pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
+    let (body, crc) = frame.split_last_chunk::<2>()?;
+    if body.len() < 2 || crc16(body) != u16::from_le_bytes(*crc) {
+        return None;
+    }
+    let (&address, pdu) = body.split_first()?;
+    Some((address, pdu))
+}
+
+/// What `bytes` are as the answer to `request`.
+///
+/// The end of a reply is known from its own first bytes, so no silence has to be waited for: the
+/// regular reply has a fixed length, an exception five characters, 43/14 counts its objects.
+/// Bytes that begin another drive's or another function's frame are measured the same way and
+/// dropped when their CRC is right.
+pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
+    let Some(len) = frame_len(request, bytes) else {
+        return if bytes.len() >= MAX_PDU + OVERHEAD { Decoded::Corrupt("no frame in 256 characters") } else { Decoded::Incomplete };
+    };
+    let Some(frame) = bytes.get(..len) else {
+        return Decoded::Incomplete;
+    };
+    let Some((address, pdu)) = open_frame(frame) else {
+        return Decoded::Corrupt("check code is wrong");
+    };
+    if address != request.address {
+        return Decoded::Foreign { used: len };
+    }
+    match Reply::decode(&request.pdu, pdu) {
+        Ok(reply) => Decoded::Reply { used: len, reply },
+        Err(_) => Decoded::Foreign { used: len },
+    }
+}
+
+/// Length of the frame that starts `bytes`, once its first bytes tell it.
+fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
+    let function = *bytes.get(1)?;
+    let own = function == request.pdu.function();
+    let pdu = match function {
+        _ if function & 0x80 != 0 => 2,
+        1..=4 | 23 => 2 + usize::from(*bytes.get(2)?),
+        5 | 6 | 8 | 15 | 16 => 5,
+        22 => 7,
+        43 => return device_identification_len(bytes),
+        _ if own => request.pdu.reply_len(),
+        // A function that nobody was asked for: its length is not known, take the shortest frame.
+        _ => 2,
+    };
+    Some(pdu + OVERHEAD)
+}
+
+/// 43/14 replies list objects of id, length and text behind a header of seven bytes.
+fn device_identification_len(bytes: &[u8]) -> Option<usize> {
+    let objects = *bytes.get(7)?;
+    let mut at = 8;
+    for _ in 0..objects {
+        at += 2 + usize::from(*bytes.get(at + 1)?);
+    }
+    Some(at + 2)
+}
+
+/// Splits what a slave or a listener received into the first frame of a master and the rest.
+///
+/// Returns `None` while the frame is not whole; the length comes from the function code.
+pub fn request_len(bytes: &[u8]) -> Option<usize> {
+    let function = *bytes.get(1)?;
+    let pdu = match function {
+        15 | 16 => 6 + usize::from(*bytes.get(6)?),
+        22 => 7,
+        23 => 10 + usize::from(*bytes.get(10)?),
+        43 => 4,
+        _ => 5,
+    };
+    Some(pdu + OVERHEAD)
+}
+
+/// The request in a whole frame, as a slave reads it.
+///
+/// # Errors
+/// `None` when the CRC is wrong (a slave stays silent); the exception with the function when the
+/// PDU is refused.
+pub fn decode_request(frame: &[u8]) -> Option<(u8, Result<RequestPdu, (u8, super::Exception)>)> {
+    let (address, pdu) = open_frame(frame)?;
+    let function = *pdu.first()?;
+    Some((address, RequestPdu::decode(pdu).map_err(|code| (function, code))))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::modbus::{Exception, Table};
+    use super::*;
+    use proptest::prelude::*;
+
+    fn hex(text: &str) -> Vec<u8> {
+        text.split_whitespace().map(|b| u8::from_str_radix(b, 16).unwrap()).collect()
+    }
+
+    fn read(table: Table, start: u16, count: u16) -> Request {
+        Request { address: 1, pdu: RequestPdu::Read { table, start, count } }
+    }
+
+    fn write(start: u16, values: &[u16]) -> Request {
+        Request { address: 1, pdu: RequestPdu::WriteRegisters { start, values: values.to_vec() } }
+    }
+
+    fn set(address: u16, value: u16) -> Request {
+        Request { address: 1, pdu: RequestPdu::WriteRegister { address, value } }
+    }
+
+    fn encoded(request: &Request) -> Vec<u8> {
+        let mut out = Vec::new();
+        encode_request(request, &mut out);
+        out
+    }
+
+    /// Worked requests of drives.md, section 7 (misprints corrected there) and 7.4.
+    #[test]
+    fn requests_of_the_reference() {
+        let coil = |address, on| Request { address: 1, pdu: RequestPdu::WriteCoil { address, on } };
+        let diag = |subfunction, data| Request { address: 1, pdu: RequestPdu::Diagnostics { subfunction, data } };
+        let cases = [
+            (read(Table::Holding, 2000, 3), "01 03 07 D0 00 03 05 46"),
+            (read(Table::Input, 2000, 1), "01 04 07 D0 00 01 31 47"),
+            (set(2000, 1), "01 06 07 D0 00 01 48 87"),
+            (write(2000, &[1, 16]), "01 10 07 D0 00 02 04 00 01 00 10 88 CF"),
+            (read(Table::Input, 6000, 5), "01 04 17 70 00 05 34 66"),
+            (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 03 06 00 01 00 00 13 88 C8 CB"),
+            (read(Table::Input, 2102, 2), "01 04 08 36 00 02 93 A5"),
+            (coil(0, true), "01 05 00 00 FF 00 8C 3A"),
+            (read(Table::DiscreteInput, 2, 1), "01 02 00 02 00 01 18 0A"),
+            (set(0, 1000), "01 06 00 00 03 E8 89 74"),
+            (coil(0, false), "01 05 00 00 00 00 CD CA"),
+            (read(Table::Coil, 0x042E, 1), "01 01 04 2E 00 01 9C F3"),
+            (read(Table::Input, 2, 1), "01 04 00 02 00 01 90 0A"),
+            (read(Table::Input, 100, 1), "01 04 00 64 00 01 70 15"),
+            (set(301, 25), "01 06 01 2D 00 19 D9 F5"),
+            (read(Table::Holding, 101, 1), "01 03 00 65 00 01 94 15"),
+            (set(2000, 0), "01 06 07 D0 00 00 89 47"),
+            (set(2000, 3), "01 06 07 D0 00 03 C9 46"),
+            (set(2000, 4), "01 06 07 D0 00 04 88 84"),
+            (set(2002, 5000), "01 06 07 D2 13 88 25 D1"),
+            (set(2002, (-5000i16) as u16), "01 06 07 D2 EC 78 64 65"),
+            (Request { address: 0, ..set(2000, 0) }, "00 06 07 D0 00 00 88 96"),
+            (read(Table::Holding, 2100, 11), "01 03 08 34 00 0B 47 A3"),
+            (read(Table::Holding, 2100, 1), "01 03 08 34 00 01 C7 A4"),
+            (read(Table::Holding, 98, 1), "01 03 00 62 00 01 25 D4"),
+            (read(Table::Holding, 732, 1), "01 03 02 DC 00 01 44 48"),
+            (set(732, 2), "01 06 02 DC 00 02 C8 49"),
+            (coil(1, true), "01 05 00 01 FF 00 DD FA"),
+            (coil(2, true), "01 05 00 02 FF 00 2D FA"),
+            (read(Table::DiscreteInput, 0, 5), "01 02 00 00 00 05 B8 09"),
+            (diag(0, 0xA537), "01 08 00 00 A5 37 DA 8D"),
+            (diag(4, 0), "01 08 00 04 00 00 A1 CA"),
+            (diag(0x0B, 0), "01 08 00 0B 00 00 91 C9"),
+        ];
+        for (request, frame) in cases {
+            assert_eq!(encoded(&request), hex(frame), "{request:?}");
+            let frame = hex(frame);
+            assert_eq!(request_len(&frame), Some(frame.len()), "{request:?}");
+            assert_eq!(decode_request(&frame), Some((request.address, Ok(request.pdu))));
+        }
+    }
+
+    /// Worked replies of drives.md, section 7.
+    #[test]
+    fn replies_of_the_reference() {
+        let status = vec![0x0023, 0x2000, 5000, 2500, 750, 12, 105, 53, 2000, 560, 0];
+        let cases = [
+            (read(Table::Input, 6000, 5), "01 84 02 C2 C1", Reply::Exception(Exception::ADDRESS)),
+            (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 03 80 85", Reply::Written),
+            (read(Table::Input, 2102, 2), "01 04 04 13 88 09 C4 78 E9", Reply::Registers(vec![5000, 2500])),
+            (read(Table::Coil, 0x042E, 1), "01 81 02 C1 91", Reply::Exception(Exception::ADDRESS)),
+            (read(Table::DiscreteInput, 2, 1), "01 02 01 01 60 48", Reply::Bits(vec![true])),
+            (read(Table::Input, 2, 1), "01 04 02 00 9C B9 59", Reply::Registers(vec![156])),
+            (read(Table::Input, 100, 1), "01 04 02 00 01 78 F0", Reply::Registers(vec![1])),
+            (read(Table::Holding, 101, 1), "01 03 02 00 32 39 91", Reply::Registers(vec![50])),
+            (
+                read(Table::Holding, 2100, 11),
+                "01 03 16 00 23 20 00 13 88 09 C4 02 EE 00 0C 00 69 00 35 07 D0 02 30 00 00 11 05",
+                Reply::Registers(status),
+            ),
+            (read(Table::Holding, 2100, 1), "01 03 02 00 03 F8 45", Reply::Registers(vec![3])),
+            (read(Table::Holding, 98, 1), "01 03 02 00 35 78 53", Reply::Registers(vec![53])),
+            (write(2000, &[1, 16]), "01 10 07 D0 00 02 41 45", Reply::Written),
+            (set(2000, 7), "01 86 03 02 61", Reply::Exception(Exception::VALUE)),
+            (write(2000, &[1]), "01 90 06 CC 02", Reply::Exception(Exception::BUSY)),
+            (set(2000, 1), "01 86 04 43 A3", Reply::Exception(Exception::DEVICE_FAILURE)),
+            (
+                read(Table::DiscreteInput, 0, 5),
+                "01 02 01 07 E0 4A",
+                Reply::Bits(vec![true, true, true, false, false]),
+            ),
+        ];
+        for (request, frame, reply) in cases {
+            let frame = hex(frame);
+            for cut in 0..frame.len() {
+                assert_eq!(decode_reply(&request, &frame[..cut]), Decoded::Incomplete, "{request:?} cut at {cut}");
+            }
+            assert_eq!(decode_reply(&request, &frame), Decoded::Reply { used: frame.len(), reply: reply.clone() });
+            let mut pdu = Vec::new();
+            reply.encode(&request.pdu, &mut pdu);
+            let mut out = Vec::new();
+            encode_frame(1, &pdu, &mut out);
+            assert_eq!(out, frame, "the slave's side of {request:?}");
+        }
+    }
+
+    /// The misprinted frames whose CRC is valid must not be believed (drives.md, section 7, 8).
+    #[test]
+    fn misprints_are_not_believed() {
+        let cases = [
+            (read(Table::Input, 6000, 5), "01 14 02 AE C1"),
+            (read(Table::Input, 2102, 2), "01 04 02 13 88 09 C4 F0 E9"),
+            (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 F1 01"),
+            (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 03 F1 01"),
+        ];
+        for (request, frame) in cases {
+            let decoded = decode_reply(&request, &hex(frame));
+            assert!(!matches!(decoded, Decoded::Reply { .. }), "{request:?} {decoded:?}");
+        }
+    }
+
+    #[test]
+    fn foreign_frames_are_dropped_not_believed() {
+        let request = read(Table::Holding, 2100, 1);
+        let mut other_address = Vec::new();
+        encode_frame(2, &[3, 2, 0, 3], &mut other_address);
+        assert_eq!(decode_reply(&request, &other_address), Decoded::Foreign { used: 7 });
+        let mut other_length = Vec::new();
+        encode_frame(1, &[3, 4, 0, 3, 0, 4], &mut other_length);
+        assert_eq!(decode_reply(&request, &other_length), Decoded::Foreign { used: 9 });
+        let echo = encoded(&set(2000, 1));
+        assert_eq!(decode_reply(&set(2000, 2), &echo), Decoded::Foreign { used: 8 });
+    }
+
+    proptest! {
+        #[test]
+        fn no_bytes_panic_and_only_sound_frames_are_believed(
+            bytes in prop::collection::vec(any::<u8>(), 0..300),
+            start in any::<u16>(),
+            count in 1u16..=125,
+        ) {
+            let request = read(Table::Holding, start, count);
+            if let Decoded::Reply { used, .. } = decode_reply(&request, &bytes) {
+                prop_assert!(open_frame(&bytes[..used]).is_some());
+            }
+            let _ = request_len(&bytes);
+            let _ = decode_request(&bytes);
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! Time on the wire: how long characters take at a baud rate and a character format.
+
+use std::fmt;
+use std::str::FromStr;
+use std::time::Duration;
+
+/// Parity bit of a character.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum Parity {
+    /// No parity bit.
+    None,
+    /// Even parity.
+    Even,
+    /// Odd parity.
+    Odd,
+}
+
+/// Baud rate and character format of a line, as `8N1` writes them.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct LineFormat {
+    /// Bits a second, 300 and more.
+    pub baud: u32,
+    /// 7 or 8.
+    pub data_bits: u8,
+    /// Parity.
+    pub parity: Parity,
+    /// 1 or 2.
+    pub stop_bits: u8,
+}
+
+/// Why a text is no character format.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("`{0}` is no character format; write data bits 7 or 8, parity N, E or O, stop bits 1 or 2, such as 8N1")]
+pub struct BadFormat(pub String);
+
+impl LineFormat {
+    /// The format `text` (such as `8N1`) at `baud`.
+    ///
+    /// # Errors
+    /// When the text is not data bits (7, 8), parity (N, E, O) and stop bits (1, 2).
+    pub fn new(baud: u32, text: &str) -> Result<LineFormat, BadFormat> {
+        let bad = || BadFormat(text.to_string());
+        let mut chars = text.chars();
+        let (Some(data), Some(parity), Some(stop), None) = (chars.next(), chars.next(), chars.next(), chars.next())
+        else {
+            return Err(bad());
+        };
+        let data_bits = match data {
+            '7' => 7,
+            '8' => 8,
+            _ => return Err(bad()),
+        };
+        let parity = match parity.to_ascii_uppercase() {
+            'N' => Parity::None,
+            'E' => Parity::Even,
+            'O' => Parity::Odd,
+            _ => return Err(bad()),
+        };
+        let stop_bits = match stop {
+            '1' => 1,
+            '2' => 2,
+            _ => return Err(bad()),
+        };
+        Ok(LineFormat { baud: baud.max(1), data_bits, parity, stop_bits })
+    }
+
+    /// Bits of one character on the wire: start, data, parity, stop.
+    pub fn bits_per_char(&self) -> u32 {
+        1 + u32::from(self.data_bits) + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits)
+    }
+
+    /// Time of `chars` characters.
+    pub fn chars(&self, chars: usize) -> Duration {
+        let bits = u64::from(self.bits_per_char()) * chars as u64;
+        Duration::from_nanos(bits * 1_000_000_000 / u64::from(self.baud.max(1)))
+    }
+
+    /// 3.5 characters at any baud.
+    pub fn silence_chars(&self) -> Duration {
+        self.chars(7) / 2
+    }
+
+    /// 3.5 characters, fixed at 1.75 ms above 19200 baud (Modbus over serial line, 2.5.1.1).
+    pub fn silence_spec(&self) -> Duration {
+        if self.baud > 19_200 { Duration::from_micros(1750) } else { self.silence_chars() }
+    }
+}
+
+impl fmt::Display for LineFormat {
+    /// `38400 8N1`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let parity = match self.parity {
+            Parity::None => 'N',
+            Parity::Even => 'E',
+            Parity::Odd => 'O',
+        };
+        write!(f, "{} {}{}{}", self.baud, self.data_bits, parity, self.stop_bits)
+    }
+}
+
+/// Silence that the master keeps before each request.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Silence {
+    /// 3.5 characters, 1.75 ms above 19200 baud.
+    Spec,
+    /// 3.5 characters at any baud.
+    Chars,
+    /// A fixed time, for slow drives.
+    Fixed(Duration),
+}
+
+impl Silence {
+    /// The silence in time on a line of that format.
+    pub fn on(self, format: &LineFormat) -> Duration {
+        match self {
+            Silence::Spec => format.silence_spec(),
+            Silence::Chars => format.silence_chars(),
+            Silence::Fixed(time) => time,
+        }
+    }
+}
+
+impl FromStr for Silence {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        match text {
+            "spec" => Ok(Silence::Spec),
+            "chars" => Ok(Silence::Chars),
+            other => crate::document::parse_duration(other)
+                .map(Silence::Fixed)
+                .map_err(|_| format!("`{other}` is neither \"spec\" nor \"chars\" nor a duration such as \"2ms\"")),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bits_and_times() {
+        let f = LineFormat::new(38_400, "8N1").unwrap();
+        assert_eq!(f.bits_per_char(), 10);
+        assert_eq!(f.chars(8).as_nanos(), 2_083_333);
+        assert_eq!(f.silence_chars().as_nanos(), 911_458);
+        assert_eq!(f.silence_spec(), Duration::from_micros(1750));
+        assert_eq!(LineFormat::new(9600, "8E1").unwrap().bits_per_char(), 11);
+        assert_eq!(LineFormat::new(9600, "7N2").unwrap().bits_per_char(), 10);
+        assert_eq!(LineFormat::new(19_200, "8N2").unwrap().silence_spec().as_micros(), 2005);
+        assert_eq!(f.to_string(), "38400 8N1");
+    }
+
+    #[test]
+    fn silences_of_the_reference() {
+        // drives.md, section 2, RTU timing, 11-bit characters.
+        for (baud, tenths) in [(300, 1283), (600, 642), (1200, 321), (2400, 160), (4800, 80), (9600, 40), (19_200, 20)] {
+            let f = LineFormat::new(baud, "8E1").unwrap();
+            let ms10 = (f.silence_chars().as_secs_f64() * 10_000.0).round() as i64;
+            assert_eq!(ms10, tenths, "{baud}");
+        }
+    }
+
+    #[test]
+    fn bad_formats() {
+        for bad in ["", "8", "8N", "8N3", "9N1", "8X1", "8N1 ", "N81"] {
+            assert!(LineFormat::new(9600, bad).is_err(), "{bad}");
+        }
+    }
+}

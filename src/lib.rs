@@ -1,0 +1,3 @@
+//! drivegate.
+pub mod codec;
+pub mod document;
