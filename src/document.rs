@@ -377,7 +377,7 @@ impl<'d> Reader<'d> {
     }
 
     /// Reports the keys nobody asked for, with the nearest known one.
-    pub fn finish(self) {
+    pub fn finish(&self) {
         if self.lenient.get() {
             return;
         }

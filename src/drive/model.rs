@@ -1,0 +1,225 @@
+//! The common drive model: the same points, units and meanings for every family (public contract, section 4).
+
+use std::fmt;
+use std::time::Instant;
+
+use serde::Serialize;
+
+/// A value in engineering units.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+#[serde(untagged)]
+pub enum Value {
+    /// A state.
+    Bool(bool),
+    /// A code or a bit mask.
+    Integer(i64),
+    /// A figure in the point's unit; always finite.
+    Number(f64),
+}
+
+impl Value {
+    /// The figure; true is 1.
+    pub fn as_f64(self) -> f64 {
+        match self {
+            Value::Bool(b) => f64::from(u8::from(b)),
+            Value::Integer(i) => i as f64,
+            Value::Number(n) => n,
+        }
+    }
+
+    /// Whether the value is not zero.
+    pub fn as_bool(self) -> bool {
+        self.as_f64() != 0.0
+    }
+}
+
+impl fmt::Display for Value {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Value::Bool(b) => write!(f, "{b}"),
+            Value::Integer(i) => write!(f, "{i}"),
+            Value::Number(n) => write!(f, "{n}"),
+        }
+    }
+}
+
+/// What a value is worth.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Quality {
+    /// Read from the drive within its time.
+    Good,
+    /// Older than allowed, or the drive is offline.
+    Stale,
+    /// The drive refused the point, or it was never read.
+    Bad,
+}
+
+impl Quality {
+    /// The name in payloads.
+    pub fn name(self) -> &'static str {
+        match self {
+            Quality::Good => "good",
+            Quality::Stale => "stale",
+            Quality::Bad => "bad",
+        }
+    }
+}
+
+/// A value with its quality and its time of reading.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sample {
+    /// The last value read; absent when there never was one.
+    pub value: Option<Value>,
+    /// What it is worth.
+    pub quality: Quality,
+    /// When the reply that carried it ended.
+    pub at: Option<Instant>,
+}
+
+impl Sample {
+    /// Nothing is known.
+    pub const NONE: Sample = Sample { value: None, quality: Quality::Bad, at: None };
+
+    /// The value, only if it is good.
+    pub fn good(&self) -> Option<Value> {
+        if self.quality == Quality::Good { self.value } else { None }
+    }
+}
+
+/// The state of a drive in one word.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum State {
+    /// Does not answer, was never reached, or its values are too old.
+    Offline,
+    /// Answers, is not ready to run.
+    NotReady,
+    /// Ready to run.
+    Ready,
+    /// Runs.
+    Running,
+    /// Has a fault.
+    Fault,
+}
+
+impl State {
+    /// All states in the order of their codes at 0x8001.
+    pub const ALL: [State; 5] = [State::Offline, State::NotReady, State::Ready, State::Running, State::Fault];
+
+    /// Code in the common block of Modbus TCP.
+    pub fn code(self) -> u16 {
+        match self {
+            State::Offline => 0,
+            State::NotReady => 1,
+            State::Ready => 2,
+            State::Running => 3,
+            State::Fault => 4,
+        }
+    }
+
+    /// The name in payloads and labels.
+    pub fn name(self) -> &'static str {
+        match self {
+            State::Offline => "offline",
+            State::NotReady => "not_ready",
+            State::Ready => "ready",
+            State::Running => "running",
+            State::Fault => "fault",
+        }
+    }
+}
+
+/// Kind of a point's values.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// True or false.
+    Bool,
+    /// A figure.
+    Number,
+    /// A code.
+    Integer,
+}
+
+macro_rules! model_points {
+    ($($variant:ident $name:literal $unit:literal $kind:ident $doc:literal,)*) => {
+        /// A point of the common model.
+        #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+        pub enum ModelPoint {
+            $(#[doc = $doc] $variant,)*
+        }
+
+        impl ModelPoint {
+            /// All points, in the order of the contract.
+            pub const ALL: &'static [ModelPoint] = &[$(ModelPoint::$variant,)*];
+
+            /// The public name.
+            pub fn name(self) -> &'static str {
+                match self { $(ModelPoint::$variant => $name,)* }
+            }
+
+            /// The unit, empty for states and codes.
+            pub fn unit(self) -> &'static str {
+                match self { $(ModelPoint::$variant => $unit,)* }
+            }
+
+            /// The kind of its values.
+            pub fn kind(self) -> Kind {
+                match self { $(ModelPoint::$variant => Kind::$kind,)* }
+            }
+        }
+    };
+}
+
+model_points! {
+    Ready "ready" "" Bool "Ready to run.",
+    Running "running" "" Bool "Runs.",
+    Reversed "reversed" "" Bool "Turns in reverse.",
+    Fault "fault" "" Bool "Has a fault.",
+    Warning "warning" "" Bool "Has a warning.",
+    AtReference "at_reference" "" Bool "Output has reached the reference.",
+    ZeroSpeed "zero_speed" "" Bool "Motor stands.",
+    Remote "remote" "" Bool "The fieldbus is the control place.",
+    ActualSpeed "actual_speed" "%" Number "Speed in percent of the speed range.",
+    OutputFrequency "output_frequency" "Hz" Number "Output frequency.",
+    MotorSpeed "motor_speed" "rpm" Number "Motor speed.",
+    MotorCurrent "motor_current" "A" Number "Motor current.",
+    MotorTorque "motor_torque" "%" Number "Torque in percent of nominal.",
+    MotorPower "motor_power" "%" Number "Power in percent of nominal.",
+    MotorVoltage "motor_voltage" "V" Number "Motor voltage.",
+    DcLinkVoltage "dc_link_voltage" "V" Number "DC link voltage.",
+    HeatsinkTemperature "heatsink_temperature" "°C" Number "Heatsink temperature.",
+    Energy "energy" "kWh" Number "Energy counter.",
+    OperatingHours "operating_hours" "h" Number "Operating hours.",
+    FaultCode "fault_code" "" Integer "Active fault code, 0 without a fault.",
+    Run "run" "" Bool "Command: run; read: as the drive has it.",
+    Reverse "reverse" "" Bool "Command: reverse; read: as the drive has it.",
+    FaultReset "fault_reset" "" Bool "Command: true resets a fault by one pulse.",
+    SpeedReference "speed_reference" "%" Number "Speed reference, command and as the drive has it.",
+    FrequencyReference "frequency_reference" "Hz" Number "Frequency reference, command and as the drive has it.",
+}
+
+impl ModelPoint {
+    /// The point of that name.
+    pub fn from_name(name: &str) -> Option<ModelPoint> {
+        ModelPoint::ALL.iter().copied().find(|p| p.name() == name)
+    }
+
+    /// Place in [`ModelPoint::ALL`].
+    pub fn index(self) -> usize {
+        self as usize
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_are_unique_and_found() {
+        for (i, &point) in ModelPoint::ALL.iter().enumerate() {
+            assert_eq!(point.index(), i);
+            assert_eq!(ModelPoint::from_name(point.name()), Some(point));
+        }
+    }
+}
