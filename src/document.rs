@@ -116,11 +116,25 @@ impl Document {
         let file = file.into();
         let lines = Lines::of(source);
         let (table, errors) = DeTable::parse_recoverable(source);
-        let root = Node { value: table_of(table.into_inner(), &lines), line: None, env: None };
-        let document = Document { file, root, problems: RefCell::default() };
+        let root = Node {
+            value: table_of(table.into_inner(), &lines),
+            line: None,
+            env: None,
+        };
+        let document = Document {
+            file,
+            root,
+            problems: RefCell::default(),
+        };
         for error in errors {
-            let place = Place { line: error.span().map(|s| lines.line(s.start)), ..Place::default() };
-            document.problem(&place, format!("not valid TOML: {}", error.message().replace('\n', ", ")));
+            let place = Place {
+                line: error.span().map(|s| lines.line(s.start)),
+                ..Place::default()
+            };
+            document.problem(
+                &place,
+                format!("not valid TOML: {}", error.message().replace('\n', ", ")),
+            );
         }
         document
     }
@@ -128,12 +142,20 @@ impl Document {
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
     pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
-        let mut variables: Vec<_> = variables.into_iter().filter(|(name, _)| name.starts_with(&start)).collect();
+        let mut variables: Vec<_> = variables
+            .into_iter()
+            .filter(|(name, _)| name.starts_with(&start))
+            .collect();
         variables.sort();
         for (name, value) in variables {
             let path: Vec<String> = name.split("__").skip(1).map(str::to_lowercase).collect();
             if let Err(message) = set(&mut self.root, &path, &name, value) {
-                let problem = Problem { file: name, line: None, key: path.join("."), message };
+                let problem = Problem {
+                    file: name,
+                    line: None,
+                    key: path.join("."),
+                    message,
+                };
                 self.problems.get_mut().push(problem);
             }
         }
@@ -141,13 +163,24 @@ impl Document {
 
     /// The reader of the whole document.
     pub fn reader(&self) -> Reader<'_> {
-        Reader { document: self, entries: entries(&self.root), place: Place::default(), known: RefCell::default(), lenient: Cell::new(false) }
+        Reader {
+            document: self,
+            entries: entries(&self.root),
+            place: Place::default(),
+            known: RefCell::default(),
+            lenient: Cell::new(false),
+        }
     }
 
     /// Adds a problem.
     pub fn problem(&self, place: &Place, message: impl Into<String>) {
         let file = place.env.clone().unwrap_or_else(|| self.file.clone());
-        let problem = Problem { file, line: place.line, key: place.key.clone(), message: message.into() };
+        let problem = Problem {
+            file,
+            line: place.line,
+            key: place.key.clone(),
+            message: message.into(),
+        };
         self.problems.borrow_mut().push(problem);
     }
 
@@ -176,7 +209,14 @@ struct Lines(Vec<usize>);
 
 impl Lines {
     fn of(source: &str) -> Lines {
-        Lines(source.bytes().enumerate().filter(|&(_, b)| b == b'\n').map(|(i, _)| i).collect())
+        Lines(
+            source
+                .bytes()
+                .enumerate()
+                .filter(|&(_, b)| b == b'\n')
+                .map(|(i, _)| i)
+                .collect(),
+        )
     }
 
     fn line(&self, offset: usize) -> usize {
@@ -188,11 +228,27 @@ fn table_of(table: DeTable<'_>, lines: &Lines) -> Raw {
     let entries = table.into_iter().map(|(key, value)| {
         let line = lines.line(key.span().start);
         let span = value.span();
-        let node_line = if span.start == 0 && span.end == 0 { line } else { lines.line(span.start) };
+        let node_line = if span.start == 0 && span.end == 0 {
+            line
+        } else {
+            lines.line(span.start)
+        };
         let value = value_of(value.into_inner(), lines);
         // A table's own place is its header or key, not the first of its values.
-        let node_line = if matches!(value, Raw::Table(_)) { line } else { node_line };
-        (key.into_inner().into_owned(), Some(line), Node { value, line: Some(node_line), env: None })
+        let node_line = if matches!(value, Raw::Table(_)) {
+            line
+        } else {
+            node_line
+        };
+        (
+            key.into_inner().into_owned(),
+            Some(line),
+            Node {
+                value,
+                line: Some(node_line),
+                env: None,
+            },
+        )
     });
     Raw::Table(entries.collect())
 }
@@ -211,7 +267,11 @@ fn value_of(value: DeValue<'_>, lines: &Lines) -> Raw {
                 .into_iter()
                 .map(|item| {
                     let line = Some(lines.line(item.span().start));
-                    Node { value: value_of(item.into_inner(), lines), line, env: None }
+                    Node {
+                        value: value_of(item.into_inner(), lines),
+                        line,
+                        env: None,
+                    }
                 })
                 .collect(),
         ),
@@ -221,7 +281,11 @@ fn value_of(value: DeValue<'_>, lines: &Lines) -> Raw {
 
 fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(), String> {
     let Some((key, rest)) = path.split_first() else {
-        *node = Node { value: Raw::Env(text), line: None, env: Some(name.to_string()) };
+        *node = Node {
+            value: Raw::Env(text),
+            line: None,
+            env: Some(name.to_string()),
+        };
         return Ok(());
     };
     match &mut node.value {
@@ -230,9 +294,15 @@ fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(),
                 return set(child, rest, name, text);
             }
             if !rest.is_empty() {
-                return Err(format!("there is no `{key}` in the file to override; add the section to the file first"));
+                return Err(format!(
+                    "there is no `{key}` in the file to override; add the section to the file first"
+                ));
             }
-            let child = Node { value: Raw::Env(text), line: None, env: Some(name.to_string()) };
+            let child = Node {
+                value: Raw::Env(text),
+                line: None,
+                env: Some(name.to_string()),
+            };
             entries.push((key.clone(), None, child));
             Ok(())
         }
@@ -345,7 +415,14 @@ impl<'d> Reader<'d> {
         match node.value {
             Raw::Table(_) => Some(self.child(node, self.path(key))),
             _ => {
-                self.problem(key, format!("`{key}` is {}, not a table; write [{}]", node.value.kind(), self.path(key)));
+                self.problem(
+                    key,
+                    format!(
+                        "`{key}` is {}, not a table; write [{}]",
+                        node.value.kind(),
+                        self.path(key)
+                    ),
+                );
                 None
             }
         }
@@ -359,11 +436,18 @@ impl<'d> Reader<'d> {
             Raw::Array(items) if items.iter().all(|i| matches!(i.value, Raw::Table(_))) => items,
             other => {
                 let kind = other.kind();
-                self.problem(key, format!("`{key}` is {kind}, not a list of tables; write [[{}]]", self.path(key)));
+                self.problem(
+                    key,
+                    format!("`{key}` is {kind}, not a list of tables; write [[{}]]", self.path(key)),
+                );
                 return Vec::new();
             }
         };
-        items.iter().enumerate().map(|(i, item)| self.child(item, format!("{}[{i}]", self.path(key)))).collect()
+        items
+            .iter()
+            .enumerate()
+            .map(|(i, item)| self.child(item, format!("{}[{i}]", self.path(key))))
+            .collect()
     }
 
     /// The keys asked for so far: what the table may hold.
@@ -386,7 +470,11 @@ impl<'d> Reader<'d> {
             if known.iter().any(|k| k == key) {
                 continue;
             }
-            let place = Place { line: line.or(node.line), env: node.env.clone(), key: self.path(key) };
+            let place = Place {
+                line: line.or(node.line),
+                env: node.env.clone(),
+                key: self.path(key),
+            };
             let remedy = match nearest(key, known.iter().map(String::as_str)) {
                 Some(near) => format!("did you mean `{near}`?"),
                 None => format!("known here: {}", known.join(", ")),
@@ -396,8 +484,18 @@ impl<'d> Reader<'d> {
     }
 
     fn child(&self, node: &'d Node, key: String) -> Reader<'d> {
-        let place = Place { line: node.line, env: node.env.clone(), key };
-        Reader { document: self.document, entries: entries(node), place, known: RefCell::default(), lenient: Cell::new(false) }
+        let place = Place {
+            line: node.line,
+            env: node.env.clone(),
+            key,
+        };
+        Reader {
+            document: self.document,
+            entries: entries(node),
+            place,
+            known: RefCell::default(),
+            lenient: Cell::new(false),
+        }
     }
 
     fn find(&self, key: &str) -> Option<&'d Node> {
@@ -412,7 +510,11 @@ impl<'d> Reader<'d> {
     }
 
     fn path(&self, key: &str) -> String {
-        if self.place.key.is_empty() { key.to_string() } else { format!("{}.{key}", self.place.key) }
+        if self.place.key.is_empty() {
+            key.to_string()
+        } else {
+            format!("{}.{key}", self.place.key)
+        }
     }
 }
 
@@ -463,7 +565,9 @@ impl FromNode for PathBuf {
     const WANTED: &'static str = "a path in quotes";
 
     fn from_node(node: &Node) -> Result<Self, String> {
-        String::from_node(node).map(PathBuf::from).map_err(|_| wrong::<Self>(node))
+        String::from_node(node)
+            .map(PathBuf::from)
+            .map_err(|_| wrong::<Self>(node))
     }
 }
 
@@ -518,7 +622,11 @@ impl FromNode for f64 {
             Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node))?,
             _ => return Err(wrong::<Self>(node)),
         };
-        if value.is_finite() { Ok(value) } else { Err(wrong::<Self>(node)) }
+        if value.is_finite() {
+            Ok(value)
+        } else {
+            Err(wrong::<Self>(node))
+        }
     }
 }
 
@@ -543,7 +651,11 @@ impl<T: FromNode> FromNode for Vec<T> {
                 .split(',')
                 .map(|item| {
                     let value = Raw::Env(item.trim().to_string());
-                    T::from_node(&Node { value, line: node.line, env: node.env.clone() })
+                    T::from_node(&Node {
+                        value,
+                        line: node.line,
+                        env: node.env.clone(),
+                    })
                 })
                 .collect(),
             _ => Err(format!("{}, each {}", wrong::<Self>(node), T::WANTED)),
@@ -558,7 +670,9 @@ impl<T: FromNode> FromNode for Vec<T> {
 pub fn parse_duration(text: &str) -> Result<Duration, String> {
     let bad = || format!("`{text}` is no duration; write {}", Duration::WANTED);
     let trimmed = text.trim();
-    let digits = trimmed.find(|c: char| !c.is_ascii_digit() && c != '.').ok_or_else(bad)?;
+    let digits = trimmed
+        .find(|c: char| !c.is_ascii_digit() && c != '.')
+        .ok_or_else(bad)?;
     let (number, unit) = trimmed.split_at(digits);
     let number: f64 = number.parse().map_err(|_| bad())?;
     let seconds = match unit.trim_start() {
@@ -589,7 +703,10 @@ pub fn parse_size(text: &str) -> Result<u64, String> {
         "GiB" => 30,
         _ => return Err(bad()),
     };
-    number.checked_shl(shift).filter(|v| v >> shift == number).ok_or_else(bad)
+    number
+        .checked_shl(shift)
+        .filter(|v| v >> shift == number)
+        .ok_or_else(bad)
 }
 
 /// Reads a file for a document; the problem says why it cannot.

@@ -88,7 +88,10 @@ pub struct Events {
 
 impl Default for Events {
     fn default() -> Self {
-        Events { sender: broadcast::channel(KEPT).0, kept: Arc::default() }
+        Events {
+            sender: broadcast::channel(KEPT).0,
+            kept: Arc::default(),
+        }
     }
 }
 
@@ -116,6 +119,12 @@ impl Events {
 
     /// The last events, oldest first.
     pub fn recent(&self) -> Vec<Arc<Event>> {
-        self.kept.lock().unwrap_or_else(PoisonError::into_inner).1.iter().cloned().collect()
+        self.kept
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .1
+            .iter()
+            .cloned()
+            .collect()
     }
 }

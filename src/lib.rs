@@ -1,5 +1,11 @@
 //! drivegate.
+pub mod bus;
+pub mod cache;
 pub mod codec;
+pub mod command;
 pub mod document;
 pub mod drive;
 pub mod event;
+pub mod line;
+pub mod north;
+pub mod plant;

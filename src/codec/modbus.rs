@@ -51,7 +51,9 @@ impl Table {
 
     /// The table of that name.
     pub fn from_name(name: &str) -> Option<Table> {
-        [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding].into_iter().find(|t| t.name() == name)
+        [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding]
+            .into_iter()
+            .find(|t| t.name() == name)
     }
 
     /// Most items that one request of the protocol may read.
@@ -218,12 +220,19 @@ fn words(bytes: &[u8]) -> Vec<u16> {
 
 fn pack(bits: &[bool], out: &mut Vec<u8>) {
     for chunk in bits.chunks(8) {
-        out.push(chunk.iter().enumerate().fold(0, |byte, (i, &bit)| byte | (u8::from(bit) << i)));
+        out.push(
+            chunk
+                .iter()
+                .enumerate()
+                .fold(0, |byte, (i, &bit)| byte | (u8::from(bit) << i)),
+        );
     }
 }
 
 fn unpack(bytes: &[u8], count: usize) -> Vec<bool> {
-    (0..count).map(|i| bytes.get(i / 8).is_some_and(|byte| (byte >> (i % 8)) & 1 == 1)).collect()
+    (0..count)
+        .map(|i| bytes.get(i / 8).is_some_and(|byte| (byte >> (i % 8)) & 1 == 1))
+        .collect()
 }
 
 impl RequestPdu {
@@ -272,7 +281,11 @@ impl RequestPdu {
     pub fn reply_len(&self) -> usize {
         match self {
             RequestPdu::Read { table, count, .. } => {
-                2 + if table.is_bits() { usize::from(*count).div_ceil(8) } else { 2 * usize::from(*count) }
+                2 + if table.is_bits() {
+                    usize::from(*count).div_ceil(8)
+                } else {
+                    2 * usize::from(*count)
+                }
             }
             RequestPdu::ReadWrite { read_count, .. } => 2 + 2 * usize::from(*read_count),
             RequestPdu::MaskWrite { .. } => 7,
@@ -313,12 +326,21 @@ impl RequestPdu {
                 out.push((values.len() * 2) as u8);
                 values.iter().for_each(|&v| put(out, v));
             }
-            RequestPdu::MaskWrite { address, and_mask, or_mask } => {
+            RequestPdu::MaskWrite {
+                address,
+                and_mask,
+                or_mask,
+            } => {
                 put(out, *address);
                 put(out, *and_mask);
                 put(out, *or_mask);
             }
-            RequestPdu::ReadWrite { read_start, read_count, write_start, values } => {
+            RequestPdu::ReadWrite {
+                read_start,
+                read_count,
+                write_start,
+                values,
+            } => {
                 put(out, *read_start);
                 put(out, *read_count);
                 put(out, *write_start);
@@ -338,7 +360,13 @@ impl RequestPdu {
     pub fn decode(pdu: &[u8]) -> Result<RequestPdu, Exception> {
         let (&function, body) = pdu.split_first().ok_or(Exception::FUNCTION)?;
         let word = |at| be(body, at).ok_or(Exception::VALUE);
-        let exact = |len: usize| if body.len() == len { Ok(()) } else { Err(Exception::VALUE) };
+        let exact = |len: usize| {
+            if body.len() == len {
+                Ok(())
+            } else {
+                Err(Exception::VALUE)
+            }
+        };
         let table = match function {
             1 => Some(Table::Coil),
             2 => Some(Table::DiscreteInput),
@@ -362,33 +390,61 @@ impl RequestPdu {
                 };
                 Ok(RequestPdu::WriteCoil { address: word(0)?, on })
             }
-            6 => exact(4).and_then(|()| Ok(RequestPdu::WriteRegister { address: word(0)?, value: word(2)? })),
-            8 => exact(4).and_then(|()| Ok(RequestPdu::Diagnostics { subfunction: word(0)?, data: word(2)? })),
+            6 => exact(4).and_then(|()| {
+                Ok(RequestPdu::WriteRegister {
+                    address: word(0)?,
+                    value: word(2)?,
+                })
+            }),
+            8 => exact(4).and_then(|()| {
+                Ok(RequestPdu::Diagnostics {
+                    subfunction: word(0)?,
+                    data: word(2)?,
+                })
+            }),
             15 => {
                 let (start, count) = (word(0)?, word(2)?);
                 let data = counted(body, 4, usize::from(count).div_ceil(8))?;
                 check_span(start, count, 1968)?;
-                Ok(RequestPdu::WriteCoils { start, bits: unpack(data, usize::from(count)) })
+                Ok(RequestPdu::WriteCoils {
+                    start,
+                    bits: unpack(data, usize::from(count)),
+                })
             }
             16 => {
                 let (start, count) = (word(0)?, word(2)?);
                 let data = counted(body, 4, 2 * usize::from(count))?;
                 check_span(start, count, 123)?;
-                Ok(RequestPdu::WriteRegisters { start, values: words(data) })
+                Ok(RequestPdu::WriteRegisters {
+                    start,
+                    values: words(data),
+                })
             }
             22 => {
                 exact(6)?;
-                Ok(RequestPdu::MaskWrite { address: word(0)?, and_mask: word(2)?, or_mask: word(4)? })
+                Ok(RequestPdu::MaskWrite {
+                    address: word(0)?,
+                    and_mask: word(2)?,
+                    or_mask: word(4)?,
+                })
             }
             23 => {
                 let (read_start, read_count, write_start, count) = (word(0)?, word(2)?, word(4)?, word(6)?);
                 let data = counted(body, 8, 2 * usize::from(count))?;
                 check_span(read_start, read_count, 125)?;
                 check_span(write_start, count, 121)?;
-                Ok(RequestPdu::ReadWrite { read_start, read_count, write_start, values: words(data) })
+                Ok(RequestPdu::ReadWrite {
+                    read_start,
+                    read_count,
+                    write_start,
+                    values: words(data),
+                })
             }
             43 => match body {
-                [14, code, object] => Ok(RequestPdu::DeviceIdentification { code: *code, object: *object }),
+                [14, code, object] => Ok(RequestPdu::DeviceIdentification {
+                    code: *code,
+                    object: *object,
+                }),
                 [14, ..] => Err(Exception::VALUE),
                 _ => Err(Exception::FUNCTION),
             },
@@ -412,7 +468,11 @@ fn check_span(start: u16, count: u16, max: u16) -> Result<(), Exception> {
 fn counted(body: &[u8], at: usize, len: usize) -> Result<&[u8], Exception> {
     let count = usize::from(*body.get(at).ok_or(Exception::VALUE)?);
     let data = body.get(at + 1..).ok_or(Exception::VALUE)?;
-    if count == len && data.len() == len { Ok(data) } else { Err(Exception::VALUE) }
+    if count == len && data.len() == len {
+        Ok(data)
+    } else {
+        Err(Exception::VALUE)
+    }
 }
 
 impl Reply {
@@ -435,7 +495,11 @@ impl Reply {
             }
             Reply::Diagnostics(data) => {
                 if let RequestPdu::Diagnostics { subfunction, .. } = request {
-                    RequestPdu::Diagnostics { subfunction: *subfunction, data: *data }.encode(out);
+                    RequestPdu::Diagnostics {
+                        subfunction: *subfunction,
+                        data: *data,
+                    }
+                    .encode(out);
                 }
             }
             Reply::DeviceIdentification(body) => {
@@ -531,34 +595,62 @@ mod tests {
         assert_eq!(decode_bytes(&[0x41]), Err(Exception::FUNCTION));
         assert_eq!(decode_bytes(&[3, 0, 0, 0, 0]), Err(Exception::VALUE), "quantity 0");
         assert_eq!(decode_bytes(&[3, 0, 0, 0, 126]), Err(Exception::VALUE), "126 registers");
-        assert_eq!(decode_bytes(&[3, 0xFF, 0xFF, 0, 2]), Err(Exception::ADDRESS), "past the end");
+        assert_eq!(
+            decode_bytes(&[3, 0xFF, 0xFF, 0, 2]),
+            Err(Exception::ADDRESS),
+            "past the end"
+        );
         assert_eq!(decode_bytes(&[3, 0, 0, 0]), Err(Exception::VALUE), "short");
         assert_eq!(decode_bytes(&[5, 0, 0, 1, 0]), Err(Exception::VALUE), "coil value");
-        assert_eq!(decode_bytes(&[16, 0, 0, 0, 1, 3, 0, 0, 0]), Err(Exception::VALUE), "odd byte count");
-        assert_eq!(decode_bytes(&[15, 0, 0, 0, 100, 1, 0]), Err(Exception::VALUE), "100 coils in one byte");
+        assert_eq!(
+            decode_bytes(&[16, 0, 0, 0, 1, 3, 0, 0, 0]),
+            Err(Exception::VALUE),
+            "odd byte count"
+        );
+        assert_eq!(
+            decode_bytes(&[15, 0, 0, 0, 100, 1, 0]),
+            Err(Exception::VALUE),
+            "100 coils in one byte"
+        );
         assert_eq!(decode_bytes(&[43, 13, 1, 0]), Err(Exception::FUNCTION));
     }
 
     fn any_request() -> impl Strategy<Value = RequestPdu> {
-        let table = prop_oneof![Just(Table::Coil), Just(Table::DiscreteInput), Just(Table::Input), Just(Table::Holding)];
+        let table = prop_oneof![
+            Just(Table::Coil),
+            Just(Table::DiscreteInput),
+            Just(Table::Input),
+            Just(Table::Holding)
+        ];
         prop_oneof![
-            (table, 0u16..60_000, 1u16..=125).prop_map(|(table, start, count)| RequestPdu::Read { table, start, count }),
+            (table, 0u16..60_000, 1u16..=125).prop_map(|(table, start, count)| RequestPdu::Read {
+                table,
+                start,
+                count
+            }),
             (any::<u16>(), any::<bool>()).prop_map(|(address, on)| RequestPdu::WriteCoil { address, on }),
             (any::<u16>(), any::<u16>()).prop_map(|(address, value)| RequestPdu::WriteRegister { address, value }),
             (0u16..60_000, prop::collection::vec(any::<bool>(), 1..1968))
                 .prop_map(|(start, bits)| RequestPdu::WriteCoils { start, bits }),
             (0u16..60_000, prop::collection::vec(any::<u16>(), 1..=123))
                 .prop_map(|(start, values)| RequestPdu::WriteRegisters { start, values }),
-            (any::<u16>(), any::<u16>(), any::<u16>())
-                .prop_map(|(address, and_mask, or_mask)| RequestPdu::MaskWrite { address, and_mask, or_mask }),
-            (0u16..60_000, 1u16..=125, 0u16..60_000, prop::collection::vec(any::<u16>(), 1..=121)).prop_map(
-                |(read_start, read_count, write_start, values)| RequestPdu::ReadWrite {
+            (any::<u16>(), any::<u16>(), any::<u16>()).prop_map(|(address, and_mask, or_mask)| RequestPdu::MaskWrite {
+                address,
+                and_mask,
+                or_mask
+            }),
+            (
+                0u16..60_000,
+                1u16..=125,
+                0u16..60_000,
+                prop::collection::vec(any::<u16>(), 1..=121)
+            )
+                .prop_map(|(read_start, read_count, write_start, values)| RequestPdu::ReadWrite {
                     read_start,
                     read_count,
                     write_start,
                     values
-                }
-            ),
+                }),
             (any::<u16>(), any::<u16>()).prop_map(|(subfunction, data)| RequestPdu::Diagnostics { subfunction, data }),
             (any::<u8>(), any::<u8>()).prop_map(|(code, object)| RequestPdu::DeviceIdentification { code, object }),
         ]

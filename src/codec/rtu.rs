@@ -41,7 +41,11 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
 /// dropped when their CRC is right.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let Some(len) = frame_len(request, bytes) else {
-        return if bytes.len() >= MAX_PDU + OVERHEAD { Decoded::Corrupt("no frame in 256 characters") } else { Decoded::Incomplete };
+        return if bytes.len() >= MAX_PDU + OVERHEAD {
+            Decoded::Corrupt("no frame in 256 characters")
+        } else {
+            Decoded::Incomplete
+        };
     };
     let Some(frame) = bytes.get(..len) else {
         return Decoded::Incomplete;
@@ -100,12 +104,15 @@ pub fn request_len(bytes: &[u8]) -> Option<usize> {
     Some(pdu + OVERHEAD)
 }
 
+/// The request that a slave received, or its function and the exception that answers it.
+pub type ReceivedPdu = Result<RequestPdu, (u8, super::Exception)>;
+
 /// The request in a whole frame, as a slave reads it.
 ///
 /// # Errors
 /// `None` when the CRC is wrong (a slave stays silent); the exception with the function when the
 /// PDU is refused.
-pub fn decode_request(frame: &[u8]) -> Option<(u8, Result<RequestPdu, (u8, super::Exception)>)> {
+pub fn decode_request(frame: &[u8]) -> Option<(u8, ReceivedPdu)> {
     let (address, pdu) = open_frame(frame)?;
     let function = *pdu.first()?;
     Some((address, RequestPdu::decode(pdu).map_err(|code| (function, code))))
@@ -118,19 +125,33 @@ mod tests {
     use proptest::prelude::*;
 
     fn hex(text: &str) -> Vec<u8> {
-        text.split_whitespace().map(|b| u8::from_str_radix(b, 16).unwrap()).collect()
+        text.split_whitespace()
+            .map(|b| u8::from_str_radix(b, 16).unwrap())
+            .collect()
     }
 
     fn read(table: Table, start: u16, count: u16) -> Request {
-        Request { address: 1, pdu: RequestPdu::Read { table, start, count } }
+        Request {
+            address: 1,
+            pdu: RequestPdu::Read { table, start, count },
+        }
     }
 
     fn write(start: u16, values: &[u16]) -> Request {
-        Request { address: 1, pdu: RequestPdu::WriteRegisters { start, values: values.to_vec() } }
+        Request {
+            address: 1,
+            pdu: RequestPdu::WriteRegisters {
+                start,
+                values: values.to_vec(),
+            },
+        }
     }
 
     fn set(address: u16, value: u16) -> Request {
-        Request { address: 1, pdu: RequestPdu::WriteRegister { address, value } }
+        Request {
+            address: 1,
+            pdu: RequestPdu::WriteRegister { address, value },
+        }
     }
 
     fn encoded(request: &Request) -> Vec<u8> {
@@ -142,15 +163,24 @@ mod tests {
     /// Worked requests of drives.md, section 7 (misprints corrected there) and 7.4.
     #[test]
     fn requests_of_the_reference() {
-        let coil = |address, on| Request { address: 1, pdu: RequestPdu::WriteCoil { address, on } };
-        let diag = |subfunction, data| Request { address: 1, pdu: RequestPdu::Diagnostics { subfunction, data } };
+        let coil = |address, on| Request {
+            address: 1,
+            pdu: RequestPdu::WriteCoil { address, on },
+        };
+        let diag = |subfunction, data| Request {
+            address: 1,
+            pdu: RequestPdu::Diagnostics { subfunction, data },
+        };
         let cases = [
             (read(Table::Holding, 2000, 3), "01 03 07 D0 00 03 05 46"),
             (read(Table::Input, 2000, 1), "01 04 07 D0 00 01 31 47"),
             (set(2000, 1), "01 06 07 D0 00 01 48 87"),
             (write(2000, &[1, 16]), "01 10 07 D0 00 02 04 00 01 00 10 88 CF"),
             (read(Table::Input, 6000, 5), "01 04 17 70 00 05 34 66"),
-            (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 03 06 00 01 00 00 13 88 C8 CB"),
+            (
+                write(2000, &[1, 0, 5000]),
+                "01 10 07 D0 00 03 06 00 01 00 00 13 88 C8 CB",
+            ),
             (read(Table::Input, 2102, 2), "01 04 08 36 00 02 93 A5"),
             (coil(0, true), "01 05 00 00 FF 00 8C 3A"),
             (read(Table::DiscreteInput, 2, 1), "01 02 00 02 00 01 18 0A"),
@@ -166,7 +196,13 @@ mod tests {
             (set(2000, 4), "01 06 07 D0 00 04 88 84"),
             (set(2002, 5000), "01 06 07 D2 13 88 25 D1"),
             (set(2002, (-5000i16) as u16), "01 06 07 D2 EC 78 64 65"),
-            (Request { address: 0, ..set(2000, 0) }, "00 06 07 D0 00 00 88 96"),
+            (
+                Request {
+                    address: 0,
+                    ..set(2000, 0)
+                },
+                "00 06 07 D0 00 00 88 96",
+            ),
             (read(Table::Holding, 2100, 11), "01 03 08 34 00 0B 47 A3"),
             (read(Table::Holding, 2100, 1), "01 03 08 34 00 01 C7 A4"),
             (read(Table::Holding, 98, 1), "01 03 00 62 00 01 25 D4"),
@@ -192,25 +228,65 @@ mod tests {
     fn replies_of_the_reference() {
         let status = vec![0x0023, 0x2000, 5000, 2500, 750, 12, 105, 53, 2000, 560, 0];
         let cases = [
-            (read(Table::Input, 6000, 5), "01 84 02 C2 C1", Reply::Exception(Exception::ADDRESS)),
+            (
+                read(Table::Input, 6000, 5),
+                "01 84 02 C2 C1",
+                Reply::Exception(Exception::ADDRESS),
+            ),
             (write(2000, &[1, 0, 5000]), "01 10 07 D0 00 03 80 85", Reply::Written),
-            (read(Table::Input, 2102, 2), "01 04 04 13 88 09 C4 78 E9", Reply::Registers(vec![5000, 2500])),
-            (read(Table::Coil, 0x042E, 1), "01 81 02 C1 91", Reply::Exception(Exception::ADDRESS)),
-            (read(Table::DiscreteInput, 2, 1), "01 02 01 01 60 48", Reply::Bits(vec![true])),
-            (read(Table::Input, 2, 1), "01 04 02 00 9C B9 59", Reply::Registers(vec![156])),
-            (read(Table::Input, 100, 1), "01 04 02 00 01 78 F0", Reply::Registers(vec![1])),
-            (read(Table::Holding, 101, 1), "01 03 02 00 32 39 91", Reply::Registers(vec![50])),
+            (
+                read(Table::Input, 2102, 2),
+                "01 04 04 13 88 09 C4 78 E9",
+                Reply::Registers(vec![5000, 2500]),
+            ),
+            (
+                read(Table::Coil, 0x042E, 1),
+                "01 81 02 C1 91",
+                Reply::Exception(Exception::ADDRESS),
+            ),
+            (
+                read(Table::DiscreteInput, 2, 1),
+                "01 02 01 01 60 48",
+                Reply::Bits(vec![true]),
+            ),
+            (
+                read(Table::Input, 2, 1),
+                "01 04 02 00 9C B9 59",
+                Reply::Registers(vec![156]),
+            ),
+            (
+                read(Table::Input, 100, 1),
+                "01 04 02 00 01 78 F0",
+                Reply::Registers(vec![1]),
+            ),
+            (
+                read(Table::Holding, 101, 1),
+                "01 03 02 00 32 39 91",
+                Reply::Registers(vec![50]),
+            ),
             (
                 read(Table::Holding, 2100, 11),
                 "01 03 16 00 23 20 00 13 88 09 C4 02 EE 00 0C 00 69 00 35 07 D0 02 30 00 00 11 05",
                 Reply::Registers(status),
             ),
-            (read(Table::Holding, 2100, 1), "01 03 02 00 03 F8 45", Reply::Registers(vec![3])),
-            (read(Table::Holding, 98, 1), "01 03 02 00 35 78 53", Reply::Registers(vec![53])),
+            (
+                read(Table::Holding, 2100, 1),
+                "01 03 02 00 03 F8 45",
+                Reply::Registers(vec![3]),
+            ),
+            (
+                read(Table::Holding, 98, 1),
+                "01 03 02 00 35 78 53",
+                Reply::Registers(vec![53]),
+            ),
             (write(2000, &[1, 16]), "01 10 07 D0 00 02 41 45", Reply::Written),
             (set(2000, 7), "01 86 03 02 61", Reply::Exception(Exception::VALUE)),
             (write(2000, &[1]), "01 90 06 CC 02", Reply::Exception(Exception::BUSY)),
-            (set(2000, 1), "01 86 04 43 A3", Reply::Exception(Exception::DEVICE_FAILURE)),
+            (
+                set(2000, 1),
+                "01 86 04 43 A3",
+                Reply::Exception(Exception::DEVICE_FAILURE),
+            ),
             (
                 read(Table::DiscreteInput, 0, 5),
                 "01 02 01 07 E0 4A",
@@ -220,9 +296,19 @@ mod tests {
         for (request, frame, reply) in cases {
             let frame = hex(frame);
             for cut in 0..frame.len() {
-                assert_eq!(decode_reply(&request, &frame[..cut]), Decoded::Incomplete, "{request:?} cut at {cut}");
+                assert_eq!(
+                    decode_reply(&request, &frame[..cut]),
+                    Decoded::Incomplete,
+                    "{request:?} cut at {cut}"
+                );
             }
-            assert_eq!(decode_reply(&request, &frame), Decoded::Reply { used: frame.len(), reply: reply.clone() });
+            assert_eq!(
+                decode_reply(&request, &frame),
+                Decoded::Reply {
+                    used: frame.len(),
+                    reply: reply.clone()
+                }
+            );
             let mut pdu = Vec::new();
             reply.encode(&request.pdu, &mut pdu);
             let mut out = Vec::new();

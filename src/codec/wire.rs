@@ -61,7 +61,12 @@ impl LineFormat {
             '2' => 2,
             _ => return Err(bad()),
         };
-        Ok(LineFormat { baud: baud.max(1), data_bits, parity, stop_bits })
+        Ok(LineFormat {
+            baud: baud.max(1),
+            data_bits,
+            parity,
+            stop_bits,
+        })
     }
 
     /// Bits of one character on the wire: start, data, parity, stop.
@@ -82,7 +87,11 @@ impl LineFormat {
 
     /// 3.5 characters, fixed at 1.75 ms above 19200 baud (Modbus over serial line, 2.5.1.1).
     pub fn silence_spec(&self) -> Duration {
-        if self.baud > 19_200 { Duration::from_micros(1750) } else { self.silence_chars() }
+        if self.baud > 19_200 {
+            Duration::from_micros(1750)
+        } else {
+            self.silence_chars()
+        }
     }
 }
 
@@ -154,7 +163,15 @@ mod tests {
     #[test]
     fn silences_of_the_reference() {
         // drives.md, section 2, RTU timing, 11-bit characters.
-        for (baud, tenths) in [(300, 1283), (600, 642), (1200, 321), (2400, 160), (4800, 80), (9600, 40), (19_200, 20)] {
+        for (baud, tenths) in [
+            (300, 1283),
+            (600, 642),
+            (1200, 321),
+            (2400, 160),
+            (4800, 80),
+            (9600, 40),
+            (19_200, 20),
+        ] {
             let f = LineFormat::new(baud, "8E1").unwrap();
             let ms10 = (f.silence_chars().as_secs_f64() * 10_000.0).round() as i64;
             assert_eq!(ms10, tenths, "{baud}");

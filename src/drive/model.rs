@@ -79,11 +79,19 @@ pub struct Sample {
 
 impl Sample {
     /// Nothing is known.
-    pub const NONE: Sample = Sample { value: None, quality: Quality::Bad, at: None };
+    pub const NONE: Sample = Sample {
+        value: None,
+        quality: Quality::Bad,
+        at: None,
+    };
 
     /// The value, only if it is good.
     pub fn good(&self) -> Option<Value> {
-        if self.quality == Quality::Good { self.value } else { None }
+        if self.quality == Quality::Good {
+            self.value
+        } else {
+            None
+        }
     }
 }
 
@@ -105,7 +113,13 @@ pub enum State {
 
 impl State {
     /// All states in the order of their codes at 0x8001.
-    pub const ALL: [State; 5] = [State::Offline, State::NotReady, State::Ready, State::Running, State::Fault];
+    pub const ALL: [State; 5] = [
+        State::Offline,
+        State::NotReady,
+        State::Ready,
+        State::Running,
+        State::Fault,
+    ];
 
     /// Code in the common block of Modbus TCP.
     pub fn code(self) -> u16 {

@@ -22,12 +22,18 @@ pub struct PlannedRead {
 impl PlannedRead {
     /// The request.
     pub fn pdu(&self) -> RequestPdu {
-        RequestPdu::Read { table: self.table, start: self.start, count: self.count }
+        RequestPdu::Read {
+            table: self.table,
+            start: self.start,
+            count: self.count,
+        }
     }
 
     /// Whether it reads that address.
     pub fn covers(&self, table: Table, address: u16) -> bool {
-        self.table == table && address >= self.start && u32::from(address) < u32::from(self.start) + u32::from(self.count)
+        self.table == table
+            && address >= self.start
+            && u32::from(address) < u32::from(self.start) + u32::from(self.count)
     }
 }
 
@@ -47,9 +53,18 @@ impl Plan {
         let mut reads = Vec::new();
         for class in [PollClass::Fast, PollClass::Slow, PollClass::Once] {
             let mut wanted: BTreeSet<(Table, u16)> = BTreeSet::new();
-            for raw in profile.points.iter().filter(|p| p.class == class).filter_map(|p| p.raw()) {
+            for raw in profile
+                .points
+                .iter()
+                .filter(|p| p.class == class)
+                .filter_map(|p| p.raw())
+            {
                 for item in 0..raw.form.items() {
-                    if let Some(address) = raw.address.checked_add(item).filter(|a| !taken.contains(&(raw.table, *a))) {
+                    if let Some(address) = raw
+                        .address
+                        .checked_add(item)
+                        .filter(|a| !taken.contains(&(raw.table, *a)))
+                    {
                         wanted.insert((raw.table, address));
                     }
                 }
@@ -67,7 +82,11 @@ impl Plan {
         }
         let first = read.count / 2;
         let low = PlannedRead { count: first, ..read };
-        let high = PlannedRead { start: read.start.checked_add(first)?, count: read.count - first, ..read };
+        let high = PlannedRead {
+            start: read.start.checked_add(first)?,
+            count: read.count - first,
+            ..read
+        };
         Some((low, high))
     }
 }
@@ -75,7 +94,9 @@ impl Plan {
 fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -> Vec<PlannedRead> {
     let mut reads: Vec<PlannedRead> = Vec::new();
     for &(table, address) in wanted {
-        let Some(range) = profile.range(table, address) else { continue };
+        let Some(range) = profile.range(table, address) else {
+            continue;
+        };
         if let Some(last) = reads.last_mut() {
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = u32::from(address) + 1 - u32::from(last.start);
@@ -86,7 +107,12 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -
                 continue;
             }
         }
-        reads.push(PlannedRead { class, table, start: address, count: 1 });
+        reads.push(PlannedRead {
+            class,
+            table,
+            start: address,
+            count: 1,
+        });
     }
     reads
 }
@@ -125,7 +151,11 @@ mod tests {
         let profiles = Profiles::built_in();
         let plan = Plan::of(profiles.get("vacon-nx").unwrap());
         let of = |class| -> Vec<(u16, u16)> {
-            plan.reads.iter().filter(|r| r.class == class).map(|r| (r.start, r.count)).collect()
+            plan.reads
+                .iter()
+                .filter(|r| r.class == class)
+                .map(|r| (r.start, r.count))
+                .collect()
         };
         assert_eq!(of(PollClass::Fast), [(2100, 11)]);
         assert_eq!(of(PollClass::Slow), [(7, 2), (2000, 3)]);
@@ -149,11 +179,18 @@ mod tests {
         let range = |first, last, read, holes| {
             format!("[[range]]\ntable = \"holding\"\nfirst = {first}\nlast = {last}\nread = {read}\nholes = {holes}")
         };
-        assert_eq!(spans(&profile(&range(0, 99, 2, false), &[1, 2, 3, 4, 5])), [(1, 2), (3, 2), (5, 1)]);
+        assert_eq!(
+            spans(&profile(&range(0, 99, 2, false), &[1, 2, 3, 4, 5])),
+            [(1, 2), (3, 2), (5, 1)]
+        );
         assert_eq!(spans(&profile(&range(0, 99, 10, false), &[1, 3])), [(1, 1), (3, 1)]);
         assert_eq!(spans(&profile(&range(0, 99, 10, true), &[1, 3, 20])), [(1, 3), (20, 1)]);
         let two = format!("{}\n{}", range(0, 9, 10, false), range(10, 19, 10, false));
-        assert_eq!(spans(&profile(&two, &[8, 9, 10, 11])), [(8, 2), (10, 2)], "never across a border");
+        assert_eq!(
+            spans(&profile(&two, &[8, 9, 10, 11])),
+            [(8, 2), (10, 2)],
+            "never across a border"
+        );
         assert_eq!(spans(&profile(&range(0, 99, 1, false), &[1, 2])), [(1, 1), (2, 1)]);
     }
 
@@ -163,7 +200,11 @@ mod tests {
         // by 3.5 characters of silence: 87.4 and 241.2 reads a second.
         for (baud, rate) in [(38_400, 87.4), (115_200, 241.2)] {
             let format = LineFormat::new(baud, "8N1").unwrap();
-            let pdu = RequestPdu::Read { table: Table::Holding, start: 2100, count: 11 };
+            let pdu = RequestPdu::Read {
+                table: Table::Holding,
+                start: 2100,
+                count: 11,
+            };
             let time = WireTime::of(Protocol::ModbusRtu, &format, &pdu);
             let turnaround = format.silence_chars() + Duration::from_micros(500);
             let total = time.total(turnaround, format.silence_chars()).as_secs_f64();

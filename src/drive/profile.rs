@@ -219,7 +219,11 @@ impl Raw {
         let count = ((value.as_f64() - self.offset) / self.scale).round();
         if !(least..=most).contains(&count) {
             let unit = |c: f64| tidy(c * self.scale + self.offset);
-            return Err(Unwritable::Type { value: value.as_f64(), least: unit(least), most: unit(most) });
+            return Err(Unwritable::Type {
+                value: value.as_f64(),
+                least: unit(least),
+                most: unit(most),
+            });
         }
         Ok(count as i32 as u16)
     }
@@ -235,7 +239,12 @@ impl Point {
     /// Kind of its values.
     pub fn kind(&self) -> Kind {
         match (&self.source, self.model) {
-            (Source::Raw(Raw { form: Form::Bit { .. }, .. }), _) => Kind::Bool,
+            (
+                Source::Raw(Raw {
+                    form: Form::Bit { .. }, ..
+                }),
+                _,
+            ) => Kind::Bool,
             (_, Some(model)) => model.kind(),
             _ => Kind::Number,
         }
@@ -268,12 +277,18 @@ impl Profile {
 
     /// The range that holds `address`.
     pub fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
-        self.ranges.iter().find(|r| r.table == table && r.addresses.contains(&address))
+        self.ranges
+            .iter()
+            .find(|r| r.table == table && r.addresses.contains(&address))
     }
 
     /// The table that a read of `table` really means in this family.
     pub fn canonical(&self, table: Table) -> Table {
-        if table == Table::Input && self.input_is_holding { Table::Holding } else { table }
+        if table == Table::Input && self.input_is_holding {
+            Table::Holding
+        } else {
+            table
+        }
     }
 
     /// Text of a fault code; a code without text is shown as a plain number.
@@ -334,7 +349,13 @@ mod tests {
     use super::*;
 
     fn raw(form: Form, scale: f64) -> Raw {
-        Raw { table: Table::Holding, address: 2002, form, scale, offset: 0.0 }
+        Raw {
+            table: Table::Holding,
+            address: 2002,
+            form,
+            scale,
+            offset: 0.0,
+        }
     }
 
     #[test]
@@ -346,7 +367,10 @@ mod tests {
         assert_eq!(reference.encode(Value::Number(33.333), 0), Ok(3333));
         assert!(reference.encode(Value::Number(400.0), 0).is_err());
         assert!(reference.encode(Value::Number(f64::NAN), 0).is_err());
-        assert_eq!(raw(Form::U16, 0.1).decode(&[12], Kind::Number), Some(Value::Number(1.2)));
+        assert_eq!(
+            raw(Form::U16, 0.1).decode(&[12], Kind::Number),
+            Some(Value::Number(1.2))
+        );
         assert_eq!(raw(Form::U16, 1.0).decode(&[], Kind::Number), None);
     }
 

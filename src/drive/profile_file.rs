@@ -30,9 +30,15 @@ impl Profiles {
         let files = match files_of(directory) {
             Ok(files) => files,
             Err(error) => {
-                let message = format!("cannot read the profile directory: {error}; check `profile_dirs` and permissions");
+                let message =
+                    format!("cannot read the profile directory: {error}; check `profile_dirs` and permissions");
                 let file = directory.display().to_string();
-                return vec![Problem { file, line: None, key: String::new(), message }];
+                return vec![Problem {
+                    file,
+                    line: None,
+                    key: String::new(),
+                    message,
+                }];
             }
         };
         let mut seen: BTreeMap<String, PathBuf> = BTreeMap::new();
@@ -99,7 +105,10 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
     let protocols = read_protocols(reader);
     let addresses = read_pair::<u8>(reader, "addresses").unwrap_or(1..=247);
     if addresses.is_empty() || *addresses.start() == 0 {
-        reader.problem("addresses", "the first address is 0 or above the last; write for example [1, 247]");
+        reader.problem(
+            "addresses",
+            "the first address is 0 or above the last; write for example [1, 247]",
+        );
     }
     let input_is_holding = reader.or("input_is_holding", false);
     let ranges: Vec<AddressRange> = reader.tables("range").into_iter().filter_map(read_range).collect();
@@ -108,13 +117,19 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
         reader.problem("point", "the profile has no point; write at least one [[point]]");
     }
     let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
-    let points: Vec<Point> =
-        tables.into_iter().enumerate().filter_map(|(i, table)| read_point(table, i, &names, &ranges)).collect();
+    let points: Vec<Point> = tables
+        .into_iter()
+        .enumerate()
+        .filter_map(|(i, table)| read_point(table, i, &names, &ranges))
+        .collect();
     let mut faults = read_faults(reader, "faults", true);
     for (code, text) in read_faults(reader, "faults_unverified", false) {
         faults.entry(code).or_insert(text);
     }
-    let model = ModelPoint::ALL.iter().map(|m| points.iter().position(|p| p.model == Some(*m))).collect();
+    let model = ModelPoint::ALL
+        .iter()
+        .map(|m| points.iter().position(|p| p.model == Some(*m)))
+        .collect();
     let profile = Profile {
         name: name.clone().unwrap_or_default(),
         title: reader.or("title", String::new()),
@@ -144,7 +159,10 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
             Some(protocol) => protocols.push(protocol),
             None => {
                 let known: Vec<&str> = Protocol::ALL.iter().map(|p| p.name()).collect();
-                reader.problem("protocols", format!("unknown protocol `{name}`; known: {}", known.join(", ")));
+                reader.problem(
+                    "protocols",
+                    format!("unknown protocol `{name}`; known: {}", known.join(", ")),
+                );
             }
         }
     }
@@ -165,7 +183,10 @@ fn read_pair<T: document::FromNode + Copy + PartialOrd>(reader: &Reader<'_>, key
 fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<Table> {
     let table = Table::from_name(text);
     if table.is_none() {
-        reader.problem(key, format!("unknown table `{text}`; known: coil, discrete-input, input, holding"));
+        reader.problem(
+            key,
+            format!("unknown table `{text}`; known: coil, discrete-input, input, holding"),
+        );
     }
     table
 }
@@ -187,16 +208,29 @@ fn read_range(reader: Reader<'_>) -> Option<AddressRange> {
         }
     };
     if first > last {
-        reader.problem("last", format!("{last} lies before the first address {first}; swap them"));
+        reader.problem(
+            "last",
+            format!("{last} lies before the first address {first}; swap them"),
+        );
     }
     if read == 0 || read > table.max_read() {
-        reader.problem("read", format!("{read} is out of range; write 1 to {}", table.max_read()));
+        reader.problem(
+            "read",
+            format!("{read} is out of range; write 1 to {}", table.max_read()),
+        );
     }
     if write > 123 {
         reader.problem("write", format!("{write} is out of range; write 0 (read-only) to 123"));
     }
     reader.finish();
-    Some(AddressRange { table, addresses: first..=last, read, write, holes, note })
+    Some(AddressRange {
+        table,
+        addresses: first..=last,
+        read,
+        write,
+        holes,
+        note,
+    })
 }
 
 fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[AddressRange]) -> Option<Point> {
@@ -208,11 +242,18 @@ fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[Addr
         reader.problem("name", format!("there are two points `{name}`; rename one of them"));
     }
     let model = ModelPoint::from_name(&name);
-    let source = if reader.has("derive") { read_derived(&reader, names) } else { read_raw(&reader, ranges) };
+    let source = if reader.has("derive") {
+        read_derived(&reader, names)
+    } else {
+        read_raw(&reader, ranges)
+    };
     let unit = match model {
         Some(model) => {
             if reader.has("unit") && reader.optional::<String>("unit").as_deref() != Some(model.unit()) {
-                reader.problem("unit", format!("the unit of `{name}` is fixed to `{}`; leave the key out", model.unit()));
+                reader.problem(
+                    "unit",
+                    format!("the unit of `{name}` is fixed to `{}`; leave the key out", model.unit()),
+                );
             }
             model.unit().to_string()
         }
@@ -230,7 +271,11 @@ fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[Addr
         range: read_pair::<f64>(&reader, "range"),
         verified: reader.or("verified", true),
         note: reader.or("note", String::new()),
-        source: source.unwrap_or(Source::Band { of: index, minimum: index, maximum: index }),
+        source: source.unwrap_or(Source::Band {
+            of: index,
+            minimum: index,
+            maximum: index,
+        }),
     };
     check_write(&reader, &point, ranges);
     reader.finish();
@@ -258,26 +303,37 @@ fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
         let index = names.iter().position(|n| *n == name);
         if index.is_none() {
             let near = document::nearest(&name, names.iter().map(String::as_str));
-            let remedy = near.map_or_else(|| "name a point of this profile".to_string(), |n| format!("did you mean `{n}`?"));
+            let remedy = near.map_or_else(
+                || "name a point of this profile".to_string(),
+                |n| format!("did you mean `{n}`?"),
+            );
             reader.problem(key, format!("there is no point `{name}`; {remedy}"));
         }
         index
     };
     let (of, minimum, maximum) = (other("of"), other("minimum"), other("maximum"));
-    Some(Source::Band { of: of?, minimum: minimum?, maximum: maximum? })
+    Some(Source::Band {
+        of: of?,
+        minimum: minimum?,
+        maximum: maximum?,
+    })
 }
 
 /// `holding 2100.3`: table, PDU address, bit.
 fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
     let at: String = reader.required("at")?;
-    let bad = || format!("`{at}` is no place; write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"");
+    let bad =
+        || format!("`{at}` is no place; write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"");
     let Some((table, place)) = at.split_once(' ') else {
         reader.problem("at", bad());
         return None;
     };
     let table = read_table(reader, "at", table)?;
     let (address, bit) = match place.split_once('.') {
-        Some((address, bit)) => (address.parse::<u16>().ok(), bit.parse::<u8>().ok().filter(|b| *b < 16).map(Some)),
+        Some((address, bit)) => (
+            address.parse::<u16>().ok(),
+            bit.parse::<u8>().ok().filter(|b| *b < 16).map(Some),
+        ),
         None => (place.parse::<u16>().ok(), Some(None)),
     };
     let (Some(address), Some(bit)) = (address, bit) else {
@@ -286,12 +342,27 @@ fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
     };
     let invert = reader.or("invert", false);
     let form = read_form(reader, table, bit, invert)?;
-    let raw = Raw { table, address, form, scale: reader.or("scale", 1.0), offset: reader.or("offset", 0.0) };
+    let raw = Raw {
+        table,
+        address,
+        form,
+        scale: reader.or("scale", 1.0),
+        offset: reader.or("offset", 0.0),
+    };
     if raw.scale == 0.0 {
-        reader.problem("scale", "a scale of 0 loses every value; write the engineering value of one count");
+        reader.problem(
+            "scale",
+            "a scale of 0 loses every value; write the engineering value of one count",
+        );
     }
-    if !ranges.iter().any(|r| r.table == table && r.addresses.contains(&address)) {
-        reader.problem("at", format!("{table} {address} lies in no [[range]] of the profile; add the range"));
+    if !ranges
+        .iter()
+        .any(|r| r.table == table && r.addresses.contains(&address))
+    {
+        reader.problem(
+            "at",
+            format!("{table} {address} lies in no [[range]] of the profile; add the range"),
+        );
     }
     Some(Source::Raw(raw))
 }
@@ -308,7 +379,10 @@ fn read_form(reader: &Reader<'_>, table: Table, bit: Option<u8>, invert: bool) -
             None
         }
         (true, _, _) => {
-            reader.problem("at", "an item of a bit table has neither bit number nor type; leave them out");
+            reader.problem(
+                "at",
+                "an item of a bit table has neither bit number nor type; leave them out",
+            );
             None
         }
         (false, Some(_), Some(_)) => {
@@ -320,17 +394,32 @@ fn read_form(reader: &Reader<'_>, table: Table, bit: Option<u8>, invert: bool) -
 
 fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if point.pulse && !point.write {
-        reader.problem("pulse", "only a point that can be written can be a pulse; add `write = true`");
+        reader.problem(
+            "pulse",
+            "only a point that can be written can be a pulse; add `write = true`",
+        );
     }
-    let Some(raw) = point.raw().filter(|_| point.write) else { return };
-    let writable = ranges.iter().any(|r| r.table == raw.table && r.addresses.contains(&raw.address) && r.write > 0);
+    let Some(raw) = point.raw().filter(|_| point.write) else {
+        return;
+    };
+    let writable = ranges
+        .iter()
+        .any(|r| r.table == raw.table && r.addresses.contains(&raw.address) && r.write > 0);
     if !writable {
-        reader.problem("write", format!("{} {} lies in a read-only range; set `write` there", raw.table, raw.address));
+        reader.problem(
+            "write",
+            format!(
+                "{} {} lies in a read-only range; set `write` there",
+                raw.table, raw.address
+            ),
+        );
     }
 }
 
 fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, FaultText> {
-    let Some(table) = reader.table(key) else { return BTreeMap::new() };
+    let Some(table) = reader.table(key) else {
+        return BTreeMap::new();
+    };
     let mut faults = BTreeMap::new();
     for code in table.keys() {
         let text: Option<String> = table.optional(code);
@@ -338,7 +427,10 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
             (Ok(number), Some(text)) => {
                 faults.insert(number, FaultText { text, verified });
             }
-            (Err(_), _) => table.problem(code, format!("`{code}` is no fault code; write a number from 0 to 65535")),
+            (Err(_), _) => table.problem(
+                code,
+                format!("`{code}` is no fault code; write a number from 0 to 65535"),
+            ),
             (Ok(_), None) => {}
         }
     }
@@ -349,7 +441,9 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
 /// Lower-case letters, digits and `joint`, beginning with a letter.
 fn is_name(text: &str, joint: char) -> bool {
     text.starts_with(|c: char| c.is_ascii_lowercase())
-        && text.chars().all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == joint)
+        && text
+            .chars()
+            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == joint)
 }
 
 #[cfg(test)]
@@ -360,7 +454,11 @@ mod tests {
     fn built_in_profiles_are_valid() {
         for (file, source) in BUILT_IN {
             let found = Profile::parse(file, source, true).err().unwrap_or_default();
-            assert!(found.is_empty(), "{}", found.iter().map(Problem::to_string).collect::<Vec<_>>().join("\n"));
+            assert!(
+                found.is_empty(),
+                "{}",
+                found.iter().map(Problem::to_string).collect::<Vec<_>>().join("\n")
+            );
         }
         assert_eq!(Profiles::built_in().iter().count(), BUILT_IN.len());
     }

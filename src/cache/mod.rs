@@ -1,0 +1,310 @@
+//! The process image: what is known of every drive and bus. One writer a bus, any number of readers.
+//!
+//! The writer replaces a drive's [`Snapshot`] as a whole after each exchange, so a reader always sees the
+//! registers of one poll together: a torn 32-bit value is impossible, and nobody waits for anybody.
+
+mod health;
+mod snapshot;
+mod trace;
+
+pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
+pub use snapshot::{Link, Reading, Snapshot, Unavailable};
+pub use trace::{Direction, FrameRecord, Trace};
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+
+use crate::codec::{LineFormat, Protocol};
+use crate::drive::{ModelPoint, Plan, Profile, Value};
+
+/// Whether a drive may be commanded.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Access {
+    /// Every write is refused.
+    Monitor,
+    /// Writes are passed on.
+    Control,
+}
+
+/// What is done when nobody renews a drive's lease any more.
+#[derive(Debug, Clone, PartialEq)]
+pub enum LeaseAction {
+    /// Stop the drive.
+    Stop,
+    /// Only tell.
+    Hold,
+    /// Set the speed reference, percent.
+    SpeedReference(f64),
+}
+
+/// Lease of a drive: a commanding client must be heard of within `timeout`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Supervision {
+    /// Time without any accepted write or heartbeat.
+    pub timeout: Duration,
+    /// What is done then, once.
+    pub action: LeaseAction,
+}
+
+/// What is done with a drive when the gateway stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OnShutdown {
+    /// Nothing is written.
+    Hold,
+    /// The stop is written and its acknowledgement awaited.
+    Stop,
+}
+
+/// A drive as configured.
+#[derive(Debug, Clone)]
+pub struct DriveSpec {
+    /// Name, unique in the gateway.
+    pub name: String,
+    /// Name of its bus.
+    pub bus: String,
+    /// Address on the bus, 1..=247.
+    pub address: u8,
+    /// Modbus TCP unit id, 1..=254.
+    pub unit: u8,
+    /// Its family.
+    pub profile: Arc<Profile>,
+    /// Whether it may be commanded.
+    pub access: Access,
+    /// Limits of commands in engineering units, by point name.
+    pub limits: BTreeMap<String, RangeInclusive<f64>>,
+    /// Lease, if there is one.
+    pub supervision: Option<Supervision>,
+    /// What happens when the gateway stops.
+    pub on_shutdown: OnShutdown,
+    /// Time the drive takes to begin its answer, for the prediction.
+    pub turnaround: Duration,
+    /// Minimum and maximum frequency, Hz, where the drive's own parameters cannot be read.
+    pub frequency_range: Option<RangeInclusive<f64>>,
+}
+
+/// A bus as configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BusSpec {
+    /// Name, unique in the gateway.
+    pub name: String,
+    /// Path of the serial port, or `tcp://host:port`.
+    pub port: String,
+    /// Protocol.
+    pub protocol: Protocol,
+    /// Baud rate and character format.
+    pub format: LineFormat,
+    /// Cadence aimed at for process data.
+    pub cycle: Duration,
+    /// Cadence aimed at for the slow class.
+    pub slow_cycle: Duration,
+}
+
+/// The image of one drive.
+#[derive(Debug)]
+pub struct DriveImage {
+    /// As configured.
+    pub spec: DriveSpec,
+    /// The requests that read it.
+    pub plan: Plan,
+    /// Cadence of the slow class, which the staleness of slow points depends on.
+    slow_cycle: Duration,
+    snapshot: ArcSwap<Snapshot>,
+    outcomes: [AtomicU64; Outcome::ALL.len()],
+    /// Last turnaround measured, ns; 0 is none yet.
+    turnaround: AtomicU64,
+    lease: Mutex<Option<Instant>>,
+}
+
+impl DriveImage {
+    /// An image of which nothing is known yet.
+    pub fn new(spec: DriveSpec, slow_cycle: Duration) -> DriveImage {
+        let plan = Plan::of(&spec.profile);
+        let snapshot = ArcSwap::from_pointee(Snapshot::empty(&plan));
+        let outcomes = Default::default();
+        DriveImage {
+            spec,
+            plan,
+            slow_cycle,
+            snapshot,
+            outcomes,
+            turnaround: AtomicU64::new(0),
+            lease: Mutex::default(),
+        }
+    }
+
+    /// What is known now; stays as it is while the caller holds it.
+    pub fn snapshot(&self) -> Arc<Snapshot> {
+        self.snapshot.load_full()
+    }
+
+    /// Changes the image as one step. Only the bus that owns the drive may call this.
+    pub fn update(&self, change: impl FnOnce(&mut Snapshot)) {
+        let mut next = Snapshot::clone(&self.snapshot.load());
+        change(&mut next);
+        self.snapshot.store(Arc::new(next));
+    }
+
+    /// How a reader at `now` looks at the drive.
+    pub fn reading(&self, now: Instant, stale_after: Duration) -> Reading<'_> {
+        let snapshot = self.snapshot();
+        Reading {
+            spec: &self.spec,
+            snapshot,
+            now,
+            stale_after,
+            slow_cycle: self.slow_cycle,
+        }
+    }
+
+    /// Counts one exchange.
+    pub fn count(&self, outcome: Outcome) {
+        if let Some(counter) = self.outcomes.get(outcome as usize) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Exchanges of that outcome so far.
+    pub fn counted(&self, outcome: Outcome) -> u64 {
+        self.outcomes
+            .get(outcome as usize)
+            .map_or(0, |c| c.load(Ordering::Relaxed))
+    }
+
+    /// Notes the time from the end of a request to the beginning of its answer.
+    pub fn set_turnaround(&self, time: Duration) {
+        self.turnaround
+            .store(time.as_nanos().clamp(1, u128::from(u64::MAX)) as u64, Ordering::Relaxed);
+    }
+
+    /// The last turnaround measured.
+    pub fn turnaround(&self) -> Option<Duration> {
+        match self.turnaround.load(Ordering::Relaxed) {
+            0 => None,
+            nanos => Some(Duration::from_nanos(nanos)),
+        }
+    }
+
+    /// A commanding client was heard of: the lease runs anew.
+    pub fn renew_lease(&self, now: Instant) {
+        if self.spec.supervision.is_some() {
+            *self.lease.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
+        }
+    }
+
+    /// Ends the lease if it ran out; true exactly once for each lease.
+    pub fn lease_ran_out(&self, now: Instant) -> bool {
+        let Some(supervision) = &self.spec.supervision else {
+            return false;
+        };
+        let mut lease = self.lease.lock().unwrap_or_else(PoisonError::into_inner);
+        let out = lease.is_some_and(|renewed| now.saturating_duration_since(renewed) >= supervision.timeout);
+        if out {
+            *lease = None;
+        }
+        out
+    }
+}
+
+/// The image of one bus and its drives.
+#[derive(Debug)]
+pub struct BusImage {
+    /// As configured.
+    pub spec: BusSpec,
+    /// Its drives, in the order of the file.
+    pub drives: Vec<Arc<DriveImage>>,
+    /// Time of whole exchanges, s.
+    pub transactions: Histogram,
+    /// Achieved cycle of the fast class, s.
+    pub fast_cycles: Histogram,
+    /// Achieved cycle of the slow class, s.
+    pub slow_cycles: Histogram,
+    /// The frames on the line, for whoever listens.
+    pub trace: Trace,
+    health: Mutex<BusHealth>,
+}
+
+impl BusImage {
+    /// An image of a bus that is not open yet.
+    pub fn new(spec: BusSpec, drives: Vec<Arc<DriveImage>>) -> BusImage {
+        BusImage {
+            spec,
+            drives,
+            transactions: Histogram::new(),
+            fast_cycles: Histogram::new(),
+            slow_cycles: Histogram::new(),
+            trace: Trace::default(),
+            health: Mutex::new(BusHealth::default()),
+        }
+    }
+
+    /// State and figures of the bus.
+    pub fn health(&self) -> BusHealth {
+        self.health.lock().unwrap_or_else(PoisonError::into_inner).clone()
+    }
+
+    /// Changes state and figures. Only the bus itself may call this.
+    pub fn update_health(&self, change: impl FnOnce(&mut BusHealth)) {
+        change(&mut self.health.lock().unwrap_or_else(PoisonError::into_inner));
+    }
+
+    /// Exchanges of all drives so far.
+    pub fn transactions_total(&self) -> u64 {
+        Outcome::ALL.iter().map(|&o| self.counted(o)).sum()
+    }
+
+    /// Exchanges that failed: no or no sound answer.
+    pub fn errors_total(&self) -> u64 {
+        self.counted(Outcome::Timeout) + self.counted(Outcome::Corrupt)
+    }
+
+    /// Drives that answer.
+    pub fn online(&self) -> usize {
+        self.drives.iter().filter(|d| d.snapshot().link.is_online()).count()
+    }
+
+    fn counted(&self, outcome: Outcome) -> u64 {
+        self.drives.iter().map(|d| d.counted(outcome)).sum()
+    }
+}
+
+impl DriveSpec {
+    /// Percent of the speed range as Hz, or Hz as percent, with the band `minimum..maximum` in Hz.
+    pub fn percent_of(frequency: f64, minimum: f64, maximum: f64) -> Option<f64> {
+        let span = maximum - minimum;
+        (span > 0.0).then(|| (frequency - minimum) / span * 100.0)
+    }
+
+    /// Limits of a command to that point: the configured ones, else the profile's.
+    pub fn limits_of(&self, point: usize) -> Option<RangeInclusive<f64>> {
+        let point = self.profile.points.get(point)?;
+        self.limits.get(&point.name).cloned().or_else(|| point.range.clone())
+    }
+}
+
+/// Serves as the public shape of a drive in JSON: name to value, `null` where nothing good is known.
+pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
+    value.map_or(serde_json::Value::Null, |v| match v {
+        Value::Bool(b) => b.into(),
+        Value::Integer(i) => i.into(),
+        Value::Number(n) => n.into(),
+    })
+}
+
+/// All model points and profile points of a drive with their names, in the order of the contract.
+pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
+    let model = ModelPoint::ALL
+        .iter()
+        .filter_map(|m| profile.model_index(*m).map(|i| (i, m.name())));
+    let own = profile
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, p)| p.model.is_none())
+        .map(|(i, p)| (i, p.name.as_str()));
+    model.chain(own).collect()
+}

@@ -1,0 +1,302 @@
+//! What is known of a drive at one time: raw words with their times, and how they read as points.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::DriveSpec;
+use crate::codec::{Exception, Table};
+use crate::drive::{ModelPoint, Plan, PollClass, Quality, Sample, Source, State, Value};
+
+/// Whether a drive answers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Link {
+    /// Not asked yet.
+    Untried,
+    /// Answers since.
+    Online(SystemTime),
+    /// Does not answer since.
+    Offline(SystemTime),
+}
+
+impl Link {
+    /// Whether the drive answers.
+    pub fn is_online(self) -> bool {
+        matches!(self, Link::Online(_))
+    }
+
+    /// Whether the drive was asked at least once to an end.
+    pub fn is_tried(self) -> bool {
+        self != Link::Untried
+    }
+}
+
+/// One register (or bit as 0 and 1) of the drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+struct Cell {
+    word: u16,
+    at: Option<Instant>,
+    refused: Option<Exception>,
+}
+
+/// Cells that lie together and are polled alike.
+#[derive(Debug, Clone, PartialEq, Eq)]
+struct Span {
+    table: Table,
+    start: u16,
+    class: PollClass,
+    cells: Vec<Cell>,
+}
+
+impl Span {
+    fn offset(&self, table: Table, address: u16) -> Option<usize> {
+        let offset = usize::from(address.checked_sub(self.start)?);
+        (self.table == table && offset < self.cells.len()).then_some(offset)
+    }
+}
+
+/// What is known of a drive.
+#[derive(Debug, Clone)]
+pub struct Snapshot {
+    /// Whether it answers.
+    pub link: Link,
+    /// When the process data (fast class) was last read.
+    pub fast_at: Option<Instant>,
+    spans: Vec<Span>,
+}
+
+/// Why words cannot be served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unavailable {
+    /// Not part of the plan: only the drive itself knows.
+    NotPolled,
+    /// Too old, never read, or the drive is offline.
+    Stale,
+    /// The drive refuses the address with this exception.
+    Refused(Exception),
+}
+
+impl Snapshot {
+    /// Nothing is known of the plan's addresses yet.
+    pub fn empty(plan: &Plan) -> Snapshot {
+        let spans = plan.reads.iter().map(|read| Span {
+            table: read.table,
+            start: read.start,
+            class: read.class,
+            cells: vec![Cell::default(); usize::from(read.count)],
+        });
+        Snapshot {
+            link: Link::Untried,
+            fast_at: None,
+            spans: spans.collect(),
+        }
+    }
+
+    /// Words that the drive answered.
+    pub fn store(&mut self, table: Table, start: u16, words: &[u16], now: Instant) {
+        self.each(table, start, words.len(), |cell, offset| {
+            let word = words.get(offset).copied().unwrap_or_default();
+            *cell = Cell {
+                word,
+                at: Some(now),
+                refused: None,
+            };
+        });
+    }
+
+    /// The drive refused these addresses.
+    pub fn refuse(&mut self, table: Table, start: u16, count: u16, exception: Exception) {
+        self.each(table, start, usize::from(count), |cell, _| {
+            cell.refused = Some(exception)
+        });
+    }
+
+    fn each(&mut self, table: Table, start: u16, count: usize, mut change: impl FnMut(&mut Cell, usize)) {
+        for offset in 0..count {
+            let Some(address) = u16::try_from(offset).ok().and_then(|o| start.checked_add(o)) else {
+                return;
+            };
+            for span in &mut self.spans {
+                let place = span.offset(table, address);
+                if let Some(cell) = place.and_then(|p| span.cells.get_mut(p)) {
+                    change(cell, offset);
+                }
+            }
+        }
+    }
+
+    /// The last word read at an address, whatever its age.
+    pub fn word(&self, table: Table, address: u16) -> Option<u16> {
+        self.cell(table, address)
+            .filter(|(_, c)| c.at.is_some())
+            .map(|(_, c)| c.word)
+    }
+
+    fn cell(&self, table: Table, address: u16) -> Option<(PollClass, &Cell)> {
+        self.spans
+            .iter()
+            .find_map(|s| Some((s.class, s.cells.get(s.offset(table, address)?)?)))
+    }
+}
+
+/// A drive as a reader sees it at one time.
+#[derive(Debug, Clone)]
+pub struct Reading<'d> {
+    /// As configured.
+    pub spec: &'d DriveSpec,
+    /// What is known.
+    pub snapshot: Arc<Snapshot>,
+    /// When the reader looks.
+    pub now: Instant,
+    /// Age from which a sample of the fast class is stale.
+    pub stale_after: Duration,
+    /// Cadence of the slow class.
+    pub slow_cycle: Duration,
+}
+
+impl Reading<'_> {
+    /// Age from which a sample of that class is stale: slow points get two of their cycles on top, points
+    /// read once stay good while the drive is online.
+    fn age_limit(&self, class: PollClass) -> Option<Duration> {
+        match class {
+            PollClass::Fast => Some(self.stale_after),
+            PollClass::Slow => Some(self.stale_after + 2 * self.slow_cycle),
+            PollClass::Once | PollClass::Never => None,
+        }
+    }
+
+    fn quality(&self, class: PollClass, cell: &Cell) -> Quality {
+        match (cell.refused, cell.at) {
+            (Some(_), _) | (None, None) => Quality::Bad,
+            _ if !self.snapshot.link.is_online() => Quality::Stale,
+            (None, Some(at)) => {
+                let age = self.now.saturating_duration_since(at);
+                let old = self.age_limit(class).is_some_and(|limit| age > limit);
+                if old { Quality::Stale } else { Quality::Good }
+            }
+        }
+    }
+
+    /// The words of an address span, if every one of them is good.
+    ///
+    /// # Errors
+    /// Why not: an address that is not polled first, then one refused, then one stale.
+    pub fn words(&self, table: Table, start: u16, count: u16) -> Result<Vec<u16>, Unavailable> {
+        let table = self.spec.profile.canonical(table);
+        let mut words = Vec::with_capacity(usize::from(count));
+        let mut worst = None;
+        for offset in 0..count {
+            let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
+            let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
+            match self.quality(class, cell) {
+                Quality::Good => {}
+                _ if cell.refused.is_some() && self.snapshot.link.is_online() => {
+                    worst = cell.refused.map(Unavailable::Refused);
+                }
+                _ => worst = worst.or(Some(Unavailable::Stale)),
+            }
+            words.push(cell.word);
+        }
+        worst.map_or(Ok(words), Err)
+    }
+
+    /// The sample of a point.
+    pub fn sample(&self, point: usize) -> Sample {
+        let Some(point) = self.spec.profile.points.get(point) else {
+            return Sample::NONE;
+        };
+        match &point.source {
+            Source::Raw(raw) => {
+                let Some((class, cell)) = self.snapshot.cell(raw.table, raw.address) else {
+                    return Sample::NONE;
+                };
+                let quality = self.quality(class, cell);
+                let value = cell.at.and_then(|_| raw.decode(&[cell.word], point.kind()));
+                Sample {
+                    value,
+                    quality,
+                    at: cell.at,
+                }
+            }
+            Source::Band { of, minimum, maximum } => {
+                let percent = self.sample(*of);
+                let band = self.band(*minimum, *maximum);
+                match (percent.value, band) {
+                    (Some(p), Some((low, high))) => {
+                        let value = crate::drive::profile::tidy(low + p.as_f64() / 100.0 * (high - low));
+                        Sample {
+                            value: Some(Value::Number(value)),
+                            ..percent
+                        }
+                    }
+                    _ => Sample::NONE,
+                }
+            }
+        }
+    }
+
+    /// Minimum and maximum frequency: the drive's own, else the configured ones.
+    pub fn band(&self, minimum: usize, maximum: usize) -> Option<(f64, f64)> {
+        let good = |point| self.sample(point).good().map(Value::as_f64);
+        match (good(minimum), good(maximum)) {
+            (Some(low), Some(high)) if high > low => Some((low, high)),
+            _ => self.spec.frequency_range.as_ref().map(|r| (*r.start(), *r.end())),
+        }
+    }
+
+    /// The sample of a model point; a point that the family lacks is bad.
+    pub fn model(&self, point: ModelPoint) -> Sample {
+        self.spec
+            .profile
+            .model_index(point)
+            .map_or(Sample::NONE, |i| self.sample(i))
+    }
+
+    /// Whether a bit of the model is good and set.
+    pub fn is_set(&self, point: ModelPoint) -> bool {
+        self.model(point).good().is_some_and(Value::as_bool)
+    }
+
+    /// Age of the process data; `None` if it was never read.
+    pub fn age(&self) -> Option<Duration> {
+        self.snapshot.fast_at.map(|at| self.now.saturating_duration_since(at))
+    }
+
+    /// Whether the process data is too old or the drive is offline.
+    pub fn is_stale(&self) -> bool {
+        !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > self.stale_after)
+    }
+
+    /// The drive in one word.
+    pub fn state(&self) -> State {
+        if self.is_stale() {
+            State::Offline
+        } else if self.is_set(ModelPoint::Fault) {
+            State::Fault
+        } else if self.is_set(ModelPoint::Running) {
+            State::Running
+        } else if self.is_set(ModelPoint::Ready) {
+            State::Ready
+        } else {
+            State::NotReady
+        }
+    }
+
+    /// Text of the active fault; empty without a fault.
+    pub fn fault_text(&self) -> String {
+        match self.model(ModelPoint::FaultCode).good() {
+            Some(Value::Integer(code)) => self.spec.profile.fault_text(code),
+            _ => String::new(),
+        }
+    }
+
+    /// Quality of the drive as a whole: that of its process data.
+    pub fn overall(&self) -> Quality {
+        if self.snapshot.fast_at.is_none() {
+            Quality::Bad
+        } else if self.is_stale() {
+            Quality::Stale
+        } else {
+            Quality::Good
+        }
+    }
+}

@@ -1,0 +1,64 @@
+//! The frames on a line, for whoever listens; costs nothing while nobody does.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use tokio::sync::broadcast;
+
+/// Frames in flight for a listener; one that is further behind loses the oldest.
+const IN_FLIGHT: usize = 1024;
+
+/// Who sent a frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Direction {
+    /// The gateway.
+    Request,
+    /// A drive.
+    Reply,
+}
+
+/// One frame, or bytes that are none.
+#[derive(Debug, Clone, PartialEq)]
+pub struct FrameRecord {
+    /// Beginning of a request, arrival of the last byte of a reply.
+    pub time: SystemTime,
+    /// Time since the end of the frame before.
+    pub gap: Option<Duration>,
+    /// Who sent it.
+    pub direction: Direction,
+    /// The bytes on the wire.
+    pub bytes: Vec<u8>,
+    /// What became of it: `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `timeout`.
+    pub verdict: String,
+}
+
+/// The tap of one line.
+#[derive(Debug, Clone)]
+pub struct Trace(broadcast::Sender<Arc<FrameRecord>>);
+
+impl Default for Trace {
+    fn default() -> Self {
+        Trace(broadcast::channel(IN_FLIGHT).0)
+    }
+}
+
+impl Trace {
+    /// Whether somebody listens.
+    pub fn wanted(&self) -> bool {
+        self.0.receiver_count() > 0
+    }
+
+    /// Tells a frame to the listeners; the record is only built when there are any.
+    pub fn tell(&self, record: impl FnOnce() -> FrameRecord) {
+        if self.wanted() {
+            // The last listener may have gone meanwhile, which is no error.
+            let _ = self.0.send(Arc::new(record()));
+        }
+    }
+
+    /// Hears all frames from now on.
+    pub fn subscribe(&self) -> broadcast::Receiver<Arc<FrameRecord>> {
+        self.0.subscribe()
+    }
+}

@@ -1,0 +1,410 @@
+//! Which commands are let through: authority first, then address, then value. Pure.
+
+use super::{Order, Refusal, Urgency};
+use crate::cache::{Access, Reading};
+use crate::codec::{RequestPdu, Table};
+use crate::drive::model::Kind;
+use crate::drive::{ModelPoint, Point, Source, Value};
+
+/// An order that may go to the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Admitted {
+    /// The order, derived points replaced by the points they rest on.
+    pub order: Order,
+    /// Its rank.
+    pub urgency: Urgency,
+    /// It sets references only.
+    pub reference_only: bool,
+}
+
+/// Checks an order against what client and drive allow, the profile and the limits.
+///
+/// `may_write` says whether the client may write at all.
+///
+/// # Errors
+/// The refusal, in the order authority, address, value; nothing is clamped.
+pub fn admit(order: Order, drive: &Reading<'_>, may_write: bool) -> Result<Admitted, Refusal> {
+    match order {
+        Order::Read(pdu) => Ok(Admitted {
+            order: Order::Read(pdu),
+            urgency: Urgency::Read,
+            reference_only: false,
+        }),
+        Order::Write(pdu) => {
+            authority(drive, may_write)?;
+            raw_write(drive, &pdu)?;
+            let urgency = if stops(drive, &pdu) {
+                Urgency::Stop
+            } else {
+                Urgency::Command
+            };
+            Ok(Admitted {
+                order: Order::Write(pdu),
+                urgency,
+                reference_only: false,
+            })
+        }
+        Order::Points(values) => {
+            authority(drive, may_write)?;
+            points(drive, values)
+        }
+    }
+}
+
+fn authority(drive: &Reading<'_>, may_write: bool) -> Result<(), Refusal> {
+    if !may_write {
+        return Err(Refusal::NotAllowed(
+            "this client may not write; it is not in the `write` list".to_string(),
+        ));
+    }
+    if drive.spec.access == Access::Monitor {
+        let name = &drive.spec.name;
+        return Err(Refusal::NotAllowed(format!(
+            "drive `{name}` is only monitored; set access = \"control\" for it"
+        )));
+    }
+    Ok(())
+}
+
+fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, Refusal> {
+    let profile = &drive.spec.profile;
+    if values.is_empty() {
+        return Err(Refusal::BadValue(
+            "the command names no point; nothing was written".to_string(),
+        ));
+    }
+    let mut resolved: Vec<(usize, Value)> = Vec::with_capacity(values.len());
+    for (index, value) in values {
+        let point =
+            profile.points.get(index).filter(|p| p.write).ok_or_else(|| {
+                Refusal::NotWritable(format!("point {index} of `{}` cannot be written", drive.spec.name))
+            })?;
+        let value = checked(drive, index, point, value)?;
+        let (index, value) = resolve(drive, index, point, value)?;
+        if resolved.iter().any(|(other, _)| *other == index) {
+            let what = profile.points.get(index).map_or("", |p| p.name.as_str());
+            return Err(Refusal::BadValue(format!(
+                "the command sets `{what}` twice; send one reference only"
+            )));
+        }
+        resolved.push((index, value));
+    }
+    let is = |point: ModelPoint, wanted: Option<bool>| {
+        resolved
+            .iter()
+            .any(|(i, v)| profile.model_index(point) == Some(*i) && wanted.is_none_or(|wanted| v.as_bool() == wanted))
+    };
+    let stop = is(ModelPoint::Run, Some(false));
+    let bits = resolved
+        .iter()
+        .any(|(i, _)| profile.points.get(*i).is_some_and(|p| p.kind() == Kind::Bool));
+    let urgency = if stop { Urgency::Stop } else { Urgency::Command };
+    Ok(Admitted {
+        order: Order::Points(resolved),
+        urgency,
+        reference_only: !bits,
+    })
+}
+
+/// The value in the point's kind and within its limits.
+fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<Value, Refusal> {
+    let name = &point.name;
+    let number = value.as_f64();
+    if !number.is_finite() {
+        return Err(Refusal::BadValue(format!(
+            "`{name}` = {number} is no number; nothing was written"
+        )));
+    }
+    if point.kind() == Kind::Bool {
+        return match value {
+            Value::Bool(_) => Ok(value),
+            _ if number == 0.0 || number == 1.0 => Ok(Value::Bool(number == 1.0)),
+            _ => Err(Refusal::BadValue(format!(
+                "`{name}` = {number} is neither true nor false; nothing was written"
+            ))),
+        };
+    }
+    if let Some(limits) = drive.spec.limits_of(index).filter(|l| !l.contains(&number)) {
+        let (low, high) = limits.into_inner();
+        let unit = &point.unit;
+        let text =
+            format!("`{name}` = {number} {unit} is outside the limits {low} to {high} {unit}; nothing was written");
+        return Err(Refusal::BadValue(text));
+    }
+    Ok(Value::Number(number))
+}
+
+/// A derived point becomes the point it rests on; the value must fit the register.
+fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<(usize, Value), Refusal> {
+    match &point.source {
+        Source::Raw(raw) => {
+            raw.encode(value, 0)
+                .map_err(|why| Refusal::BadValue(format!("`{}`: {why}; nothing was written", point.name)))?;
+            Ok((index, value))
+        }
+        Source::Band { of, minimum, maximum } => {
+            let (low, high) = drive.band(*minimum, *maximum).ok_or_else(|| {
+                Refusal::NotWritable(format!(
+                    "`{}` needs the drive's frequency range, which is not known; set frequency_range for the drive",
+                    point.name
+                ))
+            })?;
+            let base = drive.spec.profile.points.get(*of);
+            let percent = crate::cache::DriveSpec::percent_of(value.as_f64(), low, high);
+            let (Some(base), Some(percent)) = (base, percent) else {
+                return Err(Refusal::NotWritable(format!(
+                    "the frequency range {low} to {high} Hz is empty"
+                )));
+            };
+            // The limits of the frequency were checked; those of the percentage hold as well.
+            let rounded = Value::Number((percent * 100.0).round() / 100.0);
+            let value = checked(drive, *of, base, rounded)?;
+            resolve(drive, *of, base, value)
+        }
+    }
+}
+
+/// The registers that a raw write sets, as address and value.
+fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {
+    let many = |start: u16, values: &mut dyn Iterator<Item = u16>| -> Vec<(u16, u16)> {
+        (0u16..)
+            .zip(values)
+            .filter_map(|(i, v)| Some((start.checked_add(i)?, v)))
+            .collect()
+    };
+    match pdu {
+        RequestPdu::WriteRegister { address, value } => Some((Table::Holding, vec![(*address, *value)])),
+        RequestPdu::WriteRegisters { start, values } => {
+            Some((Table::Holding, many(*start, &mut values.iter().copied())))
+        }
+        RequestPdu::WriteCoil { address, on } => Some((Table::Coil, vec![(*address, u16::from(*on))])),
+        RequestPdu::WriteCoils { start, bits } => {
+            Some((Table::Coil, many(*start, &mut bits.iter().map(|b| u16::from(*b)))))
+        }
+        _ => None,
+    }
+}
+
+fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
+    let profile = &drive.spec.profile;
+    let Some((table, items)) = written(pdu) else {
+        return Err(Refusal::NotAllowed(format!(
+            "function {} cannot be passed on to this drive",
+            pdu.function()
+        )));
+    };
+    let Some((first, _)) = items.first() else {
+        return Err(Refusal::BadValue(
+            "the write names no register; nothing was written".to_string(),
+        ));
+    };
+    let range = profile.range(table, *first).filter(|r| r.write > 0).ok_or_else(|| {
+        Refusal::NotWritable(format!(
+            "{table} {first} of `{}` is read-only or unknown",
+            drive.spec.name
+        ))
+    })?;
+    if let Some((beyond, _)) = items.iter().find(|(address, _)| !range.addresses.contains(address)) {
+        return Err(Refusal::NotWritable(format!(
+            "{table} {beyond} of `{}` is read-only or unknown",
+            drive.spec.name
+        )));
+    }
+    if items.len() > usize::from(range.write) {
+        let (count, most) = (items.len(), range.write);
+        return Err(Refusal::BadValue(format!(
+            "{count} items in one write, the drive takes {most}; nothing was written"
+        )));
+    }
+    for (address, word) in items {
+        for (index, point) in profile.points.iter().enumerate() {
+            let Some(raw) = point.raw().filter(|r| r.table == table && r.address == address) else {
+                continue;
+            };
+            if point.kind() != Kind::Bool
+                && let Some(value) = raw.decode(&[word], Kind::Number)
+            {
+                checked(drive, index, point, value)?;
+            }
+        }
+    }
+    Ok(())
+}
+
+/// Whether a raw write takes the run command away.
+fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
+    let profile = &drive.spec.profile;
+    written(pdu).is_some_and(|(table, items)| {
+        items
+            .iter()
+            .any(|(address, value)| profile.is_stop(table, *address, *value))
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+    use std::time::{Duration, Instant};
+
+    use super::*;
+    use crate::cache::{DriveImage, DriveSpec, Link, OnShutdown};
+    use crate::codec::Exception;
+    use crate::drive::profile::Profiles;
+
+    fn drive(access: Access) -> DriveImage {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let spec = DriveSpec {
+            name: "pump-1".to_string(),
+            bus: "line1".to_string(),
+            address: 1,
+            unit: 1,
+            profile: Arc::clone(&profile),
+            access,
+            limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
+            supervision: None,
+            on_shutdown: OnShutdown::Hold,
+            turnaround: Duration::from_millis(2),
+            frequency_range: None,
+        };
+        let image = DriveImage::new(spec, Duration::from_secs(1));
+        image.update(|s| {
+            s.link = Link::Online(std::time::SystemTime::now());
+            s.store(Table::Holding, 100, &[1000, 5000], Instant::now());
+        });
+        image
+    }
+
+    fn try_order(order: Order) -> Result<Admitted, Refusal> {
+        let image = drive(Access::Control);
+        admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    }
+
+    fn point(name: &str) -> usize {
+        Profiles::built_in().get("vacon-nx").unwrap().point_index(name).unwrap()
+    }
+
+    fn set(points: &[(&str, f64)]) -> Result<Admitted, Refusal> {
+        try_order(Order::Points(
+            points.iter().map(|(n, v)| (point(n), Value::Number(*v))).collect(),
+        ))
+    }
+
+    fn write(address: u16, value: u16) -> Order {
+        Order::Write(RequestPdu::WriteRegister { address, value })
+    }
+
+    #[test]
+    fn authority_comes_first() {
+        let image = drive(Access::Monitor);
+        let reading = image.reading(Instant::now(), Duration::from_secs(1));
+        for (order, may) in [(write(2000, 1), true), (write(9999, 1), true), (write(2000, 1), false)] {
+            assert_eq!(
+                admit(order, &reading, may).unwrap_err().exception(),
+                Exception::FUNCTION
+            );
+        }
+        assert!(
+            admit(
+                Order::Read(RequestPdu::Read {
+                    table: Table::Holding,
+                    start: 0,
+                    count: 1
+                }),
+                &reading,
+                false
+            )
+            .is_ok()
+        );
+    }
+
+    #[test]
+    fn limits_are_told_never_clamped() {
+        let refusal = set(&[("speed_reference", 80.5)]).unwrap_err();
+        assert_eq!(refusal.exception(), Exception::VALUE);
+        assert_eq!(
+            refusal.to_string(),
+            "`speed_reference` = 80.5 % is outside the limits 0 to 80 %; nothing was written"
+        );
+        assert!(set(&[("speed_reference", 80.0)]).is_ok());
+        assert!(set(&[("speed_reference", f64::NAN)]).is_err());
+        assert!(set(&[("run", 0.5)]).is_err());
+        assert!(try_order(write(2002, 8001)).is_err(), "raw writes obey the limits too");
+        assert!(try_order(write(2002, 8000)).is_ok());
+    }
+
+    #[test]
+    fn frequency_becomes_percent_of_the_band() {
+        let admitted = set(&[("frequency_reference", 30.0)]).unwrap();
+        assert_eq!(
+            admitted.order,
+            Order::Points(vec![(point("speed_reference"), Value::Number(50.0))])
+        );
+        assert!(admitted.reference_only);
+        assert!(
+            set(&[("frequency_reference", 49.0)]).is_err(),
+            "97.5 % is beyond the limit of the percentage"
+        );
+        let twice = set(&[("frequency_reference", 30.0), ("speed_reference", 50.0)]).unwrap_err();
+        assert!(twice.to_string().contains("twice"), "{twice}");
+    }
+
+    #[test]
+    fn stops_are_known_as_such() {
+        assert_eq!(
+            set(&[("run", 0.0), ("speed_reference", 0.0)]).unwrap().urgency,
+            Urgency::Stop
+        );
+        assert_eq!(set(&[("run", 1.0)]).unwrap().urgency, Urgency::Command);
+        assert_eq!(try_order(write(2000, 2)).unwrap().urgency, Urgency::Stop);
+        assert_eq!(try_order(write(2000, 1)).unwrap().urgency, Urgency::Command);
+        assert_eq!(try_order(write(2002, 0)).unwrap().urgency, Urgency::Command);
+    }
+
+    #[test]
+    fn addresses_and_counts() {
+        let many = |start, count| {
+            Order::Write(RequestPdu::WriteRegisters {
+                start,
+                values: vec![0; count],
+            })
+        };
+        assert_eq!(
+            try_order(write(2100, 1)).unwrap_err().exception(),
+            Exception::ADDRESS,
+            "status word"
+        );
+        assert_eq!(
+            try_order(write(7000, 1)).unwrap_err().exception(),
+            Exception::ADDRESS,
+            "unknown"
+        );
+        assert_eq!(
+            try_order(many(2000, 12)).unwrap_err().exception(),
+            Exception::ADDRESS,
+            "past the range"
+        );
+        assert_eq!(
+            try_order(many(200, 2)).unwrap_err().exception(),
+            Exception::VALUE,
+            "one parameter a message"
+        );
+        assert!(try_order(many(2000, 3)).is_ok());
+        assert_eq!(
+            try_order(Order::Write(RequestPdu::WriteCoil { address: 0, on: true }))
+                .unwrap_err()
+                .exception(),
+            Exception::ADDRESS
+        );
+        assert_eq!(set(&[("ready", 1.0)]).unwrap_err().exception(), Exception::ADDRESS);
+        let mask = RequestPdu::MaskWrite {
+            address: 2000,
+            and_mask: 0,
+            or_mask: 0,
+        };
+        assert_eq!(
+            try_order(Order::Write(mask)).unwrap_err().exception(),
+            Exception::FUNCTION
+        );
+    }
+}

@@ -1,0 +1,229 @@
+//! Commands: who may command what, and how each command gets exactly one answer.
+//!
+//! The north sides build an [`Order`], [`admit`] checks it against authority, profile and limits, and the
+//! [`CommandQueue`] of the bus takes it. The [`Ticket`] inside a command answers when it is used or dropped,
+//! so a command can neither be answered twice nor be forgotten.
+
+mod admit;
+mod queue;
+mod ticket;
+
+pub use admit::{Admitted, admit};
+pub use queue::{CAPACITY, CommandQueue, Pending};
+pub use ticket::{Ticket, WriteStats};
+
+use std::fmt;
+use std::time::{Duration, Instant};
+
+use crate::codec::{Exception, Reply, RequestPdu};
+use crate::drive::Value;
+
+/// Time after which a command is not sent any more, unless it says otherwise.
+pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
+
+/// Where a command comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum SourceKind {
+    /// Modbus TCP client.
+    ModbusTcp,
+    /// MQTT topic.
+    Mqtt,
+    /// Lease that ran out.
+    Supervision,
+    /// The gateway stops.
+    Shutdown,
+}
+
+impl SourceKind {
+    /// All kinds.
+    pub const ALL: [SourceKind; 4] = [
+        SourceKind::ModbusTcp,
+        SourceKind::Mqtt,
+        SourceKind::Supervision,
+        SourceKind::Shutdown,
+    ];
+
+    /// The label of metrics and audit lines.
+    pub fn name(self) -> &'static str {
+        match self {
+            SourceKind::ModbusTcp => "modbus_tcp",
+            SourceKind::Mqtt => "mqtt",
+            SourceKind::Supervision => "supervision",
+            SourceKind::Shutdown => "shutdown",
+        }
+    }
+}
+
+/// Who commands, for the audit.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Origin {
+    /// Kind of the source.
+    pub kind: SourceKind,
+    /// Address, topic or certificate name.
+    pub who: String,
+}
+
+/// What is wanted of a drive.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Order {
+    /// Points set as one command: index in the profile, value in engineering units.
+    Points(Vec<(usize, Value)>),
+    /// A raw write, passed on as it is (bits of a control word apart).
+    Write(RequestPdu),
+    /// A raw read outside the plan.
+    Read(RequestPdu),
+}
+
+/// Rank of a command on the bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Urgency {
+    /// Takes a run command away.
+    Stop,
+    /// Any other command.
+    Command,
+    /// Forwarded read.
+    Read,
+}
+
+/// A command on its way to the bus.
+#[derive(Debug)]
+pub struct Command {
+    /// Index of the drive on its bus.
+    pub drive: usize,
+    /// What is wanted.
+    pub order: Order,
+    /// Rank.
+    pub urgency: Urgency,
+    /// The order sets references only: a newer one of the same points replaces it.
+    pub reference_only: bool,
+    /// Not sent after this.
+    pub expires: Instant,
+    /// Answers it.
+    pub ticket: Ticket,
+}
+
+/// How a command ended.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Outcome {
+    /// The drive acknowledged it (a read: its reply).
+    Acknowledged(Reply),
+    /// The drive refused it.
+    Exception(Exception),
+    /// Refused before it reached the bus.
+    Refused(Refusal),
+    /// The drive did not answer.
+    TimedOut,
+    /// Too old when its turn came; not sent.
+    Expired,
+    /// A newer reference took its place; not sent.
+    Replaced,
+    /// A stop removed it; not sent.
+    Purged,
+    /// The port is not open.
+    BusDown,
+    /// The drive is offline.
+    Offline,
+    /// 64 commands wait already.
+    QueueFull,
+    /// The gateway stops.
+    ShuttingDown,
+}
+
+impl Outcome {
+    /// The code in results, audit lines and metrics.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Outcome::Acknowledged(_) => "acknowledged",
+            Outcome::Exception(_) => "refused_by_drive",
+            Outcome::Refused(refusal) => refusal.code(),
+            Outcome::TimedOut => "timeout",
+            Outcome::Expired => "expired",
+            Outcome::Replaced => "replaced",
+            Outcome::Purged => "purged",
+            Outcome::BusDown => "bus_down",
+            Outcome::Offline => "offline",
+            Outcome::QueueFull => "queue_full",
+            Outcome::ShuttingDown => "shutting_down",
+        }
+    }
+
+    /// Whether the drive took it.
+    pub fn is_ok(&self) -> bool {
+        matches!(self, Outcome::Acknowledged(_))
+    }
+
+    /// The exception that tells a Modbus TCP client (public contract, section 5); `None` for success.
+    pub fn exception(&self) -> Option<Exception> {
+        match self {
+            Outcome::Acknowledged(_) => None,
+            Outcome::Exception(code) if code.0 <= 0x0B => Some(*code),
+            Outcome::Exception(_) => Some(Exception::DEVICE_FAILURE),
+            Outcome::Refused(refusal) => Some(refusal.exception()),
+            Outcome::QueueFull => Some(Exception::BUSY),
+            Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
+            Outcome::TimedOut | Outcome::Offline | Outcome::Expired => Some(Exception::GATEWAY_TARGET),
+            Outcome::Replaced | Outcome::Purged => Some(Exception::BUSY),
+        }
+    }
+}
+
+impl fmt::Display for Outcome {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Outcome::Acknowledged(_) => f.write_str("the drive acknowledged it"),
+            Outcome::Exception(code) => write!(f, "the drive refused it with {code}"),
+            Outcome::Refused(refusal) => refusal.fmt(f),
+            Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
+            Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
+            Outcome::Replaced => f.write_str("a newer reference took its place; it was not sent"),
+            Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
+            Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
+            Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
+            Outcome::QueueFull => write!(f, "{CAPACITY} commands wait already; it was not sent, try again"),
+            Outcome::ShuttingDown => f.write_str("the gateway stops; it was not sent"),
+        }
+    }
+}
+
+/// Why a command was refused before it reached the bus.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// Writing is off for that client or drive.
+    #[error("{0}")]
+    NotAllowed(String),
+    /// The point or address cannot be written, or does not exist.
+    #[error("{0}")]
+    NotWritable(String),
+    /// The value is outside the type, the profile or the limits, or the command contradicts itself.
+    #[error("{0}")]
+    BadValue(String),
+}
+
+impl Refusal {
+    /// The code in results.
+    pub fn code(&self) -> &'static str {
+        match self {
+            Refusal::NotAllowed(_) => "not_allowed",
+            Refusal::NotWritable(_) => "not_writable",
+            Refusal::BadValue(_) => "bad_value",
+        }
+    }
+
+    /// The Modbus exception.
+    pub fn exception(&self) -> Exception {
+        match self {
+            Refusal::NotAllowed(_) => Exception::FUNCTION,
+            Refusal::NotWritable(_) => Exception::ADDRESS,
+            Refusal::BadValue(_) => Exception::VALUE,
+        }
+    }
+}
+
+/// The one answer to a command.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Answer {
+    /// How it ended.
+    pub outcome: Outcome,
+    /// From acceptance to answer.
+    pub latency: Duration,
+}

@@ -1,0 +1,298 @@
+//! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
+
+use std::collections::VecDeque;
+use std::io;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Instant;
+
+use rustix::event::{EventfdFlags, eventfd};
+
+use super::{Command, Order, Outcome, Urgency};
+
+/// Commands that may wait on one bus.
+pub const CAPACITY: usize = 64;
+
+/// The waiting commands: pure, time is an argument.
+#[derive(Debug, Default)]
+pub struct Pending {
+    waiting: VecDeque<Command>,
+    /// Set when the queue takes nothing any more: the answer that every command gets.
+    closed: Option<Outcome>,
+}
+
+impl Pending {
+    /// Takes a command in. A stop removes the queued run and reference commands of its drive; a newer
+    /// reference takes the place of an older one; when 64 wait, only a stop still gets in, in place of the
+    /// youngest forwarded read or command.
+    pub fn push(&mut self, command: Command, now: Instant) {
+        if let Some(outcome) = &self.closed {
+            command.ticket.answer(outcome.clone(), now);
+            return;
+        }
+        if command.urgency == Urgency::Stop {
+            self.remove(now, &Outcome::Purged, |c| {
+                c.drive == command.drive && c.urgency == Urgency::Command
+            });
+        }
+        if command.reference_only {
+            self.remove(now, &Outcome::Replaced, |c| {
+                c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order)
+            });
+        }
+        if self.waiting.len() >= CAPACITY {
+            let victim = self.waiting.iter().rposition(|c| c.urgency > Urgency::Stop);
+            match (command.urgency, victim.and_then(|i| self.waiting.remove(i))) {
+                (Urgency::Stop, Some(victim)) => victim.ticket.answer(Outcome::QueueFull, now),
+                (_, restored) => {
+                    if let (Some(restored), Some(i)) = (restored, victim) {
+                        self.waiting.insert(i, restored);
+                    }
+                    command.ticket.answer(Outcome::QueueFull, now);
+                    return;
+                }
+            }
+        }
+        self.waiting.push_back(command);
+    }
+
+    /// Rank of the command that would come next, expired ones answered and removed.
+    pub fn next_urgency(&mut self, now: Instant) -> Option<Urgency> {
+        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
+        self.waiting.iter().map(|c| c.urgency).min()
+    }
+
+    /// Takes the next command of at least that rank: the oldest of the highest rank.
+    pub fn pop(&mut self, at_least: Urgency, now: Instant) -> Option<Command> {
+        let urgency = self.next_urgency(now).filter(|u| *u <= at_least)?;
+        let index = self.waiting.iter().position(|c| c.urgency == urgency)?;
+        self.waiting.remove(index)
+    }
+
+    /// Answers and removes the commands that `which` names.
+    pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
+        let mut kept = VecDeque::with_capacity(self.waiting.len());
+        for command in self.waiting.drain(..) {
+            if which(&command) {
+                command.ticket.answer(outcome.clone(), now);
+            } else {
+                kept.push_back(command);
+            }
+        }
+        self.waiting = kept;
+    }
+
+    /// Commands that wait.
+    pub fn len(&self) -> usize {
+        self.waiting.len()
+    }
+
+    /// Whether none waits.
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+}
+
+fn same_points(older: &Order, newer: &Order) -> bool {
+    match (older, newer) {
+        (Order::Points(a), Order::Points(b)) => {
+            a.len() == b.len() && a.iter().zip(b).all(|((left, _), (right, _))| left == right)
+        }
+        _ => false,
+    }
+}
+
+/// The queue between the north sides and one bus.
+#[derive(Debug)]
+pub struct CommandQueue {
+    pending: Mutex<Pending>,
+    wake: OwnedFd,
+}
+
+impl CommandQueue {
+    /// An empty queue.
+    ///
+    /// # Errors
+    /// When the system gives no event descriptor.
+    pub fn new() -> io::Result<CommandQueue> {
+        let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
+        Ok(CommandQueue {
+            pending: Mutex::default(),
+            wake,
+        })
+    }
+
+    /// Takes a command in and wakes the bus.
+    pub fn submit(&self, command: Command, now: Instant) {
+        self.lock().push(command, now);
+        self.wake();
+    }
+
+    /// The waiting commands, for the bus.
+    pub fn lock(&self) -> MutexGuard<'_, Pending> {
+        self.pending.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Answers everything that waits, and all that comes from now on, with `outcome`.
+    pub fn close(&self, outcome: Outcome, now: Instant) {
+        let mut pending = self.lock();
+        pending.remove(now, &outcome, |_| true);
+        pending.closed = Some(outcome);
+    }
+
+    /// Takes commands again.
+    pub fn open(&self) {
+        self.lock().closed = None;
+    }
+
+    /// Wakes the bus from its wait.
+    pub fn wake(&self) {
+        // A full counter means that the bus is being woken already.
+        let _ = rustix::io::write(&self.wake, &1u64.to_ne_bytes());
+    }
+
+    /// Readable when the bus is to look at the queue.
+    pub fn wake_fd(&self) -> BorrowedFd<'_> {
+        self.wake.as_fd()
+    }
+
+    /// Clears the wake-up.
+    pub fn clear_wake(&self) {
+        let mut count = [0u8; 8];
+        // Nothing to read means that nobody woke the bus.
+        let _ = rustix::io::read(&self.wake, &mut count);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use tokio::sync::oneshot::Receiver;
+
+    use super::super::ticket::tests::ticket;
+    use super::super::{Answer, WriteStats};
+    use super::*;
+    use crate::drive::Value;
+
+    struct Bench {
+        pending: Pending,
+        stats: Arc<WriteStats>,
+        now: Instant,
+    }
+
+    impl Bench {
+        fn new() -> Bench {
+            Bench {
+                pending: Pending::default(),
+                stats: Arc::default(),
+                now: Instant::now(),
+            }
+        }
+
+        fn push(&mut self, drive: usize, urgency: Urgency, points: &[usize], reference_only: bool) -> Receiver<Answer> {
+            let (ticket, receiver) = ticket(&self.stats, self.now);
+            let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
+            let expires = self.now + Duration::from_secs(2);
+            self.pending.push(
+                Command {
+                    drive,
+                    order,
+                    urgency,
+                    reference_only,
+                    expires,
+                    ticket,
+                },
+                self.now,
+            );
+            receiver
+        }
+
+        fn pop(&mut self) -> Option<(usize, Urgency)> {
+            self.pending.pop(Urgency::Read, self.now).map(|c| (c.drive, c.urgency))
+        }
+    }
+
+    fn outcome(receiver: &mut Receiver<Answer>) -> Option<Outcome> {
+        receiver.try_recv().ok().map(|a| a.outcome)
+    }
+
+    #[test]
+    fn stop_first_and_it_purges_its_drive() {
+        let mut bench = Bench::new();
+        let mut read = bench.push(1, Urgency::Read, &[], false);
+        let mut run = bench.push(1, Urgency::Command, &[1], false);
+        let mut other = bench.push(2, Urgency::Command, &[1], false);
+        let _stop = bench.push(1, Urgency::Stop, &[1], false);
+        assert_eq!(outcome(&mut run), Some(Outcome::Purged));
+        assert_eq!((outcome(&mut read), outcome(&mut other)), (None, None));
+        assert_eq!(bench.pop(), Some((1, Urgency::Stop)));
+        assert_eq!(bench.pop(), Some((2, Urgency::Command)));
+        assert_eq!(bench.pop(), Some((1, Urgency::Read)));
+        assert_eq!(bench.pop(), None);
+    }
+
+    #[test]
+    fn newer_references_replace_older_ones_of_the_same_points() {
+        let mut bench = Bench::new();
+        let mut old = bench.push(1, Urgency::Command, &[7], true);
+        let mut other_point = bench.push(1, Urgency::Command, &[8], true);
+        let mut other_drive = bench.push(2, Urgency::Command, &[7], true);
+        let _new = bench.push(1, Urgency::Command, &[7], true);
+        assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
+        assert_eq!((outcome(&mut other_point), outcome(&mut other_drive)), (None, None));
+        assert_eq!(bench.pending.len(), 3);
+    }
+
+    #[test]
+    fn full_queue_refuses_all_but_a_stop() {
+        let mut bench = Bench::new();
+        let mut waiting: Vec<_> = (0..CAPACITY)
+            .map(|_| bench.push(1, Urgency::Command, &[1], false))
+            .collect();
+        let mut refused = bench.push(1, Urgency::Command, &[1], false);
+        assert_eq!(outcome(&mut refused), Some(Outcome::QueueFull));
+        let mut stop = bench.push(2, Urgency::Stop, &[1], false);
+        assert_eq!(outcome(&mut stop), None);
+        assert_eq!(
+            outcome(waiting.last_mut().unwrap()),
+            Some(Outcome::QueueFull),
+            "the youngest made room"
+        );
+        assert_eq!(outcome(waiting.first_mut().unwrap()), None);
+        assert_eq!(bench.pending.len(), CAPACITY);
+        assert_eq!(bench.pop(), Some((2, Urgency::Stop)));
+    }
+
+    #[test]
+    fn expired_commands_are_never_sent() {
+        let mut bench = Bench::new();
+        let mut late = bench.push(1, Urgency::Command, &[1], false);
+        bench.now += Duration::from_secs(2);
+        assert_eq!(bench.pop(), None);
+        assert_eq!(outcome(&mut late), Some(Outcome::Expired));
+    }
+
+    #[test]
+    fn a_closed_queue_answers_at_once() {
+        let queue = CommandQueue::new().unwrap();
+        let mut bench = Bench::new();
+        let (ticket_a, mut a) = ticket(&bench.stats, bench.now);
+        let command = |ticket| Command {
+            drive: 0,
+            order: Order::Points(Vec::new()),
+            urgency: Urgency::Command,
+            reference_only: false,
+            expires: bench.now + Duration::from_secs(1),
+            ticket,
+        };
+        queue.submit(command(ticket_a), bench.now);
+        queue.close(Outcome::BusDown, bench.now);
+        assert_eq!(outcome(&mut a), Some(Outcome::BusDown));
+        let (ticket_b, mut b) = ticket(&bench.stats, bench.now);
+        queue.submit(command(ticket_b), bench.now);
+        assert_eq!(outcome(&mut b), Some(Outcome::BusDown));
+        bench.now += Duration::from_secs(1);
+    }
+}

@@ -1,0 +1,9 @@
+//! The north sides: Modbus TCP, MQTT and HTTP. They read the process image and queue commands; they never
+//! name the bus.
+
+pub mod http;
+pub mod modbus_tcp;
+pub mod mqtt;
+mod stats;
+
+pub use stats::{ModbusTcpStats, MqttStats, NorthStats};

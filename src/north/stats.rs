@@ -1,0 +1,88 @@
+//! Counters of the north sides, for the metrics.
+
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+
+/// Counters of all north sides.
+#[derive(Debug, Default)]
+pub struct NorthStats {
+    /// Of the Modbus TCP server.
+    pub modbus_tcp: ModbusTcpStats,
+    /// Of the MQTT client.
+    pub mqtt: MqttStats,
+}
+
+const FUNCTIONS: [u8; 11] = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43];
+const OUTCOMES: [(u8, &str); 8] = [
+    (0x00, "ok"),
+    (0x01, "illegal_function"),
+    (0x02, "illegal_address"),
+    (0x03, "illegal_value"),
+    (0x04, "device_failure"),
+    (0x06, "busy"),
+    (0x0A, "no_path"),
+    (0x0B, "no_answer"),
+];
+const OTHER: &str = "other";
+
+/// Counters of the Modbus TCP server.
+#[derive(Debug, Default)]
+pub struct ModbusTcpStats {
+    connections: AtomicU64,
+    requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
+}
+
+impl ModbusTcpStats {
+    /// A client connected.
+    pub fn connected(&self) {
+        self.connections.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// A client left.
+    pub fn disconnected(&self) {
+        self.connections.fetch_sub(1, Ordering::Relaxed);
+    }
+
+    /// Clients connected now.
+    pub fn connections(&self) -> u64 {
+        self.connections.load(Ordering::Relaxed)
+    }
+
+    /// Counts an answer: exception code, 0 for a regular one.
+    pub fn answered(&self, function: u8, exception: u8) {
+        let row = FUNCTIONS.iter().position(|f| *f == function).unwrap_or(FUNCTIONS.len());
+        let column = OUTCOMES
+            .iter()
+            .position(|(code, _)| *code == exception)
+            .unwrap_or(OUTCOMES.len());
+        if let Some(counter) = self.requests.get(row).and_then(|r| r.get(column)) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Answers so far by function and outcome, zeros left out.
+    pub fn requests(&self) -> Vec<(String, &'static str, u64)> {
+        let functions = FUNCTIONS.iter().map(u8::to_string).chain([OTHER.to_string()]);
+        let mut all = Vec::new();
+        for (function, row) in functions.zip(&self.requests) {
+            let outcomes = OUTCOMES.iter().map(|(_, name)| *name).chain([OTHER]);
+            for (outcome, counter) in outcomes.zip(row) {
+                let count = counter.load(Ordering::Relaxed);
+                if count > 0 {
+                    all.push((function.clone(), outcome, count));
+                }
+            }
+        }
+        all
+    }
+}
+
+/// Counters of the MQTT client.
+#[derive(Debug, Default)]
+pub struct MqttStats {
+    /// Whether the client is connected to the broker.
+    pub connected: AtomicBool,
+    /// Messages that the broker took.
+    pub published: AtomicU64,
+    /// Messages that wait for the broker.
+    pub buffered: AtomicU64,
+}

@@ -1,0 +1,178 @@
+//! What the north sides see: images to read from, queues to write into.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+
+use crate::cache::{BusImage, DriveImage, Reading};
+use crate::command::{self, Answer, Command, CommandQueue, Order, Origin, Outcome, Ticket, WriteStats};
+use crate::drive::Value;
+use crate::event::{Event, EventKind, Events};
+
+/// The plant as it is configured now; a reload puts a new one in its place.
+pub type SharedPlant = Arc<ArcSwap<Plant>>;
+
+/// One bus: its image and its queue.
+#[derive(Debug, Clone)]
+pub struct BusHandle {
+    /// What is known.
+    pub image: Arc<BusImage>,
+    /// What is wanted.
+    pub queue: Arc<CommandQueue>,
+}
+
+/// All buses of the gateway.
+#[derive(Debug)]
+pub struct Plant {
+    /// Name of the gateway: topics, metric label.
+    pub gateway: String,
+    /// Age from which a sample of process data is stale.
+    pub stale_after: Duration,
+    /// In the order of the file.
+    pub buses: Vec<BusHandle>,
+    /// What happens.
+    pub events: Events,
+    /// Counters of commands.
+    pub writes: Arc<WriteStats>,
+}
+
+/// One drive and the way to it.
+#[derive(Debug, Clone)]
+pub struct DriveHandle {
+    /// Its bus.
+    pub bus: BusHandle,
+    /// Index on the bus.
+    pub index: usize,
+    /// What is known.
+    pub image: Arc<DriveImage>,
+    stale_after: Duration,
+    events: Events,
+    writes: Arc<WriteStats>,
+}
+
+impl Plant {
+    /// All drives, bus by bus in the order of the file.
+    pub fn drives(&self) -> impl Iterator<Item = DriveHandle> {
+        self.buses.iter().flat_map(move |bus| {
+            bus.image
+                .drives
+                .iter()
+                .enumerate()
+                .map(move |(index, image)| self.handle(bus, index, image))
+        })
+    }
+
+    /// The drive of that name.
+    pub fn drive(&self, name: &str) -> Option<DriveHandle> {
+        self.find(|drive| drive.spec.name == name)
+    }
+
+    /// The drive of that Modbus TCP unit id.
+    pub fn unit(&self, unit: u8) -> Option<DriveHandle> {
+        self.find(|drive| drive.spec.unit == unit)
+    }
+
+    fn find(&self, which: impl Fn(&DriveImage) -> bool) -> Option<DriveHandle> {
+        self.buses.iter().find_map(|bus| {
+            let index = bus.image.drives.iter().position(|d| which(d))?;
+            Some(self.handle(bus, index, bus.image.drives.get(index)?))
+        })
+    }
+
+    fn handle(&self, bus: &BusHandle, index: usize, image: &Arc<DriveImage>) -> DriveHandle {
+        DriveHandle {
+            bus: bus.clone(),
+            index,
+            image: image.clone(),
+            stale_after: self.stale_after,
+            events: self.events.clone(),
+            writes: self.writes.clone(),
+        }
+    }
+}
+
+impl DriveHandle {
+    /// The drive as it looks at `now`.
+    pub fn reading(&self, now: Instant) -> Reading<'_> {
+        self.image.reading(now, self.stale_after)
+    }
+
+    /// Whether the bus is open.
+    pub fn bus_up(&self) -> bool {
+        self.bus.image.health().up
+    }
+
+    /// Gives an order to the drive and waits for its one answer.
+    ///
+    /// `may_write` says whether the client may write at all; the order is refused at once when it is not
+    /// admitted, the bus is down or the drive is offline. Refused writes are audited and told as an event.
+    pub async fn order(&self, order: Order, origin: Origin, may_write: bool, expiry: Duration) -> Answer {
+        let accepted = Instant::now();
+        let reading = self.reading(accepted);
+        let write = !matches!(order, Order::Read(_));
+        let what = self.describe(&order);
+        let (ticket, answer) = Ticket::new(
+            origin,
+            &self.image.spec.name,
+            what.clone(),
+            write,
+            accepted,
+            self.writes.clone(),
+        );
+        match command::admit(order, &reading, may_write) {
+            Err(refusal) => {
+                self.tell_refusal(&what, &refusal.to_string(), ticket.origin());
+                ticket.answer(Outcome::Refused(refusal), accepted);
+            }
+            Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, accepted),
+            Ok(_) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, accepted),
+            Ok(admitted) => {
+                if write {
+                    self.image.renew_lease(accepted);
+                }
+                let command = Command {
+                    drive: self.index,
+                    order: admitted.order,
+                    urgency: admitted.urgency,
+                    reference_only: admitted.reference_only,
+                    expires: accepted + expiry,
+                    ticket,
+                };
+                self.bus.queue.submit(command, accepted);
+            }
+        }
+        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        answer.await.unwrap_or(Answer {
+            outcome: Outcome::ShuttingDown,
+            latency: accepted.elapsed(),
+        })
+    }
+
+    /// Tells that a command was refused.
+    pub fn tell_refusal(&self, what: &str, why: &str, origin: &Origin) {
+        self.events.tell(Event {
+            id: 0,
+            time: std::time::SystemTime::now(),
+            kind: EventKind::RefusedCommand,
+            bus: self.image.spec.bus.clone(),
+            drive: Some(self.image.spec.name.clone()),
+            fault_code: None,
+            text: format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who),
+        });
+    }
+
+    fn describe(&self, order: &Order) -> String {
+        match order {
+            Order::Points(values) => {
+                let name = |i: usize| self.image.spec.profile.points.get(i).map_or("?", |p| p.name.as_str());
+                let parts: Vec<String> = values
+                    .iter()
+                    .map(|(i, v): &(usize, Value)| format!("{}={v}", name(*i)))
+                    .collect();
+                parts.join(" ")
+            }
+            Order::Write(pdu) | Order::Read(pdu) => format!("{pdu:?}"),
+        }
+    }
+}
