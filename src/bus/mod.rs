@@ -1,5 +1,8 @@
 //! The bus: one owner of the line, one transaction at a time.
 
+pub mod schedule;
+pub mod transaction;
+
 use std::time::Duration;
 
 use crate::codec::wire::Silence;

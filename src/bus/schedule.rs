@@ -1,0 +1,571 @@
+//! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
+//!
+//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls (public contract, section 8).
+//! Three rules soften it: after eight commands in a row a due poll goes first; slow polls that had less than 5 %
+//! of the line go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use crate::codec::Exception;
+use crate::command::Urgency;
+use crate::drive::{Plan, PlannedRead, PollClass};
+
+/// Commands in a row before a due poll goes first.
+pub const COMMANDS_IN_A_ROW: u32 = 8;
+/// Share of a saturated line that slow polls get at least.
+const SLOW_SHARE: f64 = 0.05;
+/// Share of the line that a drive which does not answer costs at most.
+const DEAD_SHARE: f64 = 0.02;
+/// First and longest pause between two probes of a drive that does not answer.
+const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
+/// Pause before a request that the drive refused, or never answers, is tried again.
+const REFUSED_PAUSE: Duration = Duration::from_secs(60);
+
+/// A planned read of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Poll {
+    /// Index of the drive on the bus.
+    pub drive: usize,
+    /// What is read.
+    pub read: PlannedRead,
+    /// Asked to find out whether the drive answers (again).
+    pub probe: bool,
+}
+
+/// What the bus does next.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Decision {
+    /// Take a command of at least that rank.
+    Command(Urgency),
+    /// Read.
+    Poll(Poll),
+    /// Nothing is due before then.
+    Idle(Instant),
+}
+
+/// How a poll went.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Polled {
+    /// The drive answered.
+    Ok,
+    /// The drive refused it.
+    Refused(Exception),
+    /// No answer, or none to be believed.
+    Failed,
+}
+
+/// What changed by a poll.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Change {
+    /// Nothing.
+    None,
+    /// The drive answers (again).
+    Online,
+    /// The drive does not answer any more.
+    Offline,
+    /// The drive refuses these addresses.
+    Unavailable(PlannedRead, Exception),
+}
+
+/// Cadence of a bus.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Cadence {
+    /// Aimed at for the fast class.
+    pub fast: Duration,
+    /// Aimed at for the slow class.
+    pub slow: Duration,
+    /// Tries after the first.
+    pub retries: u32,
+}
+
+#[derive(Debug, Clone)]
+struct Item {
+    read: PlannedRead,
+    /// The read of the plan that this one is a part of.
+    origin: PlannedRead,
+    due: Instant,
+    cost: Duration,
+    refused: bool,
+    failures: u32,
+    /// A read of the once class that is still to be done.
+    wanted: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Presence {
+    Online,
+    /// Asked again at that time; the pause before it.
+    Away(Instant, Duration),
+}
+
+#[derive(Debug)]
+struct DriveSchedule {
+    presence: Presence,
+    tried: bool,
+    failures: u32,
+    items: Vec<Item>,
+}
+
+/// A round of the fast class that was started.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct RoundStart {
+    /// When.
+    pub at: Instant,
+    /// Time since the start of the round before.
+    pub cycle: Option<Duration>,
+}
+
+/// The schedule of a bus.
+#[derive(Debug)]
+pub struct Schedule {
+    cadence: Cadence,
+    drives: Vec<DriveSchedule>,
+    round: VecDeque<(usize, PlannedRead)>,
+    round_due: Instant,
+    round_started: Option<Instant>,
+    new_round: Option<RoundStart>,
+    slow_started: Option<Instant>,
+    new_slow: Option<RoundStart>,
+    slow_credit: Duration,
+    commands_in_a_row: u32,
+    stops_in_a_row: u32,
+}
+
+impl Schedule {
+    /// A schedule for drives of these plans; `cost` is the whole time of an exchange on the line.
+    pub fn new(
+        cadence: Cadence,
+        plans: &[&Plan],
+        cost: impl Fn(usize, &PlannedRead) -> Duration,
+        now: Instant,
+    ) -> Self {
+        let drives = plans.iter().enumerate().map(|(index, plan)| DriveSchedule {
+            presence: Presence::Away(now, Duration::ZERO),
+            tried: false,
+            failures: 0,
+            items: plan
+                .reads
+                .iter()
+                .map(|read| Item::new(*read, *read, cost(index, read), now))
+                .collect(),
+        });
+        Schedule {
+            cadence,
+            drives: drives.collect(),
+            round: VecDeque::new(),
+            round_due: now,
+            round_started: None,
+            new_round: None,
+            slow_started: None,
+            new_slow: None,
+            slow_credit: Duration::ZERO,
+            commands_in_a_row: 0,
+            stops_in_a_row: 0,
+        }
+    }
+
+    /// What comes next. `waiting` is the rank of the command that would be next.
+    pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
+        self.start_round(now);
+        let poll = self.due_poll(now);
+        if let Some(urgency) = waiting {
+            let row = if urgency == Urgency::Stop {
+                self.stops_in_a_row
+            } else {
+                self.commands_in_a_row
+            };
+            if poll.is_none() || row < COMMANDS_IN_A_ROW {
+                return Decision::Command(urgency);
+            }
+        }
+        match poll {
+            Some(poll) => Decision::Poll(poll),
+            None => Decision::Idle(self.next_due(now)),
+        }
+    }
+
+    /// A fast round that was started by the last [`Schedule::next`], told once.
+    pub fn take_round(&mut self) -> Option<RoundStart> {
+        self.new_round.take()
+    }
+
+    /// A slow round (the first slow poll after all were done), told once.
+    pub fn take_slow_round(&mut self) -> Option<RoundStart> {
+        self.new_slow.take()
+    }
+
+    /// A command (or a step of one) was on the line for `took`.
+    pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
+        self.commands_in_a_row += 1;
+        self.stops_in_a_row = if urgency == Urgency::Stop {
+            self.stops_in_a_row + 1
+        } else {
+            0
+        };
+        self.earn(took);
+    }
+
+    /// A poll is over.
+    pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
+        self.commands_in_a_row = 0;
+        self.stops_in_a_row = 0;
+        self.earn(took);
+        if poll.read.class == PollClass::Fast {
+            if self.round.front() == Some(&(poll.drive, poll.read)) {
+                self.round.pop_front();
+            }
+        } else {
+            self.slow_credit = self.slow_credit.saturating_sub(took);
+            self.note_slow(now);
+        }
+        match polled {
+            Polled::Ok | Polled::Refused(_) => self.answered(poll, polled, now),
+            Polled::Failed => self.failed(poll, took, now),
+        }
+    }
+
+    /// The drive answered a command: it is alive.
+    pub fn seen(&mut self, drive: usize) {
+        if let Some(drive) = self.drives.get_mut(drive) {
+            drive.failures = 0;
+        }
+    }
+
+    /// Reads that cover an address are due at once: a command changed it.
+    pub fn refresh(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+        let Some(drive) = self.drives.get_mut(drive) else {
+            return;
+        };
+        for item in drive
+            .items
+            .iter_mut()
+            .filter(|i| i.read.class != PollClass::Fast && covers(&i.read))
+        {
+            item.due = item.due.min(now);
+            item.wanted = true;
+        }
+    }
+
+    /// Whether the drive answers.
+    pub fn is_online(&self, drive: usize) -> bool {
+        self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)
+    }
+
+    /// Forgets all presence: the port was lost, every drive is found anew.
+    pub fn reset(&mut self, now: Instant) {
+        self.round.clear();
+        self.round_due = now;
+        self.round_started = None;
+        self.slow_started = None;
+        for drive in &mut self.drives {
+            drive.presence = Presence::Away(now, Duration::ZERO);
+            drive.failures = 0;
+        }
+    }
+
+    fn earn(&mut self, took: Duration) {
+        // A quarter of a second of slow polls at most: more would be a burst.
+        self.slow_credit = (self.slow_credit + took.mul_f64(SLOW_SHARE)).min(Duration::from_millis(250));
+    }
+
+    fn start_round(&mut self, now: Instant) {
+        if !self.round.is_empty() || now < self.round_due {
+            return;
+        }
+        for (index, drive) in self
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, d)| d.presence == Presence::Online)
+        {
+            let due = drive
+                .items
+                .iter()
+                .filter(|i| i.read.class == PollClass::Fast && i.due <= now);
+            self.round.extend(due.map(|i| (index, i.read)));
+        }
+        if self.round.is_empty() {
+            self.round_due = now + self.cadence.fast;
+            self.round_started = None;
+            return;
+        }
+        let cycle = self.round_started.map(|before| now.saturating_duration_since(before));
+        self.round_started = Some(now);
+        self.new_round = Some(RoundStart { at: now, cycle });
+        // The grid is kept while the line carries it; a round missed altogether is not caught up.
+        let next = self.round_due + self.cadence.fast;
+        self.round_due = if next + self.cadence.fast < now { now } else { next };
+    }
+
+    fn due_poll(&mut self, now: Instant) -> Option<Poll> {
+        if let Some(probe) = self.due_probe(now) {
+            return Some(probe);
+        }
+        let slow = self.due_slow(now);
+        if let Some((due, poll, cost)) = slow
+            && self.slow_credit >= cost
+            && now.saturating_duration_since(due) > self.cadence.fast
+        {
+            // A whole round went by without room for it: the line is saturated.
+            return Some(poll);
+        }
+        if let Some(&(drive, read)) = self.round.front() {
+            return Some(Poll {
+                drive,
+                read,
+                probe: false,
+            });
+        }
+        // In the idle time of a round a slow poll must not delay the next one.
+        let fast_active = self.round_started.is_some();
+        slow.filter(|(_, _, cost)| !fast_active || now + *cost <= self.round_due)
+            .map(|(_, poll, _)| poll)
+    }
+
+    /// The drive that is asked whether it answers: the one waiting longest.
+    fn due_probe(&self, now: Instant) -> Option<Poll> {
+        let due = |drive: &DriveSchedule| match drive.presence {
+            Presence::Away(at, _) if at <= now => Some(at),
+            _ => None,
+        };
+        let mut waiting: Vec<(Instant, usize)> = self
+            .drives
+            .iter()
+            .enumerate()
+            .filter_map(|(i, d)| Some((due(d)?, i)))
+            .collect();
+        waiting.sort();
+        waiting.into_iter().find_map(|(_, index)| {
+            let read = self.drives.get(index)?.items.first()?.read;
+            Some(Poll {
+                drive: index,
+                read,
+                probe: true,
+            })
+        })
+    }
+
+    fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
+        let mut best: Option<(Instant, Poll, Duration)> = None;
+        for (index, drive) in self
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, d)| d.presence == Presence::Online)
+        {
+            for item in drive.items.iter().filter(|i| i.is_slow() && i.due <= now) {
+                if best.as_ref().is_none_or(|(due, _, _)| item.due < *due) {
+                    let poll = Poll {
+                        drive: index,
+                        read: item.read,
+                        probe: false,
+                    };
+                    best = Some((item.due, poll, item.cost));
+                }
+            }
+        }
+        best
+    }
+
+    /// When something is due; a slow poll that is due but does not fit before the round waits for the round.
+    fn next_due(&self, now: Instant) -> Instant {
+        let mut next = self.round_due;
+        for drive in &self.drives {
+            let due = match drive.presence {
+                Presence::Away(at, _) => Some(at),
+                Presence::Online => drive
+                    .items
+                    .iter()
+                    .filter(|i| i.is_slow() && i.due > now)
+                    .map(|i| i.due)
+                    .min(),
+            };
+            next = due.map_or(next, |due| next.min(due));
+        }
+        next
+    }
+
+    fn note_slow(&mut self, now: Instant) {
+        let started = self.slow_started;
+        if started.is_none_or(|at| now.saturating_duration_since(at) >= self.cadence.slow.mul_f64(0.5)) {
+            let cycle = started.map(|before| now.saturating_duration_since(before));
+            self.new_slow = Some(RoundStart { at: now, cycle });
+            self.slow_started = Some(now);
+        }
+    }
+
+    fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
+        let slow = self.cadence.slow;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        drive.failures = 0;
+        drive.tried = true;
+        let came = drive.presence != Presence::Online;
+        if came {
+            drive.presence = Presence::Online;
+            if self.round_started.is_none() {
+                self.round_due = self.round_due.min(now);
+            }
+            for item in &mut drive.items {
+                item.wanted = true;
+                item.due = now;
+                item.failures = 0;
+            }
+        }
+        let mut change = Change::None;
+        if let Polled::Refused(exception) = polled {
+            change = drive.refused(poll.read, exception, now);
+        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.failures = 0;
+            item.refused = false;
+            item.wanted = item.read.class != PollClass::Once;
+            if item.read.class == PollClass::Slow {
+                let next = item.due + slow;
+                item.due = if next < now { now + slow } else { next };
+            }
+        }
+        if came { Change::Online } else { change }
+    }
+
+    fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
+        let retries = self.cadence.retries;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        if let Presence::Away(_, pause) = drive.presence {
+            drive.failures += 1;
+            if !drive.tried && drive.failures <= retries {
+                drive.presence = Presence::Away(now, pause);
+                return Change::None;
+            }
+            let first = !drive.tried;
+            drive.tried = true;
+            drive.presence = away(now, pause, took);
+            return if first { Change::Offline } else { Change::None };
+        }
+        let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        if !presence_counts {
+            // A request that is never answered must not take the drive away while its process data comes.
+            if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+                item.failures += 1;
+                item.due = if item.failures > retries {
+                    now + REFUSED_PAUSE
+                } else {
+                    now
+                };
+            }
+            return Change::None;
+        }
+        drive.failures += 1;
+        if drive.failures <= retries {
+            if poll.read.class == PollClass::Fast {
+                self.round.push_front((poll.drive, poll.read));
+            }
+            return Change::None;
+        }
+        drive.presence = away(now, Duration::ZERO, took);
+        drive.failures = 0;
+        self.round.retain(|(index, _)| *index != poll.drive);
+        Change::Offline
+    }
+}
+
+/// The next probe: the pause doubles, and the probe's cost stays within its share of the line.
+fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
+    let (first, longest) = PROBE_PAUSE;
+    let doubled = if pause.is_zero() {
+        first
+    } else {
+        (pause * 2).min(longest)
+    };
+    let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
+    Presence::Away(now + doubled.max(affordable), doubled)
+}
+
+impl Item {
+    fn new(read: PlannedRead, origin: PlannedRead, cost: Duration, now: Instant) -> Item {
+        Item {
+            read,
+            origin,
+            due: now,
+            cost,
+            refused: false,
+            failures: 0,
+            wanted: true,
+        }
+    }
+
+    fn is_slow(&self) -> bool {
+        match self.read.class {
+            PollClass::Slow => true,
+            PollClass::Once => self.wanted,
+            PollClass::Fast | PollClass::Never => false,
+        }
+    }
+}
+
+impl DriveSchedule {
+    fn has_fast(&self) -> bool {
+        self.items.iter().any(|i| i.read.class == PollClass::Fast)
+    }
+
+    /// Splits a refused block until the bad point is found, which is retried slowly.
+    fn refused(&mut self, read: PlannedRead, exception: Exception, now: Instant) -> Change {
+        let addressed =
+            exception == Exception::ADDRESS || exception == Exception::VALUE || exception == Exception::FUNCTION;
+        let Some(index) = self.items.iter().position(|i| i.read == read) else {
+            return Change::None;
+        };
+        let Some(item) = self.items.get_mut(index) else {
+            return Change::None;
+        };
+        if !addressed {
+            // Busy or failing: the drive is alive, the values age, the poll comes round again.
+            item.due = item.due.max(now);
+            if item.read.class == PollClass::Once {
+                item.due = now + Duration::from_secs(1);
+            }
+            return Change::None;
+        }
+        let Some((low, high)) = Plan::halves(read) else {
+            item.refused = true;
+            item.wanted = true;
+            item.due = now + REFUSED_PAUSE;
+            let origin = item.origin;
+            self.join(origin, now);
+            return Change::Unavailable(read, exception);
+        };
+        let (origin, cost) = (item.origin, item.cost);
+        let halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
+        self.items.splice(index..=index, halves);
+        Change::None
+    }
+
+    /// Joins the sound neighbours that splitting tore apart, around the refused addresses.
+    fn join(&mut self, origin: PlannedRead, now: Instant) {
+        let mut joined: Vec<Item> = Vec::with_capacity(self.items.len());
+        for item in self.items.drain(..) {
+            match joined.last_mut() {
+                Some(last)
+                    if item.origin == origin
+                        && last.origin == origin
+                        && !item.refused
+                        && !last.refused
+                        && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
+                {
+                    last.read.count += item.read.count;
+                    last.wanted = true;
+                    last.due = last.due.min(now);
+                }
+                _ => joined.push(item),
+            }
+        }
+        self.items = joined;
+    }
+}
+
+#[cfg(test)]
+#[path = "schedule_tests.rs"]
+mod tests;

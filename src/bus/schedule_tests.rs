@@ -1,0 +1,277 @@
+use std::collections::BTreeMap;
+
+use super::*;
+use crate::codec::Table;
+
+const COST: Duration = Duration::from_millis(12);
+
+fn read(class: PollClass, start: u16, count: u16) -> PlannedRead {
+    PlannedRead {
+        class,
+        table: Table::Holding,
+        start,
+        count,
+    }
+}
+
+fn plan() -> Plan {
+    let reads = vec![
+        read(PollClass::Fast, 2100, 11),
+        read(PollClass::Slow, 2000, 3),
+        read(PollClass::Once, 100, 4),
+    ];
+    Plan { reads }
+}
+
+/// A line in virtual time: every exchange takes `COST`, a dead drive ten times that.
+struct Bench {
+    schedule: Schedule,
+    now: Instant,
+    dead: Vec<usize>,
+    log: Vec<(Instant, Decision)>,
+    offline: Vec<usize>,
+}
+
+impl Bench {
+    fn new(drives: usize, cycle: Duration) -> Bench {
+        let plan = plan();
+        let plans: Vec<&Plan> = (0..drives).map(|_| &plan).collect();
+        let now = Instant::now();
+        let cadence = Cadence {
+            fast: cycle,
+            slow: Duration::from_secs(1),
+            retries: 1,
+        };
+        let schedule = Schedule::new(cadence, &plans, |_, _| COST, now);
+        Bench {
+            schedule,
+            now,
+            dead: Vec::new(),
+            log: Vec::new(),
+            offline: Vec::new(),
+        }
+    }
+
+    fn step(&mut self, waiting: Option<Urgency>) -> Decision {
+        let decision = self.schedule.next(self.now, waiting);
+        self.log.push((self.now, decision));
+        match decision {
+            Decision::Idle(until) => {
+                assert!(until > self.now, "idle into the past");
+                self.now = until;
+            }
+            Decision::Command(urgency) => {
+                self.now += COST;
+                self.schedule.command_done(urgency, COST);
+            }
+            Decision::Poll(poll) => {
+                let dead = self.dead.contains(&poll.drive);
+                let took = if dead { COST * 10 } else { COST };
+                self.now += took;
+                let polled = if dead { Polled::Failed } else { Polled::Ok };
+                if self.schedule.poll_done(&poll, polled, took, self.now) == Change::Offline {
+                    self.offline.push(poll.drive);
+                }
+            }
+        }
+        decision
+    }
+
+    fn run(&mut self, time: Duration) {
+        let end = self.now + time;
+        while self.now < end {
+            self.step(None);
+        }
+    }
+
+    fn polls(&self, class: PollClass) -> BTreeMap<usize, usize> {
+        let mut counts = BTreeMap::new();
+        for (_, decision) in &self.log {
+            if let Decision::Poll(poll) = decision
+                && poll.read.class == class
+                && !poll.probe
+            {
+                *counts.entry(poll.drive).or_default() += 1;
+            }
+        }
+        counts
+    }
+}
+
+#[test]
+fn a_saturated_line_is_never_idle_and_fair() {
+    let mut bench = Bench::new(10, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.log.clear();
+    bench.run(Duration::from_secs(20));
+    assert!(bench.log.iter().all(|(_, d)| !matches!(d, Decision::Idle(_))));
+    let fast = bench.polls(PollClass::Fast);
+    let (least, most) = (fast.values().min().unwrap(), fast.values().max().unwrap());
+    assert!(most - least <= 1, "{fast:?}");
+    // Ten slow polls a second would be 12 %; they get 5 %.
+    let slow: usize = bench.polls(PollClass::Slow).values().sum();
+    let share = slow as f64 * COST.as_secs_f64() / 20.0;
+    assert!((0.045..0.07).contains(&share), "{share}");
+}
+
+#[test]
+fn the_grid_is_kept_without_drift() {
+    let mut bench = Bench::new(1, Duration::from_millis(30));
+    bench.run(Duration::from_secs(30));
+    let fast: Vec<Instant> = bench
+        .log
+        .iter()
+        .filter(|(_, d)| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast && !p.probe))
+        .map(|(at, _)| *at)
+        .collect();
+    assert!((999..=1001).contains(&fast.len()), "{}", fast.len());
+    let grid = fast.iter().skip(1).filter(|at| {
+        let off = (**at - fast[0]).as_micros() % 30_000;
+        off < 1000 || off > 29_000
+    });
+    assert!(grid.count() >= fast.len() - 2, "slow polls fit into the idle time");
+}
+
+#[test]
+fn eight_commands_then_a_poll() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.log.clear();
+    for _ in 0..90 {
+        bench.step(Some(Urgency::Command));
+    }
+    let mut row = 0;
+    for (_, decision) in &bench.log {
+        row = if matches!(decision, Decision::Command(_)) {
+            row + 1
+        } else {
+            0
+        };
+        assert!(row <= 8);
+    }
+    let polls = bench.log.iter().filter(|(_, d)| matches!(d, Decision::Poll(_))).count();
+    assert_eq!(polls, 10);
+}
+
+#[test]
+fn a_stop_goes_before_the_due_poll_even_after_eight_commands() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    for _ in 0..8 {
+        assert_eq!(
+            bench.schedule.next(bench.now, Some(Urgency::Command)),
+            Decision::Command(Urgency::Command)
+        );
+        bench.schedule.command_done(Urgency::Command, COST);
+        bench.now += COST;
+    }
+    assert!(matches!(
+        bench.schedule.next(bench.now, Some(Urgency::Command)),
+        Decision::Poll(_)
+    ));
+    assert_eq!(
+        bench.schedule.next(bench.now, Some(Urgency::Stop)),
+        Decision::Command(Urgency::Stop)
+    );
+}
+
+#[test]
+fn dead_drives_cost_two_percent_each() {
+    let mut all = Bench::new(7, Duration::from_millis(10));
+    all.run(Duration::from_secs(60));
+    let mut some = Bench::new(10, Duration::from_millis(10));
+    some.dead = vec![2, 5, 9];
+    some.run(Duration::from_secs(60));
+    let total = |bench: &Bench| bench.polls(PollClass::Fast).values().sum::<usize>() as f64;
+    let ratio = total(&some) / total(&all);
+    assert!(ratio >= 0.94, "{ratio}");
+    assert_eq!(some.offline, [2, 5, 9], "told once each");
+    // It comes back within ten seconds, and its once class is read again.
+    some.dead.clear();
+    some.log.clear();
+    some.run(Duration::from_secs(11));
+    for drive in [2, 5, 9] {
+        assert!(
+            some.polls(PollClass::Fast).contains_key(&drive),
+            "{drive} is polled again"
+        );
+        assert_eq!(some.polls(PollClass::Once)[&drive], 1);
+    }
+}
+
+#[test]
+fn a_drive_that_dies_is_offline_after_the_retries() {
+    let mut bench = Bench::new(2, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.dead = vec![1];
+    let died = bench.now;
+    while bench.offline.is_empty() {
+        bench.step(None);
+    }
+    assert!(bench.now - died <= COST * 10 * 2 + COST * 3, "two tries");
+    assert!(!bench.schedule.is_online(1) && bench.schedule.is_online(0));
+}
+
+#[test]
+fn refused_blocks_are_split_joined_and_retried_slowly() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let bad = 2105;
+    let mut unavailable = Vec::new();
+    let mut asked = Vec::new();
+    let end = bench.now + Duration::from_secs(30);
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let refused = poll.read.covers(Table::Holding, bad);
+                let polled = if refused {
+                    Polled::Refused(Exception::ADDRESS)
+                } else {
+                    Polled::Ok
+                };
+                asked.push((poll.read.start, poll.read.count));
+                if let Change::Unavailable(read, _) = bench.schedule.poll_done(&poll, polled, COST, bench.now) {
+                    unavailable.push(read.start);
+                }
+            }
+        }
+    }
+    assert_eq!(unavailable, [bad]);
+    let tail: Vec<_> = asked
+        .iter()
+        .rev()
+        .take(20)
+        .filter(|(start, _)| *start >= 2100)
+        .collect();
+    assert!(
+        tail.iter().all(|read| **read == (2100, 5) || **read == (2106, 5)),
+        "{tail:?}"
+    );
+    assert!(bench.schedule.is_online(0));
+}
+
+#[test]
+fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let mut mute = 0;
+    let end = bench.now + Duration::from_secs(30);
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let silent = poll.read.class == PollClass::Once;
+                mute += usize::from(silent);
+                let polled = if silent { Polled::Failed } else { Polled::Ok };
+                assert_ne!(
+                    bench.schedule.poll_done(&poll, polled, COST, bench.now),
+                    Change::Offline
+                );
+            }
+        }
+    }
+    assert_eq!(mute, 2, "first try and one retry, then a long pause");
+}
