@@ -1,7 +1,13 @@
 //! The bus: one owner of the line, one transaction at a time.
 
+pub mod execute;
+pub mod leases;
+mod report;
 pub mod schedule;
+mod task;
 pub mod transaction;
+
+pub use task::BusTask;
 
 use std::time::Duration;
 

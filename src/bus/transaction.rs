@@ -31,6 +31,7 @@ pub struct Transaction<'r> {
     request: &'r Request,
     frame: &'r [u8],
     received: Vec<u8>,
+    seen: Vec<u8>,
     deadline: Instant,
     first_byte: Option<Instant>,
     foreign: u32,
@@ -55,6 +56,7 @@ impl<'r> Transaction<'r> {
             request,
             frame,
             received: Vec::with_capacity(260),
+            seen: Vec::with_capacity(260),
             deadline: end_of_transmission + response_timeout + reply_time,
             first_byte: None,
             foreign: 0,
@@ -67,6 +69,7 @@ impl<'r> Transaction<'r> {
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
         self.first_byte.get_or_insert(now);
         self.received.extend_from_slice(bytes);
+        self.seen.extend_from_slice(bytes);
         loop {
             if self.strip_echo() {
                 continue;
@@ -132,6 +135,11 @@ impl<'r> Transaction<'r> {
     /// Frames that were nobody's answer.
     pub fn foreign(&self) -> u32 {
         self.foreign
+    }
+
+    /// All bytes that came in this exchange.
+    pub fn seen(&self) -> &[u8] {
+        &self.seen
     }
 
     /// Bytes that came behind the reply, or were no reply.

@@ -1,0 +1,522 @@
+//! A command step by step: control words from a shadow, pulses, safe order. Pure.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::{Duration, Instant};
+
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{Command, Order, Outcome, Ticket, Urgency};
+use crate::drive::profile::Form;
+use crate::drive::{ModelPoint, Profile, Raw, Value};
+
+/// The registers of all drives of a bus whose bits are commanded, as the drives have them.
+///
+/// Filled by reading the drive's own words and by acknowledged writes, never by assumption.
+#[derive(Debug, Default)]
+pub struct Shadow(BTreeMap<(usize, u16), u16>);
+
+impl Shadow {
+    /// A word that the drive has.
+    pub fn learn(&mut self, drive: usize, table: Table, address: u16, word: u16) {
+        if table == Table::Holding {
+            self.0.insert((drive, address), word);
+        }
+    }
+
+    /// The word, if it is known.
+    pub fn get(&self, drive: usize, address: u16) -> Option<u16> {
+        self.0.get(&(drive, address)).copied()
+    }
+
+    /// The drive may have started anew: its words are read again before a bit is changed.
+    pub fn forget(&mut self, drive: usize) {
+        self.0.retain(|(of, _), _| *of != drive);
+    }
+}
+
+/// What a command needs next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// This request on the line.
+    Send(RequestPdu),
+    /// Nothing before then.
+    Wait(Instant),
+    /// It is done.
+    Done,
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum Action {
+    /// A raw request, or a register of its own.
+    Send(RequestPdu),
+    /// Bits of one word, merged into the shadow when they are sent.
+    Bits { raw: Raw, changes: Vec<(u8, bool)> },
+    /// Takes the reset bit (and the run bit of a motor that stands) away, if set.
+    PulseLow { raw: Raw, bit: u8, invert: bool },
+    /// Sets the reset bit.
+    PulseHigh { raw: Raw, bit: u8, invert: bool },
+    /// Takes the reset bit away again.
+    PulseEnd { raw: Raw, bit: u8, invert: bool },
+    /// Two update periods of the drive.
+    Hold(Duration),
+}
+
+/// A command that the bus has begun.
+#[derive(Debug)]
+pub struct Execution {
+    /// Index of the drive.
+    pub drive: usize,
+    /// Rank.
+    pub urgency: Urgency,
+    actions: VecDeque<Action>,
+    not_before: Option<Instant>,
+    ticket: Ticket,
+    purged: bool,
+    reply: Reply,
+    failures: u32,
+}
+
+impl Execution {
+    /// Lays the command out in the order that is safe: a stop before anything, references before run, a reset
+    /// before a new run edge.
+    pub fn new(command: Command, profile: &Profile) -> Execution {
+        let Command {
+            drive,
+            order,
+            urgency,
+            ticket,
+            ..
+        } = command;
+        let actions = match order {
+            Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
+            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
+        };
+        Execution {
+            drive,
+            urgency,
+            actions,
+            not_before: None,
+            ticket,
+            purged: false,
+            reply: Reply::Written,
+            failures: 0,
+        }
+    }
+
+    /// What the command needs next. `running` is what the drive last said.
+    pub fn next(&mut self, shadow: &Shadow, profile: &Profile, running: bool, now: Instant) -> Next {
+        if let Some(at) = self.not_before {
+            if now < at {
+                return Next::Wait(at);
+            }
+            self.not_before = None;
+        }
+        loop {
+            let Some(action) = self.actions.front() else {
+                return Next::Done;
+            };
+            if let Action::Hold(time) = action {
+                let until = now + *time;
+                self.actions.pop_front();
+                self.not_before = Some(until);
+                return Next::Wait(until);
+            }
+            match request(action, self.drive, shadow, profile, running) {
+                Some(pdu) => return Next::Send(pdu),
+                // Nothing to take away: the pulse starts at once, without the pause behind.
+                None => {
+                    self.actions.pop_front();
+                    if matches!(self.actions.front(), Some(Action::Hold(_))) {
+                        self.actions.pop_front();
+                    }
+                }
+            }
+        }
+    }
+
+    /// The drive answered the request that [`Execution::next`] gave. The outcome, when the command is over.
+    pub fn answered(&mut self, sent: &RequestPdu, reply: Reply, shadow: &mut Shadow) -> Option<Outcome> {
+        self.failures = 0;
+        if let Reply::Exception(code) = reply {
+            return Some(Outcome::Exception(code));
+        }
+        note_write(self.drive, sent, shadow);
+        if let (RequestPdu::Read { table, start, .. }, Some(action)) = (sent, self.actions.front())
+            && !matches!(action, Action::Send(_))
+        {
+            // The drive's own word, read because the shadow did not have it.
+            return match reply {
+                Reply::Registers(words) => {
+                    let word = words.first().copied()?;
+                    shadow.learn(self.drive, *table, *start, word);
+                    None
+                }
+                _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
+            };
+        }
+        self.reply = reply;
+        self.actions.pop_front();
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// No believable answer came. The outcome, when the tries are used up.
+    pub fn failed(&mut self, retries: u32) -> Option<Outcome> {
+        self.failures += 1;
+        (self.failures > retries).then_some(Outcome::TimedOut)
+    }
+
+    /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
+    /// Whether the command is over by that.
+    pub fn purge(&mut self) -> bool {
+        let before = self.actions.len();
+        let high = self.actions.iter().any(|a| matches!(a, Action::PulseHigh { .. }));
+        self.actions
+            .retain(|a| !high && matches!(a, Action::PulseEnd { .. } | Action::Hold(_)));
+        self.purged = before != self.actions.len();
+        self.actions.is_empty()
+    }
+
+    /// How the command ends when nothing is left to do.
+    pub fn success(&self) -> Outcome {
+        if self.purged {
+            Outcome::Purged
+        } else {
+            Outcome::Acknowledged(self.reply.clone())
+        }
+    }
+
+    /// Answers the command.
+    pub fn finish(self, outcome: Outcome, now: Instant) {
+        self.ticket.answer(outcome, now);
+    }
+}
+
+/// A word and the bits of it that change.
+type WordChange = (Raw, Vec<(u8, bool)>);
+
+fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque<Action> {
+    let mut numbers = VecDeque::new();
+    let mut pulses = VecDeque::new();
+    let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();
+    for (index, value) in values {
+        let Some(point) = profile.points.get(*index) else {
+            continue;
+        };
+        let Some(raw) = point.raw() else { continue };
+        match raw.form {
+            Form::Bit { bit, invert } if point.pulse => {
+                if value.as_bool() {
+                    let hold = Action::Hold(2 * profile.update_period);
+                    pulses.push_back(Action::PulseLow {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                    pulses.push_back(hold.clone());
+                    pulses.push_back(Action::PulseHigh {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                    pulses.push_back(hold);
+                    pulses.push_back(Action::PulseEnd {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                }
+            }
+            Form::Bit { bit, invert } => {
+                let entry = words
+                    .entry((raw.table, raw.address))
+                    .or_insert_with(|| (raw.clone(), Vec::new()));
+                entry.1.push((bit, value.as_bool() != invert));
+            }
+            Form::U16 | Form::I16 => {
+                // Admitted values fit; one that does not is left out rather than sent wrong.
+                if let Ok(word) = raw.encode(*value, 0) {
+                    numbers.push_back(Action::Send(RequestPdu::WriteRegister {
+                        address: raw.address,
+                        value: word,
+                    }));
+                }
+            }
+        }
+    }
+    let bits = words.into_values().map(|(raw, changes)| Action::Bits { raw, changes });
+    if stop {
+        bits.chain(numbers).chain(pulses).collect()
+    } else {
+        numbers.into_iter().chain(pulses).chain(bits).collect()
+    }
+}
+
+/// The request of an action with the shadow as it is now; a read where the shadow does not know the word;
+/// `None` where there is nothing to do.
+fn request(action: &Action, drive: usize, shadow: &Shadow, profile: &Profile, running: bool) -> Option<RequestPdu> {
+    let (raw, changes) = match action {
+        Action::Send(pdu) => return Some(pdu.clone()),
+        Action::Hold(_) => return None,
+        Action::Bits { raw, changes } => (raw, changes.clone()),
+        Action::PulseHigh { raw, bit, invert } => (raw, vec![(*bit, !invert)]),
+        Action::PulseEnd { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
+        Action::PulseLow { raw, bit, invert } => {
+            let mut changes = vec![(*bit, *invert)];
+            // A reset must not start the motor: a run bit left over from before the fault is taken away.
+            if !running && let Some(run) = standing_run_bit(profile, raw) {
+                changes.push(run);
+            }
+            (raw, changes)
+        }
+    };
+    if raw.table == Table::Coil {
+        let on = changes.first().is_some_and(|(_, on)| *on);
+        return Some(RequestPdu::WriteCoil {
+            address: raw.address,
+            on,
+        });
+    }
+    let Some(old) = shadow.get(drive, raw.address) else {
+        return Some(RequestPdu::Read {
+            table: raw.table,
+            start: raw.address,
+            count: 1,
+        });
+    };
+    let value = changes.iter().fold(
+        old,
+        |word, (bit, on)| if *on { word | (1 << bit) } else { word & !(1 << bit) },
+    );
+    let idle = matches!(action, Action::PulseLow { .. }) && value == old;
+    (!idle).then_some(RequestPdu::WriteRegister {
+        address: raw.address,
+        value,
+    })
+}
+
+fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
+    let run = profile.model_point(ModelPoint::Run)?.raw()?;
+    match run.form {
+        Form::Bit { bit, invert } if run.table == of.table && run.address == of.address => Some((bit, invert)),
+        _ => None,
+    }
+}
+
+/// Acknowledged words are known from then on.
+fn note_write(drive: usize, sent: &RequestPdu, shadow: &mut Shadow) {
+    match sent {
+        RequestPdu::WriteRegister { address, value } => shadow.learn(drive, Table::Holding, *address, *value),
+        RequestPdu::WriteRegisters { start, values } => {
+            for (address, value) in (*start..).zip(values) {
+                shadow.learn(drive, Table::Holding, address, *value);
+            }
+        }
+        _ => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use tokio::sync::oneshot::Receiver;
+
+    use super::*;
+    use crate::command::{Answer, Origin, SourceKind, WriteStats};
+    use crate::drive::profile::Profiles;
+
+    struct Bench {
+        profile: Arc<Profile>,
+        shadow: Shadow,
+        now: Instant,
+        /// Control word and reference as the drive has them.
+        drive: BTreeMap<u16, u16>,
+        running: bool,
+    }
+
+    impl Bench {
+        fn new(control_word: u16) -> Bench {
+            let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+            let drive = BTreeMap::from([(2000, control_word), (2002, 0)]);
+            Bench {
+                profile,
+                shadow: Shadow::default(),
+                now: Instant::now(),
+                drive,
+                running: false,
+            }
+        }
+
+        fn begin(&self, points: &[(&str, f64)], urgency: Urgency) -> (Execution, Receiver<Answer>) {
+            let values = points
+                .iter()
+                .map(|(name, v)| {
+                    let index = self.profile.point_index(name).unwrap();
+                    let bool = matches!(*name, "run" | "reverse" | "fault_reset");
+                    (
+                        index,
+                        if bool {
+                            Value::Bool(*v != 0.0)
+                        } else {
+                            Value::Number(*v)
+                        },
+                    )
+                })
+                .collect();
+            let origin = Origin {
+                kind: SourceKind::Mqtt,
+                who: "t".into(),
+            };
+            let stats = Arc::new(WriteStats::default());
+            let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
+            let expires = self.now + Duration::from_secs(1);
+            let command = Command {
+                drive: 0,
+                order: Order::Points(values),
+                urgency,
+                reference_only: false,
+                expires,
+                ticket,
+            };
+            (Execution::new(command, &self.profile), receiver)
+        }
+
+        /// Runs the command against a drive that does as it is told; the writes as (ms, address, value).
+        fn run(&mut self, execution: &mut Execution) -> Vec<(u128, u16, u16)> {
+            let start = self.now;
+            let mut writes = Vec::new();
+            for _ in 0..50 {
+                match execution.next(&self.shadow, &self.profile, self.running, self.now) {
+                    Next::Done => return writes,
+                    Next::Wait(until) => self.now = until,
+                    Next::Send(pdu) => {
+                        let reply = match pdu {
+                            RequestPdu::Read { start, .. } => Reply::Registers(vec![self.drive[&start]]),
+                            RequestPdu::WriteRegister { address, value } => {
+                                writes.push(((self.now - start).as_millis(), address, value));
+                                self.drive.insert(address, value);
+                                Reply::Written
+                            }
+                            _ => unreachable!(),
+                        };
+                        if execution.answered(&pdu, reply, &mut self.shadow).is_some() {
+                            return writes;
+                        }
+                    }
+                }
+            }
+            panic!("the command does not end");
+        }
+    }
+
+    #[test]
+    fn bits_of_others_are_kept_and_the_word_is_read_first() {
+        let mut bench = Bench::new(0x0800);
+        let (mut execution, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        assert!(matches!(
+            execution.next(&bench.shadow, &bench.profile, false, bench.now),
+            Next::Send(RequestPdu::Read {
+                start: 2000,
+                count: 1,
+                ..
+            })
+        ));
+        assert_eq!(bench.run(&mut execution), [(0, 2000, 0x0801)]);
+        assert_eq!(execution.success(), Outcome::Acknowledged(Reply::Written));
+    }
+
+    #[test]
+    fn safe_order() {
+        let mut bench = Bench::new(0);
+        let (mut start, _a) = bench.begin(
+            &[("run", 1.0), ("reverse", 1.0), ("speed_reference", 50.0)],
+            Urgency::Command,
+        );
+        assert_eq!(
+            bench.run(&mut start),
+            [(0, 2002, 5000), (0, 2000, 3)],
+            "reference before run, one control word"
+        );
+        let (mut stop, _b) = bench.begin(&[("speed_reference", 0.0), ("run", 0.0)], Urgency::Stop);
+        assert_eq!(
+            bench.run(&mut stop),
+            [(0, 2000, 2), (0, 2002, 0)],
+            "stop before anything"
+        );
+    }
+
+    #[test]
+    fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
+        let mut bench = Bench::new(0);
+        let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+        assert_eq!(bench.run(&mut reset), [(0, 2000, 4), (20, 2000, 0)]);
+        // The bit is set already, and so is the run bit of a motor that stands with a fault.
+        let mut bench = Bench::new(0x0005);
+        let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+        assert_eq!(bench.run(&mut reset), [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0)]);
+        // A motor that runs keeps its run bit.
+        let mut bench = Bench::new(0x0001);
+        bench.running = true;
+        let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+        assert_eq!(bench.run(&mut reset), [(0, 2000, 5), (20, 2000, 1)]);
+        // Reset and run in one command: a new edge after the pulse.
+        let mut bench = Bench::new(0x0001);
+        let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
+        assert_eq!(
+            bench.run(&mut both),
+            [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0), (40, 2000, 1)]
+        );
+    }
+
+    #[test]
+    fn a_stop_purges_what_was_begun() {
+        let mut bench = Bench::new(0);
+        bench.shadow.learn(0, Table::Holding, 2000, 0);
+        let (mut start, _a) = bench.begin(&[("run", 1.0), ("speed_reference", 50.0)], Urgency::Command);
+        let sent = RequestPdu::WriteRegister {
+            address: 2002,
+            value: 5000,
+        };
+        assert_eq!(
+            start.next(&bench.shadow, &bench.profile, false, bench.now),
+            Next::Send(sent.clone())
+        );
+        assert_eq!(start.answered(&sent, Reply::Written, &mut bench.shadow), None);
+        assert!(start.purge(), "the run bit is not sent any more");
+        assert_eq!(start.success(), Outcome::Purged);
+    }
+
+    #[test]
+    fn a_stop_lets_a_pulse_end() {
+        let mut bench = Bench::new(0);
+        bench.shadow.learn(0, Table::Holding, 2000, 0);
+        let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
+        let high = RequestPdu::WriteRegister {
+            address: 2000,
+            value: 4,
+        };
+        assert_eq!(
+            both.next(&bench.shadow, &bench.profile, false, bench.now),
+            Next::Send(high.clone())
+        );
+        assert_eq!(both.answered(&high, Reply::Written, &mut bench.shadow), None);
+        assert!(!both.purge());
+        assert_eq!(bench.run(&mut both), [(20, 2000, 0)], "no run behind the stop");
+        assert_eq!(both.success(), Outcome::Purged);
+    }
+
+    #[test]
+    fn exceptions_and_silence_end_it() {
+        let bench = Bench::new(0);
+        let mut shadow = Shadow::default();
+        let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+        let sent = RequestPdu::WriteRegister {
+            address: 2002,
+            value: 100,
+        };
+        let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut shadow);
+        assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
+        let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+        assert_eq!(command.failed(1), None);
+        assert_eq!(command.failed(1), Some(Outcome::TimedOut));
+    }
+}

@@ -1,0 +1,143 @@
+//! Leases: a gateway that polls keeps a drive's own watchdog content even when nobody commands the drive any more.
+//! So a drive can have a lease, renewed by accepted writes and heartbeats of a commanding client; when it runs out
+//! while the drive runs, the configured action is written once. Not a safety function.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use tokio::sync::oneshot::Receiver;
+
+use crate::cache::LeaseAction;
+use crate::command::{Answer, Command, Order, Origin, SourceKind, Ticket, Urgency, WriteStats};
+use crate::drive::{ModelPoint, Value};
+use crate::event::{Event, EventKind, Events};
+use crate::plant::BusHandle;
+
+/// How long an action that was not acknowledged waits before it is written again.
+const AGAIN: Duration = Duration::from_secs(1);
+
+/// Watches the leases of one bus.
+#[derive(Debug)]
+pub struct Leases {
+    events: Events,
+    stats: Arc<WriteStats>,
+    owed: Vec<Owed>,
+}
+
+/// An action that is not acknowledged yet.
+#[derive(Debug)]
+struct Owed {
+    drive: usize,
+    answer: Option<Receiver<Answer>>,
+    next_try: Instant,
+}
+
+impl Leases {
+    /// Watches with these listeners and counters.
+    pub fn new(events: Events, stats: Arc<WriteStats>) -> Leases {
+        Leases {
+            events,
+            stats,
+            owed: Vec::new(),
+        }
+    }
+
+    /// Looks for leases that ran out and for actions that are still owed.
+    pub fn look(&mut self, bus: &BusHandle, now: Instant) {
+        for (index, drive) in bus.image.drives.iter().enumerate() {
+            if drive.lease_ran_out(now) && drive.reading(now, Duration::from_secs(60)).is_set(ModelPoint::Running) {
+                self.ran_out(bus, index, now);
+            }
+        }
+        let mut owed = std::mem::take(&mut self.owed);
+        owed.retain_mut(|item| !item.settled(now));
+        for item in owed
+            .iter_mut()
+            .filter(|item| item.answer.is_none() && item.next_try <= now)
+        {
+            item.answer = self.submit(bus, item.drive, now);
+        }
+        self.owed = owed;
+    }
+
+    fn ran_out(&mut self, bus: &BusHandle, index: usize, now: Instant) {
+        let Some(drive) = bus.image.drives.get(index) else {
+            return;
+        };
+        let Some(supervision) = &drive.spec.supervision else {
+            return;
+        };
+        let action = match supervision.action {
+            LeaseAction::Stop => "the drive is stopped".to_string(),
+            LeaseAction::Hold => "nothing is written".to_string(),
+            LeaseAction::SpeedReference(percent) => format!("the speed reference is set to {percent} %"),
+        };
+        self.events.tell(Event {
+            id: 0,
+            time: SystemTime::now(),
+            kind: EventKind::Supervision,
+            bus: drive.spec.bus.clone(),
+            drive: Some(drive.spec.name.clone()),
+            fault_code: None,
+            text: format!(
+                "no commanding client of {} for {:?}: {action}",
+                drive.spec.name, supervision.timeout
+            ),
+        });
+        if supervision.action != LeaseAction::Hold && !self.owed.iter().any(|o| o.drive == index) {
+            self.owed.push(Owed {
+                drive: index,
+                answer: None,
+                next_try: now,
+            });
+        }
+    }
+
+    fn submit(&self, bus: &BusHandle, index: usize, now: Instant) -> Option<Receiver<Answer>> {
+        let drive = bus.image.drives.get(index)?;
+        let (point, value, urgency) = match drive.spec.supervision.as_ref()?.action {
+            LeaseAction::Stop => (ModelPoint::Run, Value::Bool(false), Urgency::Stop),
+            LeaseAction::SpeedReference(percent) => {
+                (ModelPoint::SpeedReference, Value::Number(percent), Urgency::Command)
+            }
+            LeaseAction::Hold => return None,
+        };
+        let point_index = drive.spec.profile.model_index(point)?;
+        let origin = Origin {
+            kind: SourceKind::Supervision,
+            who: "lease".to_string(),
+        };
+        let what = format!("{}={value}", point.name());
+        let (ticket, answer) = Ticket::new(origin, &drive.spec.name, what, true, now, self.stats.clone());
+        let order = Order::Points(vec![(point_index, value)]);
+        let expires = now + crate::command::DEFAULT_EXPIRY;
+        bus.queue.submit(
+            Command {
+                drive: index,
+                order,
+                urgency,
+                reference_only: false,
+                expires,
+                ticket,
+            },
+            now,
+        );
+        Some(answer)
+    }
+}
+
+impl Owed {
+    /// Whether the action was acknowledged; one that failed is owed again after a pause.
+    fn settled(&mut self, now: Instant) -> bool {
+        let Some(answer) = &mut self.answer else { return false };
+        match answer.try_recv() {
+            Ok(answer) if answer.outcome.is_ok() => true,
+            Err(tokio::sync::oneshot::error::TryRecvError::Empty) => false,
+            Ok(_) | Err(_) => {
+                self.answer = None;
+                self.next_try = now + AGAIN;
+                false
+            }
+        }
+    }
+}

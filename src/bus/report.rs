@@ -1,0 +1,276 @@
+//! What the bus tells: health and figures of the image, events, and the frames for whoever listens.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::task::{counted, time_of_day};
+use super::transaction::{Ended, Transaction};
+use crate::cache::{BusImage, Direction, FrameRecord, Link, PollCycle};
+use crate::codec::{Exception, Reply};
+use crate::drive::{ModelPoint, PlannedRead, Value};
+use crate::event::{Event, EventKind, Events};
+
+/// The load of the line is reckoned over this time.
+const LOAD_WINDOW: Duration = Duration::from_secs(1);
+
+/// Tells what a bus does.
+#[derive(Debug)]
+pub(super) struct Report {
+    image: Arc<BusImage>,
+    events: Events,
+    window: Instant,
+    busy: Duration,
+    /// Fault code of each drive as last told; `None` is no fault.
+    faults: Vec<Option<i64>>,
+    up: bool,
+    reason: String,
+}
+
+impl Report {
+    pub(super) fn new(image: Arc<BusImage>, events: Events) -> Report {
+        let faults = vec![None; image.drives.len()];
+        Report {
+            image,
+            events,
+            window: Instant::now(),
+            busy: Duration::ZERO,
+            faults,
+            up: false,
+            reason: String::new(),
+        }
+    }
+
+    fn tell(&self, kind: EventKind, drive: Option<usize>, fault_code: Option<i64>, text: String) {
+        let drive = drive
+            .and_then(|i| self.image.drives.get(i))
+            .map(|d| d.spec.name.clone());
+        let bus = self.image.spec.name.clone();
+        self.events.tell(Event {
+            id: 0,
+            time: SystemTime::now(),
+            kind,
+            bus,
+            drive,
+            fault_code,
+            text,
+        });
+    }
+
+    pub(super) fn bus_up(&mut self) {
+        self.up = true;
+        self.reason.clear();
+        self.window = Instant::now();
+        self.busy = Duration::ZERO;
+        self.image.update_health(|h| {
+            h.up = true;
+            h.tried = true;
+            h.since = Some(SystemTime::now());
+            h.reason = None;
+            h.opened += 1;
+        });
+        let text = format!("port {} of bus {} is open", self.image.spec.port, self.image.spec.name);
+        self.tell(EventKind::BusUp, None, None, text);
+    }
+
+    /// Told once a reason, not at every try.
+    pub(super) fn bus_down(&mut self, why: &str) {
+        let news = self.up || self.reason != why;
+        self.image.update_health(|h| {
+            if h.up || !h.tried {
+                h.since = Some(SystemTime::now());
+            }
+            h.up = false;
+            h.tried = true;
+            h.load = 0.0;
+            h.reason = Some(why.to_string());
+        });
+        self.up = false;
+        if news {
+            self.reason = why.to_string();
+            let name = &self.image.spec.name;
+            self.tell(
+                EventKind::BusDown,
+                None,
+                None,
+                format!("bus {name} is down: {why}; trying again every 3 s at the latest"),
+            );
+        }
+    }
+
+    pub(super) fn online(&mut self, index: usize) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.update(|s| s.link = Link::Online(SystemTime::now()));
+        self.tell(
+            EventKind::Online,
+            Some(index),
+            None,
+            format!("drive {} answers", drive.spec.name),
+        );
+    }
+
+    pub(super) fn offline(&mut self, index: usize, why: &str) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        if matches!(drive.snapshot().link, Link::Offline(_)) {
+            return;
+        }
+        drive.update(|s| s.link = Link::Offline(SystemTime::now()));
+        let text = format!(
+            "drive {} is offline: {why}; it is asked again with pauses up to 10 s",
+            drive.spec.name
+        );
+        self.tell(EventKind::Offline, Some(index), None, text);
+    }
+
+    pub(super) fn unavailable(&self, index: usize, read: &PlannedRead, exception: Exception) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
+        tracing::warn!(
+            bus = %self.image.spec.name, drive = %drive.spec.name,
+            "the drive refuses {} {} with {exception}; its points are bad, asked again every minute", read.table, read.start
+        );
+    }
+
+    /// Faults that came or went with the last poll.
+    pub(super) fn look(&mut self, index: usize, _began: Instant) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let reading = drive.reading(Instant::now(), Duration::from_secs(60));
+        let Some(fault) = reading.model(ModelPoint::Fault).good() else {
+            return;
+        };
+        let code = match reading.model(ModelPoint::FaultCode).good() {
+            Some(Value::Integer(code)) => code,
+            _ => 0,
+        };
+        let now = fault.as_bool().then_some(code);
+        let Some(before) = self.faults.get_mut(index) else {
+            return;
+        };
+        if *before == now {
+            return;
+        }
+        *before = now;
+        let name = &drive.spec.name;
+        match now {
+            Some(code) => {
+                let text = format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code));
+                self.tell(EventKind::Fault, Some(index), Some(code), text);
+            }
+            None => self.tell(
+                EventKind::FaultEnd,
+                Some(index),
+                None,
+                format!("the fault of drive {name} is gone"),
+            ),
+        }
+    }
+
+    pub(super) fn fast_round(&self, cycle: Option<Duration>) {
+        if let Some(cycle) = cycle {
+            self.image.fast_cycles.observe(cycle);
+        }
+        self.image.update_health(|h| {
+            h.fast = PollCycle {
+                last: cycle.or(h.fast.last),
+                rounds: h.fast.rounds + 1,
+            }
+        });
+    }
+
+    pub(super) fn slow_round(&self, cycle: Option<Duration>) {
+        if let Some(cycle) = cycle {
+            self.image.slow_cycles.observe(cycle);
+        }
+        self.image.update_health(|h| {
+            h.slow = PollCycle {
+                last: cycle.or(h.slow.last),
+                rounds: h.slow.rounds + 1,
+            }
+        });
+    }
+
+    pub(super) fn sent(&self, frame: &[u8], quiet_since: Instant, began: Instant) {
+        self.image.trace.tell(|| FrameRecord {
+            time: time_of_day(began),
+            gap: Some(began.saturating_duration_since(quiet_since)),
+            direction: Direction::Request,
+            bytes: frame.to_vec(),
+            verdict: String::new(),
+        });
+    }
+
+    pub(super) fn noise(&self, bytes: &[u8]) {
+        self.image.update_health(|h| h.foreign += 1);
+        self.image.trace.tell(|| FrameRecord {
+            time: SystemTime::now(),
+            gap: None,
+            direction: Direction::Reply,
+            bytes: bytes.to_vec(),
+            verdict: "not asked for".to_string(),
+        });
+    }
+
+    /// An exchange is over: counters, turnaround, load, trace.
+    pub(super) fn exchanged(
+        &mut self,
+        index: usize,
+        transaction: &Transaction<'_>,
+        ended: &Ended,
+        sent: Instant,
+        reply_time: Duration,
+        took: Duration,
+    ) {
+        self.busy += took;
+        self.image.transactions.observe(took);
+        if transaction.foreign() > 0 {
+            self.image
+                .update_health(|h| h.foreign += u64::from(transaction.foreign()));
+        }
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.count(counted(ended));
+        let now = Instant::now();
+        if let (Ended::Reply(reply), Some(first)) = (ended, transaction.first_byte()) {
+            // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
+            let by_first = first.saturating_duration_since(sent);
+            let by_last = now.saturating_duration_since(sent).saturating_sub(reply_time);
+            if !matches!(reply, Reply::Exception(_)) {
+                drive.set_turnaround(by_first.min(by_last));
+            }
+        }
+        self.image.trace.tell(|| FrameRecord {
+            time: SystemTime::now(),
+            gap: transaction
+                .first_byte()
+                .map(|first| first.saturating_duration_since(sent)),
+            direction: Direction::Reply,
+            bytes: transaction.seen().to_vec(),
+            verdict: match ended {
+                Ended::Reply(Reply::Exception(code)) => code.to_string(),
+                Ended::Reply(_) => "ok".to_string(),
+                Ended::Silent => "no answer".to_string(),
+                Ended::Corrupt(why) => format!("corrupt: {why}"),
+            },
+        });
+    }
+
+    /// Reckons the load once a second.
+    pub(super) fn tick(&mut self, now: Instant) {
+        let window = now.saturating_duration_since(self.window);
+        if window < LOAD_WINDOW {
+            return;
+        }
+        let load = (self.busy.as_secs_f64() / window.as_secs_f64()).min(1.0);
+        self.image.update_health(|h| h.load = load);
+        self.window = now;
+        self.busy = Duration::ZERO;
+    }
+}

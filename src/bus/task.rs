@@ -1,0 +1,567 @@
+//! The bus at work: the only place south that does I/O. One thread owns the line.
+
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::time::{Duration, Instant, SystemTime};
+
+use super::BusOptions;
+use super::execute::{Execution, Next, Shadow};
+use super::leases::Leases;
+use super::report::Report;
+use super::schedule::{Cadence, Change, Decision, Poll, Polled, Schedule};
+use super::transaction::{Ended, Step, Transaction};
+use crate::cache::{Outcome as Counted, Snapshot};
+use crate::codec::{Reply, Request, RequestPdu, Table};
+use crate::command::{Command, Outcome, Urgency};
+use crate::drive::plan::WireTime;
+use crate::drive::{ModelPoint, Plan, PlannedRead, PollClass};
+use crate::event::Events;
+use crate::line::{self, Line, Lost, Woken};
+use crate::plant::BusHandle;
+
+/// First and longest pause between two tries to open the port.
+const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
+/// Commands begun at one time (a reset pulse is held while others go on).
+const BEGUN: usize = 8;
+/// A line that never falls silent is spoken on after this time: a stop must get out.
+const BABBLE: Duration = Duration::from_millis(500);
+/// A status older than this does not tell whether the motor runs.
+const FRESH: Duration = Duration::from_secs(2);
+/// The bus looks around at least this often.
+const LOOK_ROUND: Duration = Duration::from_millis(100);
+
+/// A bus that runs.
+#[derive(Debug)]
+pub struct BusTask {
+    handle: BusHandle,
+    stop: Arc<AtomicBool>,
+    beats: Arc<AtomicU64>,
+    thread: Option<std::thread::JoinHandle<()>>,
+}
+
+impl BusTask {
+    /// Starts the bus in a thread of its own.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(handle: BusHandle, options: BusOptions, leases: Leases, events: Events) -> std::io::Result<BusTask> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let beats = Arc::new(AtomicU64::new(0));
+        let worker = Worker::new(handle.clone(), options, leases, events, stop.clone(), beats.clone());
+        let name = format!("bus-{}", handle.image.spec.name);
+        let thread = std::thread::Builder::new().name(name).spawn(move || worker.run())?;
+        Ok(BusTask {
+            handle,
+            stop,
+            beats,
+            thread: Some(thread),
+        })
+    }
+
+    /// Turns that the bus has taken: it hangs when this stands still for seconds.
+    pub fn beats(&self) -> u64 {
+        self.beats.load(Ordering::Relaxed)
+    }
+
+    /// The bus.
+    pub fn handle(&self) -> &BusHandle {
+        &self.handle
+    }
+
+    /// Ends the bus after the exchange that is running; everything that waits is answered.
+    pub fn stop(mut self) {
+        self.halt();
+    }
+
+    fn halt(&mut self) {
+        self.stop.store(true, Ordering::Relaxed);
+        self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
+        self.handle.queue.wake();
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!(bus = %self.handle.image.spec.name, "the bus ended by a panic");
+        }
+    }
+}
+
+impl Drop for BusTask {
+    fn drop(&mut self) {
+        self.halt();
+    }
+}
+
+/// Who speaks next.
+enum Job {
+    Poll(Poll),
+    Command { index: usize, pdu: RequestPdu },
+}
+
+struct Worker {
+    handle: BusHandle,
+    options: BusOptions,
+    silence: Duration,
+    schedule: Schedule,
+    begun: Vec<Execution>,
+    shadow: Shadow,
+    leases: Leases,
+    report: Report,
+    stop: Arc<AtomicBool>,
+    beats: Arc<AtomicU64>,
+    /// End of the last character on the line, either direction.
+    quiet_since: Instant,
+    /// The adapter sends back what it is given.
+    echo: bool,
+    frame: Vec<u8>,
+}
+
+impl Worker {
+    fn new(
+        handle: BusHandle,
+        options: BusOptions,
+        leases: Leases,
+        events: Events,
+        stop: Arc<AtomicBool>,
+        beats: Arc<AtomicU64>,
+    ) -> Worker {
+        let now = Instant::now();
+        let spec = handle.image.spec.clone();
+        let silence = options.silence.on(&spec.format);
+        let cadence = Cadence {
+            fast: spec.cycle,
+            slow: spec.slow_cycle,
+            retries: options.retries,
+        };
+        let plans: Vec<&Plan> = handle.image.drives.iter().map(|d| &d.plan).collect();
+        let drives = &handle.image.drives;
+        let cost = |index: usize, read: &PlannedRead| {
+            let turnaround = drives.get(index).map_or(Duration::ZERO, |d| d.spec.turnaround);
+            WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
+        };
+        let schedule = Schedule::new(cadence, &plans, cost, now);
+        let report = Report::new(handle.image.clone(), events);
+        Worker {
+            handle,
+            options,
+            silence,
+            schedule,
+            begun: Vec::new(),
+            shadow: Shadow::default(),
+            leases,
+            report,
+            stop,
+            beats,
+            quiet_since: now,
+            echo: false,
+            frame: Vec::with_capacity(260),
+        }
+    }
+
+    fn run(mut self) {
+        line::sharpen_timers();
+        let mut pause = REOPEN.0;
+        while !self.stopping() {
+            let spec = &self.handle.image.spec;
+            match Line::open(&spec.port, &spec.format, self.options.rs485) {
+                Ok((line, warnings)) => {
+                    pause = REOPEN.0;
+                    self.opened(warnings);
+                    let why = self.serve(&line);
+                    if let Err(lost) = why {
+                        self.lost(&lost.to_string());
+                    }
+                }
+                Err(error) => self.lost(&error.to_string()),
+            }
+            self.rest(pause);
+            pause = (pause * 2).min(REOPEN.1);
+        }
+        let now = Instant::now();
+        for execution in self.begun.drain(..) {
+            execution.finish(Outcome::ShuttingDown, now);
+        }
+    }
+
+    fn stopping(&self) -> bool {
+        self.beats.fetch_add(1, Ordering::Relaxed);
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn rest(&self, pause: Duration) {
+        let until = Instant::now() + pause;
+        while !self.stopping() && Instant::now() < until {
+            line::wait_without_port(until.min(Instant::now() + LOOK_ROUND), self.handle.queue.wake_fd());
+            self.handle.queue.clear_wake();
+        }
+    }
+
+    fn opened(&mut self, warnings: Vec<String>) {
+        let now = Instant::now();
+        for warning in warnings {
+            tracing::warn!(bus = %self.handle.image.spec.name, "{warning}");
+        }
+        self.quiet_since = now;
+        self.echo = false;
+        self.schedule.reset(now);
+        self.handle.queue.open();
+        self.report.bus_up();
+    }
+
+    /// The port is gone or cannot be opened: everything is stale at once, everybody who waits is answered.
+    fn lost(&mut self, why: &str) {
+        let now = Instant::now();
+        self.handle.queue.close(Outcome::BusDown, now);
+        for execution in self.begun.drain(..) {
+            execution.finish(Outcome::BusDown, now);
+        }
+        for index in 0..self.handle.image.drives.len() {
+            self.shadow.forget(index);
+            self.report.offline(index, "its bus is down");
+        }
+        self.report.bus_down(why);
+    }
+
+    fn serve(&mut self, line: &Line) -> Result<(), Lost> {
+        while !self.stopping() {
+            let now = Instant::now();
+            self.leases.look(&self.handle, now);
+            match self.decide(now) {
+                Ok(job) => self.work(line, job)?,
+                Err(until) => self.idle(line, until.min(now + LOOK_ROUND))?,
+            }
+            self.report.tick(Instant::now());
+        }
+        Ok(())
+    }
+
+    fn idle(&mut self, line: &Line, until: Instant) -> Result<(), Lost> {
+        match line.wait(until, Some(self.handle.queue.wake_fd()), true)? {
+            Woken::Readable => self.hear_noise(line),
+            Woken::Command => {
+                self.handle.queue.clear_wake();
+                Ok(())
+            }
+            Woken::Time => Ok(()),
+        }
+    }
+
+    /// Bytes that nobody asked for; the line is not silent while they come.
+    fn hear_noise(&mut self, line: &Line) -> Result<(), Lost> {
+        let mut buffer = [0u8; 512];
+        let count = line.receive(&mut buffer)?;
+        if count > 0 {
+            self.quiet_since = Instant::now();
+            self.report.noise(buffer.get(..count).unwrap_or_default());
+        }
+        Ok(())
+    }
+
+    /// What goes on the line next, or until when nothing does.
+    fn decide(&mut self, now: Instant) -> Result<Job, Instant> {
+        let (begun, mut wake_at) = self.begun_next(now);
+        let queued = self.handle.queue.lock().next_urgency(now);
+        // A full hand of begun commands takes only a stop besides.
+        let queued = queued.filter(|u| self.begun.len() < BEGUN || *u == Urgency::Stop);
+        let waiting = [begun.as_ref().map(|(u, _, _)| *u), queued].into_iter().flatten().min();
+        let decision = self.schedule.next(now, waiting);
+        if let Some(round) = self.schedule.take_round() {
+            self.report.fast_round(round.cycle);
+        }
+        match decision {
+            Decision::Poll(poll) => Ok(Job::Poll(poll)),
+            Decision::Idle(until) => {
+                wake_at = wake_at.map(|at| at.min(until)).or(Some(until));
+                Err(wake_at.unwrap_or(until))
+            }
+            Decision::Command(urgency) => match begun {
+                Some((of_begun, index, pdu)) if queued.is_none_or(|q| of_begun <= q) => Ok(Job::Command { index, pdu }),
+                _ => {
+                    self.begin(urgency, now);
+                    // What was begun is decided on anew: it may wait, or another one may go first.
+                    Err(now)
+                }
+            },
+        }
+    }
+
+    /// The begun command that can go on, of the highest rank; else when one can.
+    fn begun_next(&mut self, now: Instant) -> (Option<(Urgency, usize, RequestPdu)>, Option<Instant>) {
+        let mut best: Option<(Urgency, usize, RequestPdu)> = None;
+        let mut wake_at: Option<Instant> = None;
+        let mut done = Vec::new();
+        for (index, execution) in self.begun.iter_mut().enumerate() {
+            let Some(drive) = self.handle.image.drives.get(execution.drive) else {
+                continue;
+            };
+            let running = drive
+                .reading(now, LOOK_ROUND * 20)
+                .is_set(crate::drive::ModelPoint::Running);
+            match execution.next(&self.shadow, &drive.spec.profile, running, now) {
+                Next::Send(pdu) => {
+                    if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
+                        best = Some((execution.urgency, index, pdu));
+                    }
+                }
+                Next::Wait(until) => wake_at = Some(wake_at.map_or(until, |at| at.min(until))),
+                Next::Done => done.push(index),
+            }
+        }
+        if !done.is_empty() {
+            for index in done.into_iter().rev() {
+                let execution = self.begun.remove(index);
+                let outcome = execution.success();
+                execution.finish(outcome, now);
+            }
+            return self.begun_next(now);
+        }
+        (best, wake_at)
+    }
+
+    /// Takes the next command from the queue.
+    fn begin(&mut self, at_least: Urgency, now: Instant) {
+        let Some(command) = self.handle.queue.lock().pop(at_least, now) else {
+            return;
+        };
+        let profile = self
+            .handle
+            .image
+            .drives
+            .get(command.drive)
+            .map(|d| d.spec.profile.clone());
+        let Some(profile) = profile else {
+            command.ticket.answer(Outcome::Offline, now);
+            return;
+        };
+        if !self.schedule.is_online(command.drive) {
+            command.ticket.answer(Outcome::Offline, now);
+            return;
+        }
+        if command.urgency == Urgency::Stop {
+            self.purge(command.drive, now);
+        }
+        self.begun.push(Execution::new(command, &profile));
+    }
+
+    /// Nothing that was begun for a drive goes on behind a stop.
+    fn purge(&mut self, drive: usize, now: Instant) {
+        let mut index = 0;
+        while let Some(execution) = self.begun.get_mut(index) {
+            let over = execution.drive == drive && execution.urgency == Urgency::Command && execution.purge();
+            if over {
+                self.begun.remove(index).finish(Outcome::Purged, now);
+            } else {
+                index += 1;
+            }
+        }
+    }
+
+    fn work(&mut self, line: &Line, job: Job) -> Result<(), Lost> {
+        let (drive, pdu, urgency) = match &job {
+            Job::Poll(poll) => (poll.drive, poll.read.pdu(), None),
+            Job::Command { index, pdu } => {
+                let Some(execution) = self.begun.get(*index) else {
+                    return Ok(());
+                };
+                (execution.drive, pdu.clone(), Some(execution.urgency))
+            }
+        };
+        let Some(address) = self.handle.image.drives.get(drive).map(|d| d.spec.address) else {
+            return Ok(());
+        };
+        let request = Request { address, pdu };
+        let mut frame = std::mem::take(&mut self.frame);
+        frame.clear();
+        self.handle.image.spec.protocol.encode(&request, &mut frame);
+        let clear = self.wait_for_silence(line, urgency == Some(Urgency::Stop));
+        let result = match clear {
+            Ok(true) => self.exchange(line, drive, &request, &frame).map(Some),
+            // A command came in meanwhile: what goes next is decided anew.
+            Ok(false) => Ok(None),
+            Err(lost) => Err(lost),
+        };
+        self.frame = frame;
+        let Some((ended, began, took)) = result? else {
+            return Ok(());
+        };
+        match job {
+            Job::Poll(poll) => self.polled(&poll, ended, began, took),
+            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, took),
+        }
+        Ok(())
+    }
+
+    /// Waits until the line was silent for its time. False when a command came in before (never for a stop).
+    fn wait_for_silence(&mut self, line: &Line, stop: bool) -> Result<bool, Lost> {
+        let give_up = Instant::now() + self.silence + BABBLE;
+        loop {
+            let free = self.quiet_since + self.silence;
+            let wake = (!stop).then(|| self.handle.queue.wake_fd());
+            match line.wait(free.min(give_up), wake, true)? {
+                Woken::Time if Instant::now() >= give_up => {
+                    tracing::warn!(bus = %self.handle.image.spec.name, "the line does not fall silent; speaking all the same");
+                    return Ok(true);
+                }
+                Woken::Time => return Ok(true),
+                Woken::Readable => self.hear_noise(line)?,
+                Woken::Command => {
+                    self.handle.queue.clear_wake();
+                    return Ok(false);
+                }
+            }
+        }
+    }
+
+    /// One request and its answer. Returns how it ended, when it began and how long the line was taken.
+    fn exchange(
+        &mut self,
+        line: &Line,
+        drive: usize,
+        request: &Request,
+        frame: &[u8],
+    ) -> Result<(Ended, Instant, Duration), Lost> {
+        let spec = &self.handle.image.spec;
+        let wire = WireTime::of(spec.protocol, &spec.format, &request.pdu);
+        let began = Instant::now();
+        line.send(frame)?;
+        self.report.sent(frame, self.quiet_since, began);
+        let sent = began + spec.format.chars(frame.len());
+        let mut transaction = Transaction::new(
+            spec.protocol,
+            request,
+            frame,
+            sent,
+            self.options.response_timeout,
+            wire.reply,
+            self.echo,
+        );
+        self.quiet_since = sent;
+        let mut buffer = [0u8; 512];
+        let mut step = transaction.on_time(began);
+        let ended = loop {
+            match step {
+                Step::Done(ended) => break ended,
+                Step::Wait(until) => {
+                    let woken = line.wait(until, None, false)?;
+                    let now = Instant::now();
+                    step = match woken {
+                        Woken::Readable => {
+                            let count = line.receive(&mut buffer)?;
+                            if count > 0 {
+                                self.quiet_since = self.quiet_since.max(now);
+                            }
+                            transaction.on_bytes(now, buffer.get(..count).unwrap_or_default())
+                        }
+                        _ => transaction.on_time(now),
+                    };
+                }
+            }
+        };
+        self.echo |= transaction.echo_seen();
+        let took = Instant::now().saturating_duration_since(began) + self.silence;
+        self.report
+            .exchanged(drive, &transaction, &ended, sent, wire.reply, took);
+        Ok((ended, began, took))
+    }
+
+    fn polled(&mut self, poll: &Poll, ended: Ended, began: Instant, took: Duration) {
+        let now = Instant::now();
+        let polled = match &ended {
+            Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
+            Ended::Reply(reply) => {
+                self.store(poll, reply, now);
+                Polled::Ok
+            }
+            Ended::Silent | Ended::Corrupt(_) => Polled::Failed,
+        };
+        let change = self.schedule.poll_done(poll, polled, took, now);
+        if let Some(round) = self.schedule.take_slow_round() {
+            self.report.slow_round(round.cycle);
+        }
+        match change {
+            Change::Online => self.report.online(poll.drive),
+            Change::Offline => {
+                self.shadow.forget(poll.drive);
+                self.report.offline(poll.drive, "it does not answer");
+                let gone = |c: &Command| c.drive == poll.drive;
+                self.handle.queue.lock().remove(now, &Outcome::Offline, gone);
+            }
+            Change::Unavailable(read, exception) => self.report.unavailable(poll.drive, &read, exception),
+            Change::None => {}
+        }
+        if matches!(ended, Ended::Reply(_)) {
+            self.report.look(poll.drive, began);
+        }
+    }
+
+    fn store(&mut self, poll: &Poll, reply: &Reply, now: Instant) {
+        let read = poll.read;
+        let words: Vec<u16> = match reply {
+            Reply::Registers(words) => words.clone(),
+            Reply::Bits(bits) => bits.iter().map(|b| u16::from(*b)).collect(),
+            _ => return,
+        };
+        let Some(drive) = self.handle.image.drives.get(poll.drive) else {
+            return;
+        };
+        for (address, word) in (read.start..).zip(&words) {
+            let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.address == address);
+            if drive.spec.profile.points.iter().any(commanded) {
+                self.shadow.learn(poll.drive, read.table, address, *word);
+            }
+        }
+        drive.update(|snapshot: &mut Snapshot| {
+            snapshot.store(read.table, read.start, &words, now);
+            if read.class == PollClass::Fast {
+                snapshot.fast_at = Some(now);
+            }
+        });
+    }
+
+    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, took: Duration) {
+        let now = Instant::now();
+        let Some(execution) = self.begun.get_mut(index) else {
+            return;
+        };
+        let drive = execution.drive;
+        self.schedule.command_done(execution.urgency, took);
+        let outcome = match ended {
+            Ended::Reply(reply) => {
+                self.schedule.seen(drive);
+                execution.answered(pdu, reply, &mut self.shadow)
+            }
+            Ended::Silent | Ended::Corrupt(_) => execution.failed(self.options.retries),
+        };
+        if pdu.is_write() {
+            self.schedule
+                .refresh(drive, |read| written(pdu).any(|a| read.covers(Table::Holding, a)), now);
+        }
+        if let Some(outcome) = outcome {
+            self.begun.remove(index).finish(outcome, now);
+        }
+    }
+}
+
+/// The registers that a write sets.
+fn written(pdu: &RequestPdu) -> impl Iterator<Item = u16> {
+    let (start, count) = match pdu {
+        RequestPdu::WriteRegister { address, .. } => (*address, 1),
+        RequestPdu::WriteRegisters { start, values } => (*start, values.len()),
+        _ => (0, 0),
+    };
+    (0..count).filter_map(move |offset| start.checked_add(u16::try_from(offset).ok()?))
+}
+
+/// What the counters call an exchange that ended so.
+pub(super) fn counted(ended: &Ended) -> Counted {
+    match ended {
+        Ended::Reply(Reply::Exception(_)) => Counted::Exception,
+        Ended::Reply(_) => Counted::Ok,
+        Ended::Silent => Counted::Timeout,
+        Ended::Corrupt(_) => Counted::Corrupt,
+    }
+}
+
+/// The time of day of an instant in the near past.
+pub(super) fn time_of_day(at: Instant) -> SystemTime {
+    SystemTime::now() - Instant::now().saturating_duration_since(at)
+}
