@@ -293,9 +293,7 @@ impl Worker {
             let Some(drive) = self.handle.image.drives.get(execution.drive) else {
                 continue;
             };
-            let running = drive
-                .reading(now, LOOK_ROUND * 20)
-                .is_set(crate::drive::ModelPoint::Running);
+            let running = drive.reading(now, FRESH).is_set(ModelPoint::Running);
             match execution.next(&self.shadow, &drive.spec.profile, running, now) {
                 Next::Send(pdu) => {
                     if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
