@@ -217,7 +217,7 @@ impl Report {
         });
     }
 
-    /// An exchange is over: counters, turnaround, load, trace.
+    /// An exchange is over: counters, turnaround, load, trace. `sent` is when the drive knew that the request was over.
     pub(super) fn exchanged(
         &mut self,
         index: usize,

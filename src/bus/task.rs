@@ -457,7 +457,7 @@ impl Worker {
         self.echo |= transaction.echo_seen();
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         self.report
-            .exchanged(drive, &transaction, &ended, sent, wire.reply, took);
+            .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
         Ok((ended, began, took))
     }
 

@@ -91,6 +91,13 @@ impl Protocol {
         }
     }
 
+    /// Silence by which a drive knows that a request is over, before its turnaround begins.
+    pub fn recognition(self, format: &LineFormat) -> std::time::Duration {
+        match self {
+            Protocol::ModbusRtu => format.silence_chars(),
+        }
+    }
+
     /// Characters on the wire of the regular (not exception) reply's frame.
     pub fn reply_chars(self, request: &RequestPdu) -> usize {
         match self {

@@ -122,6 +122,9 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -
 pub struct WireTime {
     /// Characters of the request.
     pub request: Duration,
+    /// Silence by which the drive knows that the request is over (Modbus RTU: 3.5 characters); its turnaround
+    /// begins behind it.
+    pub recognition: Duration,
     /// Characters of the regular reply.
     pub reply: Duration,
 }
@@ -131,13 +134,14 @@ impl WireTime {
     pub fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
         WireTime {
             request: format.chars(protocol.request_chars(pdu)),
+            recognition: protocol.recognition(format),
             reply: format.chars(protocol.reply_chars(pdu)),
         }
     }
 
-    /// The whole transaction: request, turnaround, reply, silence.
+    /// The whole transaction: request, recognition, turnaround, reply, silence.
     pub fn total(&self, turnaround: Duration, silence: Duration) -> Duration {
-        self.request + turnaround + self.reply + silence
+        self.request + self.recognition + turnaround + self.reply + silence
     }
 }
 
@@ -206,8 +210,9 @@ mod tests {
                 count: 11,
             };
             let time = WireTime::of(Protocol::ModbusRtu, &format, &pdu);
-            let turnaround = format.silence_chars() + Duration::from_micros(500);
-            let total = time.total(turnaround, format.silence_chars()).as_secs_f64();
+            let total = time
+                .total(Duration::from_micros(500), format.silence_chars())
+                .as_secs_f64();
             assert!((1.0 / total - rate).abs() < 0.1, "{baud}: {}", 1.0 / total);
         }
     }
