@@ -1,0 +1,160 @@
+//! A bus with simulated drives, for tests.
+#![allow(dead_code, unreachable_pub)] // each test file uses its own part
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use drivegate::bus::leases::Leases;
+use drivegate::bus::{BusOptions, BusTask};
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, OnShutdown};
+use drivegate::codec::wire::Silence;
+use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
+use drivegate::command::{CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::drive::profile::Profiles;
+use drivegate::drive::{ModelPoint, Sample, State, Value};
+use drivegate::event::Events;
+use drivegate::line::Rs485;
+use drivegate::plant::{BusHandle, DriveHandle, Plant};
+use drivegate::sim::drive::DriveOptions;
+use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+
+/// Longest wait for something that must come.
+const PATIENCE: Duration = Duration::from_secs(20);
+
+/// A bus, its simulated line, and the plant around it.
+pub struct Rig {
+    pub plant: Plant,
+    pub events: Events,
+    // The bus ends before its line.
+    pub bus: BusTask,
+    pub line: SimulatedBus,
+    _link: tempfile::TempDir,
+}
+
+/// Name of the drive at an address.
+pub fn drive(address: u8) -> String {
+    format!("drive-{address}")
+}
+
+fn spec(address: u8) -> DriveSpec {
+    DriveSpec {
+        name: drive(address),
+        bus: "line1".to_string(),
+        address,
+        unit: address,
+        profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
+        access: Access::Control,
+        limits: BTreeMap::new(),
+        supervision: None,
+        on_shutdown: OnShutdown::Hold,
+        turnaround: Duration::from_micros(500),
+        frequency_range: None,
+    }
+}
+
+impl Rig {
+    pub async fn start(addresses: &[u8], baud: u32) -> Rig {
+        Rig::build(addresses, baud, 0, |_| {})
+    }
+
+    pub async fn start_recorded(addresses: &[u8], baud: u32) -> Rig {
+        Rig::build(addresses, baud, 10_000, |_| {})
+    }
+
+    pub async fn start_with(addresses: &[u8], baud: u32, change: impl Fn(&mut DriveSpec)) -> Rig {
+        Rig::build(addresses, baud, 0, change)
+    }
+
+    fn build(addresses: &[u8], baud: u32, transcript: usize, change: impl Fn(&mut DriveSpec)) -> Rig {
+        let format = LineFormat::new(baud, "8N1").unwrap();
+        let link = tempfile::tempdir().unwrap();
+        let path = link.path().join("line1");
+        let drives = addresses.iter().map(|a| DriveOptions::nx(*a)).collect();
+        let options = SimulatedBusOptions {
+            endpoint: EndpointOptions::Pty { link: Some(path.clone()) },
+            transcript,
+            ..SimulatedBusOptions::new("line1", LineRules::new(format), drives)
+        };
+        let line = SimulatedBus::start(options).unwrap();
+        let bus_spec = BusSpec {
+            name: "line1".to_string(),
+            port: path.display().to_string(),
+            protocol: Protocol::ModbusRtu,
+            format,
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_millis(500),
+        };
+        let images = addresses.iter().map(|address| {
+            let mut spec = spec(*address);
+            change(&mut spec);
+            Arc::new(DriveImage::new(spec, bus_spec.slow_cycle))
+        });
+        let image = Arc::new(BusImage::new(bus_spec.clone(), images.collect()));
+        let handle = BusHandle { image, queue: Arc::new(CommandQueue::new().unwrap()) };
+        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let options = BusOptions {
+            response_timeout: Duration::from_millis(100),
+            retries: 1,
+            silence: Silence::Chars,
+            rs485: Rs485::Off,
+        };
+        let leases = Leases::new(events.clone(), writes.clone());
+        let bus = BusTask::start(handle.clone(), options, leases, events.clone()).unwrap();
+        let plant = Plant {
+            gateway: "test".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: vec![handle],
+            events: events.clone(),
+            writes,
+        };
+        Rig { plant, events, bus, line, _link: link }
+    }
+
+    /// Waits until something holds.
+    pub async fn until(&self, what: &str, holds: impl Fn(&Rig) -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        while !holds(self) {
+            assert!(Instant::now() < deadline, "never came: {what}");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    pub fn handle(&self, address: u8) -> DriveHandle {
+        self.plant.drive(&drive(address)).unwrap()
+    }
+
+    pub fn state(&self, address: u8) -> State {
+        self.handle(address).reading(Instant::now()).state()
+    }
+
+    pub fn sample(&self, address: u8, point: ModelPoint) -> Sample {
+        self.handle(address).reading(Instant::now()).model(point)
+    }
+
+    pub fn good(&self, address: u8, point: ModelPoint) -> Option<Value> {
+        self.sample(address, point).good()
+    }
+
+    pub fn bus_up(&self) -> bool {
+        self.bus.handle().image.health().up
+    }
+
+    /// Sets points as one command.
+    pub async fn set(&self, address: u8, points: &[(&str, f64)]) -> Outcome {
+        let handle = self.handle(address);
+        let index = |name| handle.image.spec.profile.point_index(name).unwrap();
+        let values = points.iter().map(|(name, value)| (index(name), Value::Number(*value))).collect();
+        let origin = Origin { kind: SourceKind::Mqtt, who: "test".to_string() };
+        handle.order(Order::Points(values), origin, true, DEFAULT_EXPIRY).await.outcome
+    }
+
+    /// Reads holding registers of a drive through the bus.
+    pub async fn read(&self, name: String, start: u16, count: u16) -> Outcome {
+        let pdu = RequestPdu::Read { table: Table::Holding, start, count };
+        let origin = Origin { kind: SourceKind::Mqtt, who: "test".to_string() };
+        self.plant.drive(&name).unwrap().order(Order::Read(pdu), origin, false, DEFAULT_EXPIRY).await.outcome
+    }
+}
