@@ -12,7 +12,11 @@ use drivegate::sim::statistics::{Direction, Recorded};
 
 fn hex(frames: &[Recorded], direction: Direction) -> Vec<String> {
     let text = |bytes: &[u8]| bytes.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ");
-    frames.iter().filter(|f| f.direction == direction).map(|f| text(&f.bytes)).collect()
+    frames
+        .iter()
+        .filter(|f| f.direction == direction)
+        .map(|f| text(&f.bytes))
+        .collect()
 }
 
 #[tokio::test]
@@ -22,7 +26,10 @@ async fn the_frames_on_the_line_are_those_of_the_reference() {
     rig.line.record(10_000);
     assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
     assert!(rig.set(1, &[("run", 1.0)]).await.is_ok());
-    rig.until("it runs at its reference", |r| r.good(1, ModelPoint::AtReference) == Some(Value::Bool(true))).await;
+    rig.until("it runs at its reference", |r| {
+        r.good(1, ModelPoint::AtReference) == Some(Value::Bool(true))
+    })
+    .await;
     assert_eq!(rig.good(1, ModelPoint::OutputFrequency), Some(Value::Number(25.0)));
     assert_eq!(rig.good(1, ModelPoint::ActualSpeed), Some(Value::Number(50.0)));
     assert!(rig.set(1, &[("run", 1.0), ("reverse", 1.0)]).await.is_ok());
@@ -43,22 +50,49 @@ async fn the_frames_on_the_line_are_those_of_the_reference() {
         ("stop", "01 06 07 D0 00 00 89 47"),
         ("fault reset", "01 06 07 D0 00 04 88 84"),
     ] {
-        assert!(requests.iter().any(|r| r == frame), "{meaning}: {frame} was not on the line");
+        assert!(
+            requests.iter().any(|r| r == frame),
+            "{meaning}: {frame} was not on the line"
+        );
     }
     let writes: Vec<&String> = requests.iter().filter(|r| r.starts_with("01 06 07 D0")).collect();
-    assert_eq!(writes.last().map(|w| w.as_str()), Some("01 06 07 D0 00 00 89 47"), "the pulse ends");
-    let at = |frame: &str| frames.iter().rev().find(|f| hex(std::slice::from_ref(f), Direction::ToDrives) == [frame]);
-    let (high, low) = (at("01 06 07 D0 00 04 88 84").unwrap(), at("01 06 07 D0 00 00 89 47").unwrap());
-    assert!(low.start - high.end >= Duration::from_millis(20), "held for two update periods");
+    assert_eq!(
+        writes.last().map(|w| w.as_str()),
+        Some("01 06 07 D0 00 00 89 47"),
+        "the pulse ends"
+    );
+    let at = |frame: &str| {
+        frames
+            .iter()
+            .rev()
+            .find(|f| hex(std::slice::from_ref(f), Direction::ToDrives) == [frame])
+    };
+    let (high, low) = (
+        at("01 06 07 D0 00 04 88 84").unwrap(),
+        at("01 06 07 D0 00 00 89 47").unwrap(),
+    );
+    assert!(
+        low.start - high.end >= Duration::from_millis(20),
+        "held for two update periods"
+    );
     let statistics = rig.line.statistics();
-    assert_eq!((statistics.silence_violations, statistics.collisions, statistics.bad_crc), (0, 0, 0));
+    assert_eq!(
+        (statistics.silence_violations, statistics.collisions, statistics.bad_crc),
+        (0, 0, 0)
+    );
 }
 
 #[tokio::test]
 async fn nothing_is_written_at_start() {
     let rig = Rig::start_recorded(&[1, 2], 38_400).await;
-    rig.until("both drives answer", |r| r.state(1) == State::Ready && r.state(2) == State::Ready).await;
-    rig.until("all classes were read", |r| r.good(2, ModelPoint::FrequencyReference).is_some()).await;
+    rig.until("both drives answer", |r| {
+        r.state(1) == State::Ready && r.state(2) == State::Ready
+    })
+    .await;
+    rig.until("all classes were read", |r| {
+        r.good(2, ModelPoint::FrequencyReference).is_some()
+    })
+    .await;
     let requests = hex(&rig.line.transcript(), Direction::ToDrives);
     assert!(requests.len() > 10);
     for request in requests {
@@ -85,7 +119,10 @@ async fn a_fault_is_told_and_reset() {
 #[tokio::test]
 async fn a_dead_drive_is_stale_at_once_and_comes_back() {
     let rig = Rig::start(&[1, 2], 115_200).await;
-    rig.until("both drives answer", |r| r.state(1) == State::Ready && r.state(2) == State::Ready).await;
+    rig.until("both drives answer", |r| {
+        r.state(1) == State::Ready && r.state(2) == State::Ready
+    })
+    .await;
     rig.line.set_alive(2, false);
     rig.until("it is offline", |r| r.state(2) == State::Offline).await;
     let sample = rig.sample(2, ModelPoint::OutputFrequency);
@@ -105,14 +142,25 @@ async fn the_port_vanishes_and_returns() {
     assert_eq!(rig.sample(1, ModelPoint::OutputFrequency).quality, Quality::Stale);
     assert_eq!(rig.set(1, &[("run", 1.0)]).await, Outcome::BusDown);
     rig.line.restore().unwrap();
-    rig.until("it is back", |r| r.bus_up() && r.state(1) == State::Ready).await;
+    rig.until("it is back", |r| r.bus_up() && r.state(1) == State::Ready)
+        .await;
 }
 
 #[tokio::test]
 async fn a_stop_overtakes_and_purges() {
     let rig = Rig::start(&[1, 2, 3, 4], 9_600).await;
-    rig.until("the drives answer", |r| (1..=4).all(|d| r.state(d) == State::Ready)).await;
-    let references = (0..20).map(|i| rig.set(1, if i % 2 == 0 { &[("speed_reference", 10.0)] } else { &[("run", 1.0)] }));
+    rig.until("the drives answer", |r| (1..=4).all(|d| r.state(d) == State::Ready))
+        .await;
+    let references = (0..20).map(|i| {
+        rig.set(
+            1,
+            if i % 2 == 0 {
+                &[("speed_reference", 10.0)]
+            } else {
+                &[("run", 1.0)]
+            },
+        )
+    });
     let all = futures_util::future::join_all(references);
     let stop = async {
         tokio::task::yield_now().await;
@@ -120,10 +168,17 @@ async fn a_stop_overtakes_and_purges() {
     };
     let (outcomes, stopped) = tokio::join!(all, stop);
     assert!(stopped.is_ok());
-    let purged = outcomes.iter().filter(|o| matches!(o, Outcome::Purged | Outcome::Replaced)).count();
+    let purged = outcomes
+        .iter()
+        .filter(|o| matches!(o, Outcome::Purged | Outcome::Replaced))
+        .count();
     assert!(purged >= 17, "{outcomes:?}");
     tokio::time::sleep(Duration::from_millis(200)).await;
-    assert_eq!(rig.good(1, ModelPoint::Running), Some(Value::Bool(false)), "nothing runs behind a stop");
+    assert_eq!(
+        rig.good(1, ModelPoint::Running),
+        Some(Value::Bool(false)),
+        "nothing runs behind a stop"
+    );
 }
 
 #[tokio::test]
@@ -140,17 +195,28 @@ async fn a_lease_that_runs_out_stops_the_drive_once() {
     assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).await.is_ok());
     rig.until("it runs", |r| r.state(1) == State::Running).await;
     rig.until("it was stopped", |r| r.state(1) == State::Ready).await;
-    let supervision = std::iter::from_fn(|| events.try_recv().ok()).filter(|e| e.kind == EventKind::Supervision).count();
+    let supervision = std::iter::from_fn(|| events.try_recv().ok())
+        .filter(|e| e.kind == EventKind::Supervision)
+        .count();
     assert_eq!(supervision, 1);
 }
 
 #[tokio::test]
 async fn commands_are_checked_against_the_drive() {
     let rig = Rig::start(&[1], 115_200).await;
-    rig.until("the drive answers", |r| r.good(1, ModelPoint::FrequencyReference).is_some()).await;
-    assert!(matches!(rig.set(1, &[("speed_reference", 101.0)]).await, Outcome::Refused(_)));
+    rig.until("the drive answers", |r| {
+        r.good(1, ModelPoint::FrequencyReference).is_some()
+    })
+    .await;
+    assert!(matches!(
+        rig.set(1, &[("speed_reference", 101.0)]).await,
+        Outcome::Refused(_)
+    ));
     assert!(rig.set(1, &[("frequency_reference", 30.0)]).await.is_ok());
-    rig.until("it is read back", |r| r.good(1, ModelPoint::SpeedReference) == Some(Value::Number(60.0))).await;
+    rig.until("it is read back", |r| {
+        r.good(1, ModelPoint::SpeedReference) == Some(Value::Number(60.0))
+    })
+    .await;
     assert_eq!(rig.good(1, ModelPoint::FrequencyReference), Some(Value::Number(30.0)));
     let unknown = rig.read(drive(1), 6000, 5).await;
     assert_eq!(unknown, Outcome::Exception(drivegate::codec::Exception::ADDRESS));

@@ -1,5 +1,6 @@
 //! The bus: one owner of the line, one transaction at a time.
 
+pub mod debts;
 pub mod execute;
 pub mod leases;
 mod report;

@@ -232,6 +232,20 @@ impl Schedule {
         }
     }
 
+    /// A poll may not go before then.
+    pub fn postpone(&mut self, poll: &Poll, until: Instant) {
+        self.round.retain(|waiting| *waiting != (poll.drive, poll.read));
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return;
+        };
+        if let (Presence::Away(_, pause), true) = (drive.presence, poll.probe) {
+            drive.presence = Presence::Away(until, pause);
+        }
+        if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.due = item.due.max(until);
+        }
+    }
+
     /// Reads that cover an address are due at once: a command changed it.
     pub fn refresh(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
         let Some(drive) = self.drives.get_mut(drive) else {

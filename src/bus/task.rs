@@ -5,6 +5,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use super::BusOptions;
+use super::debts::Debts;
 use super::execute::{Execution, Next, Shadow};
 use super::leases::Leases;
 use super::report::Report;
@@ -104,6 +105,7 @@ struct Worker {
     schedule: Schedule,
     begun: Vec<Execution>,
     shadow: Shadow,
+    debts: Debts,
     leases: Leases,
     report: Report,
     stop: Arc<AtomicBool>,
@@ -147,6 +149,7 @@ impl Worker {
             schedule,
             begun: Vec::new(),
             shadow: Shadow::default(),
+            debts: Debts::default(),
             leases,
             report,
             stop,
@@ -268,7 +271,13 @@ impl Worker {
             self.report.fast_round(round.cycle);
         }
         match decision {
-            Decision::Poll(poll) => Ok(Job::Poll(poll)),
+            Decision::Poll(poll) => match self.debts.blocks(poll.drive, &poll.read.pdu(), now) {
+                None => Ok(Job::Poll(poll)),
+                Some(until) => {
+                    self.schedule.postpone(&poll, until);
+                    Err(now)
+                }
+            },
             Decision::Idle(until) => {
                 wake_at = wake_at.map(|at| at.min(until)).or(Some(until));
                 Err(wake_at.unwrap_or(until))
@@ -296,6 +305,12 @@ impl Worker {
             let running = drive.reading(now, FRESH).is_set(ModelPoint::Running);
             match execution.next(&self.shadow, &drive.spec.profile, running, now) {
                 Next::Send(pdu) => {
+                    // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
+                    let blocked = self.debts.blocks(execution.drive, &pdu, now);
+                    if let Some(until) = blocked.filter(|_| execution.urgency != Urgency::Stop) {
+                        wake_at = Some(wake_at.map_or(until, |at| at.min(until)));
+                        continue;
+                    }
                     if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
                         best = Some((execution.urgency, index, pdu));
                     }
@@ -469,7 +484,10 @@ impl Worker {
                 self.store(poll, reply, now);
                 Polled::Ok
             }
-            Ended::Silent | Ended::Corrupt(_) => Polled::Failed,
+            Ended::Silent | Ended::Corrupt(_) => {
+                self.debts.given_up(poll.drive, &poll.read.pdu(), now);
+                Polled::Failed
+            }
         };
         let change = self.schedule.poll_done(poll, polled, took, now);
         if let Some(round) = self.schedule.take_slow_round() {
@@ -527,7 +545,10 @@ impl Worker {
                 self.schedule.seen(drive);
                 execution.answered(pdu, reply, &mut self.shadow)
             }
-            Ended::Silent | Ended::Corrupt(_) => execution.failed(self.options.retries),
+            Ended::Silent | Ended::Corrupt(_) => {
+                self.debts.given_up(drive, pdu, now);
+                execution.failed(self.options.retries)
+            }
         };
         if pdu.is_write() {
             self.schedule

@@ -74,7 +74,9 @@ impl Rig {
         let path = link.path().join("line1");
         let drives = addresses.iter().map(|a| DriveOptions::nx(*a)).collect();
         let options = SimulatedBusOptions {
-            endpoint: EndpointOptions::Pty { link: Some(path.clone()) },
+            endpoint: EndpointOptions::Pty {
+                link: Some(path.clone()),
+            },
             transcript,
             ..SimulatedBusOptions::new("line1", LineRules::new(format), drives)
         };
@@ -93,7 +95,10 @@ impl Rig {
             Arc::new(DriveImage::new(spec, bus_spec.slow_cycle))
         });
         let image = Arc::new(BusImage::new(bus_spec.clone(), images.collect()));
-        let handle = BusHandle { image, queue: Arc::new(CommandQueue::new().unwrap()) };
+        let handle = BusHandle {
+            image,
+            queue: Arc::new(CommandQueue::new().unwrap()),
+        };
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let options = BusOptions {
             response_timeout: Duration::from_millis(100),
@@ -110,7 +115,13 @@ impl Rig {
             events: events.clone(),
             writes,
         };
-        Rig { plant, events, bus, line, _link: link }
+        Rig {
+            plant,
+            events,
+            bus,
+            line,
+            _link: link,
+        }
     }
 
     /// Waits until something holds.
@@ -146,15 +157,36 @@ impl Rig {
     pub async fn set(&self, address: u8, points: &[(&str, f64)]) -> Outcome {
         let handle = self.handle(address);
         let index = |name| handle.image.spec.profile.point_index(name).unwrap();
-        let values = points.iter().map(|(name, value)| (index(name), Value::Number(*value))).collect();
-        let origin = Origin { kind: SourceKind::Mqtt, who: "test".to_string() };
-        handle.order(Order::Points(values), origin, true, DEFAULT_EXPIRY).await.outcome
+        let values = points
+            .iter()
+            .map(|(name, value)| (index(name), Value::Number(*value)))
+            .collect();
+        let origin = Origin {
+            kind: SourceKind::Mqtt,
+            who: "test".to_string(),
+        };
+        handle
+            .order(Order::Points(values), origin, true, DEFAULT_EXPIRY)
+            .await
+            .outcome
     }
 
     /// Reads holding registers of a drive through the bus.
     pub async fn read(&self, name: String, start: u16, count: u16) -> Outcome {
-        let pdu = RequestPdu::Read { table: Table::Holding, start, count };
-        let origin = Origin { kind: SourceKind::Mqtt, who: "test".to_string() };
-        self.plant.drive(&name).unwrap().order(Order::Read(pdu), origin, false, DEFAULT_EXPIRY).await.outcome
+        let pdu = RequestPdu::Read {
+            table: Table::Holding,
+            start,
+            count,
+        };
+        let origin = Origin {
+            kind: SourceKind::Mqtt,
+            who: "test".to_string(),
+        };
+        self.plant
+            .drive(&name)
+            .unwrap()
+            .order(Order::Read(pdu), origin, false, DEFAULT_EXPIRY)
+            .await
+            .outcome
     }
 }

@@ -1,0 +1,163 @@
+//! `drivegate demo`: the whole product with no hardware and nothing to install.
+
+use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::process::ExitCode;
+
+use tokio_util::sync::CancellationToken;
+
+use super::{EXIT_FAILED, report};
+use crate::codec::LineFormat;
+use crate::config::{LogFormat, LogSettings, Settings};
+use crate::daemon::Daemon;
+use crate::sim::broker::Broker;
+use crate::sim::drive::DriveOptions;
+use crate::sim::endpoint::EndpointOptions;
+use crate::sim::half_duplex::{LineRules, Wire};
+use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+
+/// Arguments of `drivegate demo`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  drivegate demo\n  drivegate demo --speed max")]
+pub struct Args {
+    /// True wire times, or as fast as the programs are
+    #[arg(long, value_enum, default_value_t = Speed::Real)]
+    pub speed: Speed,
+    /// What to log beside the demo's own words: off, error, warn, info, debug
+    #[arg(long, default_value = "error", value_name = "LEVEL")]
+    pub log: String,
+}
+
+/// How fast the simulated lines are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Speed {
+    /// Every character takes its time.
+    Real,
+    /// No time on the wire.
+    Max,
+}
+
+/// One simulated line of the demo: name, baud, drives by name.
+const LINES: [(&str, u32, &[&str]); 2] = [("line1", 38_400, &["pump-1", "pump-2"]), ("line2", 115_200, &["fan-1"])];
+
+/// Runs the demo until Ctrl-C.
+pub fn run(args: &Args) -> ExitCode {
+    super::log::start(&LogSettings { level: args.log.clone(), format: LogFormat::Auto });
+    super::block_on(async {
+        match demo(args).await {
+            Ok(()) => ExitCode::SUCCESS,
+            Err(error) => {
+                eprintln!("error: {error}");
+                ExitCode::from(EXIT_FAILED)
+            }
+        }
+    })
+}
+
+async fn demo(args: &Args) -> Result<(), String> {
+    let lines = start_lines(args.speed).map_err(|e| format!("cannot make a simulated line: {e}"))?;
+    let cancel = CancellationToken::new();
+    let mqtt = free_port("MQTT broker", 1883)?;
+    let broker = Broker::start(mqtt, cancel.clone()).await.map_err(|e| format!("cannot start the MQTT broker: {e}"))?;
+    let modbus = free_port("Modbus TCP", 1502)?;
+    let http = free_port("HTTP", 9488)?;
+    let ports: Vec<String> = lines.iter().map(SimulatedBus::address).collect();
+    let source = configuration(&ports, modbus, mqtt, http);
+    let loaded = Settings::parse("demo.toml", &source, std::iter::empty());
+    report::problems(&loaded);
+    let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
+    let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
+    println!("{}", welcome(&ports, modbus, mqtt, http));
+    // Without a handler for Ctrl-C the process ends all the same.
+    let _ = tokio::signal::ctrl_c().await;
+    println!("\nThe demo ends.");
+    daemon.stop().await;
+    cancel.cancel();
+    broker.stop().await;
+    lines.into_iter().for_each(SimulatedBus::stop);
+    Ok(())
+}
+
+fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
+    let start = |(name, baud, drives): &(&str, u32, &[&str])| {
+        let format = LineFormat::new(*baud, "8N1").map_err(|e| std::io::Error::other(e.to_string()))?;
+        let mut rules = LineRules::new(format);
+        if speed == Speed::Max {
+            rules.wire = Wire::Instant;
+        }
+        let drives = (1..).zip(*drives).map(|(address, _)| {
+            // Different seeds, so that the drives do not move in step.
+            let seed = u64::from(*baud) + u64::from(address);
+            DriveOptions { autopilot: Some(seed), ..DriveOptions::nx(address) }
+        });
+        let options = SimulatedBusOptions::new(name, rules, drives.collect());
+        SimulatedBus::start(SimulatedBusOptions { endpoint: EndpointOptions::Pty { link: None }, ..options })
+    };
+    LINES.iter().map(start).collect()
+}
+
+/// The wanted port on loopback, or the next free one; says so when it is another.
+fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
+    for port in wanted..wanted.saturating_add(100) {
+        let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
+        if TcpListener::bind(address).is_ok() {
+            if port != wanted {
+                println!("Port {wanted} is taken; {what} listens on {port} instead.");
+            }
+            return Ok(address);
+        }
+    }
+    Err(format!("no free port for {what} from {wanted} to {}; stop another program", wanted.saturating_add(99)))
+}
+
+fn configuration(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: SocketAddr) -> String {
+    let mut text = "[gateway]\nname = \"demo\"\n".to_string();
+    let mut unit = 0;
+    for ((name, baud, drives), port) in LINES.iter().zip(ports) {
+        text += &format!("\n[[bus]]\nname = \"{name}\"\nport = \"{port}\"\nprotocol = \"modbus-rtu\"\nbaud = {baud}\n");
+        text += "format = \"8N1\"\nsilence = \"chars\"\ncycle = \"10ms\"\n";
+        for (address, drive) in (1..).zip(*drives) {
+            unit += 1;
+            text += &format!("\n[[bus.drive]]\nname = \"{drive}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
+            text += &format!("unit = {unit}\naccess = \"control\"\nturnaround = \"0.5ms\"\n");
+        }
+    }
+    text += &format!("\n[modbus_tcp]\nlisten = [\"{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n");
+    text += &format!("\n[mqtt]\nurl = \"mqtt://{mqtt}\"\nclient_id = \"drivegate-demo\"\ncommands = true\n");
+    text + &format!("\n[http]\nlisten = \"{http}\"\n")
+}
+
+fn welcome(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: SocketAddr) -> String {
+    let drives: Vec<&str> = LINES.iter().flat_map(|(_, _, drives)| drives.iter().copied()).collect();
+    let lines: Vec<String> = LINES
+        .iter()
+        .zip(ports)
+        .map(|((name, baud, drives), port)| format!("  {name}: {} at {baud} 8N1 on {port}", drives.join(", ")))
+        .collect();
+    let (modbus, mqtt) = (modbus.port(), mqtt.port());
+    format!(
+        "\
+drivegate {version} demo: simulated Vacon NX drives, true wire timing, no hardware.
+{lines}
+The drives {drives} start, stop, ramp and now and then fault by themselves until you command them.
+
+Look
+  http://{http}/                       status page in a browser
+  curl -s http://{http}/metrics | grep output_frequency
+  curl -s http://{http}/api/v1/drives/pump-1
+  mosquitto_sub -h 127.0.0.1 -p {mqtt} -v -t 'drivegate/#'
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 32768 -c 19 -1 127.0.0.1          common model of pump-1 (unit 1)
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 2100 -c 11 -1 127.0.0.1           its own registers, IDs 2101 to 2111
+
+Command pump-1
+  mosquitto_pub -h 127.0.0.1 -p {mqtt} -q 1 -t drivegate/demo/drive/pump-1/set -m '{{\"run\": true, \"speed_reference\": 50}}'
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33025 127.0.0.1 5000              speed reference 50.00 %
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 1                 run
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 4                 stop, and reset a fault
+  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 0                 stop
+
+Ctrl-C ends the demo.",
+        version = env!("CARGO_PKG_VERSION"),
+        lines = lines.join("\n"),
+        drives = drives.join(", "),
+    )
+}

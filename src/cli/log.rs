@@ -1,0 +1,71 @@
+//! Log lines: for the journal under systemd, coloured on a terminal, else JSON.
+
+use std::fmt;
+use std::io::IsTerminal;
+
+use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
+use tracing_subscriber::layer::SubscriberExt;
+use tracing_subscriber::registry::LookupSpan;
+use tracing_subscriber::util::SubscriberInitExt;
+use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
+
+use crate::config::{LogFormat, LogSettings};
+
+/// Changes the level of a running program.
+#[derive(Debug, Clone)]
+pub struct LogHandle(reload::Handle<EnvFilter, Registry>);
+
+impl LogHandle {
+    /// Takes a new level; a format change needs a restart.
+    pub fn set_level(&self, level: &str) {
+        if let Err(error) = self.0.reload(EnvFilter::new(level)) {
+            tracing::error!("the log level stays as it is: {error}");
+        }
+    }
+}
+
+/// Starts logging to standard error.
+pub fn start(settings: &LogSettings) -> LogHandle {
+    let (filter, handle) = reload::Layer::new(EnvFilter::new(&settings.level));
+    let terminal = std::io::stderr().is_terminal();
+    let format = match settings.format {
+        LogFormat::Auto if std::env::var_os("JOURNAL_STREAM").is_some() => LogFormat::Journal,
+        LogFormat::Auto if terminal => LogFormat::Text,
+        LogFormat::Auto => LogFormat::Json,
+        other => other,
+    };
+    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let lines = match format {
+        LogFormat::Journal => lines.with_ansi(false).event_format(JournalLine).boxed(),
+        LogFormat::Text => lines.with_ansi(terminal).with_target(true).boxed(),
+        LogFormat::Json | LogFormat::Auto => lines.json().flatten_event(true).boxed(),
+    };
+    // A second start in one process keeps the first subscriber.
+    if tracing_subscriber::registry().with(filter).with(lines).try_init().is_err() {
+        tracing::debug!("logging was started before");
+    }
+    LogHandle(handle)
+}
+
+/// A line with its priority in front, as systemd reads it; the journal adds the time.
+struct JournalLine;
+
+impl<S, N> FormatEvent<S, N> for JournalLine
+where
+    S: Subscriber + for<'a> LookupSpan<'a>,
+    N: for<'a> FormatFields<'a> + 'static,
+{
+    fn format_event(&self, context: &FmtContext<'_, S, N>, mut writer: Writer<'_>, event: &Event<'_>) -> fmt::Result {
+        let priority = match *event.metadata().level() {
+            Level::ERROR => 3,
+            Level::WARN => 4,
+            Level::INFO => 6,
+            Level::DEBUG | Level::TRACE => 7,
+        };
+        write!(writer, "<{priority}>{}: ", event.metadata().target())?;
+        context.format_fields(writer.by_ref(), event)?;
+        writeln!(writer)
+    }
+}

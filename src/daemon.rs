@@ -1,0 +1,264 @@
+//! The gateway as a whole: wiring, reload and the order of stopping.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+use tokio_util::sync::CancellationToken;
+
+use crate::bus::BusTask;
+use crate::bus::leases::Leases;
+use crate::cache::{Access, BusImage, DriveImage, OnShutdown};
+use crate::command::{self, Command, CommandQueue, Order, Origin, SourceKind, Ticket, Urgency, WriteStats};
+use crate::config::{BusSettings, Settings};
+use crate::drive::{ModelPoint, Value};
+use crate::event::Events;
+use crate::north::{NorthStats, http, modbus_tcp, mqtt};
+use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+
+/// Time that the stops of a shutdown may take together.
+const STOP_DRIVES: Duration = Duration::from_millis(800);
+/// Time that a server may take to end.
+const STOP_SERVER: Duration = Duration::from_secs(2);
+
+/// The gateway cannot start, or cannot take a new configuration: what, where, what to do.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub struct StartError(pub String);
+
+/// A running gateway.
+#[derive(Debug)]
+pub struct Daemon {
+    settings: Settings,
+    plant: SharedPlant,
+    buses: Vec<(BusSettings, BusTask)>,
+    events: Events,
+    writes: Arc<WriteStats>,
+    stats: Arc<NorthStats>,
+    modbus_tcp: Option<(CancellationToken, modbus_tcp::Server)>,
+    mqtt: Option<(CancellationToken, mqtt::Mqtt)>,
+    http: Option<(CancellationToken, http::Http)>,
+    beats: BTreeMap<String, u64>,
+}
+
+impl Daemon {
+    /// Starts all buses and servers. A port that cannot be opened is no error: its bus keeps trying.
+    ///
+    /// # Errors
+    /// When a server cannot listen or the system gives no thread.
+    pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
+        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let plant = Plant {
+            gateway: settings.gateway.clone(),
+            stale_after: settings.stale_after,
+            buses: Vec::new(),
+            events: events.clone(),
+            writes: writes.clone(),
+        };
+        let mut daemon = Daemon {
+            plant: Arc::new(ArcSwap::from_pointee(plant)),
+            settings: Settings { modbus_tcp: None, mqtt: None, http: None, ..settings.clone() },
+            buses: Vec::new(),
+            events,
+            writes,
+            stats: Arc::default(),
+            modbus_tcp: None,
+            mqtt: None,
+            http: None,
+            beats: BTreeMap::new(),
+        };
+        daemon.take_buses(&settings)?;
+        daemon.take_servers(&settings).await?;
+        daemon.settings = settings;
+        Ok(daemon)
+    }
+
+    /// The plant, for whoever wants to look.
+    pub fn plant(&self) -> SharedPlant {
+        self.plant.clone()
+    }
+
+    /// Where the HTTP server listens.
+    pub fn http_address(&self) -> Option<std::net::SocketAddr> {
+        self.http.as_ref().map(|(_, server)| server.address())
+    }
+
+    /// Where the Modbus TCP server listens.
+    pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
+        self.modbus_tcp.as_ref().map(|(_, server)| server.addresses().to_vec()).unwrap_or_default()
+    }
+
+    /// Whether every bus has moved since the last call; a bus that hangs must not be hidden by a watchdog that is fed.
+    pub fn is_moving(&mut self) -> bool {
+        let mut moving = true;
+        for (settings, task) in &self.buses {
+            let beats = task.beats();
+            if self.beats.insert(settings.spec.name.clone(), beats) == Some(beats) {
+                tracing::error!(bus = %settings.spec.name, "the bus hangs; the watchdog is not fed");
+                moving = false;
+            }
+        }
+        moving
+    }
+
+    /// Takes a new configuration: what is unchanged keeps running without a lost cycle.
+    ///
+    /// # Errors
+    /// When a server cannot listen on its new address; buses and other servers are as configured anew.
+    pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
+        self.take_servers(&settings).await?;
+        self.take_buses(&settings)?;
+        self.settings = settings;
+        Ok(())
+    }
+
+    fn take_buses(&mut self, settings: &Settings) -> Result<(), StartError> {
+        let mut old: Vec<(BusSettings, BusTask)> = std::mem::take(&mut self.buses);
+        let mut kept = Vec::new();
+        let mut wanted = Vec::new();
+        for bus in &settings.buses {
+            match old.iter().position(|(before, _)| before == bus) {
+                Some(index) => kept.push(old.remove(index)),
+                None => wanted.push(bus.clone()),
+            }
+        }
+        // Ports are free again before a changed bus opens one of them.
+        for (before, task) in old {
+            tracing::info!(bus = %before.spec.name, "the bus ends");
+            task.stop();
+        }
+        for bus in wanted {
+            tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
+            let task = self.start_bus(&bus)?;
+            kept.push((bus, task));
+        }
+        let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
+        kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
+        self.beats.clear();
+        self.plant.store(Arc::new(Plant {
+            gateway: settings.gateway.clone(),
+            stale_after: settings.stale_after,
+            buses: kept.iter().map(|(_, task)| task.handle().clone()).collect(),
+            events: self.events.clone(),
+            writes: self.writes.clone(),
+        }));
+        self.buses = kept;
+        Ok(())
+    }
+
+    fn start_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
+        let failed = |error: std::io::Error| {
+            StartError(format!("cannot start bus `{}`: {error}; free memory or file descriptors", bus.spec.name))
+        };
+        let drives = bus.drives.iter().map(|spec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle)));
+        let image = Arc::new(BusImage::new(bus.spec.clone(), drives.collect()));
+        let queue = Arc::new(CommandQueue::new().map_err(failed)?);
+        let leases = Leases::new(self.events.clone(), self.writes.clone());
+        BusTask::start(BusHandle { image, queue }, bus.options.clone(), leases, self.events.clone()).map_err(failed)
+    }
+
+    async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
+        if settings.modbus_tcp != self.settings.modbus_tcp {
+            if let Some((cancel, server)) = self.modbus_tcp.take() {
+                cancel.cancel();
+                within(STOP_SERVER, "Modbus TCP", server.stopped()).await;
+            }
+            if let Some(options) = settings.modbus_tcp.clone() {
+                let cancel = CancellationToken::new();
+                let server = modbus_tcp::start(options, self.plant.clone(), self.stats.clone(), cancel.clone()).await;
+                self.modbus_tcp = Some((cancel, server.map_err(|e| StartError(e.to_string()))?));
+            }
+            self.settings.modbus_tcp = settings.modbus_tcp.clone();
+        }
+        if settings.http != self.settings.http {
+            if let Some((cancel, server)) = self.http.take() {
+                cancel.cancel();
+                within(STOP_SERVER, "HTTP", server.stopped()).await;
+            }
+            if let Some(options) = settings.http.clone() {
+                let cancel = CancellationToken::new();
+                let server = http::start(options, self.plant.clone(), self.stats.clone(), cancel.clone()).await;
+                self.http = Some((cancel, server.map_err(|e| StartError(e.to_string()))?));
+            }
+            self.settings.http = settings.http.clone();
+        }
+        if settings.mqtt != self.settings.mqtt || settings.gateway != self.settings.gateway {
+            self.stop_mqtt().await;
+            if let Some(options) = settings.mqtt.clone() {
+                let cancel = CancellationToken::new();
+                let client = mqtt::start(options, self.plant.clone(), self.stats.clone(), cancel.clone());
+                self.mqtt = Some((cancel, client));
+            }
+            self.settings.mqtt = settings.mqtt.clone();
+        }
+        Ok(())
+    }
+
+    async fn stop_mqtt(&mut self) {
+        if let Some((cancel, client)) = self.mqtt.take() {
+            cancel.cancel();
+            within(STOP_SERVER, "MQTT", client.stopped()).await;
+        }
+    }
+
+    /// Stops in order: no new commands, the stops that are configured, the buses, the last messages.
+    pub async fn stop(mut self) {
+        if let Some((cancel, server)) = self.modbus_tcp.take() {
+            cancel.cancel();
+            within(STOP_SERVER, "Modbus TCP", server.stopped()).await;
+        }
+        self.stop_drives().await;
+        let buses = std::mem::take(&mut self.buses);
+        let ended = tokio::task::spawn_blocking(move || buses.into_iter().for_each(|(_, task)| task.stop()));
+        within(STOP_SERVER, "buses", async {
+            // A panic of a bus was told by the bus itself.
+            let _ = ended.await;
+        })
+        .await;
+        self.stop_mqtt().await;
+        if let Some((cancel, server)) = self.http.take() {
+            cancel.cancel();
+            within(STOP_SERVER, "HTTP", server.stopped()).await;
+        }
+    }
+
+    /// Writes the stop to the drives that are configured so, and waits for their acknowledgements.
+    async fn stop_drives(&self) {
+        let plant = self.plant.load_full();
+        let wanted = |d: &DriveHandle| {
+            let spec = &d.image.spec;
+            spec.on_shutdown == OnShutdown::Stop && spec.access == Access::Control && d.image.snapshot().link.is_online()
+        };
+        let stops = plant.drives().filter(wanted).map(|drive| self.stop_drive(drive));
+        let all = futures_util::future::join_all(stops);
+        if tokio::time::timeout(STOP_DRIVES, all).await.is_err() {
+            tracing::error!("not every drive acknowledged its stop in time; the gateway stops all the same");
+        }
+    }
+
+    async fn stop_drive(&self, drive: DriveHandle) {
+        let Some(run) = drive.image.spec.profile.model_index(ModelPoint::Run) else { return };
+        loop {
+            let now = Instant::now();
+            let origin = Origin { kind: SourceKind::Shutdown, who: "on_shutdown".to_string() };
+            let name = &drive.image.spec.name;
+            let (ticket, answer) = Ticket::new(origin, name, "run=false".to_string(), true, now, self.writes.clone());
+            let order = Order::Points(vec![(run, Value::Bool(false))]);
+            let expires = now + command::DEFAULT_EXPIRY;
+            let command =
+                Command { drive: drive.index, order, urgency: Urgency::Stop, reference_only: false, expires, ticket };
+            drive.bus.queue.submit(command, now);
+            match answer.await {
+                Ok(answer) if answer.outcome.is_ok() => return,
+                _ => tokio::time::sleep(Duration::from_millis(50)).await,
+            }
+        }
+    }
+}
+
+async fn within(time: Duration, what: &str, end: impl Future<Output = ()>) {
+    if tokio::time::timeout(time, end).await.is_err() {
+        tracing::warn!("{what} did not end within {time:?}; going on without it");
+    }
+}
