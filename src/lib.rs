@@ -1,6 +1,7 @@
 //! drivegate.
 pub mod bus;
 pub mod cache;
+pub mod cli;
 pub mod codec;
 pub mod command;
 pub mod document;

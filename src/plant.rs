@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 
 use crate::cache::{BusImage, DriveImage, Reading};
-use crate::command::{self, Answer, Command, CommandQueue, Order, Origin, Outcome, Ticket, WriteStats};
+use crate::command::{self, Answer, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats};
 use crate::drive::Value;
 use crate::event::{Event, EventKind, Events};
 
@@ -147,6 +147,20 @@ impl DriveHandle {
             outcome: Outcome::ShuttingDown,
             latency: accepted.elapsed(),
         })
+    }
+
+    /// Refuses a command before it became an order; audited, counted and told like any other refusal.
+    pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin) -> Answer {
+        let now = Instant::now();
+        self.tell_refusal(what, &refusal.to_string(), &origin);
+        let name = &self.image.spec.name;
+        let (ticket, _) = Ticket::new(origin, name, what.to_string(), true, now, self.writes.clone());
+        let outcome = Outcome::Refused(refusal);
+        ticket.answer(outcome.clone(), now);
+        Answer {
+            outcome,
+            latency: Duration::ZERO,
+        }
     }
 
     /// Tells that a command was refused.

@@ -87,6 +87,11 @@ impl Pending {
         self.waiting.len()
     }
 
+    /// Commands that wait to write, forwarded reads left out.
+    pub fn writes(&self) -> usize {
+        self.waiting.iter().filter(|c| c.urgency < Urgency::Read).count()
+    }
+
     /// Whether none waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()

@@ -4,6 +4,7 @@
 pub mod http;
 pub mod modbus_tcp;
 pub mod mqtt;
+pub mod register_map;
 mod stats;
 
 pub use stats::{ModbusTcpStats, MqttStats, NorthStats};

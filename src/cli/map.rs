@@ -1,0 +1,327 @@
+//! `drivegate map`: the Modbus TCP register map of a configuration, for the SCADA engineer.
+
+use std::fmt::Write as _;
+use std::path::PathBuf;
+
+use comfy_table::{Table as TextTable, presets};
+
+use crate::cache::{Access, DriveSpec};
+use crate::codec::Table;
+use crate::drive::profile::{Form as RawForm, Raw};
+use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile};
+use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, GATEWAY_UNIT};
+use crate::plant::Plant;
+
+/// Arguments of `drivegate map`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv")]
+pub struct Args {
+    /// Configuration file.
+    #[arg(long, value_name = "FILE", default_value = "/etc/drivegate/drivegate.toml")]
+    pub config: PathBuf,
+    /// Comma-separated values, one line for each register of each unit.
+    #[arg(long)]
+    pub csv: bool,
+}
+
+/// One line of the map.
+#[derive(Debug, Clone, PartialEq)]
+struct Row {
+    view: &'static str,
+    /// `holding`, `input`, `holding, input`, `coil`, `discrete-input`.
+    table: &'static str,
+    address: u16,
+    /// The address as many SCADA systems write it: table digit and number from 1.
+    reference: String,
+    items: u16,
+    name: String,
+    kind: String,
+    scale: String,
+    unit: String,
+    not_available: &'static str,
+    access: &'static str,
+    note: String,
+}
+
+const COLUMNS: [&str; 13] = [
+    "view",
+    "table",
+    "address",
+    "hex",
+    "reference",
+    "registers",
+    "name",
+    "type",
+    "scale",
+    "unit",
+    "not_available",
+    "access",
+    "note",
+];
+
+impl Row {
+    fn cells(&self) -> [String; COLUMNS.len()] {
+        [
+            self.view.to_string(),
+            self.table.to_string(),
+            self.address.to_string(),
+            format!("0x{:04X}", self.address),
+            self.reference.clone(),
+            self.items.to_string(),
+            self.name.clone(),
+            self.kind.clone(),
+            self.scale.clone(),
+            self.unit.clone(),
+            self.not_available.to_string(),
+            self.access.to_string(),
+            self.note.clone(),
+        ]
+    }
+}
+
+/// The map of all units: with `csv` one line for each register of each unit, else tables for people, one for
+/// each profile.
+pub fn render(plant: &Plant, csv: bool) -> String {
+    if csv { render_csv(plant) } else { render_text(plant) }
+}
+
+fn render_csv(plant: &Plant) -> String {
+    let mut out = format!("unit,drive,{}\n", COLUMNS.join(","));
+    let mut line = |unit: u8, drive: &str, row: &Row| {
+        let cells = [unit.to_string(), drive.to_string()].into_iter().chain(row.cells());
+        let cells: Vec<String> = cells.map(|c| quoted(&c)).collect();
+        let _ = writeln!(out, "{}", cells.join(","));
+    };
+    for drive in plant.drives() {
+        let spec = &drive.image.spec;
+        for row in drive_rows(&spec.profile, &drive.image.plan, spec.access) {
+            line(spec.unit, &spec.name, &row);
+        }
+    }
+    for row in gateway_rows(plant) {
+        line(GATEWAY_UNIT, "", &row);
+    }
+    out
+}
+
+/// A field of RFC 4180.
+fn quoted(text: &str) -> String {
+    if text.contains([',', '"', '\n', '\r']) {
+        format!("\"{}\"", text.replace('"', "\"\""))
+    } else {
+        text.to_string()
+    }
+}
+
+fn render_text(plant: &Plant) -> String {
+    let drives: Vec<_> = plant.drives().collect();
+    let specs: Vec<&DriveSpec> = drives.iter().map(|d| &d.image.spec).collect();
+    let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", plant.gateway);
+    let units = specs.iter().map(|s| {
+        let access = match s.access {
+            Access::Monitor => "monitor: every write is refused",
+            Access::Control => "control",
+        };
+        let address = s.address.to_string();
+        vec![
+            s.unit.to_string(),
+            s.name.clone(),
+            s.bus.clone(),
+            address,
+            s.profile.name.clone(),
+            access.to_string(),
+        ]
+    });
+    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
+    out += &table(
+        &["unit", "drive", "bus", "address", "profile", "access"],
+        units.chain([gateway]),
+    );
+    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
+            32-bit values lie high word first; age and state tell why a value is not available.\n";
+    let mut seen: Vec<&str> = Vec::new();
+    for drive in &drives {
+        let profile = &drive.image.spec.profile;
+        if seen.contains(&profile.name.as_str()) {
+            continue;
+        }
+        seen.push(&profile.name);
+        let units: Vec<String> = specs
+            .iter()
+            .filter(|s| s.profile.name == profile.name)
+            .map(|s| s.unit.to_string())
+            .collect();
+        let _ = write!(
+            out,
+            "\nProfile {} ({}), units {}\n",
+            profile.name,
+            profile.title,
+            units.join(", ")
+        );
+        // What a unit of this profile can have; the table above tells which units take writes.
+        out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
+    }
+    out += "\nThe gateway itself, unit 255\n";
+    out += &rows(&gateway_rows(plant));
+    out
+}
+
+fn rows(rows: &[Row]) -> String {
+    table(&COLUMNS, rows.iter().map(|r| r.cells().to_vec()))
+}
+
+fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let mut table = TextTable::new();
+    table
+        .load_preset(presets::NOTHING)
+        .set_header(header.iter().map(|h| h.replace('_', " ")));
+    table.add_rows(rows);
+    let mut out: String = table.trim_fmt();
+    out.push('\n');
+    out
+}
+
+fn drive_rows(profile: &Profile, plan: &Plan, access: Access) -> Vec<Row> {
+    let entries = BLOCKS
+        .into_iter()
+        .flatten()
+        .map(|entry| entry_row(profile, entry, access));
+    let raw = profile
+        .points
+        .iter()
+        .filter_map(|p| Some(raw_row(profile, plan, p, p.raw()?, access)));
+    entries.chain(raw).collect()
+}
+
+fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
+    let (name, unit, mut note) = match entry.content {
+        Content::Status => (
+            "status",
+            "",
+            "bits: 0 ready, 1 running, 2 reversed, 3 fault, 4 warning, 5 at_reference, 6 zero_speed, 7 remote, \
+             14 stale, 15 online",
+        ),
+        Content::State => ("state", "", "0 offline, 1 not_ready, 2 ready, 3 running, 4 fault"),
+        Content::Age => ("age", "ms", "of the process data; 65534 at most; 0xFFFF never read"),
+        Content::Command => ("command", "", "bits: 0 run, 1 reverse, 2 fault_reset (0 to 1)"),
+        Content::Heartbeat => ("heartbeat", "", "any write renews the supervision; reads 0"),
+        Content::Point(point) => (point.name(), point.unit(), ""),
+    };
+    let view = match entry.address {
+        0x8000..=0x80FF => "common",
+        0x8100..=0x81FF => "command",
+        _ => "float",
+    };
+    if let Content::Point(point) = entry.content {
+        note = point_note(profile, point, note);
+    }
+    let writable = entry.is_command() && access == Access::Control;
+    Row {
+        view,
+        table: "holding, input",
+        address: entry.address,
+        reference: reference(Table::Holding, entry.address),
+        items: entry.form.registers(),
+        name: name.to_string(),
+        kind: entry.form.name().to_string(),
+        scale: format!("{}", 1.0 / entry.per_unit),
+        unit: unit.to_string(),
+        not_available: entry.form.not_available(),
+        access: if writable { "read, write" } else { "read" },
+        note: note.to_string(),
+    }
+}
+
+fn point_note<'n>(profile: &Profile, point: ModelPoint, note: &'n str) -> &'n str {
+    match profile.model_point(point) {
+        None => "never available: this family lacks it",
+        Some(point) if !point.verified => "address not verified by a manual",
+        Some(_) => note,
+    }
+}
+
+fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Access) -> Row {
+    let kind = match raw.form {
+        RawForm::Bit { .. } if raw.table.is_bits() => "bit".to_string(),
+        RawForm::Bit { bit, .. } => format!("bit {bit}"),
+        RawForm::U16 => "u16".to_string(),
+        RawForm::I16 => "i16".to_string(),
+    };
+    let mut notes = Vec::new();
+    if matches!(raw.form, RawForm::Bit { invert: true, .. }) {
+        notes.push("0 means true".to_string());
+    }
+    if raw.offset != 0.0 {
+        notes.push(format!("plus {}", raw.offset));
+    }
+    if !plan.reads.iter().any(|r| r.covers(raw.table, raw.address)) {
+        notes.push("not polled: read from the drive on request".to_string());
+    } else if point.class != PollClass::Fast {
+        notes.push(format!("poll class {}", point.class.name()));
+    }
+    if !point.verified {
+        notes.push("address not verified by a manual".to_string());
+    }
+    if !point.note.is_empty() {
+        notes.push(point.note.clone());
+    }
+    let range_writes = profile.range(raw.table, raw.address).is_some_and(|r| r.write > 0);
+    let both = raw.table == Table::Holding && profile.input_is_holding;
+    Row {
+        view: "raw",
+        table: if both { "holding, input" } else { raw.table.name() },
+        address: raw.address,
+        reference: reference(raw.table, raw.address),
+        items: raw.form.items(),
+        name: point.name.clone(),
+        kind,
+        scale: raw.scale.to_string(),
+        unit: point.unit.clone(),
+        not_available: "",
+        access: if range_writes && access == Access::Control {
+            "read, write"
+        } else {
+            "read"
+        },
+        note: notes.join("; "),
+    }
+}
+
+fn gateway_rows(plant: &Plant) -> Vec<Row> {
+    let buses = (0u16..).zip(&plant.buses);
+    let rows = buses.flat_map(|(place, bus)| {
+        BUS_REGISTERS.iter().map(move |register| {
+            let address = place.saturating_mul(BUS_BLOCK).saturating_add(register.offset);
+            Row {
+                view: "gateway",
+                table: "input, holding",
+                address,
+                reference: reference(Table::Input, address),
+                items: register.form.registers(),
+                name: format!("{}: {}", bus.image.spec.name, register.name),
+                kind: register.form.name().to_string(),
+                scale: register.scale.to_string(),
+                unit: register.unit.to_string(),
+                not_available: if register.unit == "ms" {
+                    register.form.not_available()
+                } else {
+                    ""
+                },
+                access: "read",
+                note: String::new(),
+            }
+        })
+    });
+    rows.collect()
+}
+
+/// 4 holding, 3 input, 1 discrete input, 0 coil; then the number from 1, five digits.
+fn reference(table: Table, address: u16) -> String {
+    let digit = match table {
+        Table::Coil => 0,
+        Table::DiscreteInput => 1,
+        Table::Input => 3,
+        Table::Holding => 4,
+    };
+    format!("{digit}{:05}", u32::from(address) + 1)
+}

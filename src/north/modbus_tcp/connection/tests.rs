@@ -1,0 +1,178 @@
+use std::sync::Arc;
+
+use arc_swap::ArcSwap;
+use tokio::io::DuplexStream;
+use tokio::task::JoinHandle;
+
+use super::super::session::{Authority, Shared};
+use super::super::{Options, Uncached};
+use super::*;
+use crate::north::NorthStats;
+use crate::plant::Plant;
+
+/// Read input register 0 of unit 255 in a plant without a bus: answered at once with 02.
+const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 255, 4, 0, 0, 0, 1];
+const ANSWER: [u8; 9] = [0, 1, 0, 0, 0, 3, 255, 0x84, 2];
+
+struct Bench {
+    client: DuplexStream,
+    server: JoinHandle<()>,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+}
+
+/// A connection over a pipe that holds `pipe` bytes each way.
+fn bench(pipe: usize) -> Bench {
+    let options = Options {
+        listen: Vec::new(),
+        allow: Vec::new(),
+        write: Vec::new(),
+        max_connections: 1,
+        uncached: Uncached::Refuse,
+    };
+    let plant = Plant {
+        gateway: "test".to_string(),
+        stale_after: Duration::from_secs(1),
+        buses: Vec::new(),
+        events: Default::default(),
+        writes: Default::default(),
+    };
+    let stats = Arc::new(NorthStats::default());
+    let shared = Shared::new(options, Arc::new(ArcSwap::from_pointee(plant)), stats.clone());
+    let authority = Authority {
+        may_write: false,
+        who: "test".to_string(),
+    };
+    let session = Session::new(Arc::new(shared), authority);
+    let (client, end) = tokio::io::duplex(pipe);
+    let cancel = CancellationToken::new();
+    let server = tokio::spawn(serve(end, session, cancel.clone()));
+    Bench {
+        client,
+        server,
+        stats,
+        cancel,
+    }
+}
+
+impl Bench {
+    async fn send(&mut self, bytes: &[u8]) {
+        self.client.write_all(bytes).await.unwrap();
+    }
+
+    async fn receive(&mut self, count: usize) -> Vec<u8> {
+        let mut bytes = vec![0; count];
+        self.client.read_exact(&mut bytes).await.unwrap();
+        bytes
+    }
+
+    /// What comes until the connection is closed.
+    async fn rest(&mut self) -> Vec<u8> {
+        let mut bytes = Vec::new();
+        self.client.read_to_end(&mut bytes).await.unwrap();
+        bytes
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_half_frame_is_given_ten_seconds() {
+    let mut bench = bench(1024);
+    bench.send(&REQUEST).await;
+    assert_eq!(bench.receive(9).await, ANSWER);
+    let begin = Instant::now();
+    for byte in &REQUEST[..5] {
+        // Single bytes do not win more time.
+        bench.send(&[*byte]).await;
+        tokio::time::sleep(Duration::from_secs(1)).await;
+    }
+    assert_eq!(bench.rest().await, b"");
+    assert_eq!(begin.elapsed(), FRAME_TIMEOUT);
+    bench.server.await.unwrap();
+    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_silent_client_may_stay_and_a_slow_one_too() {
+    let mut bench = bench(1024);
+    tokio::time::sleep(Duration::from_secs(100_000)).await;
+    // There always is a half frame, but each is complete within its time.
+    bench.send(&REQUEST[..5]).await;
+    for _ in 0..5 {
+        tokio::time::sleep(FRAME_TIMEOUT - Duration::from_secs(1)).await;
+        bench.send(&REQUEST[5..]).await;
+        bench.send(&REQUEST[..5]).await;
+        assert_eq!(bench.receive(9).await, ANSWER);
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_client_that_takes_no_answers_is_given_up() {
+    let mut bench = bench(64);
+    let begin = Instant::now();
+    let mut sent = 0usize;
+    // The client writes on and reads nothing: the server must stop reading, then close.
+    while bench.client.write_all(&REQUEST).await.is_ok() {
+        sent += 1;
+        assert!(sent < 10_000, "the server takes requests without end");
+    }
+    assert_eq!(begin.elapsed(), WRITE_TIMEOUT);
+    bench.server.await.unwrap();
+    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_stopped_client_does_not_hold_up_the_end() {
+    let mut bench = bench(16);
+    let flood: Vec<u8> = REQUEST.iter().copied().cycle().take(12 * 20).collect();
+    let _ = tokio::time::timeout(Duration::from_secs(1), bench.send(&flood)).await;
+    let begin = Instant::now();
+    bench.cancel.cancel();
+    bench.server.await.unwrap();
+    assert!(begin.elapsed() <= FAREWELL, "{:?}", begin.elapsed());
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_batch_in_any_pieces_is_answered_whole() {
+    for piece in [1, 2, 5, 7, 11, 12, 13, 100, 4096] {
+        let mut bench = bench(4096);
+        let requests: Vec<u8> = (0..100u16)
+            .flat_map(|n| {
+                let mut request = REQUEST;
+                request[..2].copy_from_slice(&n.to_be_bytes());
+                request
+            })
+            .collect();
+        for bytes in requests.chunks(piece) {
+            bench.send(bytes).await;
+        }
+        for n in 0..100u16 {
+            let mut answer = ANSWER;
+            answer[..2].copy_from_slice(&n.to_be_bytes());
+            assert_eq!(bench.receive(9).await, answer, "pieces of {piece}");
+        }
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn what_came_before_the_nonsense_is_answered() {
+    for nonsense in [
+        &b"GET / HTTP/1.1\r\n"[..],
+        &[0, 2, 0, 0, 0, 0],
+        &[0, 2, 0, 0, 0xFF, 0xFF, 255, 4],
+        &[0, 2, 0, 1],
+    ] {
+        let mut bench = bench(1024);
+        bench.send(&[&REQUEST, nonsense, &REQUEST].concat()).await;
+        assert_eq!(bench.rest().await, ANSWER);
+        bench.server.await.unwrap();
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_client_that_only_stops_sending_gets_its_answer() {
+    let mut bench = bench(1024);
+    bench.send(&REQUEST).await;
+    bench.client.shutdown().await.unwrap();
+    assert_eq!(bench.rest().await, ANSWER);
+    bench.server.await.unwrap();
+}

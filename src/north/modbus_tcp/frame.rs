@@ -1,0 +1,146 @@
+//! MBAP framing: transaction id, protocol id 0, length, unit id, PDU. Pure.
+
+use crate::codec::modbus::MAX_PDU;
+
+/// Bytes before the PDU: transaction id, protocol id, length, unit id.
+pub(super) const HEADER: usize = 7;
+/// Longest frame.
+pub(super) const MAX_FRAME: usize = HEADER + MAX_PDU;
+/// Offset of the length field; it counts unit id and PDU.
+const LENGTH: usize = 4;
+
+/// Whom a frame belongs to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Header {
+    /// Comes back in the reply.
+    pub(super) transaction: u16,
+    /// Unit id.
+    pub(super) unit: u8,
+}
+
+/// A request frame.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Frame<'b> {
+    pub(super) header: Header,
+    /// At least the function code.
+    pub(super) function: u8,
+    /// Function code and what follows.
+    pub(super) pdu: &'b [u8],
+    /// Bytes that the frame takes in the buffer.
+    pub(super) used: usize,
+}
+
+/// No Modbus client: where its next frame begins cannot be known, so the connection is closed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum NotModbus {
+    #[error("protocol id {0} instead of 0")]
+    Protocol(u16),
+    #[error("length {0}, which is not 2 to 254")]
+    Length(u16),
+}
+
+/// The frame at the beginning of `bytes`; `None` while it is not complete.
+///
+/// # Errors
+/// As soon as the header shows it, without waiting for the rest.
+pub(super) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
+    if let [_, _, high, low, ..] = bytes
+        && (*high, *low) != (0, 0)
+    {
+        return Err(NotModbus::Protocol(u16::from_be_bytes([*high, *low])));
+    }
+    let [
+        transaction_high,
+        transaction_low,
+        _,
+        _,
+        length_high,
+        length_low,
+        rest @ ..,
+    ] = bytes
+    else {
+        return Ok(None);
+    };
+    let length = u16::from_be_bytes([*length_high, *length_low]);
+    if !(2..=MAX_PDU + 1).contains(&usize::from(length)) {
+        return Err(NotModbus::Length(length));
+    }
+    let Some([unit, pdu @ ..]) = rest.get(..usize::from(length)) else {
+        return Ok(None);
+    };
+    let header = Header {
+        transaction: u16::from_be_bytes([*transaction_high, *transaction_low]),
+        unit: *unit,
+    };
+    Ok(pdu.first().map(|function| Frame {
+        header,
+        function: *function,
+        pdu,
+        used: HEADER - 1 + usize::from(length),
+    }))
+}
+
+/// Appends a reply frame; `pdu` writes its PDU.
+pub(super) fn encode(header: Header, out: &mut Vec<u8>, pdu: impl FnOnce(&mut Vec<u8>)) {
+    let begin = out.len();
+    out.extend_from_slice(&header.transaction.to_be_bytes());
+    out.extend_from_slice(&[0, 0, 0, 0, header.unit]);
+    pdu(out);
+    let length = (out.len() - begin - (HEADER - 1)) as u16;
+    if let Some(field) = out.get_mut(begin + LENGTH..begin + LENGTH + 2) {
+        field.copy_from_slice(&length.to_be_bytes());
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn a_frame_and_its_beginning() {
+        // Transaction 0x1234, protocol 0, length 6, unit 17, read 3 holding registers from 107.
+        let bytes = [0x12, 0x34, 0, 0, 0, 6, 17, 3, 0, 107, 0, 3, 0x99];
+        for end in 0..12 {
+            assert_eq!(decode(&bytes[..end]), Ok(None), "{end} bytes");
+        }
+        let frame = decode(&bytes).unwrap().unwrap();
+        assert_eq!(
+            frame.header,
+            Header {
+                transaction: 0x1234,
+                unit: 17
+            }
+        );
+        assert_eq!((frame.function, frame.pdu, frame.used), (3, &bytes[7..12], 12));
+    }
+
+    #[test]
+    fn what_is_not_modbus_is_known_early() {
+        assert_eq!(decode(&[0, 1, 0, 7]), Err(NotModbus::Protocol(7)));
+        assert_eq!(decode(b"GET / HTTP/1.1"), Err(NotModbus::Protocol(0x5420)));
+        for length in [0, 1, 255, 65_535] {
+            let [high, low] = u16::to_be_bytes(length);
+            assert_eq!(decode(&[0, 1, 0, 0, high, low]), Err(NotModbus::Length(length)));
+        }
+        assert_eq!(decode(&[0, 1, 0, 0, 0, 254]), Ok(None));
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes(bytes in prop::collection::vec(any::<u8>(), 0..300)) {
+            if let Ok(Some(frame)) = decode(&bytes) {
+                prop_assert!(frame.used <= bytes.len().min(MAX_FRAME));
+            }
+        }
+
+        #[test]
+        fn replies_are_frames(transaction: u16, unit: u8, pdu in prop::collection::vec(any::<u8>(), 1..=MAX_PDU)) {
+            let mut out = vec![0xAA];
+            encode(Header { transaction, unit }, &mut out, |out| out.extend_from_slice(&pdu));
+            let frame = decode(&out[1..]).unwrap().unwrap();
+            prop_assert_eq!(frame.header, Header { transaction, unit });
+            prop_assert_eq!(frame.pdu, &pdu[..]);
+        }
+    }
+}

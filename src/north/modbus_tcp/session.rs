@@ -1,0 +1,480 @@
+//! What the requests of one client mean, and what is answered.
+
+use std::collections::HashMap;
+use std::future::Future;
+use std::pin::Pin;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use futures_util::FutureExt;
+
+use super::frame::{self, Frame, Header};
+use super::identify::Identity;
+use super::{Options, Seldom, Uncached};
+use crate::cache::{Access, Unavailable};
+use crate::codec::modbus::encode_exception;
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
+use crate::drive::Profile;
+use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
+use crate::north::{ModbusTcpStats, NorthStats};
+use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+
+/// Function codes that change something.
+const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
+/// Function codes that every drive has here, by the blocks from 0x8000 on and the identification.
+const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
+
+/// What all connections share.
+#[derive(Debug)]
+pub(super) struct Shared {
+    pub(super) options: Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
+    command_words: Mutex<HashMap<String, u16>>,
+}
+
+impl Shared {
+    pub(super) fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>) -> Shared {
+        Shared {
+            options,
+            plant,
+            stats,
+            command_words: Mutex::default(),
+        }
+    }
+
+    /// Does something with the word of a drive that nobody else may change in between.
+    fn with_command_word<T>(&self, drive: &str, act: impl FnOnce(&mut u16) -> T) -> T {
+        let mut words = self.command_words.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut word = words.get(drive).copied().unwrap_or_default();
+        let result = act(&mut word);
+        words.insert(drive.to_string(), word);
+        result
+    }
+}
+
+/// What a client may do, and its name in the audit.
+#[derive(Debug, Clone)]
+pub(super) struct Authority {
+    /// Whether it may write at all.
+    pub(super) may_write: bool,
+    /// Its address, or later the name in its certificate.
+    pub(super) who: String,
+}
+
+/// The drives by unit id, as the plant has them now.
+#[derive(Debug)]
+struct Routes {
+    plant: Arc<Plant>,
+    drives: Vec<DriveHandle>,
+    /// Place in `drives`.
+    units: Vec<Option<u16>>,
+}
+
+impl Routes {
+    fn new(plant: Arc<Plant>) -> Routes {
+        let drives: Vec<DriveHandle> = plant.drives().collect();
+        let mut units = vec![None; usize::from(u8::MAX) + 1];
+        for (place, drive) in (0u16..).zip(&drives) {
+            if let Some(unit) = units.get_mut(usize::from(drive.image.spec.unit)) {
+                unit.get_or_insert(place);
+            }
+        }
+        Routes { plant, drives, units }
+    }
+
+    fn drive(&self, unit: u8) -> Option<&DriveHandle> {
+        let place = self.units.get(usize::from(unit)).copied().flatten()?;
+        self.drives.get(usize::from(place))
+    }
+}
+
+/// A request that waits for the bus.
+pub(super) type Waiting = Pin<Box<dyn Future<Output = Finished> + Send>>;
+
+/// A request whose answer is known.
+#[derive(Debug)]
+pub(super) struct Finished {
+    header: Header,
+    request: RequestPdu,
+    drive: String,
+    outcome: Outcome,
+}
+
+/// What becomes of a request.
+enum Decision {
+    /// Answered at once.
+    Reply(RequestPdu, Reply),
+    /// Refused at once.
+    Exception(Exception),
+    /// The drive is asked, or a command refused on the way to it.
+    Drive(Box<Errand>),
+}
+
+impl From<Exception> for Decision {
+    fn from(exception: Exception) -> Decision {
+        Decision::Exception(exception)
+    }
+}
+
+/// A request on its way to a drive.
+struct Errand {
+    drive: DriveHandle,
+    request: RequestPdu,
+    /// The order, or why there is none.
+    order: Result<Order, Refusal>,
+    /// The order carries a fault reset that came by 0x8100.
+    resets: bool,
+}
+
+/// One client.
+#[derive(Debug)]
+pub(super) struct Session {
+    shared: Arc<Shared>,
+    authority: Authority,
+    routes: Routes,
+    foreign_codes: Seldom,
+}
+
+impl Drop for Session {
+    fn drop(&mut self) {
+        self.stats().disconnected();
+    }
+}
+
+impl Session {
+    /// A client has connected; it has left when the session is dropped.
+    pub(super) fn new(shared: Arc<Shared>, authority: Authority) -> Session {
+        shared.stats.modbus_tcp.connected();
+        let routes = Routes::new(shared.plant.load_full());
+        Session {
+            shared,
+            authority,
+            routes,
+            foreign_codes: Seldom::default(),
+        }
+    }
+
+    /// The client, for the log.
+    pub(super) fn who(&self) -> &str {
+        &self.authority.who
+    }
+
+    fn stats(&self) -> &ModbusTcpStats {
+        &self.shared.stats.modbus_tcp
+    }
+
+    /// Takes over a plant that a reload has put in place.
+    pub(super) fn refresh(&mut self) {
+        let plant = self.shared.plant.load();
+        if !Arc::ptr_eq(&plant, &self.routes.plant) {
+            self.routes = Routes::new(Arc::clone(&plant));
+        }
+    }
+
+    /// Answers a request into `out`, or gives what its answer waits for. An order has been queued when this
+    /// returns, so orders reach the bus in the order of their frames.
+    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+        match self.decide(frame, now) {
+            Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
+            Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
+                let drive = self.routes.drive(frame.header.unit);
+                let name = drive.map_or_else(String::new, |d| d.image.spec.name.clone());
+                self.tell_foreign_code(&name, code);
+                self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
+            }
+            Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
+            Decision::Drive(errand) => {
+                let mut waiting = self.send(frame.header, *errand);
+                match (&mut waiting).now_or_never() {
+                    Some(finished) => self.finish(&finished, out),
+                    None => return Some(waiting),
+                }
+            }
+        }
+        None
+    }
+
+    /// Appends the answer to a request that waited.
+    pub(super) fn finish(&mut self, finished: &Finished, out: &mut Vec<u8>) {
+        let Finished {
+            header,
+            request,
+            drive,
+            outcome,
+        } = finished;
+        if let Outcome::Exception(code) = outcome
+            && *code > Exception::GATEWAY_TARGET
+        {
+            self.tell_foreign_code(drive, *code);
+        }
+        let exception = outcome.exception();
+        match (outcome, exception) {
+            (_, Some(code)) => self.put_exception(*header, request.function(), code, out),
+            (Outcome::Acknowledged(reply), None) if answers(request, reply) => self.put(*header, request, reply, out),
+            _ => self.put_exception(*header, request.function(), Exception::DEVICE_FAILURE, out),
+        }
+    }
+
+    fn put(&self, header: Header, request: &RequestPdu, reply: &Reply, out: &mut Vec<u8>) {
+        frame::encode(header, out, |out| reply.encode(request, out));
+        self.stats().answered(request.function(), 0);
+    }
+
+    fn put_exception(&self, header: Header, function: u8, code: Exception, out: &mut Vec<u8>) {
+        frame::encode(header, out, |out| encode_exception(function, code, out));
+        self.stats().answered(function, code.0);
+    }
+
+    /// A drive's own code is answered as 04; what it means is told here.
+    fn tell_foreign_code(&mut self, drive: &str, code: Exception) {
+        if let Some(more) = self.foreign_codes.tell(Instant::now()) {
+            tracing::warn!(drive, client = %self.authority.who, more,
+                "Modbus TCP: the drive answered {code}; the client was told 04");
+        }
+    }
+
+    fn decide(&self, frame: &Frame<'_>, now: Instant) -> Decision {
+        if frame.header.unit == GATEWAY_UNIT {
+            return self.gateway(frame).unwrap_or_else(Decision::from);
+        }
+        let Some(drive) = self.routes.drive(frame.header.unit) else {
+            return Exception::GATEWAY_PATH.into();
+        };
+        let profile = &drive.image.spec.profile;
+        let decoded = RequestPdu::decode(frame.pdu);
+        // Authority comes before everything that the request could be wrong in.
+        if WRITES.contains(&frame.function) && !self.may_write(drive) {
+            return match decoded {
+                Ok(request) => order(drive, Order::Write(request.clone()), request),
+                Err(_) => Exception::FUNCTION.into(),
+            };
+        }
+        let has_function = has_function(profile, frame.function);
+        if !has_function && !OWN_FUNCTIONS.contains(&frame.function) {
+            return Exception::FUNCTION.into();
+        }
+        let request = match decoded {
+            Ok(request) => request,
+            Err(code) => return code.into(),
+        };
+        match request {
+            RequestPdu::Read { table, start, count } if !table.is_bits() && start >= FIRST => {
+                common(drive, request, start, count, now)
+            }
+            RequestPdu::WriteRegister { address, value } if address >= FIRST => {
+                self.command(drive, request, address, &[value], now)
+            }
+            RequestPdu::WriteRegisters { start, ref values } if start >= FIRST => {
+                let values = values.clone();
+                self.command(drive, request, start, &values, now)
+            }
+            RequestPdu::DeviceIdentification { code, object } => {
+                let identity = Identity {
+                    product: &profile.name,
+                    title: &profile.title,
+                    name: &drive.image.spec.name,
+                };
+                identity
+                    .reply(code, object)
+                    .map_or_else(Decision::from, |reply| Decision::Reply(request, reply))
+            }
+            RequestPdu::Read { table, start, count } if has_function => {
+                self.raw_read(drive, request, table, start, count, now)
+            }
+            _ if has_function => order(drive, Order::Write(request.clone()), request),
+            _ => Exception::FUNCTION.into(),
+        }
+    }
+
+    fn may_write(&self, drive: &DriveHandle) -> bool {
+        self.authority.may_write && drive.image.spec.access == Access::Control
+    }
+
+    /// Unit 255: input registers by contract; holding registers alike, since many clients read nothing else.
+    fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
+        if WRITES.contains(&frame.function) {
+            return Err(Exception::FUNCTION);
+        }
+        let request = RequestPdu::decode(frame.pdu)?;
+        let plant = &self.routes.plant;
+        let reply = match request {
+            RequestPdu::Read { table, start, count } if !table.is_bits() => {
+                let bus = |place: usize| plant.buses.get(place).map(figures);
+                Reply::Registers(register_map::gateway(start, count, bus)?)
+            }
+            RequestPdu::DeviceIdentification { code, object } => {
+                let identity = Identity {
+                    product: "gateway",
+                    title: "drivegate",
+                    name: &plant.gateway,
+                };
+                identity.reply(code, object)?
+            }
+            _ => return Err(Exception::FUNCTION),
+        };
+        Ok(Decision::Reply(request, reply))
+    }
+
+    fn raw_read(
+        &self,
+        drive: &DriveHandle,
+        request: RequestPdu,
+        table: Table,
+        start: u16,
+        count: u16,
+        now: Instant,
+    ) -> Decision {
+        let profile = &drive.image.spec.profile;
+        let beyond = !table.is_bits() && u32::from(start) + u32::from(count) > u32::from(FIRST);
+        if beyond {
+            return Exception::ADDRESS.into();
+        }
+        if !drive.bus_up() {
+            return Exception::GATEWAY_PATH.into();
+        }
+        match drive.reading(now).words(table, start, count) {
+            Ok(words) if table.is_bits() => {
+                Decision::Reply(request, Reply::Bits(words.iter().map(|w| *w != 0).collect()))
+            }
+            Ok(words) => Decision::Reply(request, Reply::Registers(words)),
+            Err(Unavailable::Refused(code)) => code.into(),
+            Err(Unavailable::Stale) => Exception::GATEWAY_TARGET.into(),
+            Err(Unavailable::NotPolled) if self.shared.options.uncached == Uncached::Refuse => {
+                Exception::ADDRESS.into()
+            }
+            Err(Unavailable::NotPolled) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
+            Err(Unavailable::NotPolled) => order(drive, Order::Read(request.clone()), request),
+        }
+    }
+
+    /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
+    fn command(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
+        let spec = &drive.image.spec;
+        let write = self.shared.with_command_word(&spec.name, |last| {
+            let write = register_map::command(&spec.profile, start, values, *last)?;
+            let resets = write.word.is_some_and(|word| register_map::is_reset(word, *last));
+            *last = write.word.unwrap_or(*last);
+            Ok((write, resets))
+        });
+        let (order, resets) = match write {
+            // A heartbeat alone is no command: it is answered at once and not audited.
+            Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
+                drive.image.renew_lease(now);
+                return Decision::Reply(request, Reply::Written);
+            }
+            Ok((CommandWrite { points, .. }, resets)) => (Ok(Order::Points(points)), resets),
+            Err(refusal) => (Err(refusal), false),
+        };
+        Decision::Drive(Box::new(Errand {
+            drive: drive.clone(),
+            request,
+            order,
+            resets,
+        }))
+    }
+
+    /// Sends a request to its drive; the first poll queues it.
+    fn send(&self, header: Header, errand: Errand) -> Waiting {
+        let Errand {
+            drive,
+            request,
+            order,
+            resets,
+        } = errand;
+        let origin = Origin {
+            kind: SourceKind::ModbusTcp,
+            who: self.authority.who.clone(),
+        };
+        let may_write = self.authority.may_write;
+        let shared = self.shared.clone();
+        Box::pin(async move {
+            let answer = match order {
+                Ok(order) => drive.order(order, origin, may_write, DEFAULT_EXPIRY).await,
+                Err(refusal) => drive.refuse(&format!("{request:?}"), refusal, origin),
+            };
+            let name = drive.image.spec.name.clone();
+            if resets && !answer.outcome.is_ok() {
+                shared.with_command_word(&name, |word| *word = register_map::without_reset(*word));
+            }
+            Finished {
+                header,
+                request,
+                drive: name,
+                outcome: answer.outcome,
+            }
+        })
+    }
+}
+
+fn order(drive: &DriveHandle, order: Order, request: RequestPdu) -> Decision {
+    Decision::Drive(Box::new(Errand {
+        drive: drive.clone(),
+        request,
+        order: Ok(order),
+        resets: false,
+    }))
+}
+
+fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
+    let reading = drive.reading(now);
+    Look::new(&reading, drive.bus_up())
+        .registers(start, count)
+        .map_or_else(Decision::from, |words| {
+            Decision::Reply(request, Reply::Registers(words))
+        })
+}
+
+/// Whether a raw request with that function makes sense to the family: it has the table. No family has the
+/// functions 22 and 23.
+fn has_function(profile: &Profile, function: u8) -> bool {
+    let table = match function {
+        1 | 5 | 15 => Table::Coil,
+        2 => Table::DiscreteInput,
+        3 | 6 | 16 => Table::Holding,
+        4 => profile.canonical(Table::Input),
+        _ => return false,
+    };
+    profile.ranges.iter().any(|r| r.table == table)
+}
+
+/// Items that the drive gives in one read of that span, by the ranges of the profile that it touches.
+fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
+    let table = profile.canonical(table);
+    let last = start.saturating_add(count.saturating_sub(1));
+    let touched = profile
+        .ranges
+        .iter()
+        .filter(|r| r.table == table && *r.addresses.start() <= last && start <= *r.addresses.end());
+    touched.map(|r| r.read).min().unwrap_or(table.max_read())
+}
+
+/// Whether a drive's reply is one to the request.
+fn answers(request: &RequestPdu, reply: &Reply) -> bool {
+    match (request, reply) {
+        (RequestPdu::Read { table, count, .. }, Reply::Bits(bits)) => {
+            table.is_bits() && bits.len() == usize::from(*count)
+        }
+        (RequestPdu::Read { table, count, .. }, Reply::Registers(words)) => {
+            !table.is_bits() && words.len() == usize::from(*count)
+        }
+        (_, Reply::Written) => request.is_write(),
+        _ => false,
+    }
+}
+
+fn figures(bus: &BusHandle) -> BusFigures {
+    let health = bus.image.health();
+    BusFigures {
+        up: health.up,
+        drives: bus.image.drives.len(),
+        online: bus.image.online(),
+        load: health.load,
+        cycle: health.fast.last,
+        transactions: bus.image.transactions_total(),
+        errors: bus.image.errors_total(),
+        queued: bus.queue.lock().writes(),
+    }
+}
