@@ -97,12 +97,13 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -
         let Some(range) = profile.range(table, address) else {
             continue;
         };
-        if let Some(last) = reads.last_mut() {
+        // The last read of another table may lie above this address.
+        if let Some(last) = reads.last_mut().filter(|last| last.table == table) {
             let end = u32::from(last.start) + u32::from(last.count);
             let joined = u32::from(address) + 1 - u32::from(last.start);
             let adjacent = u32::from(address) == end || range.holes;
             let fits = joined <= u32::from(range.read);
-            if last.table == table && range.addresses.contains(&last.start) && adjacent && fits {
+            if range.addresses.contains(&last.start) && adjacent && fits {
                 last.count = joined as u16;
                 continue;
             }
@@ -196,6 +197,22 @@ mod tests {
             "never across a border"
         );
         assert_eq!(spans(&profile(&range(0, 99, 1, false), &[1, 2])), [(1, 1), (2, 1)]);
+    }
+
+    #[test]
+    fn tables_are_never_mixed() {
+        let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n\
+            [[range]]\ntable = \"input\"\nfirst = 0\nlast = 9\nread = 10\n\
+            [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\nread = 10\n\
+            [[point]]\nname = \"a\"\nat = \"input 5\"\nclass = \"fast\"\n\
+            [[point]]\nname = \"b\"\nat = \"holding 0\"\nclass = \"fast\"\n\
+            [[point]]\nname = \"c\"\nat = \"holding 6\"\nclass = \"fast\"\n";
+        let plan = Plan::of(&Profile::parse("p.toml", text, false).unwrap());
+        let reads: Vec<_> = plan.reads.iter().map(|r| (r.table, r.start, r.count)).collect();
+        assert_eq!(
+            reads,
+            [(Table::Input, 5, 1), (Table::Holding, 0, 1), (Table::Holding, 6, 1)]
+        );
     }
 
     #[test]

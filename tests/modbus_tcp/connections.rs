@@ -1,0 +1,117 @@
+//! Who may connect, how many, and the end of it all.
+
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use arc_swap::ArcSwap;
+use drivegate::north::modbus_tcp;
+use tokio::net::TcpListener;
+use tokio_util::sync::CancellationToken;
+
+use crate::rig::{Client, Rig, options, plant, registers, until, words};
+
+#[tokio::test]
+async fn only_allowed_clients() {
+    let mut options = options();
+    options.allow = vec!["127.0.0.2/32".parse().unwrap()];
+    let rig = Rig::with(options).await;
+    let mut refused = rig.client().await;
+    assert!(refused.is_closed().await);
+    let mut allowed = Client::connect_from([127, 0, 0, 2], rig.address()).await;
+    assert_eq!(allowed.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
+    assert_eq!(rig.stats.modbus_tcp.connections(), 1);
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn no_more_than_max_connections() {
+    let mut options = options();
+    options.max_connections = 2;
+    let rig = Rig::with(options).await;
+    let (mut one, mut two) = (rig.client().await, rig.client().await);
+    for client in [&mut one, &mut two] {
+        client.ask(1, &words(3, &[2102, 1])).await;
+    }
+    assert!(rig.client().await.is_closed().await);
+    drop(two);
+    until("the place is free", || rig.stats.modbus_tcp.connections() == 1).await;
+    // The place is given back a moment after the count.
+    let mut three = loop {
+        let mut client = rig.client().await;
+        client.request(1, &words(3, &[2102, 1])).await;
+        if client.answer().await.is_some() {
+            break client;
+        }
+    };
+    assert_eq!(three.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
+    assert_eq!(one.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn several_listeners_share_one_server() {
+    let mut options = options();
+    options.listen = vec![
+        SocketAddr::from(([127, 0, 0, 1], 0)),
+        SocketAddr::from(([127, 0, 0, 3], 0)),
+    ];
+    let rig = Rig::with(options).await;
+    for address in rig.server.addresses() {
+        let mut client = Client::connect(*address).await;
+        assert_eq!(client.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
+    }
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn an_ipv4_client_of_an_ipv6_listener() {
+    let mut options = options();
+    options.listen = vec!["[::]:0".parse().unwrap()];
+    let rig = Rig::with(options).await;
+    let port = rig.address().port();
+    let mut client = Client::connect(SocketAddr::from(([127, 0, 0, 1], port))).await;
+    let request = words(6, &[0x8101, 5000]);
+    assert_eq!(
+        client.ask(1, &request).await,
+        request,
+        "allowed and may write by its IPv4 address"
+    );
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn a_taken_address_is_told() {
+    let taken = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = taken.local_addr().unwrap();
+    let mut options = options();
+    options.listen = vec![address];
+    let plant = Arc::new(ArcSwap::from_pointee(plant()));
+    let why = modbus_tcp::start(options, plant, Arc::default(), CancellationToken::new())
+        .await
+        .unwrap_err()
+        .to_string();
+    assert!(
+        why.starts_with(&format!(
+            "cannot listen for Modbus TCP on {address}: Address already in use"
+        )),
+        "{why}"
+    );
+    assert!(why.ends_with("in `listen` of [modbus_tcp]"), "{why}");
+}
+
+#[tokio::test]
+async fn the_end_closes_every_connection() {
+    let rig = Rig::new().await;
+    let mut clients = Vec::new();
+    for _ in 0..10 {
+        let mut client = rig.client().await;
+        client.ask(1, &words(3, &[2102, 1])).await;
+        clients.push(client);
+    }
+    let address = rig.address();
+    rig.end().await;
+    for mut client in clients {
+        assert!(client.is_closed().await);
+    }
+    assert!(tokio::net::TcpStream::connect(address).await.is_err());
+}

@@ -1,0 +1,10 @@
+//! The Modbus TCP server over real sockets, with simulated buses behind it: every answer and exception of the
+//! contract, bad input of all kinds, and independent clients.
+#![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::indexing_slicing)]
+
+mod bad_input;
+mod commands;
+mod connections;
+mod peers;
+mod requests;
+mod rig;
