@@ -16,10 +16,10 @@ use crate::plant::Plant;
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv")]
 pub struct Args {
-    /// Configuration file.
+    /// Configuration file
     #[arg(long, value_name = "FILE", default_value = "/etc/drivegate/drivegate.toml")]
     pub config: PathBuf,
-    /// Comma-separated values, one line for each register of each unit.
+    /// Comma-separated values, one line for each register of each unit
     #[arg(long)]
     pub csv: bool,
 }
@@ -160,6 +160,8 @@ fn render_text(plant: &Plant) -> String {
         );
         // What a unit of this profile can have; the table above tells which units take writes.
         out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
+        let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
+        out += &ranges(profile);
     }
     out += "\nThe gateway itself, unit 255\n";
     out += &rows(&gateway_rows(plant));
@@ -186,11 +188,39 @@ fn drive_rows(profile: &Profile, plan: &Plan, access: Access) -> Vec<Row> {
         .into_iter()
         .flatten()
         .map(|entry| entry_row(profile, entry, access));
-    let raw = profile
-        .points
-        .iter()
-        .filter_map(|p| Some(raw_row(profile, plan, p, p.raw()?, access)));
+    let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter_map(|p| Some((p, p.raw()?))).collect();
+    raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
+    let raw = raw
+        .into_iter()
+        .map(|(point, raw)| raw_row(profile, plan, point, raw, access));
     entries.chain(raw).collect()
+}
+
+/// What the raw view reaches beside the points.
+fn ranges(profile: &Profile) -> String {
+    let header = ["table", "first", "last", "read at once", "written at once", "note"];
+    let rows = profile.ranges.iter().map(|range| {
+        let table = match range.table {
+            Table::Holding if profile.input_is_holding => "holding, input",
+            table => table.name(),
+        };
+        let written = if range.write == 0 {
+            "read only".to_string()
+        } else {
+            range.write.to_string()
+        };
+        let (first, last) = range.addresses.clone().into_inner();
+        let note = range.note.clone();
+        vec![
+            table.to_string(),
+            first.to_string(),
+            last.to_string(),
+            range.read.to_string(),
+            written,
+            note,
+        ]
+    });
+    table(&header, rows)
 }
 
 fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
@@ -226,7 +256,10 @@ fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
         kind: entry.form.name().to_string(),
         scale: format!("{}", 1.0 / entry.per_unit),
         unit: unit.to_string(),
-        not_available: entry.form.not_available(),
+        not_available: match entry.content {
+            Content::Status | Content::State | Content::Heartbeat => "",
+            Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
+        },
         access: if writable { "read, write" } else { "read" },
         note: note.to_string(),
     }
@@ -324,4 +357,97 @@ fn reference(table: Table, address: u16) -> String {
         Table::Holding => 4,
     };
     format!("{digit}{:05}", u32::from(address) + 1)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+    use std::sync::Arc;
+    use std::time::Duration;
+
+    use super::*;
+    use crate::cache::{BusImage, BusSpec, DriveImage, OnShutdown};
+    use crate::codec::{LineFormat, Protocol};
+    use crate::command::CommandQueue;
+    use crate::drive::profile::Profiles;
+    use crate::plant::BusHandle;
+
+    fn plant() -> Plant {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let drive = |name: &str, unit, access| {
+            let spec = DriveSpec {
+                name: name.to_string(),
+                bus: "line1".to_string(),
+                address: unit,
+                unit,
+                profile: profile.clone(),
+                access,
+                limits: BTreeMap::new(),
+                supervision: None,
+                on_shutdown: OnShutdown::Hold,
+                turnaround: Duration::ZERO,
+                frequency_range: None,
+            };
+            Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+        };
+        let spec = BusSpec {
+            name: "line1".to_string(),
+            port: "/dev/null".to_string(),
+            protocol: Protocol::ModbusRtu,
+            format: LineFormat::new(38_400, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_secs(1),
+        };
+        let drives = vec![drive("pump-1", 1, Access::Control), drive("pump-2", 2, Access::Monitor)];
+        let image = Arc::new(BusImage::new(spec, drives));
+        let queue = Arc::new(CommandQueue::new().unwrap());
+        Plant {
+            gateway: "pump-house".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: vec![BusHandle { image, queue }],
+            events: Default::default(),
+            writes: Default::default(),
+        }
+    }
+
+    #[test]
+    fn csv_has_one_line_a_register() {
+        let csv = render(&plant(), true);
+        let mut lines = csv.lines();
+        let columns = lines.next().unwrap().split(',').count();
+        assert_eq!(columns, 15);
+        for wanted in [
+            "1,pump-1,common,\"holding, input\",32772,0x8004,432773,1,actual_speed,i16,0.01,%,0x8000,read,",
+            "1,pump-1,common,\"holding, input\",32781,0x800D,432782,2,energy,u32,1,kWh,0xFFFFFFFF,read,\
+             never available: this family lacks it",
+            "1,pump-1,command,\"holding, input\",33025,0x8101,433026,1,speed_reference,i16,0.01,%,0x8000,\"read, write\",",
+            "2,pump-2,command,\"holding, input\",33025,0x8101,433026,1,speed_reference,i16,0.01,%,0x8000,read,",
+            "1,pump-1,float,\"holding, input\",33282,0x8202,433283,2,output_frequency,f32,1,Hz,NaN,read,",
+            "1,pump-1,raw,\"holding, input\",2103,0x0837,402104,1,output_frequency,i16,0.01,Hz,,read,",
+            "255,,gateway,\"input, holding\",3,0x0003,300004,1,line1: line load,u16,0.1,%,,read,",
+        ] {
+            assert!(csv.lines().any(|line| line == wanted), "{wanted} is missing in\n{csv}");
+        }
+    }
+
+    #[test]
+    fn text_tells_units_and_each_profile_once() {
+        let text = render(&plant(), false);
+        assert!(
+            text.contains("\nProfile vacon-nx (Vacon NX, OPTC2/OPTC8 board, Modbus RTU), units 1, 2\n"),
+            "{text}"
+        );
+        assert_eq!(text.matches("Profile vacon-nx").count(), 1);
+        assert!(text.contains("monitor: every write is refused"));
+        assert!(
+            text.lines().all(|line| line == line.trim_end()),
+            "no blanks at line ends"
+        );
+    }
+
+    #[test]
+    fn fields_are_quoted_where_they_must() {
+        assert_eq!(quoted("a"), "a");
+        assert_eq!(quoted("a \"b\", c"), "\"a \"\"b\"\", c\"");
+    }
 }

@@ -5,20 +5,21 @@
 //! and input registers alike. A figure that does not fit its register is served as "not available", never
 //! clamped.
 
-use std::time::Duration;
+mod command;
+mod gateway;
+
+pub use command::{CommandWrite, command, is_reset, without_reset};
+pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, BusRegister, gateway};
 
 use crate::cache::Reading;
 use crate::codec::Exception;
-use crate::command::Refusal;
 use crate::drive::profile::tidy;
-use crate::drive::{ModelPoint, Profile, State, Value};
+use crate::drive::{ModelPoint, State, Value};
 
 /// First address that is not the drive's own.
 pub const FIRST: u16 = 0x8000;
 /// Unit id under which the gateway itself is reached.
 pub const GATEWAY_UNIT: u8 = 255;
-/// Registers of a bus in the block of the gateway.
-pub const BUS_BLOCK: u16 = 16;
 
 const COMMAND_WORD: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
@@ -34,7 +35,6 @@ const MAX_AGE_MS: u128 = 65_534;
 
 const RUN: u16 = 1 << 0;
 const REVERSE: u16 = 1 << 1;
-const FAULT_RESET: u16 = 1 << 2;
 const STALE: u16 = 1 << 14;
 const ONLINE: u16 = 1 << 15;
 
@@ -306,254 +306,6 @@ impl<'r> Look<'r> {
         let run = if run != 0.0 { RUN } else { 0 };
         run | if self.is_set(ModelPoint::Reverse) { REVERSE } else { 0 }
     }
-}
-
-/// What a write to the command block means.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct CommandWrite {
-    /// Points to set as one command: index in the profile, value in engineering units. May be empty when
-    /// only the heartbeat was written.
-    pub points: Vec<(usize, Value)>,
-    /// The word at 0x8100, if it was written.
-    pub word: Option<u16>,
-    /// The heartbeat was written.
-    pub heartbeat: bool,
-}
-
-/// What writing `values` from `start` on means to a drive of that family. `last` is the word written at
-/// 0x8100 before: a fault reset is the change of bit 2 from 0 to 1.
-///
-/// Where one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is left alone.
-///
-/// # Errors
-/// An address that takes no command or that the family lacks, then a value that is none.
-pub fn command(profile: &Profile, start: u16, values: &[u16], last: u16) -> Result<CommandWrite, Refusal> {
-    let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
-    let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
-    let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
-    if let Some((address, _)) = writes.iter().find(|(a, _)| outside(a)) {
-        return Err(Refusal::NotWritable(format!(
-            "register 0x{address:04X} takes no writes; commands go to 0x8100 to 0x8103"
-        )));
-    }
-    let mut write = CommandWrite::default();
-    let mut bad = None;
-    for (address, value) in writes {
-        match address as u16 {
-            COMMAND_WORD => {
-                write.word = Some(value);
-                bad = bad.or(command_word(profile, value, last, &mut write.points)?);
-            }
-            SPEED_REFERENCE if !(both && value == NO_I16) => {
-                write.points.push((
-                    writable(profile, ModelPoint::SpeedReference)?,
-                    Value::Number(f64::from(value as i16) / 100.0),
-                ));
-                bad = bad.or((value == NO_I16).then(|| no_value(address)));
-            }
-            FREQUENCY_REFERENCE if !(both && value == NO_U16) => {
-                write.points.push((
-                    writable(profile, ModelPoint::FrequencyReference)?,
-                    Value::Number(f64::from(value) / 100.0),
-                ));
-                bad = bad.or((value == NO_U16).then(|| no_value(address)));
-            }
-            HEARTBEAT => write.heartbeat = true,
-            _ => {}
-        }
-    }
-    let references = write
-        .points
-        .iter()
-        .filter(|(_, v)| matches!(v, Value::Number(_)))
-        .count();
-    match bad {
-        Some(refusal) => Err(refusal),
-        None if references > 1 => Err(Refusal::BadValue(
-            "two references in one command; send one and \"not available\" for the other; nothing was written"
-                .to_string(),
-        )),
-        None if write.points.is_empty() && !write.heartbeat => Err(Refusal::BadValue(
-            "both references are \"not available\"; nothing was written".to_string(),
-        )),
-        None => Ok(write),
-    }
-}
-
-fn no_value(address: u32) -> Refusal {
-    Refusal::BadValue(format!(
-        "\"not available\" is no reference for register 0x{address:04X}; nothing was written"
-    ))
-}
-
-fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
-    let index = profile.model_index(point);
-    let index = index.filter(|i| profile.points.get(*i).is_some_and(|p| p.write));
-    index.ok_or_else(|| {
-        Refusal::NotWritable(format!(
-            "`{}` of profile `{}` cannot be written",
-            point.name(),
-            profile.name
-        ))
-    })
-}
-
-/// The points that the word at 0x8100 sets, or what is wrong with its value.
-fn command_word(
-    profile: &Profile,
-    word: u16,
-    last: u16,
-    points: &mut Vec<(usize, Value)>,
-) -> Result<Option<Refusal>, Refusal> {
-    points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));
-    if word & !(RUN | REVERSE | FAULT_RESET) != 0 {
-        return Ok(Some(Refusal::BadValue(format!(
-            "0x{word:04X} is no command: bits 3 to 15 must be 0; nothing was written"
-        ))));
-    }
-    // Nothing is dropped in silence: a bit that the family lacks must be 0.
-    let lacks = |refusal: Refusal| Ok(Some(Refusal::BadValue(refusal.to_string())));
-    let reverse = word & REVERSE != 0;
-    match writable(profile, ModelPoint::Reverse) {
-        Ok(index) => points.push((index, Value::Bool(reverse))),
-        Err(refusal) if reverse => return lacks(refusal),
-        Err(_) => {}
-    }
-    if is_reset(word, last) {
-        match writable(profile, ModelPoint::FaultReset) {
-            Ok(index) => points.push((index, Value::Bool(true))),
-            Err(refusal) => return lacks(refusal),
-        }
-    }
-    Ok(None)
-}
-
-/// The word at 0x8100 after its fault reset did not reach the drive: the next write with bit 2 resets again.
-pub fn without_reset(word: u16) -> u16 {
-    word & !FAULT_RESET
-}
-
-/// Whether the word at 0x8100 asks for a fault reset after `last` stood there.
-pub fn is_reset(word: u16, last: u16) -> bool {
-    word & !last & FAULT_RESET != 0
-}
-
-/// What the gateway tells of one bus.
-#[derive(Debug, Clone, PartialEq)]
-pub struct BusFigures {
-    /// Whether the port is open.
-    pub up: bool,
-    /// Drives configured.
-    pub drives: usize,
-    /// Drives that answer.
-    pub online: usize,
-    /// Share of the time in which the line is in use, 0..=1.
-    pub load: f64,
-    /// Achieved cycle of the fast class.
-    pub cycle: Option<Duration>,
-    /// Exchanges so far.
-    pub transactions: u64,
-    /// Exchanges that failed so far.
-    pub errors: u64,
-    /// Writes that wait for the line.
-    pub queued: usize,
-}
-
-/// A register of a bus under unit 255, for the printed map.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BusRegister {
-    /// Place in the block of the bus.
-    pub offset: u16,
-    /// What it tells.
-    pub name: &'static str,
-    /// How it lies there.
-    pub form: Form,
-    /// Engineering value of one count.
-    pub scale: &'static str,
-    /// Unit.
-    pub unit: &'static str,
-}
-
-const fn bus_register(offset: u16, name: &'static str, form: Form) -> BusRegister {
-    BusRegister {
-        offset,
-        name,
-        form,
-        scale: "1",
-        unit: "",
-    }
-}
-
-/// The registers of a bus under unit 255; the rest of its block is reserved and reads 0.
-pub const BUS_REGISTERS: [BusRegister; 8] = [
-    bus_register(0, "state: 0 down, 1 up", Form::U16),
-    bus_register(1, "drives configured", Form::U16),
-    bus_register(2, "drives online", Form::U16),
-    BusRegister {
-        scale: "0.1",
-        unit: "%",
-        ..bus_register(3, "line load", Form::U16)
-    },
-    BusRegister {
-        unit: "ms",
-        ..bus_register(4, "cycle of the fast class", Form::U32)
-    },
-    bus_register(6, "transactions, modulo 2^32", Form::U32),
-    bus_register(8, "errors, modulo 2^32", Form::U32),
-    bus_register(10, "queued writes", Form::U16),
-];
-
-impl BusFigures {
-    /// The block of the bus. A bus that is down has no drive online and no load; a cycle that was never
-    /// measured is 0xFFFFFFFF; the counters run modulo 2^32; reserved registers are 0.
-    pub fn registers(&self) -> [u16; BUS_BLOCK as usize] {
-        let count = |n: usize| n.min(usize::from(u16::MAX - 1)) as u16;
-        let ms = |cycle: Duration| (cycle.as_secs_f64() * 1000.0).round().min(f64::from(u32::MAX - 1)) as u32;
-        let [cycle_high, cycle_low] = high_low(self.cycle.map_or(u32::MAX, ms));
-        let [done_high, done_low] = high_low(self.transactions as u32);
-        let [errors_high, errors_low] = high_low(self.errors as u32);
-        [
-            u16::from(self.up),
-            count(self.drives),
-            if self.up { count(self.online) } else { 0 },
-            if self.up {
-                (self.load.clamp(0.0, 1.0) * 1000.0).round() as u16
-            } else {
-                0
-            },
-            cycle_high,
-            cycle_low,
-            done_high,
-            done_low,
-            errors_high,
-            errors_low,
-            count(self.queued),
-            0,
-            0,
-            0,
-            0,
-            0,
-        ]
-    }
-}
-
-/// Registers of the gateway itself; `bus` gives the figures of a bus by its place in the file.
-///
-/// # Errors
-/// 02 when the span goes beyond the last bus.
-pub fn gateway(start: u16, count: u16, bus: impl Fn(usize) -> Option<BusFigures>) -> Result<Vec<u16>, Exception> {
-    let mut registers = Vec::with_capacity(usize::from(count));
-    let end = start.checked_add(count).ok_or(Exception::ADDRESS)?;
-    for block in start / BUS_BLOCK..end.div_ceil(BUS_BLOCK) {
-        let figures = bus(usize::from(block)).ok_or(Exception::ADDRESS)?;
-        let addressed = (u32::from(block) * u32::from(BUS_BLOCK)..).zip(figures.registers());
-        registers.extend(
-            addressed
-                .filter(|(a, _)| (u32::from(start)..u32::from(end)).contains(a))
-                .map(|(_, word)| word),
-        );
-    }
-    Ok(registers)
 }
 
 #[cfg(test)]

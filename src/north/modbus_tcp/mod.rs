@@ -9,6 +9,7 @@ mod connection;
 mod frame;
 mod identify;
 mod session;
+mod shared;
 
 use std::io;
 use std::net::{IpAddr, SocketAddr};
@@ -21,7 +22,8 @@ use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use self::session::{Authority, Session, Shared};
+use self::session::Session;
+use self::shared::{Authority, Shared};
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
 

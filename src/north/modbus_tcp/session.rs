@@ -1,95 +1,29 @@
 //! What the requests of one client mean, and what is answered.
 
-use std::collections::HashMap;
 use std::future::Future;
 use std::pin::Pin;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::Arc;
 use std::time::Instant;
 
 use futures_util::FutureExt;
 
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::{Options, Seldom, Uncached};
+use super::shared::{Authority, Routes, Shared};
+use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::Profile;
+use crate::north::ModbusTcpStats;
 use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
-use crate::north::{ModbusTcpStats, NorthStats};
-use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use crate::plant::{BusHandle, DriveHandle};
 
 /// Function codes that change something.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
 /// Function codes that every drive has here, by the blocks from 0x8000 on and the identification.
 const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
-
-/// What all connections share.
-#[derive(Debug)]
-pub(super) struct Shared {
-    pub(super) options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
-    command_words: Mutex<HashMap<String, u16>>,
-}
-
-impl Shared {
-    pub(super) fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>) -> Shared {
-        Shared {
-            options,
-            plant,
-            stats,
-            command_words: Mutex::default(),
-        }
-    }
-
-    /// Does something with the word of a drive that nobody else may change in between.
-    fn with_command_word<T>(&self, drive: &str, act: impl FnOnce(&mut u16) -> T) -> T {
-        let mut words = self.command_words.lock().unwrap_or_else(PoisonError::into_inner);
-        let mut word = words.get(drive).copied().unwrap_or_default();
-        let result = act(&mut word);
-        words.insert(drive.to_string(), word);
-        result
-    }
-}
-
-/// What a client may do, and its name in the audit.
-#[derive(Debug, Clone)]
-pub(super) struct Authority {
-    /// Whether it may write at all.
-    pub(super) may_write: bool,
-    /// Its address, or later the name in its certificate.
-    pub(super) who: String,
-}
-
-/// The drives by unit id, as the plant has them now.
-#[derive(Debug)]
-struct Routes {
-    plant: Arc<Plant>,
-    drives: Vec<DriveHandle>,
-    /// Place in `drives`.
-    units: Vec<Option<u16>>,
-}
-
-impl Routes {
-    fn new(plant: Arc<Plant>) -> Routes {
-        let drives: Vec<DriveHandle> = plant.drives().collect();
-        let mut units = vec![None; usize::from(u8::MAX) + 1];
-        for (place, drive) in (0u16..).zip(&drives) {
-            if let Some(unit) = units.get_mut(usize::from(drive.image.spec.unit)) {
-                unit.get_or_insert(place);
-            }
-        }
-        Routes { plant, drives, units }
-    }
-
-    fn drive(&self, unit: u8) -> Option<&DriveHandle> {
-        let place = self.units.get(usize::from(unit)).copied().flatten()?;
-        self.drives.get(usize::from(place))
-    }
-}
 
 /// A request that waits for the bus.
 pub(super) type Waiting = Pin<Box<dyn Future<Output = Finished> + Send>>;

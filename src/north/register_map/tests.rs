@@ -4,6 +4,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::*;
 use crate::cache::{Access, DriveImage, DriveSpec, Link, OnShutdown};
 use crate::codec::Table;
+use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 
 const STALE_AFTER: Duration = Duration::from_secs(1);

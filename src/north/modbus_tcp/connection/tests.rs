@@ -4,7 +4,7 @@ use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
 
-use super::super::session::{Authority, Shared};
+use super::super::shared::{Authority, Shared};
 use super::super::{Options, Uncached};
 use super::*;
 use crate::north::NorthStats;

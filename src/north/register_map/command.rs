@@ -1,0 +1,137 @@
+//! Writes to the command block.
+
+use super::{COMMAND_WORD, FREQUENCY_REFERENCE, HEARTBEAT, NO_I16, NO_U16, REVERSE, RUN, SPEED_REFERENCE};
+use crate::command::Refusal;
+use crate::drive::{ModelPoint, Profile, Value};
+
+const FAULT_RESET: u16 = 1 << 2;
+
+/// What a write to the command block means.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct CommandWrite {
+    /// Points to set as one command: index in the profile, value in engineering units. May be empty when
+    /// only the heartbeat was written.
+    pub points: Vec<(usize, Value)>,
+    /// The word at 0x8100, if it was written.
+    pub word: Option<u16>,
+    /// The heartbeat was written.
+    pub heartbeat: bool,
+}
+
+/// What writing `values` from `start` on means to a drive of that family. `last` is the word written at
+/// 0x8100 before: a fault reset is the change of bit 2 from 0 to 1.
+///
+/// Where one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is left alone.
+///
+/// # Errors
+/// An address that takes no command or that the family lacks, then a value that is none.
+pub fn command(profile: &Profile, start: u16, values: &[u16], last: u16) -> Result<CommandWrite, Refusal> {
+    let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
+    let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
+    let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
+    if let Some((address, _)) = writes.iter().find(|(a, _)| outside(a)) {
+        return Err(Refusal::NotWritable(format!(
+            "register 0x{address:04X} takes no writes; commands go to 0x8100 to 0x8103"
+        )));
+    }
+    let mut write = CommandWrite::default();
+    let mut bad = None;
+    for (address, value) in writes {
+        match address as u16 {
+            COMMAND_WORD => {
+                write.word = Some(value);
+                bad = bad.or(command_word(profile, value, last, &mut write.points)?);
+            }
+            SPEED_REFERENCE if !(both && value == NO_I16) => {
+                write.points.push((
+                    writable(profile, ModelPoint::SpeedReference)?,
+                    Value::Number(f64::from(value as i16) / 100.0),
+                ));
+                bad = bad.or((value == NO_I16).then(|| no_value(address)));
+            }
+            FREQUENCY_REFERENCE if !(both && value == NO_U16) => {
+                write.points.push((
+                    writable(profile, ModelPoint::FrequencyReference)?,
+                    Value::Number(f64::from(value) / 100.0),
+                ));
+                bad = bad.or((value == NO_U16).then(|| no_value(address)));
+            }
+            HEARTBEAT => write.heartbeat = true,
+            _ => {}
+        }
+    }
+    let references = write
+        .points
+        .iter()
+        .filter(|(_, v)| matches!(v, Value::Number(_)))
+        .count();
+    match bad {
+        Some(refusal) => Err(refusal),
+        None if references > 1 => Err(Refusal::BadValue(
+            "two references in one command; send one and \"not available\" for the other; nothing was written"
+                .to_string(),
+        )),
+        None if write.points.is_empty() && !write.heartbeat => Err(Refusal::BadValue(
+            "both references are \"not available\"; nothing was written".to_string(),
+        )),
+        None => Ok(write),
+    }
+}
+
+fn no_value(address: u32) -> Refusal {
+    Refusal::BadValue(format!(
+        "\"not available\" is no reference for register 0x{address:04X}; nothing was written"
+    ))
+}
+
+fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
+    let index = profile.model_index(point);
+    let index = index.filter(|i| profile.points.get(*i).is_some_and(|p| p.write));
+    index.ok_or_else(|| {
+        Refusal::NotWritable(format!(
+            "`{}` of profile `{}` cannot be written",
+            point.name(),
+            profile.name
+        ))
+    })
+}
+
+/// The points that the word at 0x8100 sets, or what is wrong with its value.
+fn command_word(
+    profile: &Profile,
+    word: u16,
+    last: u16,
+    points: &mut Vec<(usize, Value)>,
+) -> Result<Option<Refusal>, Refusal> {
+    points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));
+    if word & !(RUN | REVERSE | FAULT_RESET) != 0 {
+        return Ok(Some(Refusal::BadValue(format!(
+            "0x{word:04X} is no command: bits 3 to 15 must be 0; nothing was written"
+        ))));
+    }
+    // Nothing is dropped in silence: a bit that the family lacks must be 0.
+    let lacks = |refusal: Refusal| Ok(Some(Refusal::BadValue(refusal.to_string())));
+    let reverse = word & REVERSE != 0;
+    match writable(profile, ModelPoint::Reverse) {
+        Ok(index) => points.push((index, Value::Bool(reverse))),
+        Err(refusal) if reverse => return lacks(refusal),
+        Err(_) => {}
+    }
+    if is_reset(word, last) {
+        match writable(profile, ModelPoint::FaultReset) {
+            Ok(index) => points.push((index, Value::Bool(true))),
+            Err(refusal) => return lacks(refusal),
+        }
+    }
+    Ok(None)
+}
+
+/// The word at 0x8100 after its fault reset did not reach the drive: the next write with bit 2 resets again.
+pub fn without_reset(word: u16) -> u16 {
+    word & !FAULT_RESET
+}
+
+/// Whether the word at 0x8100 asks for a fault reset after `last` stood there.
+pub fn is_reset(word: u16, last: u16) -> bool {
+    word & !last & FAULT_RESET != 0
+}
