@@ -2,6 +2,7 @@
 //! name the bus.
 
 pub mod http;
+pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 pub mod register_map;

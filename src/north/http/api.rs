@@ -1,0 +1,252 @@
+//! What the JSON interface says of drives and buses. Fields are added, never renamed or removed.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use serde::ser::SerializeMap;
+use serde::{Serialize, Serializer};
+
+use crate::cache::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
+use crate::drive::{Quality, State};
+use crate::plant::{BusHandle, DriveHandle};
+
+/// An error reply.
+#[derive(Debug, Serialize)]
+pub(super) struct Problem {
+    pub(super) error: String,
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub(super) known: Vec<String>,
+}
+
+/// One time on both clocks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Clock {
+    now: Instant,
+    wall: SystemTime,
+}
+
+impl Clock {
+    pub(super) fn new(now: Instant, wall: SystemTime) -> Clock {
+        Clock { now, wall }
+    }
+
+    fn age(&self, at: Instant) -> Duration {
+        self.now.saturating_duration_since(at)
+    }
+
+    fn wall(&self, at: Instant) -> Option<Time> {
+        self.wall.checked_sub(self.age(at)).map(Time)
+    }
+}
+
+/// RFC 3339 with milliseconds, UTC.
+#[derive(Debug, Serialize)]
+struct Time(#[serde(serialize_with = "crate::event::rfc3339")] SystemTime);
+
+/// One drive with all its points.
+#[derive(Debug, Serialize)]
+pub(super) struct Drive<'d> {
+    name: &'d str,
+    bus: &'d str,
+    address: u8,
+    unit: u8,
+    profile: &'d str,
+    access: &'static str,
+    state: State,
+    quality: Quality,
+    online: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    since: Option<Time>,
+    age_ms: Option<u64>,
+    fault_text: String,
+    turnaround_ms: Option<f64>,
+    transactions: Outcomes,
+    points: Points<'d>,
+}
+
+impl<'d> Drive<'d> {
+    pub(super) fn new(drive: &'d DriveHandle, clock: Clock) -> Drive<'d> {
+        let image = &drive.image;
+        let spec = &image.spec;
+        let reading = drive.reading(clock.now);
+        let since = match reading.snapshot.link {
+            Link::Untried => None,
+            Link::Online(since) | Link::Offline(since) => Some(Time(since)),
+        };
+        Drive {
+            name: &spec.name,
+            bus: &spec.bus,
+            address: spec.address,
+            unit: spec.unit,
+            profile: &spec.profile.name,
+            access: match spec.access {
+                Access::Monitor => "monitor",
+                Access::Control => "control",
+            },
+            state: reading.state(),
+            quality: reading.overall(),
+            online: reading.snapshot.link.is_online(),
+            since,
+            age_ms: reading.age().map(millis),
+            fault_text: reading.fault_text(),
+            turnaround_ms: image.turnaround().map(fine_millis),
+            transactions: Outcomes::new(|outcome| image.counted(outcome)),
+            points: Points { reading, clock },
+        }
+    }
+}
+
+/// Exchanges by their outcome.
+#[derive(Debug, Serialize)]
+struct Outcomes {
+    ok: u64,
+    exception: u64,
+    timeout: u64,
+    corrupt: u64,
+}
+
+impl Outcomes {
+    fn new(counted: impl Fn(Outcome) -> u64) -> Outcomes {
+        Outcomes {
+            ok: counted(Outcome::Ok),
+            exception: counted(Outcome::Exception),
+            timeout: counted(Outcome::Timeout),
+            corrupt: counted(Outcome::Corrupt),
+        }
+    }
+}
+
+/// The points of a drive by name, in the order of the model.
+#[derive(Debug)]
+struct Points<'d> {
+    reading: Reading<'d>,
+    clock: Clock,
+}
+
+impl Serialize for Points<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let profile = &self.reading.spec.profile;
+        let names = public_points(profile);
+        let mut map = serializer.serialize_map(Some(names.len()))?;
+        for (index, name) in names {
+            let unit = profile.points.get(index).map_or("", |p| p.unit.as_str());
+            map.serialize_entry(name, &self.point(index, unit))?;
+        }
+        map.end()
+    }
+}
+
+#[derive(Debug, Serialize)]
+struct Point<'p> {
+    value: serde_json::Value,
+    quality: Quality,
+    unit: &'p str,
+    age_ms: Option<u64>,
+    time: Option<Time>,
+}
+
+impl Points<'_> {
+    /// A stale value is told with its quality; of a bad point there is nothing to tell.
+    fn point<'p>(&self, index: usize, unit: &'p str) -> Point<'p> {
+        let sample = self.reading.sample(index);
+        let told = sample.quality != Quality::Bad;
+        let at = sample.at.filter(|_| told);
+        Point {
+            value: value_or_null(sample.value.filter(|_| told)),
+            quality: sample.quality,
+            unit,
+            age_ms: at.map(|at| millis(self.clock.age(at))),
+            time: at.and_then(|at| self.clock.wall(at)),
+        }
+    }
+}
+
+/// One bus with its figures.
+#[derive(Debug, Serialize)]
+pub(super) struct Bus<'b> {
+    name: &'b str,
+    port: &'b str,
+    protocol: &'static str,
+    baud: u32,
+    format: String,
+    state: &'static str,
+    tried: bool,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    since: Option<Time>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    reason: Option<String>,
+    drives: usize,
+    online: usize,
+    load_ratio: f64,
+    fast: Cycle,
+    slow: Cycle,
+    transactions: u64,
+    errors: u64,
+    outcomes: Outcomes,
+    foreign_frames: u64,
+    opened: u64,
+    queue_depth: usize,
+}
+
+/// Cadence of a poll class.
+#[derive(Debug, Serialize)]
+struct Cycle {
+    /// Aimed at.
+    aim_ms: f64,
+    /// Achieved by the last round.
+    cycle_ms: Option<f64>,
+    rounds: u64,
+}
+
+impl Cycle {
+    fn new(aim: Duration, achieved: PollCycle) -> Cycle {
+        Cycle {
+            aim_ms: fine_millis(aim),
+            cycle_ms: achieved.last.map(fine_millis),
+            rounds: achieved.rounds,
+        }
+    }
+}
+
+impl<'b> Bus<'b> {
+    pub(super) fn new(handle: &'b BusHandle) -> Bus<'b> {
+        let image: &BusImage = &handle.image;
+        let spec = &image.spec;
+        let health = image.health();
+        let format = spec.format.to_string();
+        Bus {
+            name: &spec.name,
+            port: &spec.port,
+            protocol: spec.protocol.name(),
+            baud: spec.format.baud,
+            format: format.split_once(' ').map_or("", |(_, text)| text).to_string(),
+            state: if health.up { "up" } else { "down" },
+            tried: health.tried,
+            since: health.since.map(Time),
+            reason: health.reason.filter(|_| !health.up),
+            drives: image.drives.len(),
+            online: image.online(),
+            load_ratio: rounded(health.load, 10_000.0),
+            fast: Cycle::new(spec.cycle, health.fast),
+            slow: Cycle::new(spec.slow_cycle, health.slow),
+            transactions: image.transactions_total(),
+            errors: image.errors_total(),
+            outcomes: Outcomes::new(|outcome| image.drives.iter().map(|d| d.counted(outcome)).sum()),
+            foreign_frames: health.foreign,
+            opened: health.opened,
+            queue_depth: handle.queue.lock().len(),
+        }
+    }
+}
+
+fn millis(time: Duration) -> u64 {
+    u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
+}
+
+/// Milliseconds to the microsecond.
+fn fine_millis(time: Duration) -> f64 {
+    rounded(time.as_secs_f64() * 1000.0, 1000.0)
+}
+
+fn rounded(value: f64, parts: f64) -> f64 {
+    (value * parts).round() / parts
+}

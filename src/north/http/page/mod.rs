@@ -1,0 +1,152 @@
+//! The status page: one document, its style and its script, all from this server.
+//!
+//! The script shows the JSON interface live. Without scripts the page shows the tables made here and loads
+//! itself anew every few seconds.
+
+use std::fmt::{self, Write as _};
+use std::time::Instant;
+
+use crate::cache::Reading;
+use crate::drive::{ModelPoint, Quality};
+use crate::plant::Plant;
+
+const DOCUMENT: &str = include_str!("index.html");
+
+/// Style sheet.
+pub(in crate::north::http) const STYLE: &str = include_str!("style.css");
+
+/// Script.
+pub(in crate::north::http) const SCRIPT: &str = include_str!("page.js");
+
+/// Icon.
+pub(in crate::north::http) const ICON: &str = include_str!("icon.svg");
+
+/// Nothing but this server's own files, no inline code, no forms.
+pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
+    img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
+
+/// Columns of the drives' table without scripts.
+const COLUMNS: [(ModelPoint, &str); 4] = [
+    (ModelPoint::ActualSpeed, "Speed"),
+    (ModelPoint::OutputFrequency, "Frequency"),
+    (ModelPoint::MotorCurrent, "Current"),
+    (ModelPoint::MotorTorque, "Torque"),
+];
+
+/// The document as the plant is at `now`.
+pub(in crate::north::http) fn render(plant: &Plant, now: Instant) -> String {
+    let mut tables = String::new();
+    // Writing to a string cannot fail.
+    let _ = buses(&mut tables, plant).and_then(|()| drives(&mut tables, plant, now));
+    DOCUMENT
+        .replace("{{version}}", env!("CARGO_PKG_VERSION"))
+        .replace("{{gateway}}", &Escaped(&plant.gateway).to_string())
+        .replace("{{tables}}", &tables)
+}
+
+fn buses(out: &mut String, plant: &Plant) -> fmt::Result {
+    out.write_str("<table><caption>Buses</caption><thead><tr><th>Bus<th>State<th>Drives<th>Load</tr></thead><tbody>")?;
+    for bus in &plant.buses {
+        let image = &bus.image;
+        let health = image.health();
+        let state = match (&health.reason, health.up) {
+            (_, true) => "up".to_string(),
+            (Some(reason), false) => format!("down: {reason}"),
+            (None, false) => "down".to_string(),
+        };
+        write!(
+            out,
+            "<tr><td>{}<td>{}<td>{} of {} online<td>{:.0} %</tr>",
+            Escaped(&image.spec.name),
+            Escaped(&state),
+            image.online(),
+            image.drives.len(),
+            health.load * 100.0
+        )?;
+    }
+    out.write_str("</tbody></table>")
+}
+
+fn drives(out: &mut String, plant: &Plant, now: Instant) -> fmt::Result {
+    out.write_str("<table><caption>Drives</caption><thead><tr><th>Drive<th>State")?;
+    for (_, title) in COLUMNS {
+        write!(out, "<th>{title}")?;
+    }
+    out.write_str("<th>Quality</tr></thead><tbody>")?;
+    for drive in plant.drives() {
+        let reading = drive.reading(now);
+        let fault = reading.fault_text();
+        let gap = if fault.is_empty() { "" } else { ": " };
+        write!(
+            out,
+            "<tr><td>{}<td>{}{gap}{}",
+            Escaped(&reading.spec.name),
+            reading.state().name().replace('_', " "),
+            Escaped(&fault)
+        )?;
+        for (point, _) in COLUMNS {
+            cell(out, &reading, point)?;
+        }
+        match reading.age() {
+            Some(age) => write!(out, "<td>{}, {} ms old</tr>", reading.overall().name(), age.as_millis())?,
+            None => out.write_str("<td>never read</tr>")?,
+        }
+    }
+    out.write_str("</tbody></table>")
+}
+
+/// A value that is not good is shown as such, or not at all.
+fn cell(out: &mut String, reading: &Reading<'_>, point: ModelPoint) -> fmt::Result {
+    let sample = reading.model(point);
+    match (sample.value, sample.quality) {
+        (Some(value), Quality::Good) => write!(out, "<td>{value} {}", point.unit()),
+        (Some(value), Quality::Stale) => write!(out, "<td><s>{value} {}</s> stale", point.unit()),
+        _ => out.write_str("<td>–"),
+    }
+}
+
+/// Text between tags or in a quoted attribute.
+struct Escaped<'t>(&'t str);
+
+impl fmt::Display for Escaped<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        for c in self.0.chars() {
+            match c {
+                '&' => f.write_str("&amp;")?,
+                '<' => f.write_str("&lt;")?,
+                '>' => f.write_str("&gt;")?,
+                '"' => f.write_str("&quot;")?,
+                '\'' => f.write_str("&#39;")?,
+                other => f.write_char(other)?,
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn text_cannot_become_markup() {
+        assert_eq!(
+            Escaped("<b a=\"'\">&").to_string(),
+            "&lt;b a=&quot;&#39;&quot;&gt;&amp;"
+        );
+    }
+
+    #[test]
+    fn nothing_comes_from_elsewhere_and_no_code_is_inline() {
+        for text in [DOCUMENT, STYLE, SCRIPT] {
+            for foreign in ["http://", "https://", "@import", "eval("] {
+                let own = text.replace("http://www.w3.org/2000/svg", "");
+                assert!(!own.contains(foreign), "{foreign}");
+            }
+        }
+        for inline in ["<style", " style=", " onclick=", "<script>", "javascript:"] {
+            assert!(!DOCUMENT.contains(inline), "{inline}");
+        }
+        assert!(!SCRIPT.contains("innerHTML"), "texts of drives must not become markup");
+    }
+}

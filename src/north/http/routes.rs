@@ -1,0 +1,185 @@
+//! What is served where.
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::{Instant, SystemTime};
+
+use axum::Router;
+use axum::extract::{Path, Request, State};
+use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
+use axum::http::{Method, StatusCode, Uri};
+use axum::middleware::{self, Next};
+use axum::response::{Html, IntoResponse, Response};
+use axum::routing::get;
+use axum::{Json, response};
+use tokio::sync::Semaphore;
+use tokio_util::sync::CancellationToken;
+
+use super::{MAX_LISTENERS, api, page, streams};
+use crate::north::{NorthStats, metrics};
+use crate::plant::{Plant, SharedPlant};
+
+/// What all handlers share.
+#[derive(Debug)]
+pub(super) struct Served {
+    pub(super) plant: SharedPlant,
+    pub(super) stats: Arc<NorthStats>,
+    pub(super) cancel: CancellationToken,
+    /// Places for listeners of event streams.
+    pub(super) listeners: Arc<Semaphore>,
+}
+
+/// Everything that is served.
+pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Router {
+    let served = Arc::new(Served {
+        plant,
+        stats,
+        cancel,
+        listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
+    });
+    Router::new()
+        .route("/", get(status_page))
+        .route(
+            "/assets/style.css",
+            get(|| asset("text/css; charset=utf-8", page::STYLE)),
+        )
+        .route(
+            "/assets/page.js",
+            get(|| asset("text/javascript; charset=utf-8", page::SCRIPT)),
+        )
+        .route("/assets/icon.svg", get(|| asset("image/svg+xml", page::ICON)))
+        .route("/metrics", get(exposition))
+        .route("/healthz", get(|| async { "ok\n" }))
+        .route("/readyz", get(ready))
+        .route("/api/v1/drives", get(drives))
+        .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/buses", get(buses))
+        .route("/api/v1/events", get(streams::events))
+        .route("/api/v1/trace", get(streams::trace))
+        .fallback(unknown)
+        .with_state(served)
+        .layer(middleware::from_fn(guard))
+}
+
+/// Refuses all methods that could change something, and sets the headers of every reply.
+async fn guard(request: Request, next: Next) -> Response {
+    let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
+        next.run(request).await
+    } else {
+        let text = "this interface is read only: use GET or HEAD\n";
+        let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
+        (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+    };
+    const SET: [(HeaderName, &str); 3] = [
+        (header::CACHE_CONTROL, "no-store"),
+        (header::X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (header::REFERRER_POLICY, "no-referrer"),
+    ];
+    for (name, value) in SET {
+        response.headers_mut().insert(name, HeaderValue::from_static(value));
+    }
+    response
+}
+
+async fn status_page(State(served): State<Arc<Served>>) -> impl IntoResponse {
+    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
+    (policy, Html(page::render(&served.plant.load(), Instant::now())))
+}
+
+async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {
+    ([(header::CONTENT_TYPE, content_type)], body)
+}
+
+async fn exposition(State(served): State<Arc<Served>>, headers: HeaderMap) -> Response {
+    let accept: Vec<&str> = headers
+        .get_all(header::ACCEPT)
+        .iter()
+        .filter_map(|value| value.to_str().ok())
+        .collect();
+    let format = metrics::Format::accepted(&accept.join(","));
+    match metrics::encode(&served.plant.load(), &served.stats, Instant::now(), format) {
+        Ok(text) => {
+            let headers = [(header::CONTENT_TYPE, format.content_type()), (header::VARY, "accept")];
+            (headers, text).into_response()
+        }
+        Err(error) => {
+            tracing::error!(target: "drivegate::http", "cannot encode the metrics: {error}; report this");
+            StatusCode::INTERNAL_SERVER_ERROR.into_response()
+        }
+    }
+}
+
+async fn ready(State(served): State<Arc<Served>>) -> Response {
+    let reasons = unready(&served.plant.load());
+    if reasons.is_empty() {
+        return "ready\n".into_response();
+    }
+    let mut text = "not ready\n".to_string();
+    for reason in reasons {
+        // Writing to a string cannot fail.
+        let _ = writeln!(text, "{reason}");
+    }
+    (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
+}
+
+/// Why the gateway is not ready: buses that are not open and drives that were not tried yet, each by name.
+fn unready(plant: &Plant) -> Vec<String> {
+    let mut reasons = Vec::new();
+    for bus in &plant.buses {
+        let name = &bus.image.spec.name;
+        let health = bus.image.health();
+        if !health.up {
+            let why = health
+                .reason
+                .unwrap_or_else(|| "its port was not opened yet".to_string());
+            reasons.push(format!("bus {name}: {why}"));
+        }
+        for drive in &bus.image.drives {
+            if !drive.snapshot().link.is_tried() {
+                reasons.push(format!("drive {} on bus {name}: not tried yet", drive.spec.name));
+            }
+        }
+    }
+    reasons
+}
+
+async fn drives(State(served): State<Arc<Served>>) -> Response {
+    let plant = served.plant.load();
+    let clock = api::Clock::new(Instant::now(), SystemTime::now());
+    let all: Vec<_> = plant.drives().collect();
+    let all: Vec<_> = all.iter().map(|drive| api::Drive::new(drive, clock)).collect();
+    Json(all).into_response()
+}
+
+async fn drive(State(served): State<Arc<Served>>, Path(name): Path<String>) -> Response {
+    let plant = served.plant.load();
+    match plant.drive(&name) {
+        Some(drive) => {
+            let clock = api::Clock::new(Instant::now(), SystemTime::now());
+            Json(api::Drive::new(&drive, clock)).into_response()
+        }
+        None => {
+            let known = plant.drives().map(|d| d.image.spec.name.clone());
+            not_found(format!("there is no drive `{name}`"), known.collect())
+        }
+    }
+}
+
+async fn buses(State(served): State<Arc<Served>>) -> Response {
+    let plant = served.plant.load();
+    let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
+    Json(all).into_response()
+}
+
+async fn unknown(uri: Uri) -> Response {
+    if uri.path().starts_with("/api/") {
+        return not_found(format!("there is nothing at {}", uri.path()), Vec::new());
+    }
+    let text = "there is nothing here; the status page is at /\n";
+    (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// A reply 404 that tells the names there are.
+pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
+    (StatusCode::NOT_FOUND, Json(api::Problem { error, known })).into_response()
+}

@@ -1,0 +1,263 @@
+//! Server-sent events: what happens in the plant, and the frames on the buses.
+//!
+//! A stream ends when the gateway stops, and when a reload takes its source away; the client then connects
+//! again. A listener that is too slow loses the oldest items and is told how many.
+
+use std::convert::Infallible;
+use std::fmt::Write as _;
+use std::sync::{Arc, OnceLock};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use axum::Json;
+use axum::extract::{RawQuery, State};
+use axum::http::{HeaderMap, HeaderName, StatusCode, header};
+use axum::response::sse::{Event as Message, KeepAlive, Sse};
+use axum::response::{IntoResponse, Response};
+use futures_util::{Stream, StreamExt, stream};
+use percent_encoding::percent_decode_str;
+use serde::Serialize;
+use tokio::sync::{OwnedSemaphorePermit, broadcast};
+use tokio_stream::wrappers::BroadcastStream;
+use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
+
+use super::routes::{Served, not_found};
+use super::{MAX_LISTENERS, api};
+use crate::cache::{Direction, FrameRecord};
+use crate::event::Event;
+
+/// Time after which a browser connects again.
+const RETRY: Duration = Duration::from_secs(2);
+
+/// Cadence of comments on a stream without news: tells dead connections, keeps proxies patient.
+const KEEP_ALIVE: Duration = Duration::from_secs(10);
+
+const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
+
+/// `GET /api/v1/events`: the kept events that the client does not have yet, then each as it happens. A client
+/// that wants JSON instead gets the kept ones only, and no stream.
+pub(super) async fn events(State(served): State<Arc<Served>>, headers: HeaderMap) -> Response {
+    let plant = served.plant.load();
+    // Heard from before the kept ones are read: what comes between is in both, and is told once.
+    let live = plant.events.subscribe();
+    let mut kept = plant.events.recent();
+    let newest = kept.last().map_or(0, |event| event.id);
+    let seen = header_text(&headers, &LAST_EVENT_ID)
+        .and_then(|id| last_seen(id, instance()))
+        .filter(|seen| *seen <= newest)
+        .unwrap_or(0);
+    kept.retain(|event| event.id > seen);
+    let accept = header_text(&headers, &header::ACCEPT).unwrap_or_default();
+    if accept.contains("application/json") && !accept.contains("text/event-stream") {
+        let kept = Kept {
+            last: event_id(newest),
+            events: kept.iter().map(Arc::as_ref).collect(),
+        };
+        return ([(header::VARY, "accept")], Json(kept)).into_response();
+    }
+    let Some(place) = place(&served) else {
+        return full();
+    };
+    let kept: Vec<Message> = kept.iter().map(|event| event_message(event)).collect();
+    let live = hear(live, move |event| (event.id > newest).then(|| event_message(&event)));
+    respond(stream::iter(kept).chain(live), &served, place)
+}
+
+/// `GET /api/v1/trace?bus=`: the frames of one bus, or of all, from now on.
+pub(super) async fn trace(State(served): State<Arc<Served>>, RawQuery(query): RawQuery) -> Response {
+    let wanted = match query.as_deref().map(bus_of) {
+        None | Some(Ok(None)) => None,
+        Some(Ok(Some(name))) => Some(name),
+        Some(Err(error)) => {
+            let known = Vec::new();
+            return (StatusCode::BAD_REQUEST, Json(api::Problem { error, known })).into_response();
+        }
+    };
+    let plant = served.plant.load();
+    let buses = plant.buses.iter().map(|bus| &bus.image);
+    let heard: Vec<_> = buses
+        .filter(|image| wanted.as_ref().is_none_or(|name| *name == image.spec.name))
+        .map(|image| {
+            let bus = image.spec.name.clone();
+            hear(image.trace.subscribe(), move |frame| Some(frame_message(&bus, &frame))).boxed()
+        })
+        .collect();
+    if let (Some(name), true) = (wanted, heard.is_empty()) {
+        let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+        return not_found(format!("there is no bus `{name}`"), known.collect());
+    }
+    match place(&served) {
+        Some(place) => respond(stream::select_all(heard), &served, place),
+        None => full(),
+    }
+}
+
+fn place(served: &Served) -> Option<OwnedSemaphorePermit> {
+    served.listeners.clone().try_acquire_owned().ok()
+}
+
+fn full() -> Response {
+    let problem = api::Problem {
+        error: format!("{MAX_LISTENERS} event streams are open; close one and try again"),
+        known: Vec::new(),
+    };
+    let retry = [(header::RETRY_AFTER, "5")];
+    (StatusCode::SERVICE_UNAVAILABLE, retry, Json(problem)).into_response()
+}
+
+/// What arrives, as messages; losses become a message of their own.
+fn hear<T: Clone + Send + 'static>(
+    receiver: broadcast::Receiver<T>,
+    message: impl Fn(T) -> Option<Message> + Send + 'static,
+) -> impl Stream<Item = Message> + Send + 'static {
+    BroadcastStream::new(receiver).filter_map(move |item| {
+        std::future::ready(match item {
+            Ok(item) => message(item),
+            Err(Lost::Lagged(lost)) => Some(Message::default().event("lagged").data(format!("{{\"lost\":{lost}}}"))),
+        })
+    })
+}
+
+/// The reply; `place` is given back when the stream ends or the client leaves.
+fn respond(
+    messages: impl Stream<Item = Message> + Send + 'static,
+    served: &Served,
+    place: OwnedSemaphorePermit,
+) -> Response {
+    // Something is sent at once, so that a client sees the stream open before there is news.
+    let hello = Message::default().retry(RETRY).comment("open");
+    let messages = stream::iter([hello])
+        .chain(messages)
+        .take_until(served.cancel.clone().cancelled_owned())
+        .map(move |message| {
+            let _held = &place;
+            Ok::<_, Infallible>(message)
+        });
+    let keep_alive = KeepAlive::new().interval(KEEP_ALIVE).text("alive");
+    // Proxies of the nginx kind hold a reply back until it is whole, unless told otherwise.
+    let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
+    (unbuffered, Sse::new(messages).keep_alive(keep_alive)).into_response()
+}
+
+/// Tells this run of the program from others: the running numbers of events begin anew with each.
+fn instance() -> &'static str {
+    static INSTANCE: OnceLock<String> = OnceLock::new();
+    INSTANCE.get_or_init(|| {
+        let start = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+        format!("{:x}", start.as_millis())
+    })
+}
+
+/// Number of the last event that a client has of this run; `None` if it has none.
+fn last_seen(id: &str, instance: &str) -> Option<u64> {
+    let number = match id.split_once('-') {
+        Some((run, number)) if run == instance => number,
+        Some(_) => return None,
+        None => id,
+    };
+    number.trim().parse().ok()
+}
+
+fn event_id(number: u64) -> String {
+    format!("{}-{number}", instance())
+}
+
+/// The kept events for a client that asks now and then.
+#[derive(Debug, Serialize)]
+struct Kept<'e> {
+    /// To be sent as `Last-Event-ID` the next time.
+    last: String,
+    events: Vec<&'e Event>,
+}
+
+fn event_message(event: &Event) -> Message {
+    json(Message::default().id(event_id(event.id)), event)
+}
+
+fn header_text<'h>(headers: &'h HeaderMap, name: &HeaderName) -> Option<&'h str> {
+    headers.get(name).and_then(|value| value.to_str().ok())
+}
+
+/// A frame in JSON.
+#[derive(Debug, Serialize)]
+struct Frame<'f> {
+    bus: &'f str,
+    time: String,
+    gap_us: Option<u64>,
+    direction: Direction,
+    hex: String,
+    verdict: &'f str,
+}
+
+fn frame_message(bus: &str, record: &FrameRecord) -> Message {
+    let frame = Frame {
+        bus,
+        time: humantime::format_rfc3339_micros(record.time).to_string(),
+        gap_us: record.gap.map(|gap| u64::try_from(gap.as_micros()).unwrap_or(u64::MAX)),
+        direction: record.direction,
+        hex: hex(&record.bytes),
+        verdict: &record.verdict,
+    };
+    json(Message::default(), &frame)
+}
+
+fn json(message: Message, data: &impl Serialize) -> Message {
+    // Strings and numbers always serialize; an empty object would show otherwise.
+    message.data(serde_json::to_string(data).unwrap_or_else(|_| "{}".to_string()))
+}
+
+/// `01 03 08 34`.
+fn hex(bytes: &[u8]) -> String {
+    let mut text = String::with_capacity(bytes.len() * 3);
+    for (place, byte) in bytes.iter().enumerate() {
+        let gap = if place == 0 { "" } else { " " };
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{gap}{byte:02X}");
+    }
+    text
+}
+
+/// The bus that a query names; an empty name is none.
+fn bus_of(query: &str) -> Result<Option<String>, String> {
+    let mut bus = None;
+    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
+        match pair.split_once('=').unwrap_or((pair, "")) {
+            ("bus", name) => {
+                let name = percent_decode_str(name).decode_utf8_lossy().into_owned();
+                bus = Some(name).filter(|name| !name.is_empty());
+            }
+            (other, _) => return Err(format!("unknown parameter `{other}`; there is `bus`")),
+        }
+    }
+    Ok(bus)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn queries() {
+        assert_eq!(bus_of(""), Ok(None));
+        assert_eq!(bus_of("bus="), Ok(None));
+        assert_eq!(bus_of("bus=line1"), Ok(Some("line1".to_string())));
+        assert_eq!(bus_of("&bus=line%201&"), Ok(Some("line 1".to_string())));
+        assert!(bus_of("line=1").is_err());
+        assert!(bus_of("bus=%ff").is_ok(), "no name, but no harm either");
+    }
+
+    #[test]
+    fn ids_of_other_runs_count_for_nothing() {
+        assert_eq!(last_seen("a1-7", "a1"), Some(7));
+        assert_eq!(last_seen("a2-7", "a1"), None);
+        assert_eq!(last_seen("7", "a1"), Some(7));
+        for rubbish in ["", "-", "a1-", "a1-x", "x"] {
+            assert_eq!(last_seen(rubbish, "a1"), None, "{rubbish}");
+        }
+    }
+
+    #[test]
+    fn bytes_as_in_the_manuals() {
+        assert_eq!(hex(&[0x01, 0x03, 0xAB]), "01 03 AB");
+        assert_eq!(hex(&[]), "");
+    }
+}

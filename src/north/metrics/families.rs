@@ -1,0 +1,349 @@
+//! The families of series and what they are made of.
+
+use std::sync::atomic::Ordering;
+use std::time::Instant;
+
+use super::model::MODEL;
+use super::process;
+use crate::cache::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
+use crate::drive::{PollClass, State};
+use crate::north::NorthStats;
+use crate::plant::{BusHandle, Plant};
+
+/// Commit the program was built from, set by whoever builds a release.
+const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");
+
+/// Label names and values.
+pub(super) type Labels = Vec<(&'static str, String)>;
+
+/// Kind of a family.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Gauge,
+    Counter,
+    Histogram,
+}
+
+/// Value of one series.
+#[derive(Debug)]
+pub(super) enum Figure {
+    /// Of a gauge.
+    Value(f64),
+    /// Of a counter of things.
+    Count(u64),
+    /// Of a counter of seconds.
+    Total(f64),
+    /// Of a histogram.
+    Histogram(HistogramSnapshot),
+}
+
+/// Series of one name.
+#[derive(Debug)]
+pub(super) struct Family {
+    pub(super) name: &'static str,
+    pub(super) help: &'static str,
+    pub(super) kind: Kind,
+    pub(super) series: Vec<(Labels, Figure)>,
+}
+
+impl Family {
+    fn new(kind: Kind, name: &'static str, help: &'static str) -> Family {
+        Family {
+            name,
+            help,
+            kind,
+            series: Vec::new(),
+        }
+    }
+
+    fn of(kind: Kind, name: &'static str, help: &'static str, figure: Figure) -> Family {
+        let mut family = Family::new(kind, name, help);
+        family.add(Vec::new(), figure);
+        family
+    }
+
+    fn add(&mut self, labels: Labels, figure: Figure) {
+        self.series.push((labels, figure));
+    }
+}
+
+/// All families; those without a series are left out of the text.
+pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
+    let mut all = Vec::new();
+    drives(plant, now, &mut all);
+    buses(&plant.buses, &mut all);
+    writes(plant, &mut all);
+    north(stats, &mut all);
+    all.push(build(plant));
+    process(&process::read(), &mut all);
+    all
+}
+
+fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
+    let gauge = |name, help| Family::new(Kind::Gauge, name, help);
+    let mut up = gauge(
+        "drivegate_drive_up",
+        "Whether the drive answers: 1, else 0 (also before its first answer).",
+    );
+    let mut state = gauge(
+        "drivegate_drive_state",
+        "State of the drive: 1 for the state it is in, 0 for the others.",
+    );
+    let mut age = gauge(
+        "drivegate_drive_sample_age_seconds",
+        "Age of the drive's process data; absent while it was never read.",
+    );
+    let mut model: Vec<Family> = MODEL.iter().map(|(_, name, help)| gauge(name, help)).collect();
+    let mut point = gauge(
+        "drivegate_point_value",
+        "Points of a drive without a metric of their own, in their unit; true is 1.",
+    );
+    let mut transactions = Family::new(
+        Kind::Counter,
+        "drivegate_drive_transactions_total",
+        "Exchanges with the drive by their outcome.",
+    );
+    let mut turnaround = gauge(
+        "drivegate_drive_turnaround_seconds",
+        "Time from the end of the last request to the beginning of the drive's answer.",
+    );
+    for drive in plant.drives() {
+        let image = &drive.image;
+        let labels = labels_of(image);
+        let reading = drive.reading(now);
+        up.add(labels.clone(), yes(reading.snapshot.link.is_online()));
+        let current = reading.state();
+        for one in State::ALL {
+            state.add(with(&labels, "state", one.name()), yes(one == current));
+        }
+        if let Some(time) = reading.age() {
+            age.add(labels.clone(), Figure::Value(time.as_secs_f64()));
+        }
+        points(&reading, &labels, &mut model, &mut point);
+        for outcome in Outcome::ALL {
+            let count = Figure::Count(image.counted(outcome));
+            transactions.add(with(&labels, "outcome", outcome.name()), count);
+        }
+        if let Some(time) = image.turnaround() {
+            turnaround.add(labels, Figure::Value(time.as_secs_f64()));
+        }
+    }
+    all.extend([up, state, age]);
+    all.append(&mut model);
+    all.extend([point, transactions, turnaround]);
+}
+
+/// The good points of a drive; `model` has the families of [`MODEL`], in its order.
+fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &mut Family) {
+    let profile = &reading.spec.profile;
+    for (index, name) in public_points(profile) {
+        let Some(value) = reading
+            .sample(index)
+            .good()
+            .map(|v| v.as_f64())
+            .filter(|v| v.is_finite())
+        else {
+            continue;
+        };
+        let point = profile.points.get(index);
+        let own = point.and_then(|p| p.model).and_then(|m| {
+            let place = MODEL.iter().position(|(wanted, ..)| *wanted == m)?;
+            model.get_mut(place)
+        });
+        match own {
+            Some(family) => family.add(labels.clone(), Figure::Value(value)),
+            None => {
+                let mut labels = with(labels, "point", name);
+                labels.push(("unit", point.map(|p| p.unit.clone()).unwrap_or_default()));
+                other.add(labels, Figure::Value(value));
+            }
+        }
+    }
+}
+
+fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
+    type Of<T> = fn(&BusImage, &BusHealth) -> T;
+    let gauges: [(&str, &str, Of<f64>); 2] = [
+        (
+            "drivegate_bus_up",
+            "Whether the port of the bus is open: 1, else 0.",
+            |_, health| f64::from(u8::from(health.up)),
+        ),
+        (
+            "drivegate_bus_load_ratio",
+            "Share of the last second that the line was in use, 0 to 1.",
+            |_, health| health.load,
+        ),
+    ];
+    let looks: Vec<(Labels, &BusHandle, BusHealth)> = handles
+        .iter()
+        .map(|h| (vec![("bus", h.image.spec.name.clone())], h, h.image.health()))
+        .collect();
+    for (name, help, value) in gauges {
+        let mut family = Family::new(Kind::Gauge, name, help);
+        for (labels, handle, health) in &looks {
+            family.add(labels.clone(), Figure::Value(value(&handle.image, health)));
+        }
+        all.push(family);
+    }
+    let mut cycles = Family::new(
+        Kind::Histogram,
+        "drivegate_bus_cycle_seconds",
+        "Achieved cycle: time from the start of a poll round to the start of the next, by poll class.",
+    );
+    let mut transactions = Family::new(
+        Kind::Histogram,
+        "drivegate_bus_transaction_seconds",
+        "Time of whole exchanges on the bus.",
+    );
+    let mut queue = Family::new(
+        Kind::Gauge,
+        "drivegate_bus_queue_depth",
+        "Commands and forwarded reads that wait for the bus.",
+    );
+    for (labels, handle, _) in looks {
+        let image = &handle.image;
+        for (class, times) in [
+            (PollClass::Fast, &image.fast_cycles),
+            (PollClass::Slow, &image.slow_cycles),
+        ] {
+            cycles.add(
+                with(&labels, "class", class.name()),
+                Figure::Histogram(times.snapshot()),
+            );
+        }
+        transactions.add(labels.clone(), Figure::Histogram(image.transactions.snapshot()));
+        queue.add(labels, Figure::Value(handle.queue.lock().len() as f64));
+    }
+    all.extend([cycles, transactions, queue]);
+}
+
+fn writes(plant: &Plant, all: &mut Vec<Family>) {
+    let mut results = Family::new(
+        Kind::Counter,
+        "drivegate_writes_total",
+        "Commands answered, by where they came from and how they ended.",
+    );
+    for ((source, result), count) in plant.writes.results() {
+        let labels = vec![("source", source.name().to_string()), ("result", result.to_string())];
+        results.add(labels, Figure::Count(count));
+    }
+    all.push(results);
+    all.push(Family::of(
+        Kind::Histogram,
+        "drivegate_write_seconds",
+        "Time from the acceptance of a command to its answer.",
+        Figure::Histogram(plant.writes.seconds()),
+    ));
+}
+
+fn north(stats: &NorthStats, all: &mut Vec<Family>) {
+    all.push(Family::of(
+        Kind::Gauge,
+        "drivegate_modbus_tcp_connections",
+        "Modbus TCP clients connected now.",
+        Figure::Value(stats.modbus_tcp.connections() as f64),
+    ));
+    let mut requests = Family::new(
+        Kind::Counter,
+        "drivegate_modbus_tcp_requests_total",
+        "Modbus TCP requests answered, by function code and outcome.",
+    );
+    for (function, outcome, count) in stats.modbus_tcp.requests() {
+        let labels = vec![("function", function), ("outcome", outcome.to_string())];
+        requests.add(labels, Figure::Count(count));
+    }
+    all.push(requests);
+    let mqtt = &stats.mqtt;
+    all.push(Family::of(
+        Kind::Gauge,
+        "drivegate_mqtt_connected",
+        "Whether the gateway is connected to its MQTT broker: 1, else 0 (also without one configured).",
+        yes(mqtt.connected.load(Ordering::Relaxed)),
+    ));
+    all.push(Family::of(
+        Kind::Counter,
+        "drivegate_mqtt_published_total",
+        "Messages that the MQTT broker took.",
+        Figure::Count(mqtt.published.load(Ordering::Relaxed)),
+    ));
+    all.push(Family::of(
+        Kind::Gauge,
+        "drivegate_mqtt_buffered_messages",
+        "Messages that wait for the MQTT broker.",
+        Figure::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
+    ));
+}
+
+fn build(plant: &Plant) -> Family {
+    let labels = vec![
+        ("version", env!("CARGO_PKG_VERSION").to_string()),
+        ("commit", COMMIT.unwrap_or("unknown").to_string()),
+        ("gateway", plant.gateway.clone()),
+    ];
+    let mut family = Family::new(
+        Kind::Gauge,
+        "drivegate_build_info",
+        "Always 1; what was built, and the name of the gateway.",
+    );
+    family.add(labels, Figure::Value(1.0));
+    family
+}
+
+fn process(figures: &process::Figures, all: &mut Vec<Family>) {
+    if let Some(seconds) = figures.cpu_seconds {
+        all.push(Family::of(
+            Kind::Counter,
+            "process_cpu_seconds_total",
+            "Processor time of the process, user and system.",
+            Figure::Total(seconds),
+        ));
+    }
+    let gauges = [
+        (
+            "process_open_fds",
+            "Open file descriptors of the process.",
+            figures.open_fds,
+        ),
+        (
+            "process_max_fds",
+            "File descriptors that the process may open.",
+            figures.max_fds,
+        ),
+        (
+            "process_virtual_memory_bytes",
+            "Virtual memory of the process.",
+            figures.virtual_bytes,
+        ),
+        (
+            "process_resident_memory_bytes",
+            "Resident memory of the process.",
+            figures.resident_bytes,
+        ),
+        (
+            "process_start_time_seconds",
+            "Start of the process, Unix time.",
+            figures.start_seconds,
+        ),
+        ("process_threads", "Threads of the process.", figures.threads),
+    ];
+    for (name, help, value) in gauges {
+        if let Some(value) = value {
+            all.push(Family::of(Kind::Gauge, name, help, Figure::Value(value)));
+        }
+    }
+}
+
+fn labels_of(drive: &DriveImage) -> Labels {
+    vec![("bus", drive.spec.bus.clone()), ("drive", drive.spec.name.clone())]
+}
+
+fn with(labels: &Labels, name: &'static str, value: &str) -> Labels {
+    let mut labels = labels.clone();
+    labels.push((name, value.to_string()));
+    labels
+}
+
+fn yes(it_is: bool) -> Figure {
+    Figure::Value(f64::from(u8::from(it_is)))
+}

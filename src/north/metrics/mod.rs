@@ -1,0 +1,177 @@
+//! Prometheus metrics: one look at the plant, as families of series (public contract, section 7).
+//!
+//! The names are frozen. Every drive is read once a scrape, so its series belong together. A point that is
+//! not good has no series: a graph shows a gap, never an old figure.
+
+mod families;
+mod model;
+mod process;
+
+use std::fmt;
+use std::time::Instant;
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, MetricEncoder};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::registry::Registry;
+
+use self::families::{Family, Figure, Kind};
+use super::NorthStats;
+use crate::plant::Plant;
+
+/// Text formats of an exposition.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Format {
+    /// Prometheus text format 0.0.4: a counter's family is named like its series.
+    Prometheus,
+    /// OpenMetrics 1.0.0: a counter's family lacks the `_total` of its series; ends with `# EOF`.
+    OpenMetrics,
+}
+
+impl Format {
+    /// The format for an `Accept` header: OpenMetrics for those that ask for it by name and prefer it.
+    pub fn accepted(accept: &str) -> Format {
+        let quality = |wanted: &[&str]| {
+            accept
+                .split(',')
+                .filter_map(|range| weight(range, wanted))
+                .fold(0.0, f64::max)
+        };
+        let open_metrics = quality(&["application/openmetrics-text"]);
+        if open_metrics > 0.0 && open_metrics >= quality(&["text/plain", "text/*"]) {
+            Format::OpenMetrics
+        } else {
+            Format::Prometheus
+        }
+    }
+
+    /// The content type.
+    pub fn content_type(self) -> &'static str {
+        match self {
+            Format::Prometheus => "text/plain; version=0.0.4; charset=utf-8",
+            Format::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
+        }
+    }
+}
+
+/// Weight of a media range of an `Accept` header if it is one of `wanted`.
+fn weight(range: &str, wanted: &[&str]) -> Option<f64> {
+    let mut parts = range.split(';').map(str::trim);
+    let media = parts.next()?;
+    if !wanted.iter().any(|w| w.eq_ignore_ascii_case(media)) {
+        return None;
+    }
+    let q = parts.find_map(|p| p.strip_prefix("q=").or_else(|| p.strip_prefix("Q=")));
+    Some(
+        q.and_then(|q| q.trim().parse().ok())
+            .map_or(1.0, |q: f64| q.clamp(0.0, 1.0)),
+    )
+}
+
+/// All metrics as text.
+///
+/// # Errors
+/// Only when the encoder fails, which writing to a string does not.
+pub fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -> Result<String, fmt::Error> {
+    let mut registry = Registry::default();
+    registry.register_collector(Box::new(Scrape {
+        families: families::collect(plant, stats, now),
+        format,
+    }));
+    let mut text = String::new();
+    match format {
+        Format::Prometheus => prometheus_client::encoding::text::encode_registry(&mut text, &registry)?,
+        Format::OpenMetrics => prometheus_client::encoding::text::encode(&mut text, &registry)?,
+    }
+    Ok(text)
+}
+
+#[derive(Debug)]
+struct Scrape {
+    families: Vec<Family>,
+    format: Format,
+}
+
+impl Collector for Scrape {
+    fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), fmt::Error> {
+        for family in self.families.iter().filter(|f| !f.series.is_empty()) {
+            let kind = match family.kind {
+                Kind::Gauge => MetricType::Gauge,
+                Kind::Counter => MetricType::Counter,
+                Kind::Histogram => MetricType::Histogram,
+            };
+            let name = match (self.format, family.kind) {
+                (Format::OpenMetrics, Kind::Counter) => family.name.trim_end_matches("_total"),
+                _ => family.name,
+            };
+            let mut metric = encoder.encode_descriptor(name, family.help, None, kind)?;
+            for (labels, figure) in &family.series {
+                if labels.is_empty() {
+                    self.figure(figure, &mut metric)?;
+                } else {
+                    self.figure(figure, &mut metric.encode_family(labels)?)?;
+                }
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Scrape {
+    fn figure(&self, figure: &Figure, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
+        type NoLabels = [(&'static str, &'static str); 0];
+        match (figure, self.format) {
+            (Figure::Value(value), _) => gauge(*value, metric),
+            // The library appends `_total` to a counter; in the older format the name has it already.
+            (Figure::Count(count), Format::Prometheus) => metric.encode_gauge(count),
+            (Figure::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
+            (Figure::Total(total), Format::Prometheus) => metric.encode_gauge(total),
+            (Figure::Total(total), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, f64>(total, None),
+            (Figure::Histogram(times), _) => {
+                // The unbounded bucket of the image has the greatest number as its bound.
+                let buckets: Vec<(f64, u64)> = times
+                    .buckets
+                    .iter()
+                    .map(|&(bound, count)| (if bound == f64::MAX { f64::INFINITY } else { bound }, count))
+                    .collect();
+                metric.encode_histogram::<NoLabels>(times.sum, times.count, &buckets, None)
+            }
+        }
+    }
+}
+
+/// Whole figures without a fraction: `1`, not `1.0`.
+fn gauge(value: f64, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
+    const EXACT: f64 = 9_007_199_254_740_992.0;
+    if value.fract() == 0.0 && value.abs() < EXACT {
+        metric.encode_gauge(&(value as i64))
+    } else {
+        metric.encode_gauge(&value)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn open_metrics_only_for_those_that_ask() {
+        let prometheus = "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;\
+            q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1";
+        assert_eq!(Format::accepted(prometheus), Format::OpenMetrics);
+        for plain in [
+            "",
+            "*/*",
+            "text/plain",
+            "application/openmetrics-text;q=0",
+            "application/openmetrics-text;q=0.2, text/plain;q=0.9",
+            "application/json, text/*",
+        ] {
+            assert_eq!(Format::accepted(plain), Format::Prometheus, "{plain}");
+        }
+        assert_eq!(
+            Format::accepted("Application/OpenMetrics-Text; q=0.5, */*"),
+            Format::OpenMetrics
+        );
+    }
+}
