@@ -151,11 +151,15 @@ impl DriveHandle {
 
     /// Refuses a command before it became an order; audited, counted and told like any other refusal.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin) -> Answer {
-        let now = Instant::now();
         self.tell_refusal(what, &refusal.to_string(), &origin);
+        self.turn_away(what, Outcome::Refused(refusal), origin)
+    }
+
+    /// Answers a command that is not taken, for a reason that is not the client's fault; audited and counted.
+    pub fn turn_away(&self, what: &str, outcome: Outcome, origin: Origin) -> Answer {
+        let now = Instant::now();
         let name = &self.image.spec.name;
         let (ticket, _) = Ticket::new(origin, name, what.to_string(), true, now, self.writes.clone());
-        let outcome = Outcome::Refused(refusal);
         ticket.answer(outcome.clone(), now);
         Answer {
             outcome,

@@ -1,0 +1,367 @@
+//! The set topics: from a message to one order, and from its answer to one result.
+
+use std::collections::VecDeque;
+use std::hash::{BuildHasher, RandomState};
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+use serde_json::Value as Json;
+use tokio::task::JoinSet;
+
+use super::connection::is_topic;
+use super::outbox::Message;
+use super::payload::{self, Topics};
+use super::request::{self, Incoming, MAX_NAME, excerpt};
+use crate::command::{Answer, Order, Origin, Outcome, SourceKind};
+use crate::document::nearest;
+use crate::plant::Plant;
+
+/// Commands that wait for their answer.
+const MAX_RUNNING: usize = 64;
+/// Messages remembered to recognise a repetition.
+const REMEMBERED: usize = 256;
+
+/// Takes commands and gives their results.
+#[derive(Debug)]
+pub(super) struct Commands {
+    topics: Topics,
+    running: JoinSet<(u64, Message)>,
+    hasher: RandomState,
+    /// Commands taken, oldest first: fingerprint, and the result once it is there.
+    recent: VecDeque<(u64, Option<Message>)>,
+}
+
+impl Commands {
+    pub(super) fn new(topics: Topics) -> Commands {
+        Commands {
+            topics,
+            running: JoinSet::new(),
+            hasher: RandomState::new(),
+            recent: VecDeque::new(),
+        }
+    }
+
+    /// Takes a message; returns its result if it is there at once. A repetition of a command (QoS 1) is
+    /// answered from memory and not carried out again.
+    pub(super) fn take(&mut self, incoming: Incoming, plant: &Plant) -> Option<Message> {
+        let target = self.topics.parse_set(&incoming.topic)?;
+        if incoming.retain && incoming.payload.is_empty() {
+            return None; // somebody takes a retained message away
+        }
+        let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
+        let Some(drive) = plant.drive(target.drive) else {
+            let text = unknown_drive(target.drive, plant);
+            tracing::warn!(topic = %incoming.topic, "command refused: {text}");
+            return Some(reply.message(None, "unknown_drive", Some(text), Duration::ZERO));
+        };
+        let fingerprint = self
+            .hasher
+            .hash_one((incoming.packet, &incoming.topic, &incoming.payload));
+        if incoming.dup
+            && let Some((_, result)) = self.recent.iter().find(|(known, _)| *known == fingerprint)
+        {
+            return result.clone();
+        }
+        let origin = Origin {
+            kind: SourceKind::Mqtt,
+            who: incoming.topic.clone(),
+        };
+        let request = request::read(&incoming, target.point, &drive.image.spec.profile);
+        let what = || excerpt(&incoming.payload);
+        let answer = match request.order {
+            Err(refusal) => drive.refuse(&what(), refusal, origin),
+            Ok(_) if self.running.len() >= MAX_RUNNING => drive.turn_away(&what(), Outcome::QueueFull, origin),
+            Ok((points, expiry)) => {
+                self.remember(fingerprint);
+                self.running.spawn(async move {
+                    let answer = drive.order(Order::Points(points), origin, true, expiry).await;
+                    (fingerprint, reply.answer(request.id, &answer))
+                });
+                return None;
+            }
+        };
+        Some(reply.answer(request.id, &answer))
+    }
+
+    fn remember(&mut self, fingerprint: u64) {
+        if self.recent.len() == REMEMBERED {
+            self.recent.pop_front();
+        }
+        self.recent.push_back((fingerprint, None));
+    }
+
+    /// The next result; waits for ever when no command is running. May be cancelled without loss.
+    pub(super) async fn finished(&mut self) -> Message {
+        loop {
+            match self.running.join_next().await {
+                Some(Ok((fingerprint, message))) => {
+                    let known = self.recent.iter_mut().find(|(f, _)| *f == fingerprint);
+                    if let Some((_, result)) = known {
+                        *result = Some(message.clone());
+                    }
+                    return message;
+                }
+                Some(Err(error)) => tracing::error!("a command ended unexpectedly: {error}"),
+                None => std::future::pending().await,
+            }
+        }
+    }
+
+    /// Whether no command waits for its answer.
+    pub(super) fn is_idle(&self) -> bool {
+        self.running.is_empty()
+    }
+}
+
+fn unknown_drive(name: &str, plant: &Plant) -> String {
+    let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
+    let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));
+    let hint = near
+        .flatten()
+        .map_or(String::new(), |near| format!("; did you mean `{near}`?"));
+    format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
+}
+
+/// Where a result goes.
+#[derive(Debug, Clone)]
+struct Reply {
+    topic: String,
+    correlation: Option<Vec<u8>>,
+    drive: String,
+}
+
+#[derive(Serialize)]
+struct ResultObject<'r> {
+    id: Option<Json>,
+    drive: &'r str,
+    ok: bool,
+    result: &'r str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<ErrorObject<'r>>,
+    latency_ms: f64,
+    time: String,
+}
+
+#[derive(Serialize)]
+struct ErrorObject<'r> {
+    code: &'r str,
+    message: String,
+}
+
+impl Reply {
+    /// To the response topic of a request that names one, else to the result topic of the drive.
+    fn to(incoming: &Incoming, result: String, drive: &str) -> Reply {
+        let asked = incoming.response_topic.clone().filter(|topic| is_topic(topic));
+        Reply {
+            correlation: incoming.correlation.clone().filter(|_| asked.is_some()),
+            topic: asked.unwrap_or(result),
+            drive: drive.to_string(),
+        }
+    }
+
+    fn answer(&self, id: Option<Json>, answer: &Answer) -> Message {
+        let text = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
+        self.message(id, answer.outcome.code(), text, answer.latency)
+    }
+
+    fn message(&self, id: Option<Json>, code: &str, error: Option<String>, latency: Duration) -> Message {
+        let object = ResultObject {
+            id,
+            drive: &self.drive,
+            ok: error.is_none(),
+            result: code,
+            error: error.map(|message| ErrorObject { code, message }),
+            latency_ms: payload::milliseconds(latency),
+            time: payload::rfc3339(SystemTime::now()),
+        };
+        // Strings, figures and what was JSON before: this cannot fail.
+        let payload = serde_json::to_vec(&object).unwrap_or_default();
+        Message {
+            correlation: self.correlation.clone(),
+            ..Message::passing(self.topic.as_str(), payload)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::fixture;
+    use super::*;
+    use crate::codec::Reply as BusReply;
+    use crate::command::Urgency;
+    use std::time::Instant;
+
+    struct Bench {
+        plant: Plant,
+        commands: Commands,
+        events: tokio::sync::broadcast::Receiver<std::sync::Arc<crate::event::Event>>,
+    }
+
+    impl Bench {
+        fn new() -> Bench {
+            let plant = fixture::plant(&["p1"]);
+            fixture::read(&plant, "p1", 1, 0, Instant::now());
+            Bench {
+                events: plant.events.subscribe(),
+                commands: Commands::new(Topics::new("drivegate", "hall")),
+                plant,
+            }
+        }
+
+        fn take(&mut self, incoming: Incoming) -> Option<Message> {
+            self.commands.take(incoming, &self.plant)
+        }
+
+        fn queued(&self) -> usize {
+            self.plant.buses[0].queue.lock().len()
+        }
+
+        /// Lets the spawned commands get as far as they can, then acknowledges one.
+        async fn acknowledge(&mut self) -> Json {
+            loop {
+                let command = self.plant.buses[0].queue.lock().pop(Urgency::Read, Instant::now());
+                if let Some(command) = command {
+                    let outcome = Outcome::Acknowledged(BusReply::Written);
+                    command.ticket.answer(outcome, Instant::now());
+                    return json(&self.commands.finished().await);
+                }
+                tokio::task::yield_now().await;
+            }
+        }
+    }
+
+    fn json(message: &Message) -> Json {
+        serde_json::from_slice(&message.payload).unwrap()
+    }
+
+    fn set(topic: &str, payload: &str) -> Incoming {
+        Incoming {
+            topic: format!("drivegate/hall/drive/{topic}"),
+            payload: payload.into(),
+            packet: 1,
+            ..Incoming::default()
+        }
+    }
+
+    #[tokio::test]
+    async fn a_command_is_carried_out_and_answered() {
+        let mut bench = Bench::new();
+        assert_eq!(bench.take(set("p1/set", r#"{"id": 5, "run": true}"#)), None);
+        let result = bench.acknowledge().await;
+        assert_eq!(result["id"], 5);
+        assert_eq!(
+            (&result["ok"], &result["result"]),
+            (&true.into(), &"acknowledged".into())
+        );
+        assert!(result["latency_ms"].is_number() && result.get("error").is_none());
+        assert!(bench.commands.is_idle());
+    }
+
+    #[tokio::test]
+    async fn a_response_topic_gets_the_result_and_the_correlation() {
+        let mut bench = Bench::new();
+        let request = Incoming {
+            response_topic: Some("client/7".to_string()),
+            correlation: Some(vec![1, 0, 255]),
+            ..set("p1/set", "no")
+        };
+        let result = bench.take(request.clone()).unwrap();
+        assert_eq!(
+            (result.topic.as_ref(), result.correlation),
+            ("client/7", Some(vec![1, 0, 255]))
+        );
+        for bad in ["", "a/+", "#", "a\0b"] {
+            let request = Incoming {
+                response_topic: Some(bad.to_string()),
+                ..request.clone()
+            };
+            let result = bench.take(request).unwrap();
+            assert_eq!(result.topic.as_ref(), "drivegate/hall/drive/p1/result", "{bad:?}");
+            assert_eq!(result.correlation, None);
+        }
+    }
+
+    #[tokio::test]
+    async fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
+        let mut bench = Bench::new();
+        for (incoming, code) in [
+            (set("p1/set", "{"), "bad_value"),
+            (set("p1/set", r#"{"ready": true}"#), "not_writable"),
+            (
+                Incoming {
+                    retain: true,
+                    ..set("p1/set", r#"{"run": true}"#)
+                },
+                "not_allowed",
+            ),
+        ] {
+            let result = json(&bench.take(incoming).unwrap());
+            assert_eq!((&result["ok"], &result["error"]["code"]), (&false.into(), &code.into()));
+            assert!(!result["error"]["message"].as_str().unwrap().is_empty());
+            let event = bench.events.try_recv().unwrap();
+            assert_eq!(event.kind, crate::event::EventKind::RefusedCommand);
+        }
+        assert_eq!(bench.queued(), 0);
+        assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
+        let result = json(&bench.take(set("p11/set", "{}")).unwrap());
+        assert_eq!(result["error"]["code"], "unknown_drive");
+        assert!(
+            result["error"]["message"]
+                .as_str()
+                .unwrap()
+                .contains("did you mean `p1`?")
+        );
+        let cleared = Incoming {
+            retain: true,
+            ..set("p1/set", "")
+        };
+        assert_eq!(bench.take(cleared), None, "somebody cleans up");
+        assert!(bench.events.try_recv().is_err());
+    }
+
+    #[tokio::test]
+    async fn limits_are_refused_where_all_orders_are() {
+        let mut bench = Bench::new();
+        assert_eq!(bench.take(set("p1/set/speed_reference", "101")), None);
+        let result = json(&bench.commands.finished().await);
+        assert_eq!(result["error"]["code"], "bad_value");
+        assert_eq!(bench.take(set("p1/set", "{}")), None);
+        let result = json(&bench.commands.finished().await);
+        assert!(result["error"]["message"].as_str().unwrap().contains("names no point"));
+        assert_eq!(bench.queued(), 0);
+    }
+
+    #[tokio::test]
+    async fn a_repetition_is_answered_from_memory() {
+        let mut bench = Bench::new();
+        let first = set("p1/set", r#"{"id": 1, "run": true}"#);
+        assert_eq!(bench.take(first.clone()), None);
+        let repeated = Incoming {
+            dup: true,
+            ..first.clone()
+        };
+        assert_eq!(
+            bench.take(repeated.clone()),
+            None,
+            "still running: its result comes once"
+        );
+        let result = bench.acknowledge().await;
+        assert_eq!(json(&bench.take(repeated.clone()).unwrap()), result);
+        assert!(bench.commands.is_idle() && bench.queued() == 0);
+        // Not marked as a repetition, or another message: a new command, whatever its id.
+        assert_eq!(bench.take(first), None);
+        assert_eq!(bench.take(Incoming { packet: 2, ..repeated }), None);
+        bench.acknowledge().await;
+        bench.acknowledge().await;
+    }
+
+    #[tokio::test]
+    async fn too_many_commands_at_one_time_are_refused() {
+        let mut bench = Bench::new();
+        for _ in 0..MAX_RUNNING {
+            assert_eq!(bench.take(set("p1/set/run", "1")), None);
+        }
+        let result = json(&bench.take(set("p1/set/run", "1")).unwrap());
+        assert_eq!(result["error"]["code"], "queue_full");
+    }
+}

@@ -1,0 +1,108 @@
+//! MQTT client (public contract, section 6).
+//!
+//! ```text
+//! process image ──▶ publisher ──▶ ┌────────┐     connection        ┌────────┐
+//! events ──▶ journal (on disk) ─▶ │ outbox │ ──▶ (rumqttc, a task  │ broker │
+//! results ──────────────────────▶ └────────┘     of its own) ────▶ └────────┘
+//!                commands ◀──────────────────────── set topics ◀──────┘
+//! ```
+//!
+//! `payload`, `publisher` and `outbox` are pure: what is said, when, and in which order. `client` is the one
+//! task that owns them; `connection` wraps rumqttc, which keeps nothing for us: every connection is a new
+//! client with a clean session, and what the broker did not acknowledge is sent again from the outbox.
+
+mod client;
+mod commands;
+mod connection;
+#[cfg(test)]
+mod fixture;
+mod journal;
+mod outbox;
+mod payload;
+mod publisher;
+mod request;
+mod store;
+mod tls;
+
+use std::fmt;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+
+use super::NorthStats;
+use crate::plant::SharedPlant;
+
+/// A secret that does not show in logs.
+#[derive(Clone, PartialEq, Eq)]
+pub struct Secret(pub String);
+
+impl fmt::Debug for Secret {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("(secret)")
+    }
+}
+
+/// What the MQTT client is told.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Host of the broker.
+    pub host: String,
+    /// Port of the broker.
+    pub port: u16,
+    /// TLS (`mqtts://`).
+    pub tls: bool,
+    /// Client id.
+    pub client_id: String,
+    /// User name, with password.
+    pub username: Option<String>,
+    /// Password.
+    pub password: Option<Secret>,
+    /// CA certificates (PEM) for the broker; the system's when absent.
+    pub ca: Option<PathBuf>,
+    /// Client certificate chain and key (PEM).
+    pub identity: Option<(PathBuf, PathBuf)>,
+    /// First level of all topics.
+    pub base: String,
+    /// Least time between two publications of a topic.
+    pub min_interval: Duration,
+    /// Most time between two publications of a topic.
+    pub max_interval: Duration,
+    /// Whether the set topics are served.
+    pub commands: bool,
+    /// Where events are kept while the broker is away, and how many bytes; in memory only when absent.
+    pub buffer: Option<Buffer>,
+}
+
+/// Disk buffer for events.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Buffer {
+    /// Directory.
+    pub dir: PathBuf,
+    /// Most bytes on disk.
+    pub max_bytes: u64,
+}
+
+/// The running MQTT client.
+#[derive(Debug)]
+pub struct Mqtt(JoinHandle<()>);
+
+impl Mqtt {
+    /// Waits until the client has ended: at most about half a second after the cancellation, in which
+    /// `offline` is published and the connection closed.
+    pub async fn stopped(self) {
+        if let Err(error) = self.0.await {
+            tracing::error!("the MQTT client ended unexpectedly: {error}");
+        }
+    }
+}
+
+/// Starts the MQTT client; must be called within a Tokio runtime. It never gives up: a broker that is away is
+/// tried again and again. Events told from now on are published, so start it before the buses.
+pub fn start(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
+    // Subscribed here and not in the task: nothing told after this call is missed.
+    let events = plant.load().events.subscribe();
+    Mqtt(tokio::spawn(client::run(options, plant, stats, events, cancel)))
+}

@@ -1,0 +1,465 @@
+//! What is sent next, and what waits for its acknowledgement. Pure.
+//!
+//! Telemetry: the latest value per topic, the newest wins, one message per topic under way. Events and
+//! results: bounded queues in order. An entry leaves on its PubAck only. At most `limit` messages are under
+//! way: half the inflight window of the connection, so that packet ids are never used twice at one time.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::sync::Arc;
+
+use super::journal::RecordId;
+
+/// Results that may wait; the oldest is dropped.
+const RESULTS: usize = 256;
+/// Events that may wait in memory; with a buffer on disk the rest waits there.
+const EVENTS: usize = 1024;
+/// Events loaded from the disk at one time.
+const LOADED: usize = 64;
+/// Connections that may break under a result before it is given up: its response topic may be the cause.
+const RESULT_ATTEMPTS: u8 = 2;
+
+/// A message for the broker, QoS 1.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Message {
+    pub(super) topic: Arc<str>,
+    pub(super) payload: Vec<u8>,
+    pub(super) retain: bool,
+    /// Correlation data of the request that this answers.
+    pub(super) correlation: Option<Vec<u8>>,
+}
+
+impl Message {
+    /// A message that the broker does not keep.
+    pub(super) fn passing(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
+        Message {
+            topic: topic.into(),
+            payload,
+            retain: false,
+            correlation: None,
+        }
+    }
+}
+
+/// Names an entry while its message is under way.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Key {
+    /// Telemetry of that topic.
+    Latest(Arc<str>),
+    /// Result of that serial number.
+    Result(u64),
+    /// Event of that serial number.
+    Event(u64),
+}
+
+/// What was acknowledged.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Acked {
+    /// Topic of the message.
+    pub(super) topic: Arc<str>,
+    /// Its record on disk.
+    pub(super) record: Option<RecordId>,
+}
+
+#[derive(Debug, Default)]
+struct Slot {
+    /// The newest payload that was not handed over yet.
+    waiting: Option<Vec<u8>>,
+    under_way: bool,
+}
+
+#[derive(Debug)]
+struct Entry {
+    serial: u64,
+    message: Message,
+    record: Option<RecordId>,
+    under_way: bool,
+    attempts: u8,
+}
+
+/// Everything that is to be published.
+#[derive(Debug, Default)]
+pub(super) struct Outbox {
+    latest: BTreeMap<Arc<str>, Slot>,
+    /// Topics with a payload to hand over, oldest change first.
+    order: VecDeque<Arc<str>>,
+    results: VecDeque<Entry>,
+    events: VecDeque<Entry>,
+    serial: u64,
+    /// Handed over, packet id not known yet.
+    handed: VecDeque<Key>,
+    /// Handed over, by packet id.
+    flying: HashMap<u16, Key>,
+    /// The first topic of `order` goes before everything else.
+    lead: bool,
+    /// Whose turn it is of events and telemetry.
+    events_turn: bool,
+    dropped: u64,
+}
+
+impl Outbox {
+    /// Telemetry: replaces what waits for that topic.
+    pub(super) fn put(&mut self, topic: Arc<str>, payload: Vec<u8>) {
+        let slot = self.latest.entry(topic.clone()).or_default();
+        if slot.waiting.replace(payload).is_none() {
+            self.order.push_back(topic);
+        }
+    }
+
+    /// Telemetry that goes before everything else.
+    pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
+        self.latest.entry(topic.clone()).or_default().waiting = Some(payload);
+        self.order.retain(|t| *t != topic);
+        self.order.push_front(topic);
+        self.lead = true;
+    }
+
+    /// A result; when too many wait the oldest is dropped.
+    pub(super) fn push_result(&mut self, message: Message) {
+        self.serial += 1;
+        self.dropped += push(&mut self.results, self.serial, message, None, RESULTS);
+    }
+
+    /// An event, with its record when it is on disk; when too many wait the oldest is dropped.
+    pub(super) fn push_event(&mut self, message: Message, record: Option<RecordId>) {
+        self.serial += 1;
+        self.dropped += push(&mut self.events, self.serial, message, record, EVENTS);
+    }
+
+    /// How many events may be loaded from the disk now.
+    pub(super) fn room(&self) -> usize {
+        LOADED.saturating_sub(self.events.len())
+    }
+
+    /// Events and results that wait, those under way included.
+    pub(super) fn waiting(&self) -> usize {
+        self.results.len() + self.events.len()
+    }
+
+    /// Whether telemetry of that topic waits or is under way.
+    pub(super) fn has_telemetry(&self, topic: &str) -> bool {
+        self.latest.contains_key(topic)
+    }
+
+    /// Events and results that were dropped because too many waited.
+    pub(super) fn dropped(&self) -> u64 {
+        self.dropped
+    }
+
+    /// Messages handed over and not acknowledged.
+    pub(super) fn under_way(&self) -> usize {
+        self.handed.len() + self.flying.len()
+    }
+
+    /// The message to be handed over next: a leading one, then results, then events and telemetry by turns.
+    /// It stays here: tell with [`Outbox::handed_over`] that it was taken.
+    pub(super) fn next(&self, limit: usize) -> Option<(Key, Message)> {
+        if self.under_way() >= limit {
+            return None;
+        }
+        if self.lead
+            && let Some(lead) = self.next_latest()
+        {
+            return Some(lead);
+        }
+        next_entry(&self.results, Key::Result).or_else(|| {
+            let events = || next_entry(&self.events, Key::Event);
+            let latest = || self.next_latest();
+            if self.events_turn {
+                events().or_else(latest)
+            } else {
+                latest().or_else(events)
+            }
+        })
+    }
+
+    fn next_latest(&self) -> Option<(Key, Message)> {
+        self.order.iter().find_map(|topic| {
+            let slot = self.latest.get(topic).filter(|slot| !slot.under_way)?;
+            let message = Message {
+                topic: topic.clone(),
+                payload: slot.waiting.clone()?,
+                retain: true,
+                correlation: None,
+            };
+            Some((Key::Latest(topic.clone()), message))
+        })
+    }
+
+    /// The message of `key` was handed over to the connection.
+    pub(super) fn handed_over(&mut self, key: Key) {
+        match &key {
+            Key::Latest(topic) => {
+                if let Some(slot) = self.latest.get_mut(topic) {
+                    slot.waiting = None;
+                    slot.under_way = true;
+                }
+                // Found at or near the front: before it lie only topics that are under way.
+                if let Some(place) = self.order.iter().position(|t| t == topic) {
+                    self.order.remove(place);
+                }
+                self.lead = false;
+                self.events_turn = true;
+            }
+            Key::Result(serial) => mark(&mut self.results, *serial),
+            Key::Event(serial) => {
+                mark(&mut self.events, *serial);
+                self.events_turn = false;
+            }
+        }
+        self.handed.push_back(key);
+    }
+
+    /// The connection gave the oldest message handed over this packet id.
+    ///
+    /// # Errors
+    /// When the books do not agree: the connection must be given up.
+    pub(super) fn numbered(&mut self, packet: u16) -> Result<(), &'static str> {
+        let key = self
+            .handed
+            .pop_front()
+            .ok_or("a message was sent that nobody handed over")?;
+        match self.flying.insert(packet, key) {
+            None => Ok(()),
+            Some(_) => Err("a packet id was used twice"),
+        }
+    }
+
+    /// The broker acknowledged a message: its entry leaves.
+    pub(super) fn acked(&mut self, packet: u16) -> Option<Acked> {
+        self.settle(self.flying.get(&packet).cloned()?, Some(packet))
+    }
+
+    /// Gives up the message of `key`, which cannot be sent.
+    pub(super) fn give_up(&mut self, key: Key) -> Option<Acked> {
+        if let Key::Latest(topic) = &key {
+            self.latest.get_mut(topic)?.waiting = None;
+            self.order.retain(|t| t != topic);
+        }
+        self.settle(key, None)
+    }
+
+    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acked> {
+        if let Some(packet) = packet {
+            self.flying.remove(&packet);
+        }
+        match key {
+            Key::Latest(topic) => {
+                let slot = self.latest.get_mut(&topic)?;
+                slot.under_way = false;
+                if slot.waiting.is_none() {
+                    self.latest.remove(&topic);
+                }
+                Some(Acked { topic, record: None })
+            }
+            Key::Result(serial) => take(&mut self.results, serial),
+            Key::Event(serial) => take(&mut self.events, serial),
+        }
+    }
+
+    /// The connection is lost. Events and results that were under way wait again, in their order; telemetry
+    /// is forgotten: the process image knows better by then.
+    pub(super) fn lost(&mut self) {
+        self.latest.clear();
+        self.order.clear();
+        self.handed.clear();
+        self.flying.clear();
+        self.lead = false;
+        for entry in self.results.iter_mut().chain(&mut self.events) {
+            entry.attempts = entry.attempts.saturating_add(u8::from(entry.under_way));
+            entry.under_way = false;
+        }
+        let before = self.results.len();
+        self.results.retain(|entry| entry.attempts < RESULT_ATTEMPTS);
+        self.dropped += (before - self.results.len()) as u64;
+    }
+
+    /// Telemetry is not sent any more.
+    pub(super) fn drop_telemetry(&mut self) {
+        self.order.clear();
+        self.latest.retain(|_, slot| {
+            slot.waiting = None;
+            slot.under_way
+        });
+    }
+}
+
+/// Appends an entry; returns how many were dropped to make room. One that is under way is dropped last: it is
+/// probably delivered.
+fn push(queue: &mut VecDeque<Entry>, serial: u64, message: Message, record: Option<RecordId>, most: usize) -> u64 {
+    let mut dropped = 0;
+    while queue.len() >= most {
+        let victim = queue.iter().position(|e| !e.under_way).unwrap_or(0);
+        queue.remove(victim);
+        dropped += 1;
+    }
+    queue.push_back(Entry {
+        serial,
+        message,
+        record,
+        under_way: false,
+        attempts: 0,
+    });
+    dropped
+}
+
+fn next_entry(queue: &VecDeque<Entry>, key: fn(u64) -> Key) -> Option<(Key, Message)> {
+    let entry = queue.iter().find(|e| !e.under_way)?;
+    Some((key(entry.serial), entry.message.clone()))
+}
+
+fn mark(queue: &mut VecDeque<Entry>, serial: u64) {
+    if let Some(entry) = queue.iter_mut().find(|e| e.serial == serial) {
+        entry.under_way = true;
+    }
+}
+
+fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acked> {
+    let index = queue.iter().position(|e| e.serial == serial)?;
+    queue.remove(index).map(|entry| Acked {
+        topic: entry.message.topic,
+        record: entry.record,
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic(name: &str) -> Arc<str> {
+        Arc::from(name)
+    }
+
+    fn event(name: &str) -> Message {
+        Message::passing(name, Vec::new())
+    }
+
+    /// Hands everything over that may go; returns topics and payloads.
+    fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
+        let mut sent = Vec::new();
+        while let Some((key, message)) = outbox.next(limit) {
+            outbox.handed_over(key);
+            sent.push((message.topic.to_string(), message.payload));
+        }
+        sent
+    }
+
+    fn names(sent: &[(String, Vec<u8>)]) -> Vec<&str> {
+        sent.iter().map(|(t, _)| t.as_str()).collect()
+    }
+
+    #[test]
+    fn newest_telemetry_wins_and_one_message_per_topic_is_under_way() {
+        let mut outbox = Outbox::default();
+        outbox.put(topic("a"), vec![1]);
+        outbox.put(topic("b"), vec![1]);
+        outbox.put(topic("a"), vec![2]);
+        assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![2]), ("b".into(), vec![1])]);
+        outbox.put(topic("a"), vec![3]);
+        outbox.put(topic("a"), vec![4]);
+        assert!(outbox.next(10).is_none(), "a is under way");
+        outbox.numbered(1).unwrap();
+        outbox.numbered(2).unwrap();
+        assert!(outbox.acked(2).is_some(), "acknowledgements come in any order");
+        assert_eq!(outbox.acked(1).unwrap().topic.as_ref(), "a");
+        assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![4])]);
+        assert!(outbox.acked(77).is_none());
+    }
+
+    #[test]
+    fn the_limit_bounds_what_is_under_way() {
+        let mut outbox = Outbox::default();
+        for i in 0..10 {
+            outbox.put(topic(&format!("t{i}")), Vec::new());
+            outbox.push_event(event("e"), None);
+        }
+        assert_eq!(drain(&mut outbox, 3).len(), 3);
+        assert_eq!(outbox.under_way(), 3);
+        outbox.numbered(1).unwrap();
+        outbox.acked(1);
+        assert_eq!(drain(&mut outbox, 3).len(), 1);
+    }
+
+    #[test]
+    fn results_first_then_events_and_telemetry_by_turns_but_the_leader_leads() {
+        let mut outbox = Outbox::default();
+        for i in 1..=3 {
+            outbox.put(topic(&format!("t{i}")), Vec::new());
+            outbox.push_event(event(&format!("e{i}")), None);
+        }
+        outbox.push_result(event("r"));
+        outbox.put_first(topic("status"), Vec::new());
+        let sent = drain(&mut outbox, 100);
+        assert_eq!(names(&sent), ["status", "r", "e1", "t1", "e2", "t2", "e3", "t3"]);
+    }
+
+    #[test]
+    fn after_a_loss_events_come_again_in_order_and_telemetry_does_not() {
+        let mut outbox = Outbox::default();
+        outbox.put(topic("t"), Vec::new());
+        for name in ["e1", "e2", "e3"] {
+            outbox.push_event(event(name), None);
+        }
+        assert_eq!(drain(&mut outbox, 3).len(), 3);
+        outbox.numbered(1).unwrap();
+        outbox.numbered(2).unwrap();
+        outbox.numbered(3).unwrap();
+        assert_eq!(outbox.acked(2).unwrap().topic.as_ref(), "e1");
+        outbox.lost();
+        assert_eq!(outbox.waiting(), 2);
+        assert_eq!(outbox.under_way(), 0);
+        assert!(
+            outbox.acked(3).is_none(),
+            "an acknowledgement of the lost connection means nothing"
+        );
+        assert_eq!(names(&drain(&mut outbox, 10)), ["e2", "e3"]);
+    }
+
+    #[test]
+    fn a_result_that_breaks_connections_is_given_up() {
+        let mut outbox = Outbox::default();
+        outbox.push_result(event("bad"));
+        for _ in 0..2 {
+            assert_eq!(drain(&mut outbox, 10).len(), 1);
+            outbox.lost();
+        }
+        assert_eq!((outbox.waiting(), outbox.dropped()), (0, 1));
+    }
+
+    #[test]
+    fn queues_are_bounded_and_drop_the_oldest() {
+        let mut outbox = Outbox::default();
+        for i in 0..EVENTS + 2 {
+            outbox.push_event(event(&format!("e{i}")), None);
+            outbox.push_result(event("r"));
+        }
+        assert_eq!(outbox.waiting(), EVENTS + RESULTS);
+        assert_eq!(outbox.dropped(), 2 + (EVENTS + 2 - RESULTS) as u64);
+        for _ in 0..RESULTS {
+            let (key, _) = outbox.next(usize::MAX).unwrap();
+            outbox.give_up(key);
+        }
+        assert_eq!(outbox.next(1).unwrap().1.topic.as_ref(), "e2");
+    }
+
+    #[test]
+    fn books_that_do_not_agree_are_noticed() {
+        let mut outbox = Outbox::default();
+        assert!(outbox.numbered(1).is_err());
+        for name in ["a", "b"] {
+            outbox.push_event(event(name), None);
+        }
+        drain(&mut outbox, 10);
+        assert!(outbox.numbered(1).is_ok());
+        assert!(outbox.numbered(1).is_err());
+    }
+
+    #[test]
+    fn what_cannot_be_sent_is_given_up() {
+        let mut outbox = Outbox::default();
+        outbox.put(topic("big"), vec![0; 10]);
+        let (key, _) = outbox.next(1).unwrap();
+        outbox.give_up(key);
+        assert!(outbox.next(1).is_none());
+        assert!(!outbox.has_telemetry("big"));
+    }
+}

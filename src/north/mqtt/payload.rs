@@ -1,0 +1,335 @@
+//! What is said: topics and payloads. Pure.
+
+use std::time::{Duration, SystemTime};
+
+use serde::ser::{Serialize, SerializeMap, Serializer};
+
+use crate::cache::{BusHealth, Reading, value_or_null};
+use crate::drive::{ModelPoint, Profile, Quality, State, Value};
+use crate::event::Event;
+use crate::plant::BusHandle;
+
+/// Keys of the state object that are no points; a profile point of that name is left out of it.
+const STATE_KEYS: [&str; 6] = ["state", "quality", "time", "age_ms", "fault_text", "point_quality"];
+
+/// The topics of one gateway.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Topics {
+    /// `{base}/{gateway}`.
+    root: String,
+}
+
+/// A set topic: the drive and, for a bare value, the point.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct SetTopic<'t> {
+    pub(super) drive: &'t str,
+    pub(super) point: Option<&'t str>,
+}
+
+impl Topics {
+    pub(super) fn new(base: &str, gateway: &str) -> Topics {
+        Topics {
+            root: format!("{base}/{gateway}"),
+        }
+    }
+
+    pub(super) fn status(&self) -> String {
+        format!("{}/status", self.root)
+    }
+
+    pub(super) fn bus(&self, bus: &str) -> String {
+        format!("{}/bus/{bus}", self.root)
+    }
+
+    /// A topic under a drive: `state`, `event`, `result`.
+    pub(super) fn drive(&self, drive: &str, leaf: &str) -> String {
+        format!("{}/drive/{drive}/{leaf}", self.root)
+    }
+
+    pub(super) fn point(&self, drive: &str, point: &str) -> String {
+        format!("{}/drive/{drive}/point/{point}", self.root)
+    }
+
+    /// The filters of all set topics.
+    pub(super) fn set_filters(&self) -> [String; 2] {
+        [self.drive("+", "set"), self.drive("+", "set/+")]
+    }
+
+    /// Which drive and point a topic sets; `None` for any other topic.
+    pub(super) fn parse_set<'t>(&self, topic: &'t str) -> Option<SetTopic<'t>> {
+        let rest = topic.strip_prefix(self.root.as_str())?.strip_prefix("/drive/")?;
+        let mut levels = rest.split('/');
+        let (drive, set) = (levels.next()?, levels.next()?);
+        let point = levels.next();
+        (set == "set" && levels.next().is_none()).then_some(SetTopic { drive, point })
+    }
+}
+
+/// The points of a drive that are published: index in the profile and name.
+pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
+    let mut points = crate::cache::public_points(profile);
+    points.retain(|(_, name)| !STATE_KEYS.contains(name));
+    points
+}
+
+/// What the state object of a drive tells, its times apart: a change of it is worth a message.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Shown {
+    pub(super) state: State,
+    pub(super) quality: Quality,
+    /// Value (only if good) and quality of each published point.
+    pub(super) points: Vec<(Option<Value>, Quality)>,
+}
+
+impl Shown {
+    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> Shown {
+        let shown = |index| {
+            let sample = reading.sample(index);
+            (sample.good(), sample.quality)
+        };
+        Shown {
+            state: reading.state(),
+            quality: reading.overall(),
+            points: points.map(shown).collect(),
+        }
+    }
+}
+
+/// The state object of a drive.
+pub(super) struct StateObject<'s> {
+    pub(super) shown: &'s Shown,
+    /// Names in the order of `shown.points`.
+    pub(super) names: &'s [String],
+    pub(super) fault_text: String,
+    pub(super) age: Option<Duration>,
+    /// The time of day now.
+    pub(super) wall: SystemTime,
+}
+
+impl Serialize for StateObject<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut map = serializer.serialize_map(None)?;
+        map.serialize_entry("state", self.shown.state.name())?;
+        map.serialize_entry("quality", self.shown.quality.name())?;
+        let read_at = self.age.and_then(|age| self.wall.checked_sub(age));
+        map.serialize_entry("time", &read_at.map(rfc3339))?;
+        map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
+        map.serialize_entry("fault_text", &self.fault_text)?;
+        let points = || self.names.iter().zip(&self.shown.points);
+        for (name, (value, _)) in points() {
+            map.serialize_entry(name, &value_or_null(value.map(tidy)))?;
+        }
+        let differing: serde_json::Map<String, serde_json::Value> = points()
+            .filter(|(_, (_, quality))| *quality != self.shown.quality)
+            .map(|(name, (_, quality))| (name.clone(), quality.name().into()))
+            .collect();
+        if !differing.is_empty() {
+            map.serialize_entry("point_quality", &differing)?;
+        }
+        map.end()
+    }
+}
+
+/// A negative zero is a zero.
+fn tidy(value: Value) -> Value {
+    match value {
+        Value::Number(n) => Value::Number(n + 0.0),
+        other => other,
+    }
+}
+
+/// The payload of a point topic.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) enum Bare {
+    /// Nothing good is known: an empty payload, which takes the retained value away.
+    Nothing,
+    /// A value.
+    Value(Value),
+    /// The drive in one word.
+    State(State),
+    /// The text of this fault code.
+    FaultText(i64),
+}
+
+impl Bare {
+    /// The value, if it is good.
+    pub(super) fn of(value: Option<Value>) -> Bare {
+        value.map_or(Bare::Nothing, Bare::Value)
+    }
+
+    /// The text of the active fault, if the fault code is good.
+    pub(super) fn fault_text(reading: &Reading<'_>) -> Bare {
+        match reading.model(ModelPoint::FaultCode).good() {
+            Some(Value::Integer(code)) => Bare::FaultText(code),
+            _ => Bare::Nothing,
+        }
+    }
+
+    /// The bytes: `true`, `false`, a shortest decimal, a word, or nothing.
+    pub(super) fn render(self, profile: &Profile) -> Vec<u8> {
+        match self {
+            Bare::Nothing => Vec::new(),
+            Bare::Value(value) => tidy(value).to_string().into_bytes(),
+            Bare::State(state) => state.name().into(),
+            Bare::FaultText(code) => profile.fault_text(code).into_bytes(),
+        }
+    }
+}
+
+/// What a bus message tells at once when it changes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct BusState {
+    up: bool,
+    reason: Option<String>,
+    drives: usize,
+    online: usize,
+}
+
+/// What a bus message tells besides; these change all the time.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct BusFigures {
+    load: f64,
+    fast_cycle_ms: Option<f64>,
+    slow_cycle_ms: Option<f64>,
+    transactions: u64,
+    errors: u64,
+    queue: usize,
+}
+
+/// State and figures of a bus now.
+pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
+    let BusHealth {
+        up,
+        reason,
+        load,
+        fast,
+        slow,
+        ..
+    } = bus.image.health();
+    let state = BusState {
+        up,
+        reason,
+        drives: bus.image.drives.len(),
+        online: bus.image.online(),
+    };
+    let figures = BusFigures {
+        load: rounded(load, 1000.0),
+        fast_cycle_ms: fast.last.map(milliseconds),
+        slow_cycle_ms: slow.last.map(milliseconds),
+        transactions: bus.image.transactions_total(),
+        errors: bus.image.errors_total(),
+        queue: bus.queue.lock().len(),
+    };
+    (state, figures)
+}
+
+/// The health object of a bus.
+pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTime) -> Vec<u8> {
+    let object = serde_json::json!({
+        "state": if state.up { "up" } else { "down" },
+        "reason": state.reason,
+        "time": rfc3339(wall),
+        "drives": state.drives,
+        "online": state.online,
+        "load": figures.load,
+        "fast_cycle_ms": figures.fast_cycle_ms,
+        "slow_cycle_ms": figures.slow_cycle_ms,
+        "transactions": figures.transactions,
+        "errors": figures.errors,
+        "queue": figures.queue,
+    });
+    object.to_string().into_bytes()
+}
+
+/// The event object; `None` for an event of a whole bus, which its bus topic tells.
+pub(super) fn event(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
+    let drive = event.drive.as_deref()?;
+    // Strings and figures only: this cannot fail.
+    let payload = serde_json::to_vec(event).ok()?;
+    Some((topics.drive(drive, "event"), payload))
+}
+
+/// RFC 3339, UTC, milliseconds.
+pub(super) fn rfc3339(time: SystemTime) -> String {
+    humantime::format_rfc3339_millis(time).to_string()
+}
+
+/// Milliseconds with three decimals.
+pub(super) fn milliseconds(time: Duration) -> f64 {
+    rounded(time.as_secs_f64() * 1000.0, 1000.0)
+}
+
+fn rounded(value: f64, steps: f64) -> f64 {
+    (value * steps).round() / steps
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn set_topics_are_recognised() {
+        let topics = Topics::new("plant/a", "hall");
+        let parse = |topic| topics.parse_set(topic).map(|t| (t.drive, t.point));
+        assert_eq!(parse("plant/a/hall/drive/p1/set"), Some(("p1", None)));
+        assert_eq!(parse("plant/a/hall/drive/p1/set/run"), Some(("p1", Some("run"))));
+        for other in [
+            "plant/a/hall/drive/p1/set/run/x",
+            "plant/a/hall/drive/p1/state",
+            "plant/a/hall/drive/p1",
+            "plant/a/hallway/drive/p1/set",
+            "drive/p1/set",
+            "",
+        ] {
+            assert_eq!(parse(other), None, "{other}");
+        }
+        let [whole, single] = topics.set_filters();
+        assert_eq!(
+            (whole.as_str(), single.as_str()),
+            ("plant/a/hall/drive/+/set", "plant/a/hall/drive/+/set/+")
+        );
+    }
+
+    #[test]
+    fn bare_values_are_shortest_decimals() {
+        let profile = crate::drive::profile::Profiles::built_in()
+            .get("vacon-nx")
+            .unwrap()
+            .clone();
+        let text = |bare: Bare| String::from_utf8(bare.render(&profile)).unwrap();
+        for (value, expected) in [
+            (Value::Number(25.0), "25"),
+            (Value::Number(0.1), "0.1"),
+            (Value::Number(-12.34), "-12.34"),
+            (Value::Number(-0.0), "0"),
+            (Value::Integer(-7), "-7"),
+            (Value::Bool(true), "true"),
+        ] {
+            assert_eq!(text(Bare::Value(value)), expected);
+        }
+        assert_eq!(text(Bare::FaultText(53)), "fieldbus fault");
+        assert_eq!(text(Bare::FaultText(0)), "");
+    }
+
+    #[test]
+    fn events_of_drives_go_to_their_topic() {
+        let topics = Topics::new("drivegate", "hall");
+        let mut told = Event {
+            id: 4,
+            time: SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
+            kind: crate::event::EventKind::FaultEnd,
+            bus: "line1".to_string(),
+            drive: Some("p1".to_string()),
+            fault_code: Some(53),
+            text: "gone".to_string(),
+        };
+        let (topic, payload) = event(&topics, &told).unwrap();
+        assert_eq!(topic, "drivegate/hall/drive/p1/event");
+        let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
+        let expected = serde_json::json!({"id": 4, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
+            "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
+        assert_eq!(payload, expected);
+        told.drive = None;
+        assert_eq!(event(&topics, &told), None);
+    }
+}

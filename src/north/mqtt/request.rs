@@ -1,0 +1,418 @@
+//! What a message on a set topic asks for. Pure.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::time::Duration;
+
+use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use serde_json::Value as Json;
+
+use crate::command::{DEFAULT_EXPIRY, Refusal};
+use crate::document::nearest;
+use crate::drive::model::Kind;
+use crate::drive::{Profile, Value};
+
+/// Largest payload of a command.
+const MAX_PAYLOAD: usize = 64 * 1024;
+/// Longest `id`.
+const MAX_ID: usize = 256;
+/// Longest `expires_ms`.
+const MAX_EXPIRY_MS: u64 = 60_000;
+/// Longest name that is compared with the known ones.
+pub(super) const MAX_NAME: usize = 64;
+
+/// A message on a set topic.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Incoming {
+    pub(super) topic: String,
+    pub(super) payload: Vec<u8>,
+    pub(super) retain: bool,
+    /// The broker sends it again.
+    pub(super) dup: bool,
+    pub(super) packet: u16,
+    pub(super) response_topic: Option<String>,
+    pub(super) correlation: Option<Vec<u8>>,
+    /// What is left of the message's life, s.
+    pub(super) expiry: Option<u32>,
+}
+
+/// The payload for people: what can be printed, not too long.
+pub(super) fn excerpt(payload: &[u8]) -> String {
+    let text = String::from_utf8_lossy(payload.get(..payload.len().min(200)).unwrap_or_default());
+    let mut short = String::new();
+    for c in text.chars().take(80) {
+        if c.is_control() {
+            short.extend(c.escape_default());
+        } else {
+            short.push(c);
+        }
+    }
+    let dots = if payload.len() > 80 { "…" } else { "" };
+    format!("`{short}{dots}`")
+}
+
+/// What a message asks for.
+#[derive(Debug, PartialEq)]
+pub(super) struct Request {
+    /// The `id`, also when the rest is refused.
+    pub(super) id: Option<Json>,
+    /// Points and time to live.
+    pub(super) order: Result<(Points, Duration), Refusal>,
+}
+
+/// Points to be set: index in the profile and value.
+type Points = Vec<(usize, Value)>;
+
+/// Reads a message on a set topic; `point` is given for a bare value.
+pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Request {
+    let refused = |refusal| Request {
+        id: None,
+        order: Err(refusal),
+    };
+    if incoming.retain {
+        return refused(Refusal::NotAllowed(
+            "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
+        ));
+    }
+    if incoming.payload.len() > MAX_PAYLOAD {
+        let text = format!(
+            "the payload has {} bytes, {MAX_PAYLOAD} are allowed",
+            incoming.payload.len()
+        );
+        return refused(Refusal::BadValue(text));
+    }
+    let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
+    let within_life = |expiry: Duration| life.map_or(expiry, |life| life.min(expiry));
+    if let Some(name) = point {
+        let order = bare(&incoming.payload).and_then(|value| Ok(vec![resolve(profile, name, &value)?]));
+        return Request {
+            id: None,
+            order: order.map(|points| (points, within_life(DEFAULT_EXPIRY))),
+        };
+    }
+    match object(&incoming.payload) {
+        Err(refusal) => refused(refusal),
+        Ok(fields) => {
+            let (id, order) = fields_of(fields, profile);
+            Request {
+                id,
+                order: order.map(|(points, expiry)| (points, within_life(expiry))),
+            }
+        }
+    }
+}
+
+fn fields_of(fields: Fields, profile: &Profile) -> (Option<Json>, Result<(Points, Duration), Refusal>) {
+    let (mut id, mut expiry) = (None, DEFAULT_EXPIRY);
+    let mut points = Vec::new();
+    let mut refusal = None;
+    for (name, value) in fields.0 {
+        let result = match name.as_str() {
+            "id" => request_id(value).map(|value| id = Some(value)),
+            "expires_ms" => request_expiry(&value).map(|time| expiry = time),
+            // The first thing wrong is told; the rest is only read on for the id.
+            _ if refusal.is_some() => Ok(()),
+            name => resolve(profile, name, &value).map(|point| points.push(point)),
+        };
+        refusal = refusal.or(result.err());
+    }
+    (id, refusal.map_or(Ok((points, expiry)), Err))
+}
+
+fn request_id(value: Json) -> Result<Json, Refusal> {
+    match &value {
+        Json::Number(_) => Ok(value),
+        Json::String(text) if text.len() <= MAX_ID => Ok(value),
+        _ => Err(Refusal::BadValue(format!(
+            "`id` is a number or a string of at most {MAX_ID} bytes"
+        ))),
+    }
+}
+
+fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
+    let time = value.as_u64().filter(|ms| (1..=MAX_EXPIRY_MS).contains(ms));
+    time.map(Duration::from_millis).ok_or_else(|| {
+        Refusal::BadValue(format!(
+            "`expires_ms` = {value} is not a whole number from 1 to {MAX_EXPIRY_MS}"
+        ))
+    })
+}
+
+/// The point of that name and its value in the kind that it has. Limits are checked where the order is.
+fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
+    let Some(index) = profile.point_index(name) else {
+        let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
+        let all = || profile.points.iter().map(|p| p.name.as_str());
+        let likely = || nearest(name, writable()).or_else(|| nearest(name, all()));
+        let hint = match (name.len() <= MAX_NAME).then(likely).flatten() {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!("what can be set: {}", writable().collect::<Vec<_>>().join(", ")),
+        };
+        let name = excerpt(name.as_bytes());
+        return Err(Refusal::NotWritable(format!("there is no point {name}; {hint}")));
+    };
+    let point = profile.points.get(index).filter(|p| p.write);
+    let Some(point) = point else {
+        return Err(Refusal::NotWritable(format!("`{name}` is read-only")));
+    };
+    let wrong = |wanted: &str| Refusal::BadValue(format!("`{name}` = {} is not {wanted}", brief(value)));
+    let value = match (point.kind(), value) {
+        (Kind::Bool, Json::Bool(b)) => Value::Bool(*b),
+        (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(0.0) => Value::Bool(false),
+        (Kind::Bool, Json::Number(n)) if n.as_f64() == Some(1.0) => Value::Bool(true),
+        (Kind::Bool, _) => return Err(wrong("true or false")),
+        (Kind::Number | Kind::Integer, Json::Number(n)) => {
+            Value::Number(n.as_f64().filter(|n| n.is_finite()).ok_or_else(|| wrong("a number"))?)
+        }
+        (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; leave the quotes away")),
+        (Kind::Number | Kind::Integer, _) => return Err(wrong("a number")),
+    };
+    Ok((index, value))
+}
+
+fn brief(value: &Json) -> String {
+    let text = value.to_string();
+    match text.char_indices().nth(60) {
+        Some((end, _)) => format!("{}…", text.get(..end).unwrap_or_default()),
+        None => text,
+    }
+}
+
+/// The value of a `set/{point}` message: `true`, `false`, or a number.
+fn bare(payload: &[u8]) -> Result<Json, Refusal> {
+    let bad = || Refusal::BadValue(format!("{} is not true, false or a number", excerpt(payload)));
+    let text = std::str::from_utf8(payload).map_err(|_| bad())?.trim();
+    match text {
+        "true" => Ok(Json::Bool(true)),
+        "false" => Ok(Json::Bool(false)),
+        // Only JSON numbers, and what people type in their place: +5, .5, 007. No NaN, no infinity.
+        _ if text.chars().all(|c| c.is_ascii_digit() || "+-.eE".contains(c)) => {
+            let number: f64 = text.parse().map_err(|_| bad())?;
+            serde_json::Number::from_f64(number).map(Json::Number).ok_or_else(bad)
+        }
+        _ => Err(bad()),
+    }
+}
+
+fn object(payload: &[u8]) -> Result<Fields, Refusal> {
+    let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
+    let value: Json = serde_json::from_slice(payload)
+        .map_err(|e| Refusal::BadValue(format!("{} is no JSON: {e}; {shape}", excerpt(payload))))?;
+    if !value.is_object() {
+        return Err(Refusal::BadValue(format!(
+            "{} is no JSON object; {shape}",
+            excerpt(payload)
+        )));
+    }
+    serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))
+}
+
+/// The fields of an object; a name that comes twice is an error, because nobody knows which was meant.
+#[derive(Debug)]
+struct Fields(Vec<(String, Json)>);
+
+impl<'de> Deserialize<'de> for Fields {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Fields, D::Error> {
+        deserializer.deserialize_map(FieldsVisitor)
+    }
+}
+
+struct FieldsVisitor;
+
+impl<'de> Visitor<'de> for FieldsVisitor {
+    type Value = Fields;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Fields, A::Error> {
+        let mut fields: Vec<(String, Json)> = Vec::new();
+        let mut names = BTreeSet::new();
+        while let Some((name, value)) = map.next_entry::<String, Json>()? {
+            if !names.insert(name.clone()) {
+                let text = format!("{} comes twice; nothing was written", excerpt(name.as_bytes()));
+                return Err(serde::de::Error::custom(text));
+            }
+            fields.push((name, value));
+        }
+        Ok(Fields(fields))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::Arc;
+
+    use super::*;
+    use crate::drive::profile::Profiles;
+
+    fn profile() -> Arc<Profile> {
+        Profiles::built_in().get("vacon-nx").unwrap().clone()
+    }
+
+    fn message(payload: &str) -> Incoming {
+        Incoming {
+            payload: payload.into(),
+            ..Incoming::default()
+        }
+    }
+
+    fn set(payload: &str) -> Request {
+        read(&message(payload), None, &profile())
+    }
+
+    fn set_point(point: &str, payload: &str) -> Result<Value, Refusal> {
+        let order = read(&message(payload), Some(point), &profile()).order;
+        order.map(|(points, _)| points[0].1)
+    }
+
+    fn code(request: Request) -> (&'static str, String) {
+        let refusal = request.order.unwrap_err();
+        (refusal.code(), refusal.to_string())
+    }
+
+    #[test]
+    fn an_object_is_one_order() {
+        let request = set(r#"{"id": "a-1", "run": true, "speed_reference": 50.5, "expires_ms": 500}"#);
+        assert_eq!(request.id, Some("a-1".into()));
+        let (points, expiry) = request.order.unwrap();
+        let index = |name| profile().point_index(name).unwrap();
+        let expected = [
+            (index("run"), Value::Bool(true)),
+            (index("speed_reference"), Value::Number(50.5)),
+        ];
+        assert_eq!(points, expected);
+        assert_eq!(expiry, Duration::from_millis(500));
+        let (points, expiry) = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
+        assert_eq!((points[0].1, expiry), (Value::Bool(false), DEFAULT_EXPIRY));
+        assert_eq!(set("{}").order.unwrap().0, [], "told as an empty order later");
+    }
+
+    #[test]
+    fn what_is_wrong_is_told() {
+        for (payload, wanted, text) in [
+            ("run", "bad_value", "`run` is no JSON"),
+            ("", "bad_value", "is no JSON"),
+            ("[1]", "bad_value", "is no JSON object"),
+            ("true", "bad_value", "is no JSON object"),
+            ("NaN", "bad_value", "is no JSON"),
+            (r#"{"run": NaN}"#, "bad_value", "is no JSON"),
+            (r#"{"speed_reference": 1e999}"#, "bad_value", "is no JSON"),
+            (r#"{"run": true, "run": false}"#, "bad_value", "`run` comes twice"),
+            (
+                r#"{"sped_reference": 5}"#,
+                "not_writable",
+                "did you mean `speed_reference`?",
+            ),
+            (
+                r#"{"gobbledygook": 5}"#,
+                "not_writable",
+                "what can be set: run, reverse",
+            ),
+            (r#"{"ready": true}"#, "not_writable", "`ready` is read-only"),
+            (r#"{"speed_reference": "50"}"#, "bad_value", "leave the quotes away"),
+            (r#"{"speed_reference": true}"#, "bad_value", "is not a number"),
+            (r#"{"speed_reference": null}"#, "bad_value", "is not a number"),
+            (r#"{"run": "true"}"#, "bad_value", "is not true or false"),
+            (r#"{"run": 2}"#, "bad_value", "`run` = 2 is not true or false"),
+            (r#"{"run": [true]}"#, "bad_value", "is not true or false"),
+            (r#"{"run": true, "expires_ms": 0}"#, "bad_value", "`expires_ms` = 0"),
+            (r#"{"run": true, "expires_ms": 60001}"#, "bad_value", "from 1 to 60000"),
+            (r#"{"run": true, "expires_ms": 1.5}"#, "bad_value", "`expires_ms` = 1.5"),
+            (
+                r#"{"run": true, "id": {}}"#,
+                "bad_value",
+                "`id` is a number or a string",
+            ),
+        ] {
+            let (code, message) = code(set(payload));
+            assert_eq!(code, wanted, "{payload}: {message}");
+            assert!(message.contains(text), "{payload}: {message}");
+        }
+    }
+
+    #[test]
+    fn a_refusal_carries_the_id_wherever_it_stands() {
+        let request = set(r#"{"sped": 5, "run": true, "id": 12}"#);
+        assert_eq!(request.id, Some(12.into()));
+        assert!(request.order.is_err());
+    }
+
+    #[test]
+    fn bare_values() {
+        for (payload, value) in [
+            ("true", true),
+            (" false\n", false),
+            ("1", true),
+            ("0", false),
+            ("0.0", false),
+        ] {
+            assert_eq!(set_point("run", payload), Ok(Value::Bool(value)), "{payload}");
+        }
+        for (payload, value) in [("50", 50.0), ("-12.5", -12.5), ("+5", 5.0), (".5", 0.5), ("1e1", 10.0)] {
+            assert_eq!(
+                set_point("speed_reference", payload),
+                Ok(Value::Number(value)),
+                "{payload}"
+            );
+        }
+        for bad in [
+            "", "on", "TRUE", "nan", "NaN", "inf", "-inf", "1e999", "0x10", "\"50\"", "5 0", "{}", "-", "1,5",
+        ] {
+            assert!(set_point("speed_reference", bad).is_err(), "{bad}");
+        }
+        assert!(set_point("speed_reference", "true").is_err());
+        assert_eq!(set_point("nothing", "1").unwrap_err().code(), "not_writable");
+    }
+
+    #[test]
+    fn retained_and_oversized_messages_are_refused() {
+        let retained = Incoming {
+            retain: true,
+            ..message(r#"{"run": true}"#)
+        };
+        let (code_retained, text) = code(read(&retained, None, &profile()));
+        assert_eq!(code_retained, "not_allowed");
+        assert!(text.contains("retained"), "{text}");
+        assert!(
+            read(
+                &Incoming {
+                    retain: true,
+                    ..message("1")
+                },
+                Some("run"),
+                &profile()
+            )
+            .order
+            .is_err()
+        );
+        let big = format!(r#"{{"id": "{}"}}"#, "x".repeat(MAX_PAYLOAD));
+        assert!(code(set(&big)).1.contains("65536 are allowed"));
+    }
+
+    #[test]
+    fn the_life_of_the_message_bounds_its_expiry() {
+        let expiry = |payload: &str, life| {
+            let incoming = Incoming {
+                expiry: Some(life),
+                ..message(payload)
+            };
+            read(&incoming, None, &profile()).order.unwrap().1
+        };
+        assert_eq!(expiry(r#"{"run": true}"#, 1), Duration::from_secs(1));
+        assert_eq!(expiry(r#"{"run": true}"#, 10), DEFAULT_EXPIRY);
+        assert_eq!(
+            expiry(r#"{"run": true, "expires_ms": 9000}"#, 5),
+            Duration::from_secs(5)
+        );
+    }
+
+    #[test]
+    fn messages_for_people_stay_short() {
+        let long = format!(r#"{{"{}": 1}}"#, "n".repeat(60_000));
+        let (_, text) = code(set(&long));
+        assert!(text.len() < 400, "{}", text.len());
+        assert_eq!(excerpt(b"\"a\"\x00b\xff"), "`\"a\"\\u{0}b\u{fffd}`");
+    }
+}
