@@ -149,7 +149,12 @@ impl Client {
 
     fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
         match event {
-            Ok(event) => self.take_event(&event),
+            Ok(event) => {
+                self.take_event(&event);
+                // A burst is taken in at once: who falls behind loses events.
+                let rest: Vec<_> = drain(&mut self.events).collect();
+                rest.iter().for_each(|event| self.take_event(event));
+            }
             Err(RecvError::Lagged(lost)) => tracing::warn!("{lost} events came too fast and are not published"),
             // The plant that told them is gone; there is a new one.
             Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),

@@ -13,7 +13,7 @@ use rumqttc::v5::mqttbytes::v5::{
     ConnAck, ConnectProperties, ConnectReturnCode, Filter, LastWill, Packet, PubAckReason, Publish, PublishProperties,
     SubscribeReasonCode,
 };
-use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions};
+use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions, StateError};
 use rumqttc::{NetworkOptions, TlsConfiguration, Transport};
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
@@ -219,15 +219,21 @@ fn interpret(event: Event) -> Option<News> {
 
 fn reason(error: &ConnectionError) -> String {
     use ConnectReturnCode::{BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported};
-    match error {
-        ConnectionError::ConnectionRefused(BadUserNamePassword | NotAuthorized | Banned) => {
-            format!("{error}; check mqtt.username, mqtt.password_file and what the broker allows")
+    let ConnectionError::ConnectionRefused(code) = error else {
+        return match error {
+            ConnectionError::Timeout(_) => "no answer in time".to_string(),
+            ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker does not answer any more".to_string(),
+            ConnectionError::MqttState(StateError::ConnectionAborted) => "the broker closed the connection".to_string(),
+            _ => error.to_string(),
+        };
+    };
+    let advice = match code {
+        BadUserNamePassword | NotAuthorized | Banned => {
+            "; check mqtt.username, mqtt.password_file and what the broker allows"
         }
-        ConnectionError::ConnectionRefused(ClientIdentifierNotValid) => format!("{error}; change mqtt.client_id"),
-        ConnectionError::ConnectionRefused(RetainNotSupported) => {
-            format!("{error}; the gateway needs a broker with retained messages")
-        }
-        ConnectionError::Timeout(_) => "no answer in time".to_string(),
-        _ => error.to_string(),
-    }
+        ClientIdentifierNotValid => "; change mqtt.client_id",
+        RetainNotSupported => "; the gateway needs a broker with retained messages",
+        _ => "",
+    };
+    format!("the broker refuses the connection ({code:?}){advice}")
 }

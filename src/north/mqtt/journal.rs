@@ -65,7 +65,7 @@ impl Journal {
     /// Opens the journal in `dir`, which is created if need be, and finds what still waits there.
     ///
     /// # Errors
-    /// When the directory cannot be used, or another process uses it.
+    /// When the directory cannot be used, or (`WouldBlock`) somebody else uses it.
     pub(super) fn open(dir: &Path, max_bytes: u64) -> io::Result<Journal> {
         fs::create_dir_all(dir)?;
         let lock = OpenOptions::new()
@@ -73,8 +73,10 @@ impl Journal {
             .truncate(false)
             .write(true)
             .open(dir.join(LOCK))?;
-        flock(&lock, FlockOperation::NonBlockingLockExclusive)
-            .map_err(|_| io::Error::other("another process uses this directory; give each gateway its own"))?;
+        flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|_| {
+            let text = "another process uses this directory; give each gateway its own";
+            io::Error::new(io::ErrorKind::WouldBlock, text)
+        })?;
         let mut found: Vec<(u64, PathBuf)> = Vec::new();
         for entry in fs::read_dir(dir)? {
             let path = entry?.path();

@@ -1,6 +1,7 @@
 //! The events that wait: on disk where a buffer is configured and usable, else in memory.
 
-use std::path::PathBuf;
+use std::io;
+use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
 use super::Buffer;
@@ -9,6 +10,9 @@ use super::outbox::{Message, Outbox};
 
 /// Time after which events on disk are safe from a power cut.
 const SYNC: Duration = Duration::from_secs(1);
+/// Attempts to get the directory, and the wait between them: a process that is just ending still holds it.
+const LOCK_ATTEMPTS: u32 = 20;
+const LOCK_WAIT: Duration = Duration::from_millis(50);
 
 /// The way of an event into the outbox: over the disk, or straight on.
 #[derive(Debug, Default)]
@@ -26,13 +30,20 @@ impl EventStore {
         let Some(Buffer { dir, max_bytes }) = buffer else {
             return EventStore::default();
         };
-        let path = dir.clone();
-        let opened = tokio::task::spawn_blocking(move || Journal::open(&path, max_bytes)).await;
-        let journal = match opened.unwrap_or_else(|e| Err(std::io::Error::other(e))) {
-            Ok(journal) => Some(journal),
-            Err(error) => {
-                tell_unusable(&dir, &error);
-                None
+        let mut attempts = LOCK_ATTEMPTS;
+        let journal = loop {
+            attempts -= 1;
+            let path = dir.clone();
+            let opened = tokio::task::spawn_blocking(move || Journal::open(&path, max_bytes)).await;
+            match opened.unwrap_or_else(|e| Err(io::Error::other(e))) {
+                Ok(journal) => break Some(journal),
+                Err(error) if error.kind() == io::ErrorKind::WouldBlock && attempts > 0 => {
+                    tokio::time::sleep(LOCK_WAIT).await;
+                }
+                Err(error) => {
+                    tell_unusable(&dir, &error);
+                    break None;
+                }
             }
         };
         let waiting = journal.as_ref().map_or(0, Journal::unloaded);
@@ -108,7 +119,7 @@ impl EventStore {
     }
 }
 
-fn tell_unusable(dir: &std::path::Path, error: &std::io::Error) {
+fn tell_unusable(dir: &Path, error: &io::Error) {
     tracing::error!(
         "events cannot be kept in {}: {error}; they are kept in memory; check mqtt.buffer",
         dir.display()
