@@ -5,7 +5,7 @@ use std::fs;
 use std::io::{BufRead, BufReader};
 use std::net::{SocketAddr, TcpListener as StdListener, TcpStream as StdStream};
 use std::process::{Child, Command, Output, Stdio};
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -208,6 +208,8 @@ impl Seen {
     }
 }
 
+static MARKERS: AtomicU64 = AtomicU64::new(0);
+
 /// `mosquitto_sub`, and all that it saw.
 pub(crate) struct Watcher {
     child: Child,
@@ -223,7 +225,7 @@ impl Watcher {
     pub(crate) fn with(broker: &Broker, filter: &str, more: &[&str]) -> Watcher {
         let mut command = program("mosquitto_sub");
         let port = broker.port.to_string();
-        let marker = format!("marker/{port}/{}", std::process::id());
+        let marker = format!("marker/{}", MARKERS.fetch_add(1, Ordering::SeqCst));
         command.args([
             "-V",
             "5",
@@ -242,13 +244,20 @@ impl Watcher {
         let mut child = installed("mosquitto_sub", command.stdout(Stdio::piped()).spawn());
         let lines = BufReader::new(child.stdout.take().unwrap()).lines();
         let seen: Arc<(Mutex<Vec<Seen>>, Condvar)> = Arc::default();
-        let writer = seen.clone();
+        let stands = Arc::new(AtomicBool::new(false));
+        let (writer, arrived, own_marker) = (seen.clone(), stands.clone(), marker.clone());
         std::thread::spawn(move || {
             for line in lines.map_while(Result::ok) {
                 let parts: Vec<&str> = line.splitn(4, '|').collect();
                 let &[retain, qos, topic, payload] = parts.as_slice() else {
                     panic!("unexpected line of mosquitto_sub: {line}");
                 };
+                if topic.starts_with("marker/") {
+                    if topic == own_marker {
+                        arrived.store(true, Ordering::SeqCst);
+                    }
+                    continue;
+                }
                 writer.0.lock().unwrap().push(Seen {
                     retain: retain == "1",
                     qos: qos.parse().unwrap(),
@@ -261,9 +270,8 @@ impl Watcher {
         let watcher = Watcher { child, seen };
         wait_for("the subscription of mosquitto_sub", || {
             broker.publish(&marker, "?", more_login(more));
-            watcher.all().iter().any(|m| m.topic == marker).then_some(())
+            stands.load(Ordering::SeqCst).then_some(())
         });
-        watcher.seen.0.lock().unwrap().retain(|m| m.topic != marker);
         watcher
     }
 
