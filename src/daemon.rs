@@ -68,6 +68,8 @@ impl Daemon {
             http: None,
             beats: BTreeMap::new(),
         };
+        // First whoever keeps events, so that none is missed; last the servers that tell whether all is ready.
+        daemon.take_mqtt(&settings).await;
         daemon.take_buses(&settings)?;
         daemon.take_servers(&settings).await?;
         daemon.settings = settings;
@@ -109,6 +111,7 @@ impl Daemon {
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
         self.take_servers(&settings).await?;
         self.take_buses(&settings)?;
+        self.take_mqtt(&settings).await;
         self.settings = settings;
         Ok(())
     }
@@ -183,16 +186,22 @@ impl Daemon {
             }
             self.settings.http = settings.http.clone();
         }
-        if settings.mqtt != self.settings.mqtt || settings.gateway != self.settings.gateway {
-            self.stop_mqtt().await;
-            if let Some(options) = settings.mqtt.clone() {
-                let cancel = CancellationToken::new();
-                let client = mqtt::start(options, self.plant.clone(), self.stats.clone(), cancel.clone());
-                self.mqtt = Some((cancel, client));
-            }
-            self.settings.mqtt = settings.mqtt.clone();
-        }
         Ok(())
+    }
+
+    async fn take_mqtt(&mut self, settings: &Settings) {
+        if settings.mqtt == self.settings.mqtt && settings.gateway == self.settings.gateway {
+            return;
+        }
+        // Client id and buffer are free again before the new client takes them.
+        self.stop_mqtt().await;
+        if let Some(options) = settings.mqtt.clone() {
+            let cancel = CancellationToken::new();
+            let client = mqtt::start(options, self.plant.clone(), self.stats.clone(), cancel.clone());
+            self.mqtt = Some((cancel, client));
+        }
+        self.settings.mqtt = settings.mqtt.clone();
+        self.settings.gateway = settings.gateway.clone();
     }
 
     async fn stop_mqtt(&mut self) {
