@@ -1,0 +1,203 @@
+//! Where a master reaches the simulated line: a pseudo-terminal, a real serial port, or a TCP port.
+
+use super::pty::Pty;
+use crate::codec::{LineFormat, Parity};
+use rustix::event::{PollFd, PollFlags};
+use rustix::fs::{FlockOperation, flock};
+use rustix::termios::{ControlModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr, tcsetattr};
+use std::fs::{File, OpenOptions};
+use std::io::{self, ErrorKind, Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::os::fd::AsFd;
+use std::os::unix::fs::OpenOptionsExt;
+use std::path::{Path, PathBuf};
+
+/// Where a master reaches the line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum EndpointOptions {
+    /// A pseudo-terminal, with a symbolic link that keeps its name.
+    Pty {
+        /// The link; without it the pseudo-terminal's own path is used.
+        link: Option<PathBuf>,
+    },
+    /// A serial port on whose line the simulated drives sit.
+    Port {
+        /// The device.
+        path: PathBuf,
+    },
+    /// Raw serial-over-TCP, as a serial device server gives it. One master at a time.
+    Tcp {
+        /// Where to listen; port 0 takes a free one.
+        listen: SocketAddr,
+    },
+}
+
+/// An open endpoint. All reading and writing is non-blocking.
+#[derive(Debug)]
+pub(super) enum Endpoint {
+    Pty(Pty),
+    Port(File, PathBuf),
+    Tcp {
+        listener: TcpListener,
+        master: Option<TcpStream>,
+    },
+}
+
+impl Endpoint {
+    /// Opens it; `format` is set on a real serial port.
+    pub(super) fn open(options: &EndpointOptions, format: &LineFormat) -> io::Result<Endpoint> {
+        match options {
+            EndpointOptions::Pty { link } => Pty::open(link.as_deref()).map(Endpoint::Pty),
+            EndpointOptions::Port { path } => {
+                let explain = |error: io::Error| {
+                    let text = format!("cannot open the serial port {}: {error}", path.display());
+                    io::Error::new(error.kind(), text)
+                };
+                open_port(path, format)
+                    .map(|file| Endpoint::Port(file, path.clone()))
+                    .map_err(explain)
+            }
+            EndpointOptions::Tcp { listen } => {
+                let explain =
+                    |error: io::Error| io::Error::new(error.kind(), format!("cannot listen on {listen}: {error}"));
+                let listener = TcpListener::bind(listen).map_err(explain)?;
+                listener.set_nonblocking(true)?;
+                Ok(Endpoint::Tcp { listener, master: None })
+            }
+        }
+    }
+
+    /// What a master opens: a path, or `tcp://host:port`.
+    pub(super) fn address(&self) -> String {
+        match self {
+            Endpoint::Pty(pty) => pty.path().display().to_string(),
+            Endpoint::Port(_, path) => path.display().to_string(),
+            Endpoint::Tcp { listener, .. } => listener
+                .local_addr()
+                .map_or_else(|_| "tcp://?".to_string(), |address| format!("tcp://{address}")),
+        }
+    }
+
+    /// What to wait for.
+    pub(super) fn poll_fds(&self) -> Vec<PollFd<'_>> {
+        let wanted = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
+        match self {
+            Endpoint::Pty(pty) => vec![wanted(pty.master.as_fd())],
+            Endpoint::Port(file, _) => vec![wanted(file.as_fd())],
+            Endpoint::Tcp { listener, master } => {
+                let master = master.as_ref().map(|stream| wanted(stream.as_fd()));
+                std::iter::once(wanted(listener.as_fd())).chain(master).collect()
+            }
+        }
+    }
+
+    /// Bytes of the master; 0 when there are none now.
+    ///
+    /// # Errors
+    /// The port is gone.
+    pub(super) fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        match self {
+            Endpoint::Pty(pty) => no_wait(rustix::io::read(&pty.master, buffer).map_err(io::Error::from)),
+            Endpoint::Port(file, path) => match file.read(buffer) {
+                // With nothing to read a port says so; an end of file means that it was unplugged.
+                Ok(0) => Err(io::Error::new(
+                    ErrorKind::UnexpectedEof,
+                    format!("{} is gone", path.display()),
+                )),
+                result => no_wait(result),
+            },
+            Endpoint::Tcp { listener, master } => {
+                let count = receive_from(master, buffer);
+                // A connection beside the first is closed at once; the first may have ended just now.
+                if let Ok((stream, _)) = listener.accept()
+                    && master.is_none()
+                    && stream.set_nonblocking(true).is_ok()
+                    && stream.set_nodelay(true).is_ok()
+                {
+                    *master = Some(stream);
+                }
+                Ok(count)
+            }
+        }
+    }
+
+    /// Hands bytes to the master and returns how many it took.
+    ///
+    /// # Errors
+    /// The port is gone.
+    pub(super) fn send(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        match self {
+            Endpoint::Pty(pty) => no_wait(rustix::io::write(&pty.master, bytes).map_err(io::Error::from)),
+            Endpoint::Port(file, _) => no_wait(file.write(bytes)),
+            Endpoint::Tcp { master, .. } => {
+                let Some(stream) = master else { return Ok(0) };
+                let sent = no_wait(stream.write(bytes));
+                if sent.is_err() {
+                    *master = None;
+                }
+                Ok(sent.unwrap_or(0))
+            }
+        }
+    }
+
+    /// Nobody used the line for a while.
+    pub(super) fn settle(&self) {
+        if let Endpoint::Pty(pty) = self {
+            pty.settle();
+        }
+    }
+}
+
+/// Bytes of a connected master; an ended connection is forgotten.
+fn receive_from(master: &mut Option<TcpStream>, buffer: &mut [u8]) -> usize {
+    let Some(stream) = master else { return 0 };
+    match stream.read(buffer) {
+        Ok(count) if count > 0 => count,
+        Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => 0,
+        _ => {
+            *master = None;
+            0
+        }
+    }
+}
+
+fn no_wait(result: io::Result<usize>) -> io::Result<usize> {
+    match result {
+        Err(error) if matches!(error.kind(), ErrorKind::WouldBlock | ErrorKind::Interrupted) => Ok(0),
+        other => other,
+    }
+}
+
+/// A serial port in raw mode with that format, for this process alone.
+fn open_port(path: &Path, format: &LineFormat) -> io::Result<File> {
+    let flags = rustix::fs::OFlags::NOCTTY | rustix::fs::OFlags::NONBLOCK;
+    let file = OpenOptions::new()
+        .read(true)
+        .write(true)
+        .custom_flags(flags.bits() as i32)
+        .open(path)?;
+    flock(&file, FlockOperation::NonBlockingLockExclusive)?;
+    ioctl_tiocexcl(&file)?;
+    let mut attributes = tcgetattr(&file)?;
+    attributes.make_raw();
+    let modes = &mut attributes.control_modes;
+    modes.insert(ControlModes::CREAD | ControlModes::CLOCAL);
+    modes.remove(ControlModes::CSIZE | ControlModes::PARENB | ControlModes::PARODD | ControlModes::CSTOPB);
+    modes.insert(if format.data_bits == 7 {
+        ControlModes::CS7
+    } else {
+        ControlModes::CS8
+    });
+    match format.parity {
+        Parity::None => {}
+        Parity::Even => modes.insert(ControlModes::PARENB),
+        Parity::Odd => modes.insert(ControlModes::PARENB | ControlModes::PARODD),
+    }
+    if format.stop_bits == 2 {
+        modes.insert(ControlModes::CSTOPB);
+    }
+    attributes.set_speed(format.baud)?;
+    tcsetattr(&file, OptionalActions::Now, &attributes)?;
+    tcflush(&file, QueueSelector::IOFlush)?;
+    Ok(file)
+}

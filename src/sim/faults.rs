@@ -1,0 +1,432 @@
+//! What goes wrong on a simulated line: by chance, or by script for the request of a given number. Pure.
+
+use super::random::Random;
+use crate::codec::rtu;
+use crate::document::parse_duration;
+use std::collections::BTreeMap;
+use std::str::FromStr;
+use std::time::Duration;
+
+/// In what a foreign reply differs from the true one. Its data differs, its CRC is right.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Foreign {
+    /// From another drive.
+    Address,
+    /// To another function.
+    Function,
+    /// Of another length.
+    Length,
+}
+
+/// Something that goes wrong with one exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fault {
+    /// The drive does not hear the request.
+    Deaf,
+    /// The drive acts, its reply is lost.
+    Drop,
+    /// Only the first characters of the reply arrive.
+    Truncate,
+    /// One bit of the reply is wrong.
+    Corrupt,
+    /// The reply comes twice.
+    Double,
+    /// The reply comes later by that much.
+    Late(Duration),
+    /// A foreign reply comes instead of the true one.
+    Foreign(Foreign),
+    /// A foreign reply comes first, the true one after 3.5 characters.
+    Stray(Foreign),
+    /// The master hears its own request before the reply.
+    Echo,
+    /// Noise runs into the beginning of the reply.
+    NoiseBefore,
+    /// Noise follows the reply.
+    NoiseAfter,
+    /// The reply is delivered character by character.
+    Split,
+    /// The drive refuses with this exception code; it does not act.
+    Exception(u8),
+}
+
+/// Every name that a fault has in text, for messages.
+pub const NAMES: &str = "deaf, drop, truncate, corrupt, double, late:50ms, foreign-address, foreign-function, \
+    foreign-length, stray-address, stray-function, stray-length, echo, noise-before, noise-after, split, exception:4, busy";
+
+impl FromStr for Fault {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let (name, argument) = text
+            .split_once(':')
+            .map_or((text, None), |(name, argument)| (name, Some(argument)));
+        let fault = match (name, argument) {
+            ("late", argument) => Fault::Late(parse_duration(argument.unwrap_or("50ms"))?),
+            ("exception", Some(code)) => Fault::Exception(exception_code(code)?),
+            (_, Some(_)) => return Err(format!("`{name}` is no fault that takes a value; there are {NAMES}")),
+            ("deaf", None) => Fault::Deaf,
+            ("drop", None) => Fault::Drop,
+            ("truncate", None) => Fault::Truncate,
+            ("corrupt", None) => Fault::Corrupt,
+            ("double", None) => Fault::Double,
+            ("foreign-address", None) => Fault::Foreign(Foreign::Address),
+            ("foreign-function", None) => Fault::Foreign(Foreign::Function),
+            ("foreign-length", None) => Fault::Foreign(Foreign::Length),
+            ("stray-address", None) => Fault::Stray(Foreign::Address),
+            ("stray-function", None) => Fault::Stray(Foreign::Function),
+            ("stray-length", None) => Fault::Stray(Foreign::Length),
+            ("echo", None) => Fault::Echo,
+            ("noise-before", None) => Fault::NoiseBefore,
+            ("noise-after", None) => Fault::NoiseAfter,
+            ("split", None) => Fault::Split,
+            ("exception", None) => Fault::Exception(4),
+            ("busy", None) => Fault::Exception(6),
+            _ => return Err(format!("`{text}` is no fault; there are {NAMES}")),
+        };
+        Ok(fault)
+    }
+}
+
+fn exception_code(text: &str) -> Result<u8, String> {
+    text.parse()
+        .ok()
+        .filter(|code| *code != 0)
+        .ok_or_else(|| format!("`{text}` is no exception code; write 1 to 255, such as exception:4"))
+}
+
+/// Faults with their probability: `drop=0.01,late:50ms=0.02`.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Rates(Vec<(Fault, f64)>);
+
+impl FromStr for Rates {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, Self::Err> {
+        let mut rates = Vec::new();
+        for part in text.split(',').map(str::trim).filter(|part| !part.is_empty()) {
+            let (fault, rate) = part
+                .split_once('=')
+                .ok_or_else(|| format!("`{part}` has no probability; write it as {part}=0.01"))?;
+            let probability = rate
+                .parse()
+                .ok()
+                .filter(|p| (0.0..=1.0).contains(p))
+                .ok_or_else(|| format!("`{rate}` is no probability; write a number from 0 to 1, such as 0.01"))?;
+            rates.push((fault.parse()?, probability));
+        }
+        let sum: f64 = rates.iter().map(|(_, p)| p).sum();
+        if sum > 1.0 {
+            Err(format!("the probabilities of `{text}` add up to more than 1"))
+        } else {
+            Ok(Rates(rates))
+        }
+    }
+}
+
+/// Which request meets which fault.
+#[derive(Debug, Clone)]
+pub struct FaultPlan {
+    rates: Rates,
+    script: BTreeMap<u64, Fault>,
+    only: Vec<u8>,
+    random: Random,
+    asked: u64,
+}
+
+impl Default for FaultPlan {
+    fn default() -> Self {
+        FaultPlan::new(Rates::default(), 1)
+    }
+}
+
+impl FaultPlan {
+    /// Faults by chance; the seed fixes which request meets which.
+    pub fn new(rates: Rates, seed: u64) -> FaultPlan {
+        FaultPlan {
+            rates,
+            script: BTreeMap::new(),
+            only: Vec::new(),
+            random: Random::new(seed),
+            asked: 0,
+        }
+    }
+
+    /// The fault for the request of that number. The first sound request to a drive that answers, counted from when
+    /// the plan is put to work, is number 1.
+    #[must_use]
+    pub fn at(mut self, number: u64, fault: Fault) -> FaultPlan {
+        self.script.insert(number, fault);
+        self
+    }
+
+    /// Confines the faults (and the counting) to requests to these addresses.
+    #[must_use]
+    pub fn only(mut self, addresses: &[u8]) -> FaultPlan {
+        self.only = addresses.to_vec();
+        self
+    }
+
+    /// The fault that the next request, one to `address`, meets.
+    pub fn next(&mut self, address: u8) -> Option<Fault> {
+        if !self.only.is_empty() && !self.only.contains(&address) {
+            return None;
+        }
+        self.asked += 1;
+        if let Some(fault) = self.script.remove(&self.asked) {
+            return Some(fault);
+        }
+        if self.rates.0.is_empty() {
+            return None;
+        }
+        let mut dice = self.random.unit();
+        for &(fault, probability) in &self.rates.0 {
+            if dice < probability {
+                return Some(fault);
+            }
+            dice -= probability;
+        }
+        None
+    }
+
+    /// What comes over the line for `reply` to `request` under a fault, in order.
+    pub fn shape(&mut self, fault: Option<Fault>, request: &[u8], reply: Vec<u8>, silence: Duration) -> Vec<Burst> {
+        let random = &mut self.random;
+        let burst = |bytes| Burst {
+            gap: Duration::ZERO,
+            bytes,
+            kind: Kind::Regular,
+        };
+        let provoked = |bytes| Burst {
+            kind: Kind::Provoked,
+            ..burst(bytes)
+        };
+        match fault {
+            None | Some(Fault::Exception(_)) => vec![burst(reply)],
+            Some(Fault::Deaf | Fault::Drop) => Vec::new(),
+            Some(Fault::Truncate) => vec![burst(cut(reply, random))],
+            Some(Fault::Corrupt) => vec![burst(flip(reply, random))],
+            Some(Fault::Double) => vec![burst(reply.clone()), provoked(reply)],
+            Some(Fault::Late(by)) => vec![Burst {
+                gap: by,
+                ..provoked(reply)
+            }],
+            Some(Fault::Foreign(what)) => vec![burst(foreign(what, &reply))],
+            Some(Fault::Stray(what)) => {
+                vec![
+                    burst(foreign(what, &reply)),
+                    Burst {
+                        gap: silence,
+                        ..burst(reply)
+                    },
+                ]
+            }
+            Some(Fault::Echo) => vec![
+                Burst {
+                    kind: Kind::Echo,
+                    ..burst(request.to_vec())
+                },
+                burst(reply),
+            ],
+            Some(Fault::NoiseBefore) => vec![burst(noise(random)), burst(reply)],
+            Some(Fault::NoiseAfter) => vec![burst(reply), provoked(noise(random))],
+            Some(Fault::Split) => vec![Burst {
+                kind: Kind::Split,
+                ..burst(reply)
+            }],
+        }
+    }
+}
+
+/// What a burst is to the line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// It stands where the reply is expected.
+    Regular,
+    /// As regular, but delivered character by character.
+    Split,
+    /// The master cannot expect it: a request that meets it is not the master's doing.
+    Provoked,
+    /// It comes together with the request, not after it.
+    Echo,
+}
+
+/// Characters without a gap.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Burst {
+    /// Time between what came before and its first character.
+    pub gap: Duration,
+    /// The characters.
+    pub bytes: Vec<u8>,
+    /// What it is to the line.
+    pub kind: Kind,
+}
+
+fn cut(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
+    let keep = random.within(1..=(reply.len() as u64).saturating_sub(1).max(1));
+    reply.truncate(keep as usize);
+    reply
+}
+
+fn flip(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
+    let at = random.within(0..=(reply.len() as u64).saturating_sub(1)) as usize;
+    if let Some(byte) = reply.get_mut(at) {
+        *byte ^= 1 << random.within(0..=7);
+    }
+    reply
+}
+
+fn noise(random: &mut Random) -> Vec<u8> {
+    (0..random.within(1..=3)).map(|_| random.byte()).collect()
+}
+
+/// A sound frame that does not answer the request; its data is changed so that it proves itself when believed.
+fn foreign(what: Foreign, reply: &[u8]) -> Vec<u8> {
+    let Some((address, pdu)) = rtu::open_frame(reply) else {
+        return Vec::new();
+    };
+    let mut pdu = pdu.to_vec();
+    let registers = matches!(pdu.first(), Some(3 | 4));
+    pdu.iter_mut().skip(2).for_each(|byte| *byte ^= 0x55);
+    let mut address = address;
+    match what {
+        Foreign::Address => address = if address == 247 { 1 } else { address + 1 },
+        Foreign::Function => {
+            if let Some(function) = pdu.first_mut() {
+                *function = if *function == 3 { 4 } else { 3 };
+            }
+            // Whatever it was, it becomes a reply of one register unless it has registers already.
+            if !registers {
+                pdu.truncate(1);
+                pdu.extend_from_slice(&[2, 0x55, 0x55]);
+            }
+        }
+        Foreign::Length => {
+            pdu.extend_from_slice(&[0x55, 0x55]);
+            if let (true, Some(count)) = (registers, pdu.get_mut(1)) {
+                *count = count.wrapping_add(2);
+            }
+        }
+    }
+    let mut out = Vec::with_capacity(pdu.len() + rtu::OVERHEAD);
+    rtu::encode_frame(address, &pdu, &mut out);
+    out
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::{Decoded, Request, RequestPdu, Table};
+
+    const SILENCE: Duration = Duration::from_micros(911);
+
+    fn exchange() -> (Request, Vec<u8>, Vec<u8>) {
+        let request = Request {
+            address: 1,
+            pdu: RequestPdu::Read {
+                table: Table::Holding,
+                start: 2100,
+                count: 2,
+            },
+        };
+        let (mut asked, mut reply) = (Vec::new(), Vec::new());
+        rtu::encode_request(&request, &mut asked);
+        rtu::encode_frame(1, &[3, 4, 1, 2, 3, 4], &mut reply);
+        (request, asked, reply)
+    }
+
+    fn shaped(text: &str) -> Vec<Burst> {
+        let (_, asked, reply) = exchange();
+        FaultPlan::default().shape(Some(text.parse().unwrap()), &asked, reply, SILENCE)
+    }
+
+    #[test]
+    fn names_are_read_and_complete() {
+        for name in NAMES.split(", ") {
+            let fault: Fault = name.trim().parse().unwrap();
+            let (_, asked, reply) = exchange();
+            FaultPlan::default().shape(Some(fault), &asked, reply, SILENCE);
+        }
+        for bad in ["", "drip", "drop:3", "exception:0", "exception:x", "late:x"] {
+            assert!(bad.parse::<Fault>().is_err(), "{bad}");
+        }
+        assert_eq!("busy".parse(), Ok(Fault::Exception(6)));
+        let rates: Rates = "drop=0.01, late:150ms=0.02".parse().unwrap();
+        assert_eq!(
+            rates.0,
+            [(Fault::Drop, 0.01), (Fault::Late(Duration::from_millis(150)), 0.02)]
+        );
+        for bad in ["drop", "drop=2", "drop=x", "drop=0.6,busy=0.6", "what=0.1"] {
+            assert!(bad.parse::<Rates>().is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn chance_script_and_addresses() {
+        let rates: Rates = "drop=0.1,corrupt=0.2".parse().unwrap();
+        let mut plan = FaultPlan::new(rates.clone(), 5);
+        let seen: Vec<_> = (0..10_000).map(|_| plan.next(1)).collect();
+        let count = |wanted| seen.iter().filter(|fault| **fault == wanted).count();
+        assert!((900..1100).contains(&count(Some(Fault::Drop))));
+        assert!((1850..2150).contains(&count(Some(Fault::Corrupt))));
+        let mut again = FaultPlan::new(rates, 5);
+        assert!(
+            seen.iter().all(|fault| *fault == again.next(1)),
+            "the same seed, the same faults"
+        );
+
+        let mut script = FaultPlan::default().at(2, Fault::Echo).only(&[7]);
+        let seen: Vec<_> = [1, 7, 1, 7, 7].map(|address| script.next(address)).to_vec();
+        assert_eq!(seen, [None, None, None, Some(Fault::Echo), None]);
+    }
+
+    #[test]
+    fn no_shape_is_believed_but_the_true_reply() {
+        let (request, asked, reply) = exchange();
+        let decode = |bytes: &[u8]| rtu::decode_reply(&request, bytes);
+        let truth = decode(&reply);
+        assert!(matches!(truth, Decoded::Reply { .. }));
+        assert!(matches!(decode(&shaped("truncate")[0].bytes), Decoded::Incomplete));
+        assert!(!matches!(decode(&shaped("corrupt")[0].bytes), Decoded::Reply { .. }));
+        for name in ["foreign-address", "foreign-function", "foreign-length"] {
+            let burst = &shaped(name)[0];
+            assert_eq!(
+                decode(&burst.bytes),
+                Decoded::Foreign {
+                    used: burst.bytes.len()
+                },
+                "{name}"
+            );
+        }
+        let stray = shaped("stray-length");
+        assert_eq!((decode(&stray[1].bytes), stray[1].gap), (truth.clone(), SILENCE));
+        let echo = shaped("echo");
+        assert_eq!(
+            (echo[0].kind, &echo[0].bytes, &echo[1].bytes),
+            (Kind::Echo, &asked, &reply)
+        );
+        assert_eq!(shaped("double").len(), 2);
+        assert_eq!(shaped("late:20ms")[0].gap, Duration::from_millis(20));
+        assert!(shaped("drop").is_empty() && shaped("deaf").is_empty());
+        assert_eq!(shaped("split")[0].kind, Kind::Split);
+        assert_eq!(shaped("noise-after")[1].kind, Kind::Provoked);
+        assert_eq!(decode(&shaped("noise-before")[1].bytes), truth);
+    }
+
+    /// A foreign reply to a write or an exception is sound as well.
+    #[test]
+    fn foreign_frames_to_any_reply_are_sound() {
+        for pdu in [
+            vec![6, 7, 0xD0, 0, 1],
+            vec![0x83, 2],
+            vec![16, 7, 0xD0, 0, 3],
+            vec![4, 2, 0, 1],
+        ] {
+            for what in [Foreign::Address, Foreign::Function, Foreign::Length] {
+                let mut reply = Vec::new();
+                rtu::encode_frame(247, &pdu, &mut reply);
+                let frame = foreign(what, &reply);
+                assert!(rtu::open_frame(&frame).is_some() && frame != reply, "{what:?} {pdu:?}");
+            }
+        }
+    }
+}

@@ -1,0 +1,670 @@
+//! The simulated two-wire line: which character is on it when, silence, collisions. Pure; the time is an argument.
+//!
+//! A master on a pseudo-terminal hands over a whole frame in no time. Here it takes the time that it would take on the
+//! wire: its first character begins when the bytes were read, or right after the characters before them. A frame is
+//! over after 3.5 characters of silence; then the drive takes its turnaround, then its reply begins. Bytes of the reply
+//! are due at the end of the character that completes a chunk, never before.
+//!
+//! A strict drive, as drives of the field do, does not hear a request that begins before 3.5 characters of silence.
+
+use super::SimTime;
+use super::faults::{Burst, Fault, FaultPlan, Kind};
+use super::slave::{Asked, Heard, Slaves, refuse};
+use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
+use crate::codec::{Exception, LineFormat, rtu};
+use std::time::Duration;
+
+/// How the bytes of a reply reach the master.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Delivery {
+    /// All at the end of the last character: a master that ends a reply by its length sees no difference.
+    Whole,
+    /// In chunks of so many characters, as a UART hands over its FIFO (14 of 16 is usual); 1 is one by one.
+    Chunks(u8),
+}
+
+/// What is between the simulated drives and the master.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wire {
+    /// A port without a baud rate of its own: the time on the wire is simulated.
+    Simulated,
+    /// A real UART: bytes were on the wire when they arrive, and go onto it when they are written.
+    Real,
+    /// No time on the wire, no silence to keep: as fast as the programs are.
+    Instant,
+}
+
+/// How the line behaves.
+#[derive(Debug, Clone)]
+pub struct LineRules {
+    /// Baud and character format.
+    pub format: LineFormat,
+    /// Time between the end of a request (its last character and 3.5 characters of silence) and the reply.
+    pub turnaround: Duration,
+    /// Whether drives ignore a request that comes too early; counted it is anyway.
+    pub strict: bool,
+    /// Share of the 3.5 characters that may be missing.
+    pub tolerance: f64,
+    /// How the bytes of a reply reach the master.
+    pub delivery: Delivery,
+    /// What is between the drives and the master.
+    pub wire: Wire,
+}
+
+impl LineRules {
+    /// A strict line with whole delivery, turnaround 0.5 ms and a tolerance of 3 %.
+    pub fn new(format: LineFormat) -> LineRules {
+        LineRules {
+            format,
+            turnaround: Duration::from_micros(500),
+            strict: true,
+            tolerance: 0.03,
+            delivery: Delivery::Whole,
+            wire: Wire::Simulated,
+        }
+    }
+}
+
+/// Longest frame that is kept; what follows until the next silence is counted and thrown away.
+const LONGEST_FRAME: usize = 300;
+/// Where the time on the wire is not known, a frame that stays a fragment is over after that time.
+const FRAGMENT: Duration = Duration::from_millis(20);
+/// Bursts that may wait for delivery; late replies beyond that are lost.
+const MOST_OUTGOING: usize = 64;
+
+/// What the beginning of a request says about it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Verdict {
+    Clean,
+    TooEarly,
+    Collided,
+}
+
+/// A frame of the master on the wire.
+#[derive(Debug)]
+struct Incoming {
+    start: SimTime,
+    end: SimTime,
+    bytes: Vec<u8>,
+    verdict: Verdict,
+}
+
+/// Characters of a drive, on the wire or waiting for it.
+#[derive(Debug)]
+struct Outgoing {
+    start: SimTime,
+    bytes: Vec<u8>,
+    sent: usize,
+    chunk: usize,
+    kind: Kind,
+}
+
+/// When the line wants to be looked at again.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Wake {
+    /// When.
+    pub at: SimTime,
+    /// Whether bytes are due then, so that every microsecond counts.
+    pub delivery: bool,
+}
+
+/// A half-duplex line with its drives.
+#[derive(Debug)]
+pub struct HalfDuplex {
+    rules: LineRules,
+    slaves: Slaves,
+    faults: FaultPlan,
+    incoming: Option<Incoming>,
+    outgoing: Vec<Outgoing>,
+    /// End of the last frame that the master sent or could expect.
+    last_end: Option<SimTime>,
+    /// End of the last reply that the master could expect; it may lie ahead.
+    reply_end: Option<SimTime>,
+    /// End of the last characters that fault injection put there; it may lie ahead.
+    provoked_end: Option<SimTime>,
+    statistics: Statistics,
+    lateness: Lateness,
+    transcript: Transcript,
+}
+
+impl HalfDuplex {
+    /// A silent line.
+    pub fn new(rules: LineRules, slaves: Slaves, faults: FaultPlan, transcript: Transcript) -> HalfDuplex {
+        HalfDuplex {
+            rules,
+            slaves,
+            faults,
+            incoming: None,
+            outgoing: Vec::new(),
+            last_end: None,
+            reply_end: None,
+            provoked_end: None,
+            statistics: Statistics::default(),
+            lateness: Lateness::default(),
+            transcript,
+        }
+    }
+
+    /// The drives.
+    pub fn slaves(&mut self) -> &mut Slaves {
+        &mut self.slaves
+    }
+
+    /// Replaces the faults from the next request on.
+    pub fn set_faults(&mut self, faults: FaultPlan) {
+        self.faults = faults;
+    }
+
+    /// Counters so far.
+    pub fn statistics(&self) -> Statistics {
+        self.statistics
+    }
+
+    /// How late the simulator delivered.
+    pub fn lateness(&mut self) -> &mut Lateness {
+        &mut self.lateness
+    }
+
+    /// Bytes that the port did not take.
+    pub fn lost(&mut self, bytes: usize) {
+        self.statistics.bytes_lost += bytes as u64;
+    }
+
+    /// Frames recorded so far.
+    pub fn transcript(&self) -> &Transcript {
+        &self.transcript
+    }
+
+    /// Replaces the transcript by an empty one of that length.
+    pub fn record(&mut self, limit: usize) {
+        self.transcript = Transcript::new(limit);
+    }
+
+    /// The line was cut: what is on it is gone.
+    pub fn cut(&mut self) {
+        self.incoming = None;
+        self.outgoing.clear();
+        self.last_end = None;
+        self.reply_end = None;
+        self.provoked_end = None;
+    }
+
+    /// Silence that ends a frame, and that a request has to wait for.
+    fn silence(&self) -> Duration {
+        match self.rules.wire {
+            Wire::Instant => Duration::ZERO,
+            _ => self.rules.format.silence_chars(),
+        }
+    }
+
+    fn chars(&self, count: usize) -> Duration {
+        match self.rules.wire {
+            Wire::Instant => Duration::ZERO,
+            _ => self.rules.format.chars(count),
+        }
+    }
+
+    /// Bytes of the master that were read from the port at `now`.
+    pub fn on_bytes(&mut self, bytes: &[u8], now: SimTime) {
+        self.on_time(now);
+        self.statistics.bytes_in += bytes.len() as u64;
+        let wire_time = self.chars(bytes.len());
+        let begun = if self.rules.wire == Wire::Real {
+            now.saturating_sub(wire_time)
+        } else {
+            now
+        };
+        if self.incoming.is_none() {
+            let verdict = self.verdict(begun);
+            if verdict == Verdict::Collided {
+                self.spoil(begun);
+            }
+            self.incoming = Some(Incoming {
+                start: begun,
+                end: begun,
+                bytes: Vec::new(),
+                verdict,
+            });
+        }
+        let Some(incoming) = &mut self.incoming else { return };
+        incoming.end = incoming.end.max(begun) + wire_time;
+        let room = LONGEST_FRAME.saturating_sub(incoming.bytes.len());
+        incoming.bytes.extend(bytes.iter().take(room));
+        if self.rules.wire == Wire::Instant {
+            self.on_time(now);
+        }
+    }
+
+    /// What it means that a request begins at `start`.
+    fn verdict(&self, start: SimTime) -> Verdict {
+        let least = self.silence().mul_f64((1.0 - self.rules.tolerance).max(0.0));
+        if self.rules.wire == Wire::Instant {
+            Verdict::Clean
+        } else if self.reply_end.is_some_and(|end| start < end) {
+            Verdict::Collided
+        } else if self.last_end.max(self.reply_end).is_some_and(|end| start < end + least) {
+            Verdict::TooEarly
+        } else {
+            Verdict::Clean
+        }
+    }
+
+    /// Ends the master's frame when its silence is over by `now`.
+    pub fn on_time(&mut self, now: SimTime) {
+        let Some(frame) = self.incoming.take_if(|frame| Self::is_over(frame, &self.rules, now)) else {
+            return;
+        };
+        let heard_at = frame.end + self.silence();
+        self.last_end = Some(frame.end);
+        let met_fault = self.provoked_end.is_some_and(|end| frame.start < end + self.silence());
+        self.statistics.provoked_overlaps += u64::from(met_fault && self.rules.wire != Wire::Instant);
+        self.transcript.record(|| Recorded {
+            direction: Direction::ToDrives,
+            start: frame.start,
+            end: frame.end,
+            bytes: frame.bytes.clone(),
+        });
+        match frame.verdict {
+            Verdict::Clean => self.hear(&frame, heard_at),
+            Verdict::TooEarly => {
+                self.statistics.silence_violations += 1;
+                if !self.rules.strict {
+                    self.hear(&frame, heard_at);
+                }
+            }
+            Verdict::Collided => self.statistics.collisions += 1,
+        }
+    }
+
+    fn is_over(frame: &Incoming, rules: &LineRules, now: SimTime) -> bool {
+        now >= frame.end + Self::end_after(frame, rules)
+    }
+
+    /// Silence after which a frame is over. Drivers and adapters of real ports hand bytes over with pauses, and an
+    /// instant line knows no time, so there a frame that is not yet whole is waited for.
+    fn end_after(frame: &Incoming, rules: &LineRules) -> Duration {
+        let silence = rules.format.silence_chars();
+        let whole = || rtu::request_len(&frame.bytes).is_some_and(|len| len <= frame.bytes.len());
+        match rules.wire {
+            Wire::Instant if whole() => Duration::ZERO,
+            Wire::Instant => FRAGMENT,
+            Wire::Real if !whole() => silence.max(FRAGMENT),
+            Wire::Simulated | Wire::Real => silence,
+        }
+    }
+
+    /// Two senders at once: what is still to come of the reply is garbage.
+    fn spoil(&mut self, from: SimTime) {
+        let format = self.rules.format;
+        for burst in self.outgoing.iter_mut().filter(|burst| burst.kind != Kind::Provoked) {
+            let (start, sent) = (burst.start, burst.sent);
+            for (index, byte) in burst.bytes.iter_mut().enumerate().skip(sent) {
+                if start + format.chars(index + 1) > from {
+                    *byte = !*byte;
+                }
+            }
+        }
+    }
+
+    /// The drives hear a frame whose silence ended at `now`.
+    fn hear(&mut self, frame: &Incoming, now: SimTime) {
+        match self.slaves.hear(&frame.bytes, now) {
+            Heard::BadCrc => self.statistics.bad_crc += 1,
+            Heard::Nobody(_) => self.statistics.unanswered += 1,
+            Heard::Broadcast => self.statistics.broadcasts += 1,
+            Heard::Request(asked) => self.reply(frame, &asked, now),
+        }
+    }
+
+    fn reply(&mut self, frame: &Incoming, asked: &Asked, now: SimTime) {
+        self.statistics.requests += 1;
+        let fault = self.faults.next(asked.address);
+        self.statistics.faults += u64::from(fault.is_some());
+        let mut reply = Vec::with_capacity(64);
+        match fault {
+            Some(Fault::Deaf) => return,
+            Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
+            _ => self.slaves.answer(asked, now, &mut reply),
+        }
+        let bursts = self.faults.shape(fault, &frame.bytes, reply, self.silence());
+        self.statistics.replies += u64::from(!bursts.is_empty());
+        let mut at = now + self.rules.turnaround;
+        for burst in bursts {
+            if burst.kind == Kind::Echo {
+                // It cannot come earlier: only now is known that this request meets the fault.
+                self.send(now.saturating_sub(self.chars(burst.bytes.len())), burst);
+            } else {
+                at = self.send(at + burst.gap, burst);
+            }
+        }
+    }
+
+    /// Puts a burst onto the wire at `start`; its end is returned.
+    fn send(&mut self, start: SimTime, burst: Burst) -> SimTime {
+        let end = start + self.chars(burst.bytes.len());
+        match burst.kind {
+            Kind::Regular | Kind::Split => self.reply_end = self.reply_end.max(Some(end)),
+            Kind::Provoked => self.provoked_end = self.provoked_end.max(Some(end)),
+            Kind::Echo => {}
+        }
+        let bytes = burst.bytes;
+        self.transcript.record(|| Recorded {
+            direction: Direction::FromDrives,
+            start,
+            end,
+            bytes: bytes.clone(),
+        });
+        let chunk = match (burst.kind, self.rules.delivery) {
+            (Kind::Split, _) => 1,
+            (_, Delivery::Whole) => bytes.len(),
+            (_, Delivery::Chunks(size)) => usize::from(size),
+        };
+        if !bytes.is_empty() && self.outgoing.len() < MOST_OUTGOING {
+            self.outgoing.push(Outgoing {
+                start,
+                bytes,
+                sent: 0,
+                chunk: chunk.max(1),
+                kind: burst.kind,
+            });
+        }
+        end
+    }
+
+    /// When the next chunk of a burst is due: at the end of its last character, or, when a real UART sends it, at the
+    /// beginning of its first.
+    fn due(&self, burst: &Outgoing) -> SimTime {
+        match self.rules.wire {
+            Wire::Real => burst.start + self.chars(burst.sent),
+            _ => burst.start + self.chars((burst.sent + burst.chunk).min(burst.bytes.len())),
+        }
+    }
+
+    /// Appends the next bytes that are due by `now` to `out` and returns when they were due.
+    pub fn take_due(&mut self, now: SimTime, out: &mut Vec<u8>) -> Option<SimTime> {
+        let (index, due) = self
+            .outgoing
+            .iter()
+            .enumerate()
+            .map(|(index, burst)| (index, self.due(burst)))
+            .filter(|(_, due)| *due <= now)
+            .min_by_key(|(_, due)| *due)?;
+        let burst = self.outgoing.get_mut(index)?;
+        let chunk: &[u8] = burst
+            .bytes
+            .get(burst.sent..(burst.sent + burst.chunk).min(burst.bytes.len()))?;
+        out.extend_from_slice(chunk);
+        self.statistics.bytes_out += chunk.len() as u64;
+        burst.sent += chunk.len();
+        if burst.sent >= burst.bytes.len() {
+            self.outgoing.swap_remove(index);
+        }
+        Some(due)
+    }
+
+    /// When the line wants to be looked at next; `None` while nothing goes on.
+    pub fn wake(&self) -> Option<Wake> {
+        let over = |frame: &Incoming| frame.end + Self::end_after(frame, &self.rules);
+        let frame = self.incoming.as_ref().map(|frame| Wake {
+            at: over(frame),
+            delivery: false,
+        });
+        let delivery = self.outgoing.iter().map(|burst| Wake {
+            at: self.due(burst),
+            delivery: true,
+        });
+        delivery.chain(frame).min_by_key(|wake| (wake.at, !wake.delivery))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::drive::DriveOptions;
+    use super::*;
+
+    const READ_STATUS: [u8; 8] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B, 0x47, 0xA3];
+    /// 27 characters: the reply to it.
+    const REPLY_CHARS: usize = 27;
+
+    fn us(micros: u64) -> Duration {
+        Duration::from_micros(micros)
+    }
+
+    fn rules() -> LineRules {
+        LineRules::new(LineFormat::new(38_400, "8N1").unwrap())
+    }
+
+    fn line(rules: LineRules, faults: FaultPlan) -> HalfDuplex {
+        let drives = [DriveOptions::nx(1), DriveOptions::nx(2)];
+        HalfDuplex::new(rules, Slaves::new(drives, SimTime::ZERO), faults, Transcript::new(100))
+    }
+
+    /// Lets the line run to `until`: (due, bytes) of each delivery.
+    fn run(line: &mut HalfDuplex, until: SimTime) -> Vec<(SimTime, Vec<u8>)> {
+        let mut seen = Vec::new();
+        while let Some(wake) = line.wake().filter(|wake| wake.at <= until) {
+            line.on_time(wake.at);
+            let mut bytes = Vec::new();
+            while let Some(due) = line.take_due(wake.at, &mut bytes) {
+                assert_eq!(due, wake.at, "woken at the right time");
+                seen.push((due, std::mem::take(&mut bytes)));
+            }
+        }
+        seen
+    }
+
+    /// From the read of a request to the end of its reply: 8 + 3.5 + 27 characters and the turnaround.
+    fn exchange_time(format: &LineFormat) -> Duration {
+        format.chars(8) + format.silence_chars() + us(500) + format.chars(REPLY_CHARS)
+    }
+
+    #[test]
+    fn a_reply_takes_its_time_on_the_wire() {
+        let rules = rules();
+        let mut line = line(rules.clone(), FaultPlan::default());
+        let asked = us(1000);
+        line.on_bytes(&READ_STATUS, asked);
+        let seen = run(&mut line, us(100_000));
+        assert_eq!(seen.len(), 1);
+        assert_eq!(seen[0].0, asked + exchange_time(&rules.format));
+        assert_eq!(seen[0].1.len(), REPLY_CHARS);
+        let frames = line.transcript().frames();
+        assert_eq!(frames[0].to_string(), "0.001000 > 01 03 08 34 00 0B 47 A3");
+        assert_eq!(frames[0].end, asked + rules.format.chars(8));
+        assert_eq!(frames[1].end, seen[0].0);
+        let s = line.statistics();
+        assert_eq!(
+            (s.requests, s.replies, s.bytes_in, s.bytes_out),
+            (1, 1, 8, REPLY_CHARS as u64)
+        );
+    }
+
+    #[test]
+    fn chunks_come_as_a_fifo_hands_them_over() {
+        for (delivery, chunks) in [(Delivery::Chunks(1), 27), (Delivery::Chunks(14), 2)] {
+            let rules = LineRules { delivery, ..rules() };
+            let mut line = line(rules.clone(), FaultPlan::default());
+            line.on_bytes(&READ_STATUS, SimTime::ZERO);
+            let seen = run(&mut line, us(100_000));
+            assert_eq!(seen.len(), chunks);
+            let begun = exchange_time(&rules.format) - rules.format.chars(REPLY_CHARS);
+            let mut characters = 0;
+            for (due, bytes) in &seen {
+                characters += bytes.len();
+                assert_eq!(*due, begun + rules.format.chars(characters));
+            }
+            assert_eq!(characters, REPLY_CHARS);
+        }
+    }
+
+    #[test]
+    fn a_frame_in_pieces_is_one_frame() {
+        let mut line = line(rules(), FaultPlan::default());
+        line.on_bytes(&READ_STATUS[..3], us(0));
+        line.on_bytes(&READ_STATUS[3..], us(10));
+        assert_eq!(run(&mut line, us(100_000)).len(), 1);
+        assert_eq!(
+            line.transcript().frames()[0].end,
+            rules().format.chars(8),
+            "no time between the pieces"
+        );
+        line.on_bytes(&READ_STATUS[..3], us(100_000));
+        line.on_bytes(&READ_STATUS[3..], us(110_000));
+        assert!(run(&mut line, us(200_000)).is_empty());
+        assert_eq!(line.statistics().bad_crc, 2, "two fragments");
+    }
+
+    #[test]
+    fn the_silence_between_frames() {
+        let silence = rules().format.silence_chars();
+        let tolerated = silence.mul_f64(0.98);
+        for (gap, strict, violations, replies) in [
+            (silence, true, 0, 2),
+            (tolerated, true, 0, 2),
+            (us(800), true, 1, 1),
+            (us(800), false, 1, 2),
+            (us(0), true, 1, 1),
+        ] {
+            let mut line = line(LineRules { strict, ..rules() }, FaultPlan::default());
+            line.on_bytes(&READ_STATUS, us(0));
+            let end = run(&mut line, us(100_000))[0].0;
+            line.on_bytes(&READ_STATUS, end + gap);
+            run(&mut line, us(200_000));
+            let s = line.statistics();
+            assert_eq!(
+                (s.silence_violations, s.replies),
+                (violations, replies),
+                "gap {gap:?} strict {strict}"
+            );
+            assert_eq!(s.collisions, 0);
+        }
+        // After a frame that nobody answers, and after a broadcast, the same silence.
+        for first in [[9, 3, 8, 0x34, 0, 11, 0, 0], [0, 6, 7, 0xD0, 0, 0, 0x88, 0x96]] {
+            let mut line = line(rules(), FaultPlan::default());
+            line.on_bytes(&first, us(0));
+            line.on_bytes(&READ_STATUS, rules().format.chars(8) + silence);
+            run(&mut line, us(100_000));
+            assert_eq!(
+                (line.statistics().silence_violations, line.statistics().replies),
+                (0, 1)
+            );
+        }
+    }
+
+    #[test]
+    fn talking_into_a_reply_is_a_collision_and_spoils_it() {
+        let mut line = line(rules(), FaultPlan::default());
+        line.on_bytes(&READ_STATUS, us(0));
+        line.on_bytes(&READ_STATUS, us(8000));
+        let seen = run(&mut line, us(100_000));
+        assert_eq!(seen.len(), 1);
+        assert!(
+            rtu::open_frame(&seen[0].1).is_none(),
+            "the rest of the reply is garbage"
+        );
+        assert_eq!((line.statistics().collisions, line.statistics().requests), (1, 1));
+        line.on_bytes(&READ_STATUS, us(200_000));
+        assert!(
+            rtu::open_frame(&run(&mut line, us(300_000))[0].1).is_some(),
+            "the line recovers"
+        );
+    }
+
+    #[test]
+    fn faults_come_over_the_wire_and_are_not_the_masters_doing() {
+        let plan = |fault| FaultPlan::default().at(1, fault);
+        let exchange = exchange_time(&rules().format);
+        let deliveries = |fault| {
+            let mut line = line(rules(), plan(fault));
+            line.on_bytes(&READ_STATUS, us(0));
+            let seen = run(&mut line, us(1_000_000));
+            let s = line.statistics();
+            assert_eq!((s.faults, s.silence_violations, s.collisions), (1, 0, 0), "{fault:?}");
+            seen
+        };
+        assert!(deliveries(Fault::Drop).is_empty() && deliveries(Fault::Deaf).is_empty());
+        let late = deliveries(Fault::Late(us(20_000)));
+        assert_eq!(late[0].0, exchange + us(20_000));
+        let double = deliveries(Fault::Double);
+        assert_eq!(double[1].0, double[0].0 + rules().format.chars(REPLY_CHARS));
+        let echo = deliveries(Fault::Echo);
+        assert_eq!(
+            (echo[0].0, echo[0].1.as_slice()),
+            (
+                rules().format.chars(8) + rules().format.silence_chars(),
+                READ_STATUS.as_slice()
+            )
+        );
+        assert_eq!(deliveries(Fault::Split).len(), REPLY_CHARS);
+        assert_eq!(deliveries(Fault::Exception(4))[0].1[..3], [1, 0x83, 4]);
+
+        let mut line = line(rules(), plan(Fault::Late(us(20_000))));
+        line.on_bytes(&READ_STATUS, us(0));
+        line.on_time(us(5000));
+        line.on_bytes(&READ_STATUS, us(25_000));
+        assert_eq!(
+            run(&mut line, us(1_000_000)).len(),
+            2,
+            "the late reply and the true one"
+        );
+        let s = line.statistics();
+        assert_eq!((s.provoked_overlaps, s.collisions, s.silence_violations), (1, 0, 0));
+    }
+
+    #[test]
+    fn a_real_uart_keeps_the_time_itself() {
+        let rules = LineRules {
+            wire: Wire::Real,
+            ..rules()
+        };
+        let mut line = line(rules.clone(), FaultPlan::default());
+        let read = us(10_000);
+        line.on_bytes(&READ_STATUS, read);
+        assert_eq!(line.transcript().frames().len(), 0);
+        let seen = run(&mut line, us(100_000));
+        assert_eq!(
+            seen[0].0,
+            read + rules.format.silence_chars() + us(500),
+            "written when the reply begins"
+        );
+        assert_eq!(line.transcript().frames()[0].start, read - rules.format.chars(8));
+    }
+
+    #[test]
+    fn an_instant_line_answers_at_once() {
+        let rules = LineRules {
+            wire: Wire::Instant,
+            turnaround: Duration::ZERO,
+            ..rules()
+        };
+        let mut line = line(rules, FaultPlan::default());
+        for _ in 0..3 {
+            line.on_bytes(&READ_STATUS[..5], us(7));
+            assert!(line.wake().is_some_and(|wake| !wake.delivery));
+            line.on_bytes(&READ_STATUS[5..], us(7));
+            assert_eq!(run(&mut line, us(7)).len(), 1);
+        }
+        line.on_bytes(&READ_STATUS[..5], us(7));
+        run(&mut line, us(50_000));
+        assert_eq!(line.statistics().bad_crc, 1, "a fragment is thrown away");
+        assert_eq!(line.statistics().silence_violations, 0);
+    }
+
+    #[test]
+    fn a_flood_is_bounded() {
+        let mut line = line(rules(), FaultPlan::default());
+        for millisecond in 0..1000 {
+            line.on_bytes(&[0xFF; 500], us(millisecond * 1000));
+        }
+        assert!(
+            line.incoming
+                .as_ref()
+                .is_some_and(|frame| frame.bytes.len() == LONGEST_FRAME)
+        );
+        run(&mut line, Duration::from_secs(1000));
+        assert_eq!(line.statistics().bytes_in, 500_000);
+        assert_eq!(line.statistics().bad_crc, 1);
+        line.on_bytes(&READ_STATUS, Duration::from_secs(2000));
+        assert_eq!(run(&mut line, Duration::from_secs(2001)).len(), 1);
+    }
+}

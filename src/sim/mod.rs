@@ -1,0 +1,33 @@
+//! Simulated drives and the simulated wire, for `demo`, `simulate`, tests and benches.
+//!
+//! The pieces, from the drive to the port:
+//!
+//! - [`nx`]: what a Vacon NX with its option board does (pure), and [`autopilot`], which runs one in a demo.
+//! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
+//!   in and replies out.
+//! - [`faults`]: what goes wrong on a line, by chance or by script.
+//! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
+//! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
+//! - [`bare_master`]: a measuring rod for benches, not a master to build on.
+//!
+//! Everything but [`wire`], its endpoints and the measuring rod is pure and takes the time as an argument, so the same
+//! requests at the same times give the same bytes.
+
+use std::time::Duration;
+
+pub mod autopilot;
+pub mod bare_master;
+pub mod drive;
+pub mod endpoint;
+pub mod faults;
+pub mod half_duplex;
+pub mod nx;
+pub mod pty;
+pub mod random;
+pub mod slave;
+pub mod statistics;
+mod wait;
+pub mod wire;
+
+/// Time since the simulated line was switched on.
+pub type SimTime = Duration;

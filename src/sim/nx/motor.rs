@@ -1,0 +1,228 @@
+//! The motor behind the simulated drive: ramps, shaft, load, heat (drives.md, section 10).
+
+use super::parameters::Settings;
+
+/// The load and the mains of one drive.
+///
+/// The defaults make the worked status frame of drives.md 7.4: at 25 Hz 750 rpm, 1.2 A, torque 10.5 %, power 5.3 %,
+/// 200.0 V on the motor and 560 V in the DC link.
+#[derive(Debug, Clone, Copy)]
+pub struct Load {
+    /// Torque that the load takes at standstill, % of nominal.
+    pub base_torque: f64,
+    /// Torque at nominal frequency, % of nominal; it grows with the square of the speed, as pumps and fans do.
+    pub full_torque: f64,
+    /// Torque that turns the masses when the motor reaches its nominal frequency in one second, % of nominal.
+    pub inertia: f64,
+    /// Supply, V; the DC link has 1.35 times as much.
+    pub mains: f64,
+    /// Air around the heatsink, degrees Celsius.
+    pub ambient: f64,
+}
+
+impl Default for Load {
+    fn default() -> Self {
+        Load {
+            base_torque: 2.0,
+            full_torque: 36.0,
+            inertia: 15.0,
+            mains: 415.0,
+            ambient: 27.0,
+        }
+    }
+}
+
+/// Heatsink: rise above ambient at nominal current, kelvin, and its time constant, s.
+const HEATSINK: (f64, f64) = (38.0, 180.0);
+/// Motor: calculated heat at nominal current, %, and its time constant, s.
+const MOTOR_HEAT: (f64, f64) = (82.0, 900.0);
+/// Time in which a coasting motor comes down from nominal frequency, s.
+const COAST_TIME: f64 = 8.0;
+/// Sag of the DC link at nominal power, V.
+const DC_SAG: f64 = 6.0;
+
+/// What the inverter does with the motor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Drive {
+    /// Nothing: the motor coasts or stands.
+    Off,
+    /// Turns it towards this frequency, Hz, negative for counterclockwise.
+    To(f64),
+}
+
+/// The state of the motor and the inverter.
+#[derive(Debug, Clone)]
+pub struct Motor {
+    /// Output frequency, Hz, negative for counterclockwise; 0 while the inverter is off.
+    pub output: f64,
+    /// Frequency that the shaft turns with, Hz.
+    pub shaft: f64,
+    /// Whether the inverter feeds the motor.
+    pub fed: bool,
+    /// Torque, % of nominal.
+    pub torque: f64,
+    /// Heatsink, degrees Celsius.
+    pub heatsink: f64,
+    /// Calculated heat of the motor, %.
+    pub heat: f64,
+}
+
+impl Motor {
+    /// A motor at rest, cold.
+    pub fn new(load: &Load) -> Motor {
+        Motor {
+            output: 0.0,
+            shaft: 0.0,
+            fed: false,
+            torque: 0.0,
+            heatsink: load.ambient,
+            heat: 0.0,
+        }
+    }
+
+    /// One step of `dt` seconds.
+    pub fn step(&mut self, dt: f64, drive: Drive, settings: &Settings, load: &Load) {
+        let before = self.shaft;
+        match drive {
+            Drive::Off => {
+                self.fed = false;
+                self.output = 0.0;
+                self.shaft = towards(self.shaft, 0.0, settings.frequency / COAST_TIME * dt);
+            }
+            Drive::To(target) => {
+                if !self.fed {
+                    // Started on a turning motor: the inverter picks it up at the speed it has.
+                    self.fed = true;
+                    self.output = self.shaft;
+                }
+                self.output = self.ramp(dt, target, settings);
+                self.shaft = self.output;
+            }
+        }
+        let acceleration = (self.shaft - before) / dt / settings.frequency;
+        self.torque = if self.fed {
+            self.load_torque(settings, load) + load.inertia * acceleration
+        } else {
+            0.0
+        };
+        let warmth = (self.current(settings) / settings.current).powi(2);
+        let cool = if self.fed { HEATSINK.0 * warmth } else { 0.0 };
+        self.heatsink += (load.ambient + cool - self.heatsink) * dt / HEATSINK.1;
+        self.heat += (MOTOR_HEAT.0 * warmth - self.heat) * dt / MOTOR_HEAT.1;
+    }
+
+    /// The output one step on: down to zero first when the direction changes, then up.
+    fn ramp(&self, dt: f64, target: f64, settings: &Settings) -> f64 {
+        let up = settings.maximum / settings.acceleration.max(0.1) * dt;
+        let down = settings.maximum / settings.deceleration.max(0.1) * dt;
+        if self.output * target < 0.0 {
+            towards(self.output, 0.0, down)
+        } else if target.abs() < self.output.abs() {
+            towards(self.output, target, down)
+        } else {
+            towards(self.output, target, up)
+        }
+    }
+
+    fn load_torque(&self, settings: &Settings, load: &Load) -> f64 {
+        let ratio = self.shaft / settings.frequency;
+        let magnitude = load.base_torque + (load.full_torque - load.base_torque) * ratio * ratio;
+        if self.shaft == 0.0 {
+            0.0
+        } else {
+            magnitude.copysign(self.shaft)
+        }
+    }
+
+    /// Shaft speed, rpm: the synchronous speed less the slip that the torque costs.
+    pub fn rpm(&self, settings: &Settings) -> f64 {
+        let pole_pairs = (60.0 * settings.frequency / settings.speed.max(1.0)).floor().max(1.0);
+        let synchronous = 60.0 / pole_pairs;
+        let slip = (synchronous * settings.frequency - settings.speed).max(0.0) * self.torque / 100.0;
+        if self.shaft == 0.0 {
+            0.0
+        } else {
+            synchronous * self.shaft - slip
+        }
+    }
+
+    /// Motor current, A: magnetising and torque component at a right angle.
+    pub fn current(&self, settings: &Settings) -> f64 {
+        if !self.fed {
+            return 0.0;
+        }
+        let magnetising = settings.current * (1.0 - settings.cos_phi * settings.cos_phi).max(0.0).sqrt();
+        let active = settings.current * settings.cos_phi * self.torque / 100.0;
+        magnetising.hypot(active)
+    }
+
+    /// Shaft power, % of nominal; negative while the motor brakes.
+    pub fn power(&self, settings: &Settings) -> f64 {
+        self.torque * self.shaft / settings.frequency
+    }
+
+    /// Motor voltage, V: proportional to the frequency up to the nominal one.
+    pub fn voltage(&self, settings: &Settings) -> f64 {
+        settings.voltage * (self.output / settings.frequency).abs().min(1.0)
+    }
+
+    /// DC link voltage, V.
+    pub fn dc_link(&self, settings: &Settings, load: &Load) -> f64 {
+        1.35 * load.mains - DC_SAG * self.power(settings) / 100.0
+    }
+}
+
+fn towards(from: f64, to: f64, step: f64) -> f64 {
+    if (to - from).abs() <= step {
+        to
+    } else {
+        from + step.copysign(to - from)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::parameters::Parameters;
+    use super::*;
+
+    #[test]
+    fn ramps_by_the_times_of_the_parameters() {
+        let (settings, load) = (Parameters::default().settings(), Load::default());
+        let mut motor = Motor::new(&load);
+        let steps = |motor: &mut Motor, drive, n| (0..n).for_each(|_| motor.step(0.01, drive, &settings, &load));
+        steps(&mut motor, Drive::To(50.0), 150);
+        assert!(
+            (motor.output - 25.0).abs() < 1e-6,
+            "half of 50 Hz after half of 3 s: {}",
+            motor.output
+        );
+        assert!(motor.torque > 10.5, "accelerating takes more than the load alone");
+        steps(&mut motor, Drive::To(25.0), 1);
+        assert!((motor.current(&settings) - 1.18).abs() < 0.02);
+        steps(&mut motor, Drive::To(-25.0), 150);
+        assert_eq!(motor.output, 0.0, "through zero on the way to the other direction");
+        steps(&mut motor, Drive::To(-25.0), 151);
+        assert_eq!(motor.output, -25.0);
+        assert!(motor.rpm(&settings) == -750.0 && motor.power(&settings) > 0.0);
+        steps(&mut motor, Drive::Off, 100);
+        assert!(motor.output == 0.0 && motor.shaft < -15.0, "coasting");
+        steps(&mut motor, Drive::To(-25.0), 1);
+        assert!(motor.output < -15.0, "picked up at its speed");
+    }
+
+    #[test]
+    fn slip_of_an_asynchronous_motor() {
+        let mut parameters = Parameters::default();
+        parameters.set(super::super::parameters::NOMINAL_SPEED, 1440).unwrap();
+        let (settings, load) = (
+            parameters.settings(),
+            Load {
+                full_torque: 100.0,
+                ..Load::default()
+            },
+        );
+        let mut motor = Motor::new(&load);
+        (0..400).for_each(|_| motor.step(0.01, Drive::To(50.0), &settings, &load));
+        assert!((motor.rpm(&settings) - 1440.0).abs() < 1e-6);
+    }
+}

@@ -1,0 +1,225 @@
+//! Parameters of the simulated Vacon NX, IDs 101 to 1999.
+//!
+//! The IDs are those of drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
+//! of the All in One applications.
+
+use super::ControlPlace;
+
+/// ID of the minimum frequency, 0.01 Hz.
+pub const MINIMUM_FREQUENCY: u16 = 101;
+/// ID of the maximum frequency, 0.01 Hz.
+pub const MAXIMUM_FREQUENCY: u16 = 102;
+/// ID of the acceleration time from 0 to the maximum frequency, 0.1 s.
+pub const ACCELERATION_TIME: u16 = 103;
+/// ID of the deceleration time from the maximum frequency to 0, 0.1 s.
+pub const DECELERATION_TIME: u16 = 104;
+/// ID of the motor's nominal voltage, V.
+pub const NOMINAL_VOLTAGE: u16 = 110;
+/// ID of the motor's nominal frequency, 0.01 Hz.
+pub const NOMINAL_FREQUENCY: u16 = 111;
+/// ID of the motor's nominal speed, rpm.
+pub const NOMINAL_SPEED: u16 = 112;
+/// ID of the motor's nominal current, 0.1 A.
+pub const NOMINAL_CURRENT: u16 = 113;
+/// ID of the motor's cos phi, 0.01.
+pub const COS_PHI: u16 = 120;
+/// ID of the control place: 1 I/O terminals, 2 panel, 3 fieldbus.
+pub const CONTROL_PLACE: u16 = 125;
+/// ID of the stop function: 0 coasting, 1 ramping.
+pub const STOP_FUNCTION: u16 = 506;
+/// ID of P2.7.22, the response to a fieldbus fault: 0 none, 1 warning, 2 stop, 3 coast.
+pub const FIELDBUS_FAULT_RESPONSE: u16 = 733;
+/// ID of P2.7.23, the response to a slot fault, with the values of P2.7.22.
+pub const SLOT_FAULT_RESPONSE: u16 = 734;
+/// First ID of the eight selectors of process data out.
+pub const OUT_SELECTION: u16 = 852;
+/// Items of process data out 1 to 8 by default (drives.md 3.8): IDs 1 to 7, then the active fault.
+const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
+
+/// One parameter.
+#[derive(Debug, Clone, Copy)]
+struct Parameter {
+    id: u16,
+    min: u16,
+    max: u16,
+    value: u16,
+}
+
+/// All parameters of one drive, in the order of their IDs. They survive a power cycle.
+#[derive(Debug, Clone)]
+pub struct Parameters(Vec<Parameter>);
+
+/// Why a parameter cannot be written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Refused {
+    /// No parameter has that ID.
+    Unknown,
+    /// The value is outside the parameter's range.
+    Value,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        // (ID, minimum, maximum, default)
+        let plain = [
+            (MINIMUM_FREQUENCY, 0, 32_000, 0),
+            (MAXIMUM_FREQUENCY, 100, 32_000, 5000),
+            (ACCELERATION_TIME, 1, 30_000, 30),
+            (DECELERATION_TIME, 1, 30_000, 30),
+            (105, 0, 32_000, 1000),
+            (106, 0, 32_000, 2000),
+            (107, 1, 4000, 44),
+            (108, 0, 3, 0),
+            (109, 0, 1, 0),
+            (NOMINAL_VOLTAGE, 180, 690, 400),
+            (NOMINAL_FREQUENCY, 800, 32_000, 5000),
+            (NOMINAL_SPEED, 24, 20_000, 1500),
+            (NOMINAL_CURRENT, 1, 60_000, 22),
+            (117, 0, 4, 3),
+            (COS_PHI, 30, 100, 85),
+            (CONTROL_PLACE, 1, 3, 3),
+            (505, 0, 1, 0),
+            (STOP_FUNCTION, 0, 1, 1),
+            (FIELDBUS_FAULT_RESPONSE, 0, 3, 0),
+            (SLOT_FAULT_RESPONSE, 0, 3, 0),
+            (850, 0, 320, 0),
+            (851, 0, 320, 0),
+        ];
+        let selectors = OUT_DEFAULTS
+            .iter()
+            .zip(OUT_SELECTION..)
+            .map(|(&item, id)| (id, 0, 1999, item));
+        Parameters(
+            plain
+                .into_iter()
+                .chain(selectors)
+                .map(|(id, min, max, value)| Parameter { id, min, max, value })
+                .collect(),
+        )
+    }
+}
+
+impl Parameters {
+    /// The value of a parameter.
+    pub fn get(&self, id: u16) -> Option<u16> {
+        self.0.iter().find(|p| p.id == id).map(|p| p.value)
+    }
+
+    /// Whether `value` may be written to the parameter `id`.
+    ///
+    /// # Errors
+    /// Unknown ID, or a value outside the range; the minimum frequency may not exceed the maximum.
+    pub fn check(&self, id: u16, value: u16) -> Result<(), Refused> {
+        let parameter = self.0.iter().find(|p| p.id == id).ok_or(Refused::Unknown)?;
+        let crossed = match id {
+            MINIMUM_FREQUENCY => value > self.number(MAXIMUM_FREQUENCY),
+            MAXIMUM_FREQUENCY => value < self.number(MINIMUM_FREQUENCY),
+            _ => false,
+        };
+        if crossed || !(parameter.min..=parameter.max).contains(&value) {
+            Err(Refused::Value)
+        } else {
+            Ok(())
+        }
+    }
+
+    /// Writes a parameter that [`Parameters::check`] allows.
+    ///
+    /// # Errors
+    /// As [`Parameters::check`]; nothing is written then.
+    pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
+        self.check(id, value)?;
+        if let Some(parameter) = self.0.iter_mut().find(|p| p.id == id) {
+            parameter.value = value;
+        }
+        Ok(())
+    }
+
+    /// The value of a parameter that every drive has, 0 otherwise.
+    fn number(&self, id: u16) -> u16 {
+        self.get(id).unwrap_or(0)
+    }
+
+    /// The parameters that the drive works with, in engineering units.
+    pub fn settings(&self) -> Settings {
+        let number = |id| f64::from(self.number(id));
+        Settings {
+            minimum: number(MINIMUM_FREQUENCY) / 100.0,
+            maximum: number(MAXIMUM_FREQUENCY) / 100.0,
+            acceleration: number(ACCELERATION_TIME) / 10.0,
+            deceleration: number(DECELERATION_TIME) / 10.0,
+            voltage: number(NOMINAL_VOLTAGE),
+            frequency: number(NOMINAL_FREQUENCY) / 100.0,
+            speed: number(NOMINAL_SPEED),
+            current: number(NOMINAL_CURRENT) / 10.0,
+            cos_phi: number(COS_PHI) / 100.0,
+            place: ControlPlace::from_parameter(self.number(CONTROL_PLACE)),
+            stop: if self.number(STOP_FUNCTION) == 0 {
+                StopFunction::Coast
+            } else {
+                StopFunction::Ramp
+            },
+            fieldbus_fault: self.number(FIELDBUS_FAULT_RESPONSE),
+        }
+    }
+}
+
+/// What the drive does with the motor when it stops.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StopFunction {
+    /// Lets it run out.
+    Coast,
+    /// Brings it down with the deceleration time.
+    Ramp,
+}
+
+/// Parameters in engineering units, decoded once a change.
+#[derive(Debug, Clone, Copy)]
+pub struct Settings {
+    /// Minimum frequency, Hz.
+    pub minimum: f64,
+    /// Maximum frequency, Hz.
+    pub maximum: f64,
+    /// From 0 to the maximum frequency, s.
+    pub acceleration: f64,
+    /// From the maximum frequency to 0, s.
+    pub deceleration: f64,
+    /// Motor's nominal voltage, V.
+    pub voltage: f64,
+    /// Motor's nominal frequency, Hz.
+    pub frequency: f64,
+    /// Motor's nominal speed, rpm.
+    pub speed: f64,
+    /// Motor's nominal current, A.
+    pub current: f64,
+    /// Motor's cos phi.
+    pub cos_phi: f64,
+    /// Where the drive takes its commands from.
+    pub place: ControlPlace,
+    /// How it stops.
+    pub stop: StopFunction,
+    /// P2.7.22.
+    pub fieldbus_fault: u16,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ranges_and_order() {
+        let mut p = Parameters::default();
+        assert!(p.0.windows(2).all(|w| w[0].id < w[1].id), "sorted, no ID twice");
+        assert!(
+            p.0.iter().all(|p| p.min <= p.value && p.value <= p.max),
+            "defaults lie in their ranges"
+        );
+        assert_eq!(p.get(733), Some(0), "P2.7.22 is 0 out of the box (drives.md 3.11)");
+        assert_eq!(p.set(733, 3), Ok(()));
+        assert_eq!(p.get(733), Some(3));
+        assert_eq!(p.set(733, 4), Err(Refused::Value));
+        assert_eq!(p.set(100, 0), Err(Refused::Unknown));
+        assert_eq!(p.set(MINIMUM_FREQUENCY, 5001), Err(Refused::Value), "above the maximum");
+        assert_eq!(p.get(859), Some(37));
+    }
+}

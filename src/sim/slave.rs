@@ -1,0 +1,243 @@
+//! The drives of one Modbus RTU line: whole frames in, replies out.
+//!
+//! A frame with a wrong CRC and a frame for somebody else get silence; a broadcast acts on all and gets silence
+//! (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
+
+use super::SimTime;
+use super::drive::{DriveOptions, SimulatedDrive};
+use crate::codec::modbus::encode_exception;
+use crate::codec::{Exception, Reply, RequestPdu, rtu};
+use std::collections::BTreeMap;
+
+/// Address of a broadcast.
+const BROADCAST: u8 = 0;
+
+/// What a frame meant to the drives of a line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Heard {
+    /// The CRC is wrong or the frame is too short.
+    BadCrc,
+    /// Nobody with that address is on the line, or it is dead.
+    Nobody(u8),
+    /// A broadcast, acted upon.
+    Broadcast,
+    /// A request to this drive.
+    Request(Asked),
+}
+
+/// A request that a drive of the line has to answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Asked {
+    /// The drive's address.
+    pub address: u8,
+    /// The function code as it was sent.
+    pub function: u8,
+    /// The request, or why its PDU is refused.
+    pub request: Result<RequestPdu, Exception>,
+}
+
+/// The drives of one line by address.
+#[derive(Debug, Clone, Default)]
+pub struct Slaves {
+    drives: BTreeMap<u8, SimulatedDrive>,
+    /// The drive that [`Slaves::advance_next`] served last.
+    served: u8,
+}
+
+impl Slaves {
+    /// Drives that are switched on at `now`. A later drive with an address already taken replaces the earlier one.
+    pub fn new(drives: impl IntoIterator<Item = DriveOptions>, now: SimTime) -> Slaves {
+        let drives = drives
+            .into_iter()
+            .map(|options| (options.address, SimulatedDrive::new(options, now)))
+            .collect();
+        Slaves { drives, served: 0 }
+    }
+
+    /// A drive of the line.
+    pub fn drive(&mut self, address: u8) -> Option<&mut SimulatedDrive> {
+        self.drives.get_mut(&address)
+    }
+
+    /// Addresses on the line, ascending.
+    pub fn addresses(&self) -> impl Iterator<Item = u8> {
+        self.drives.keys().copied()
+    }
+
+    /// Lets all drives live on until `now`.
+    pub fn advance(&mut self, now: SimTime) {
+        self.drives.values_mut().for_each(|drive| drive.advance(now));
+    }
+
+    /// Lets one drive live on until `now`, each time the next: a drive that nobody asks has little to catch up when it
+    /// is asked at last.
+    pub fn advance_next(&mut self, now: SimTime) {
+        let next = self
+            .drives
+            .range(self.served.saturating_add(1)..)
+            .next()
+            .map(|(address, _)| *address);
+        self.served = next.unwrap_or(0);
+        if let Some(drive) = self.drives.get_mut(&self.served) {
+            drive.advance(now);
+        }
+    }
+
+    /// What a whole frame means; a broadcast is acted upon at once.
+    pub fn hear(&mut self, frame: &[u8], now: SimTime) -> Heard {
+        let Some((address, decoded)) = rtu::decode_request(frame) else {
+            return Heard::BadCrc;
+        };
+        if address == BROADCAST {
+            self.broadcast(decoded.ok(), now);
+            return Heard::Broadcast;
+        }
+        if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
+            return Heard::Nobody(address);
+        }
+        let function = frame.get(1).copied().unwrap_or(0);
+        Heard::Request(Asked {
+            address,
+            function,
+            request: decoded.map_err(|(_, exception)| exception),
+        })
+    }
+
+    /// The reply's frame, appended to `out`: the drive does what it is asked.
+    pub fn answer(&mut self, asked: &Asked, now: SimTime, out: &mut Vec<u8>) {
+        let Some(drive) = self.drives.get_mut(&asked.address) else {
+            return;
+        };
+        match &asked.request {
+            Ok(request) => {
+                let mut pdu = Vec::with_capacity(request.reply_len());
+                drive.answer(request, now).encode(request, &mut pdu);
+                rtu::encode_frame(asked.address, &pdu, out);
+            }
+            Err(exception) => {
+                drive.heard(now);
+                refuse(asked, *exception, out);
+            }
+        }
+    }
+
+    /// Writes only: a broadcast that asks for something has nobody to answer it.
+    fn broadcast(&mut self, request: Option<RequestPdu>, now: SimTime) {
+        for drive in self.drives.values_mut().filter(|drive| drive.answers()) {
+            drive.heard(now);
+            if let Some(request) = request.as_ref().filter(|request| request.is_write()) {
+                let _: Reply = drive.answer(request, now);
+            }
+        }
+    }
+}
+
+/// The frame of an exception to a request, appended to `out`; the drive is not asked.
+pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
+    let mut pdu = Vec::with_capacity(2);
+    encode_exception(asked.function, exception, &mut pdu);
+    rtu::encode_frame(asked.address, &pdu, out);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::drive::ModelOptions;
+    use super::super::nx::{NxOptions, StatusBits};
+    use super::*;
+    use std::time::Duration;
+
+    fn hex(text: &str) -> Vec<u8> {
+        text.split_whitespace()
+            .map(|b| u8::from_str_radix(b, 16).unwrap())
+            .collect()
+    }
+
+    /// A drive 1 with the status bits that the worked frames print.
+    fn line() -> Slaves {
+        let nx = NxOptions {
+            status: StatusBits::Common,
+            ..NxOptions::default()
+        };
+        Slaves::new(
+            [DriveOptions {
+                address: 1,
+                model: ModelOptions::Nx(nx),
+                autopilot: None,
+            }],
+            SimTime::ZERO,
+        )
+    }
+
+    fn exchange(line: &mut Slaves, request: &str, seconds: u64) -> String {
+        let now = Duration::from_secs(seconds);
+        let mut out = Vec::new();
+        if let Heard::Request(asked) = line.hear(&hex(request), now) {
+            line.answer(&asked, now, &mut out);
+        }
+        out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
+    }
+
+    /// Worked frames of drives.md 7.1 and 7.4, in an order in which the drive comes to their states.
+    #[test]
+    fn worked_frames() {
+        let mut line = line();
+        let script = [
+            (1, "01 04 17 70 00 05 34 66", "01 84 02 C2 C1"),
+            (
+                1,
+                "01 10 07 D0 00 03 06 00 01 00 00 13 88 C8 CB",
+                "01 10 07 D0 00 03 80 85",
+            ),
+            (9, "01 04 08 36 00 02 93 A5", "01 04 04 13 88 09 C4 78 E9"),
+            (
+                9,
+                "01 03 08 34 00 0B 47 A3",
+                "01 03 16 00 23 20 00 13 88 09 C4 02 EE 00 0C 00 69 00 35 07 D0 02 30 00 00 11 05",
+            ),
+            (9, "01 03 07 D0 00 03 05 46", "01 03 06 00 01 00 00 13 88 11 E3"),
+            (9, "01 06 07 D0 00 01 48 87", "01 06 07 D0 00 01 48 87"),
+            (9, "01 10 07 D0 00 02 04 00 01 00 10 88 CF", "01 10 07 D0 00 02 41 45"),
+            (9, "01 06 07 D2 EC 78 64 65", "01 06 07 D2 EC 78 64 65"),
+            (9, "01 03 02 DC 00 01 44 48", "01 03 02 00 00 B8 44"),
+            (9, "01 06 02 DC 00 02 C8 49", "01 06 02 DC 00 02 C8 49"),
+            (9, "00 06 07 D0 00 00 88 96", ""),
+            (20, "01 03 07 D0 00 01 84 87", "01 03 02 00 00 B8 44"),
+            (20, "01 06 07 D0 00 01 48 87", "01 06 07 D0 00 01 48 87"),
+            (21, "01 03 08 34 00 01 C7 A4", "01 03 02 00 07 F9 86"),
+            // Silence for longer than 20 s and P2.7.22 = 2: stopped by ramp with fault 53.
+            (50, "01 03 00 62 00 01 25 D4", "01 03 02 00 35 78 53"),
+            (50, "01 05 00 00 FF 00 8C 3A", "01 85 01 83 50"),
+            (50, "01 06 07 D2 27 11 F3 7B", "01 86 03 02 61"),
+        ];
+        for (seconds, request, reply) in script {
+            assert_eq!(exchange(&mut line, request, seconds), reply, "{request} at {seconds} s");
+        }
+        line.drive(1)
+            .unwrap()
+            .as_nx()
+            .unwrap()
+            .set_busy(Duration::from_secs(99));
+        assert_eq!(
+            exchange(&mut line, "01 10 07 D0 00 02 04 00 01 00 10 88 CF", 51),
+            "01 90 06 CC 02"
+        );
+    }
+
+    #[test]
+    fn silence_for_others_and_for_bad_frames() {
+        let mut line = line();
+        let good = hex("01 03 08 34 00 0B 47 A3");
+        assert!(matches!(line.hear(&good, SimTime::ZERO), Heard::Request(_)));
+        for bit in 0..good.len() * 8 {
+            let mut bad = good.clone();
+            bad[bit / 8] ^= 1 << (bit % 8);
+            assert_eq!(line.hear(&bad, SimTime::ZERO), Heard::BadCrc);
+        }
+        assert_eq!(line.hear(&good[..5], SimTime::ZERO), Heard::BadCrc);
+        let mut other = Vec::new();
+        rtu::encode_frame(2, &[3, 8, 0x34, 0, 11], &mut other);
+        assert_eq!(line.hear(&other, SimTime::ZERO), Heard::Nobody(2));
+        line.drive(1).unwrap().set_alive(false);
+        assert_eq!(line.hear(&good, SimTime::ZERO), Heard::Nobody(1));
+    }
+}
