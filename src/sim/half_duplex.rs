@@ -145,6 +145,11 @@ impl HalfDuplex {
         }
     }
 
+    /// How the line behaves.
+    pub fn rules(&self) -> &LineRules {
+        &self.rules
+    }
+
     /// The drives.
     pub fn slaves(&mut self) -> &mut Slaves {
         &mut self.slaves

@@ -34,6 +34,25 @@ pub struct Statistics {
     pub bytes_lost: u64,
 }
 
+impl std::iter::Sum for Statistics {
+    fn sum<I: Iterator<Item = Statistics>>(all: I) -> Statistics {
+        all.fold(Statistics::default(), |a, b| Statistics {
+            requests: a.requests + b.requests,
+            replies: a.replies + b.replies,
+            broadcasts: a.broadcasts + b.broadcasts,
+            unanswered: a.unanswered + b.unanswered,
+            bad_crc: a.bad_crc + b.bad_crc,
+            silence_violations: a.silence_violations + b.silence_violations,
+            collisions: a.collisions + b.collisions,
+            provoked_overlaps: a.provoked_overlaps + b.provoked_overlaps,
+            faults: a.faults + b.faults,
+            bytes_in: a.bytes_in + b.bytes_in,
+            bytes_out: a.bytes_out + b.bytes_out,
+            bytes_lost: a.bytes_lost + b.bytes_lost,
+        })
+    }
+}
+
 /// How late the simulator delivered, against the true wire time.
 #[derive(Debug, Clone, Default)]
 pub struct Lateness {

@@ -90,6 +90,7 @@ struct Port {
 
 #[derive(Debug)]
 struct Shared {
+    name: String,
     start: Instant,
     line: Mutex<HalfDuplex>,
     port: Mutex<Port>,
@@ -164,6 +165,7 @@ impl SimulatedBus {
         let port = Endpoint::open(&endpoint, &format)?;
         let slaves = Slaves::new(drives, SimTime::ZERO);
         let shared = Arc::new(Shared {
+            name: name.clone(),
             start: Instant::now(),
             line: Mutex::new(HalfDuplex::new(rules, slaves, faults, Transcript::new(transcript))),
             port: Mutex::new(Port {
@@ -229,6 +231,25 @@ impl LineControl {
             Found::Present(address) => address.clone(),
             _ => String::new(),
         }
+    }
+
+    /// One line for people: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`.
+    pub fn description(&self) -> String {
+        let (addresses, format) = {
+            let mut line = self.0.line();
+            (line.slaves().addresses().collect::<Vec<u8>>(), line.rules().format)
+        };
+        let drives = if addresses.len() == 1 {
+            "1 drive".to_string()
+        } else {
+            format!("{} drives", addresses.len())
+        };
+        format!(
+            "{}: {drives} ({}) at {format} on {}",
+            self.0.name,
+            ranges(&addresses),
+            self.address()
+        )
     }
 
     /// Time since the line was switched on.
@@ -302,6 +323,25 @@ impl LineControl {
             Found::Absent => Err(io::ErrorKind::TimedOut.into()),
         }
     }
+}
+
+/// Ascending addresses in short: `1-10, 12`.
+fn ranges(addresses: &[u8]) -> String {
+    let mut runs: Vec<(u8, u8)> = Vec::new();
+    for &address in addresses {
+        match runs.last_mut() {
+            Some((_, last)) if u16::from(*last) + 1 == u16::from(address) => *last = address,
+            _ => runs.push((address, address)),
+        }
+    }
+    let text = |(first, last): &(u8, u8)| {
+        if first == last {
+            first.to_string()
+        } else {
+            format!("{first}-{last}")
+        }
+    };
+    runs.iter().map(text).collect::<Vec<String>>().join(", ")
 }
 
 /// The thread of a line.

@@ -68,8 +68,8 @@ pub mod status_word {
 /// Fault code: fieldbus fault (drives.md 3.11).
 pub const FIELDBUS_FAULT: u16 = 53;
 
-/// Output and reference closer than this count as reached, Hz.
-const AT_REFERENCE_BAND: f64 = 0.05;
+/// Output and reference closer than this count as reached, Hz: below what a register can show.
+const AT_REFERENCE_BAND: f64 = 0.005;
 
 /// Where a drive takes its commands from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

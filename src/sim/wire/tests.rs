@@ -271,3 +271,9 @@ fn the_measuring_rod_keeps_the_silence() {
         (0, 0, 0, 0)
     );
 }
+
+#[test]
+fn addresses_in_short() {
+    assert_eq!(ranges(&[]), "");
+    assert_eq!(ranges(&[1, 2, 3, 7, 9, 10, 247]), "1-3, 7, 9-10, 247");
+}

@@ -1,0 +1,369 @@
+//! `drivegate simulate`: simulated drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults.
+
+use crate::codec::LineFormat;
+use crate::document::{nearest, parse_duration};
+use crate::drive::profile::Profiles;
+use crate::sim::drive::{DriveOptions, ModelOptions};
+use crate::sim::endpoint::EndpointOptions;
+use crate::sim::faults::{FaultPlan, NAMES, Rates};
+use crate::sim::half_duplex::{Delivery, LineRules, Wire};
+use crate::sim::statistics::Statistics;
+use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use std::io::{self, IsTerminal, Write};
+use std::net::{SocketAddr, ToSocketAddrs};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::{Duration, Instant};
+use tokio::signal::unix::{SignalKind, signal};
+
+/// Arguments of `drivegate simulate`.
+#[derive(Debug, clap::Args)]
+#[command(after_help = format!("Examples:
+  drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
+  drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
+  drivegate simulate --config drivegate.toml
+
+Faults: {NAMES}.
+
+A simulated drive obeys the bus. Writing a fault code to PDU address 1998 (ID 1999, which no real drive has) trips it."))]
+pub struct Args {
+    /// Simulate every bus of a gateway configuration, each under its own `port`
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "baud", "format"])]
+    pub config: Option<PathBuf>,
+    /// What the drives are
+    #[arg(long, value_name = "PROFILE", default_value = "vacon-nx")]
+    pub profile: String,
+    /// Their addresses, such as 1-10 or 1,2,7
+    #[arg(long, value_name = "LIST", default_value = "1", value_parser = parse_addresses)]
+    pub addresses: Addresses,
+    /// Symbolic link to the pseudo-terminal; removed at the end
+    #[arg(long, value_name = "PATH", conflicts_with_all = ["port", "listen"])]
+    pub link: Option<PathBuf>,
+    /// A real serial port on whose line the drives are to sit
+    #[arg(long, value_name = "DEVICE", conflicts_with = "listen")]
+    pub port: Option<PathBuf>,
+    /// Serve the line raw over TCP, as a serial device server does
+    #[arg(long, value_name = "HOST:PORT")]
+    pub listen: Option<SocketAddr>,
+    /// Bits a second
+    #[arg(long, value_name = "BAUD", default_value_t = 38_400, value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
+    pub baud: u32,
+    /// Data bits, parity and stop bits
+    #[arg(long, value_name = "FORMAT", default_value = "8N1")]
+    pub format: String,
+    /// Time between the end of a request and the reply
+    #[arg(long, value_name = "TIME", default_value = "0.5ms", value_parser = parse_duration)]
+    pub turnaround: Duration,
+    /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
+    #[arg(long, value_name = "LIST", default_value = "")]
+    pub fault: Rates,
+    /// Fixes which request meets which fault, and what the drives do by themselves
+    #[arg(long, value_name = "NUMBER", default_value_t = 1)]
+    pub seed: u64,
+    /// Let the drives start, stop and fault by themselves until a master writes to them
+    #[arg(long)]
+    pub autopilot: bool,
+    /// Answer requests that come without 3.5 characters of silence too
+    #[arg(long)]
+    pub lenient: bool,
+    /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
+    #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
+    pub chunk: u8,
+    /// True wire times, or as fast as the programs are
+    #[arg(long, value_enum, default_value_t = Speed::Real)]
+    pub speed: Speed,
+}
+
+/// How fast the simulated lines are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Speed {
+    /// Every character takes its time.
+    Real,
+    /// No time on the wire.
+    Max,
+}
+
+/// Addresses of drives, ascending, none twice.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Addresses(Vec<u8>);
+
+fn parse_addresses(text: &str) -> Result<Addresses, String> {
+    let bad = || format!("`{text}` is no list of addresses; write numbers from 1 to 247, such as 1-10 or 1,2,7");
+    let number = |word: &str| {
+        word.trim()
+            .parse::<u8>()
+            .ok()
+            .filter(|n| (1..=247).contains(n))
+            .ok_or_else(bad)
+    };
+    let mut addresses = Vec::new();
+    for part in text.split(',') {
+        let (first, last) = part.split_once('-').unwrap_or((part, part));
+        let (first, last) = (number(first)?, number(last)?);
+        if first > last {
+            return Err(bad());
+        }
+        addresses.extend(first..=last);
+    }
+    addresses.sort_unstable();
+    addresses.dedup();
+    Ok(Addresses(addresses))
+}
+
+/// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
+///
+/// # Errors
+/// A `tcp://` address that cannot be listened on by its text.
+pub fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
+    let Some(address) = port.strip_prefix("tcp://") else {
+        return Ok(EndpointOptions::Pty {
+            link: Some(PathBuf::from(port)),
+        });
+    };
+    let listen = address.to_socket_addrs().ok().and_then(|mut found| found.next());
+    listen
+        .map(|listen| EndpointOptions::Tcp { listen })
+        .ok_or_else(|| format!("`{port}` is no address to listen on; write it as tcp://127.0.0.1:4001"))
+}
+
+/// Simulates until Ctrl-C or SIGTERM. `configured` makes the lines of a configuration file, and tells what is wrong with
+/// it by itself: then its exit code is the command's.
+pub fn run(args: &Args, configured: impl FnOnce(&Path) -> Result<Vec<SimulatedBusOptions>, ExitCode>) -> ExitCode {
+    let lines = match &args.config {
+        Some(file) => match configured(file) {
+            Ok(lines) => lines,
+            Err(code) => return code,
+        },
+        None => match args.line() {
+            Ok(line) => vec![line],
+            Err(message) => return failed(2, &message),
+        },
+    };
+    let started: io::Result<Vec<SimulatedBus>> = lines
+        .into_iter()
+        .map(|line| SimulatedBus::start(args.applied_to(line)))
+        .collect();
+    match started.and_then(|lines| serve(&lines)) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => failed(1, &format!("cannot simulate: {error}")),
+    }
+}
+
+fn failed(code: u8, message: &str) -> ExitCode {
+    eprintln!("error: {message}");
+    ExitCode::from(code)
+}
+
+impl Args {
+    /// The line of the command line.
+    fn line(&self) -> Result<SimulatedBusOptions, String> {
+        let profiles = Profiles::built_in();
+        let profile = profiles.get(&self.profile).ok_or_else(|| {
+            let near = nearest(&self.profile, profiles.names()).map(|name| format!("; did you mean `{name}`?"));
+            let known: Vec<&str> = profiles.names().collect();
+            let known = format!("; there are {}", known.join(", "));
+            format!(
+                "`{}` is no profile; in --profile{}",
+                self.profile,
+                near.unwrap_or(known)
+            )
+        })?;
+        let model = profile
+            .simulator
+            .as_deref()
+            .and_then(ModelOptions::by_name)
+            .ok_or_else(|| {
+                format!(
+                    "drives of the profile `{}` cannot be simulated; in --profile; choose another",
+                    self.profile
+                )
+            })?;
+        let format = LineFormat::new(self.baud, &self.format).map_err(|error| format!("{error}; in --format"))?;
+        let drives = self.addresses.0.iter().map(|&address| DriveOptions {
+            address,
+            model: model.clone(),
+            autopilot: None,
+        });
+        let mut line = SimulatedBusOptions::new("line", LineRules::new(format), drives.collect());
+        line.endpoint = match (&self.port, self.listen) {
+            (Some(path), _) => EndpointOptions::Port { path: path.clone() },
+            (None, Some(listen)) => EndpointOptions::Tcp { listen },
+            (None, None) => EndpointOptions::Pty {
+                link: self.link.clone(),
+            },
+        };
+        Ok(line)
+    }
+
+    /// What the other options say about any line.
+    fn applied_to(&self, mut line: SimulatedBusOptions) -> SimulatedBusOptions {
+        line.faults = FaultPlan::new(self.fault.clone(), self.seed);
+        line.rules.turnaround = self.turnaround;
+        line.rules.strict = !self.lenient;
+        line.rules.delivery = if self.chunk == 0 {
+            Delivery::Whole
+        } else {
+            Delivery::Chunks(self.chunk)
+        };
+        if self.speed == Speed::Max {
+            line.rules.wire = Wire::Instant;
+            line.rules.turnaround = Duration::ZERO;
+        }
+        for drive in &mut line.drives {
+            let ModelOptions::Nx(nx) = &mut drive.model;
+            nx.trip_register = true;
+            if self.autopilot {
+                drive.autopilot = Some(self.seed.wrapping_mul(1000).wrapping_add(u64::from(drive.address)));
+            }
+        }
+        line
+    }
+}
+
+/// Tells where the lines are, and once a second, on a terminal, what goes on; ends on Ctrl-C and SIGTERM.
+fn serve(lines: &[SimulatedBus]) -> io::Result<()> {
+    for line in lines {
+        println!("{}", line.description());
+    }
+    println!("Ctrl-C ends the simulation.");
+    io::stdout().flush()?;
+    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
+    runtime.block_on(watch(lines))?;
+    println!("{}", summary(&total(lines)));
+    Ok(())
+}
+
+async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
+    let mut interrupt = signal(SignalKind::interrupt())?;
+    let mut terminate = signal(SignalKind::terminate())?;
+    let mut second = tokio::time::interval(Duration::from_secs(1));
+    let live = io::stdout().is_terminal();
+    let (mut before, mut then) = (total(lines), Instant::now());
+    loop {
+        tokio::select! {
+            _ = interrupt.recv() => break,
+            _ = terminate.recv() => break,
+            _ = second.tick(), if live => {
+                let (now, at) = (total(lines), Instant::now());
+                let seconds = at.duration_since(then).as_secs_f64().max(0.001);
+                let rate = (now.requests - before.requests) as f64 / seconds;
+                print!("\r\x1b[K{rate:7.1} requests/s   {}", summary(&now));
+                io::stdout().flush()?;
+                (before, then) = (now, at);
+            }
+        }
+    }
+    if live {
+        println!();
+    }
+    Ok(())
+}
+
+fn total(lines: &[SimulatedBus]) -> Statistics {
+    lines.iter().map(|line| line.statistics()).sum()
+}
+
+/// The counters that tell a good master from a bad one; those at rest stay unsaid.
+fn summary(s: &Statistics) -> String {
+    let mut text = format!(
+        "{} requests, {} replies, {} too early",
+        s.requests, s.replies, s.silence_violations
+    );
+    let rare = [
+        (s.collisions, "collisions"),
+        (s.bad_crc, "bad frames"),
+        (s.unanswered, "to nobody"),
+        (s.broadcasts, "broadcasts"),
+        (s.faults, "faults injected"),
+        (s.bytes_lost, "bytes nobody read"),
+    ];
+    for (count, name) in rare.into_iter().filter(|(count, _)| *count > 0) {
+        text.push_str(&format!(", {count} {name}"));
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use clap::Parser;
+
+    #[derive(Debug, Parser)]
+    struct Command {
+        #[command(flatten)]
+        args: Args,
+    }
+
+    fn parse(words: &str) -> Result<Args, String> {
+        let words = std::iter::once("simulate").chain(words.split_whitespace());
+        Command::try_parse_from(words)
+            .map(|command| command.args)
+            .map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn addresses() {
+        assert_eq!(parse_addresses("3,1-2,2").unwrap().0, [1, 2, 3]);
+        assert_eq!(parse_addresses("247").unwrap().0, [247]);
+        for bad in ["", "0", "248", "5-1", "1-", "x", "1,,2"] {
+            assert!(parse_addresses(bad).is_err(), "{bad}");
+        }
+    }
+
+    #[test]
+    fn a_line_from_the_command_line() {
+        let args =
+            parse("--addresses 1-10 --link /tmp/l --baud 9600 --format 8E1 --fault drop=0.5 --chunk 14 --lenient");
+        let args = args.unwrap();
+        let line = args.applied_to(args.line().unwrap());
+        assert_eq!(line.drives.len(), 10);
+        assert_eq!(line.rules.format.to_string(), "9600 8E1");
+        assert_eq!((line.rules.delivery, line.rules.strict), (Delivery::Chunks(14), false));
+        assert_eq!(
+            line.endpoint,
+            EndpointOptions::Pty {
+                link: Some("/tmp/l".into())
+            }
+        );
+        assert!(line.drives.iter().all(|drive| drive.autopilot.is_none()));
+        let args = parse("--listen 127.0.0.1:4001 --autopilot --speed max").unwrap();
+        let line = args.applied_to(args.line().unwrap());
+        assert_eq!(line.rules.wire, Wire::Instant);
+        assert!(line.drives.iter().all(|drive| drive.autopilot.is_some()));
+    }
+
+    #[test]
+    fn bad_command_lines() {
+        for bad in [
+            "--link /tmp/l --port /dev/ttyUSB0",
+            "--config a.toml --link /tmp/l",
+            "--baud 12",
+            "--turnaround 5",
+            "--fault drop",
+            "--addresses 0-3",
+            "--speed warp",
+        ] {
+            assert!(parse(bad).is_err(), "{bad}");
+        }
+        let error = parse("--profile vacon-nv").unwrap().line().unwrap_err();
+        assert!(error.contains("did you mean `vacon-nx`"), "{error}");
+        assert!(parse("--format 9N1").unwrap().line().unwrap_err().contains("--format"));
+        assert!(parse("--format 8N1").unwrap().line().is_ok());
+    }
+
+    #[test]
+    fn the_endpoint_of_a_configured_bus() {
+        assert_eq!(
+            endpoint_for("/dev/ttyUSB0"),
+            Ok(EndpointOptions::Pty {
+                link: Some("/dev/ttyUSB0".into())
+            })
+        );
+        let listen = "127.0.0.1:4001".parse().unwrap();
+        assert_eq!(
+            endpoint_for("tcp://127.0.0.1:4001"),
+            Ok(EndpointOptions::Tcp { listen })
+        );
+        assert!(endpoint_for("tcp://127.0.0.1").is_err());
+    }
+}
