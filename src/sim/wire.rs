@@ -59,7 +59,7 @@ impl SimulatedBusOptions {
 const SPIN: Duration = Duration::from_micros(80);
 /// An idle line is looked at so often, to let its drives live on.
 const IDLE: Duration = Duration::from_millis(100);
-/// A line without traffic for that time counts as left by its master.
+/// A line without traffic for that time may have been left by its master; the port is settled, and again so often.
 const SETTLE_AFTER: Duration = Duration::from_secs(1);
 /// A port that went away is tried again so often.
 const REOPEN: Duration = Duration::from_secs(1);
@@ -180,8 +180,7 @@ impl SimulatedBus {
             shared: Arc::clone(&shared),
             open,
             spin,
-            quiet_since: SimTime::ZERO,
-            settled: false,
+            settled: SimTime::ZERO,
         };
         let thread = std::thread::Builder::new()
             .name(format!("sim-{name}"))
@@ -349,8 +348,8 @@ struct Runner<F> {
     shared: Arc<Shared>,
     open: F,
     spin: Duration,
-    quiet_since: SimTime,
-    settled: bool,
+    /// Last traffic, or the last time that the port was settled.
+    settled: SimTime,
 }
 
 impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
@@ -438,8 +437,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
         let count = port.receive(&mut buffer)?;
         if let Some(bytes) = buffer.get(..count).filter(|bytes| !bytes.is_empty()) {
             let now = self.shared.now();
-            self.quiet_since = now;
-            self.settled = false;
+            self.settled = now;
             let mut line = self.shared.line();
             line.on_bytes(bytes, now);
             // Nothing is due before the request's silence is over: time for a drive that nobody asks.
@@ -464,8 +462,8 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
     fn idle(&mut self, port: &Endpoint) {
         let now = self.shared.now();
         self.shared.line().slaves().advance(now);
-        if !self.settled && now.saturating_sub(self.quiet_since) >= SETTLE_AFTER {
-            self.settled = true;
+        if now.saturating_sub(self.settled) >= SETTLE_AFTER {
+            self.settled = now;
             port.settle();
         }
     }
