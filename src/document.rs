@@ -156,7 +156,9 @@ impl Document {
 
     /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
     pub fn ensure_section(&mut self, name: &str) {
-        let Raw::Table(entries) = &mut self.root.value else { return };
+        let Raw::Table(entries) = &mut self.root.value else {
+            return;
+        };
         if !entries.iter().any(|(key, _, _)| key == name) {
             entries.push((name.to_string(), None, Node::empty_table(None)));
         }
@@ -173,7 +175,9 @@ impl Document {
         variables.sort();
         for (name, value) in variables {
             let path: Vec<String> = name.split("__").skip(1).map(str::to_lowercase).collect();
-            let absent = path.first().filter(|section| path.len() > 1 && !self.has_section(section));
+            let absent = path
+                .first()
+                .filter(|section| path.len() > 1 && !self.has_section(section));
             let outcome = match absent {
                 Some(section) => Err(format!(
                     "there is no `{section}` in the file to override; add the section to the file first"
@@ -388,9 +392,11 @@ impl<'d> Reader<'d> {
     /// Where `key` stands, or the table when it is absent.
     pub fn place_of(&self, key: &str) -> Place {
         let node = self.find(key);
+        let env = node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone());
+        let line = node.and_then(|n| n.line).or(self.place.line);
         Place {
-            line: node.and_then(|n| n.line).or(self.place.line),
-            env: node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone()),
+            line: line.filter(|_| env.is_none()),
+            env,
             key: self.path(key),
         }
     }
@@ -472,7 +478,7 @@ impl<'d> Reader<'d> {
                     format!(
                         "`{key}` is {}, not a table; write [{}]",
                         node.value.kind(),
-                        self.path(key)
+                        self.header(key)
                     ),
                 );
                 None
@@ -490,7 +496,10 @@ impl<'d> Reader<'d> {
                 let kind = other.kind();
                 self.problem(
                     key,
-                    format!("`{key}` is {kind}, not a list of tables; write [[{}]]", self.path(key)),
+                    format!(
+                        "`{key}` is {kind}, not a list of tables; write [[{}]]",
+                        self.header(key)
+                    ),
                 );
                 return Vec::new();
             }
@@ -558,8 +567,16 @@ impl<'d> Reader<'d> {
         let mut known = self.known.borrow_mut();
         if !known.iter().any(|k| k == key) {
             known.push(key.to_string());
-            self.document.known.borrow_mut().insert(without_numbers(&self.path(key)));
+            self.document
+                .known
+                .borrow_mut()
+                .insert(without_numbers(&self.path(key)));
         }
+    }
+
+    /// The path as it stands in the header of a table.
+    fn header(&self, key: &str) -> String {
+        without_numbers(&self.path(key)).replace("[]", "")
     }
 
     fn path(&self, key: &str) -> String {
@@ -689,7 +706,7 @@ impl FromNode for f64 {
         if value.is_finite() {
             Ok(value)
         } else {
-            Err(wrong::<Self>(node))
+            Err(format!("{value} is no finite number; write {}", Self::WANTED))
         }
     }
 }
@@ -748,6 +765,17 @@ pub fn parse_duration(text: &str) -> Result<Duration, String> {
         _ => return Err(bad()),
     };
     Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
+}
+
+/// The text that [`parse_duration`] reads as `time`, in the unit that makes it short.
+pub fn format_duration(time: Duration) -> String {
+    match (time.as_secs(), time.subsec_nanos()) {
+        (0, 0) => "0s".to_string(),
+        (seconds, 0) if seconds % 3600 == 0 => format!("{}h", seconds / 3600),
+        (seconds, 0) if seconds % 60 == 0 => format!("{}min", seconds / 60),
+        (0, nanos) if nanos < 1000 => format!("{}us", f64::from(nanos) / 1e3),
+        _ => format!("{time:?}"),
+    }
 }
 
 /// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
@@ -851,7 +879,10 @@ mod tests {
         let mqtt = reader.table("mqtt").unwrap();
         assert_eq!(mqtt.optional::<String>("password").as_deref(), Some("1234"));
         let publish = mqtt.table("publish").unwrap();
-        assert_eq!(publish.optional::<Duration>("min_interval"), Some(Duration::from_secs(1)));
+        assert_eq!(
+            publish.optional::<Duration>("min_interval"),
+            Some(Duration::from_secs(1))
+        );
         assert_eq!(reader.tables("bus")[0].optional::<u32>("baud"), Some(19_200));
         let log = reader.table("log").unwrap();
         assert_eq!(log.optional::<String>("level").as_deref(), Some("debug"));
@@ -881,6 +912,9 @@ mod tests {
         assert_eq!(parse_duration("10 s"), Ok(Duration::from_secs(10)));
         for bad in ["", "10", "ms", "-1s", "1d", "1.2.3s", "1e3s"] {
             assert!(parse_duration(bad).is_err(), "{bad}");
+        }
+        for text in ["0s", "0.5us", "303.819µs", "10ms", "1.5s", "90s", "2min", "1h"] {
+            assert_eq!(format_duration(parse_duration(text).unwrap()), text);
         }
         assert_eq!(parse_size("64MiB"), Ok(64 << 20));
         for bad in ["", "64", "64MB", "-1B", "99999999999999999GiB"] {
