@@ -236,6 +236,11 @@ impl Document {
         self.known.borrow().clone()
     }
 
+    /// Whether no problem was found so far.
+    pub fn is_sound(&self) -> bool {
+        self.problems.borrow().is_empty()
+    }
+
     /// The file's name as it was given.
     pub fn file(&self) -> &str {
         &self.file

@@ -157,8 +157,9 @@ fn the_report_of_a_sound_configuration() {
         (&first["function"], &first["address"], &first["count"]),
         (&3.into(), &2100.into(), &11.into())
     );
-    // Request of 8 characters, turnaround, reply of 27, silence of 3.5; 10 bits a character.
-    let wire = (8.0 + 27.0 + 3.5) * 10.0 / 38.4 + 0.5;
+    // Request of 8 characters, 3.5 by which the drive knows its end, turnaround, reply of 27, silence of 3.5;
+    // 10 bits a character.
+    let wire = (8.0 + 3.5 + 27.0 + 3.5) * 10.0 / 38.4 + 0.5;
     assert!((first["wire_ms"].as_f64().unwrap() - wire).abs() < 1e-4, "{first}");
     let share = |class: &str, cycle: f64| {
         let wires = requests
@@ -207,7 +208,7 @@ fn the_tables_name_every_request() {
     let ran = run(&["check", "--config", &path]);
     let wanted = [
         "Bus line1: /dev/ttyUSB9 (not there now), modbus-rtu, 38400 8N1, silence 0.91 ms",
-        " pump-1  fast   03 read holding     2100     11    10.53",
+        " pump-1  fast   03 read holding     2100     11    11.44",
         " pump-2  once   03 read holding      100      4",
         "  fast cycle  50.0 ms (aimed at 50.0 ms)",
         "  line load   ",

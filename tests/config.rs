@@ -87,7 +87,7 @@ fn one_device_under_two_names_is_one_port() {
     std::os::unix::fs::symlink(&device, &by_id).unwrap();
     let parse = || {
         Settings::parse(
-            &dir.path().join("t.toml"),
+            dir.path().join("t.toml"),
             &two_ports(&device, &by_id),
             std::iter::empty(),
         )
@@ -105,7 +105,7 @@ fn the_password_file_gives_its_line() {
         fs::write(dir.path().join("secret"), password).unwrap();
         let source = "[gateway]\nname = \"g\"\n[mqtt]\nusername = \"me\"\npassword_file = \"secret\"\n";
         let env: Vec<_> = env.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect();
-        Settings::parse(&dir.path().join("t.toml"), source, env.into_iter())
+        Settings::parse(dir.path().join("t.toml"), source, env.into_iter())
     };
     let password = |loaded: Loaded| loaded.settings.unwrap().mqtt.unwrap().password.unwrap().0;
     assert_eq!(password(parse("open sesame\n", &[])), "open sesame");

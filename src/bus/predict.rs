@@ -1,21 +1,19 @@
 //! What a bus will achieve, reckoned from its configuration alone. Pure.
 //!
 //! A round of the fast class is all fast requests of the bus once; it starts every `cycle`, or without idle
-//! time when the line cannot carry that. The slow class gets what the fast one leaves, and at least
-//! [`SLOW_SHARE`] of the line. Requests of the class `once` cost nothing in the long run.
+//! time when the line cannot carry that. Slow requests fill the idle time of a round as far as they fit in
+//! whole, and get [`SLOW_SHARE`] of the line at least. Requests of the class `once` cost nothing in the long run.
 
 use std::fmt;
 use std::time::Duration;
 
+use super::schedule::SLOW_SHARE;
 use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
 use crate::document::format_duration;
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
-
-/// Share of a saturated line that slow polls get at least.
-pub const SLOW_SHARE: f64 = 0.05;
 
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
@@ -30,7 +28,7 @@ pub struct PredictedRequest {
     pub drive: usize,
     /// The request.
     pub read: PlannedRead,
-    /// Whole transaction: request, turnaround, reply, silence.
+    /// Whole transaction: request, its recognition by the drive, turnaround, reply, silence.
     pub wire: Duration,
 }
 
@@ -43,8 +41,10 @@ pub struct Prediction {
     pub fast_cycle: Option<Duration>,
     /// Time from round to round of the slow class; absent without slow requests.
     pub slow_cycle: Option<Duration>,
-    /// Share of the line that the cadences ask for; above 1 the line cannot carry them.
+    /// Share of the line that the cadences ask for; above 1 no schedule can carry them.
     pub demand: f64,
+    /// Share of the line that will be in use, 0..=1.
+    pub load: f64,
     /// Cadences that the line cannot carry.
     pub shortage: Option<Shortage>,
 }
@@ -96,24 +96,19 @@ pub enum Remedy {
     SlowCycle(Duration),
 }
 
-impl Prediction {
-    /// Share of the line in use, 0..=1.
-    pub fn load(&self) -> f64 {
-        self.demand.min(1.0)
-    }
-}
-
 /// Predicts the bus `spec` with its drives.
 pub fn predict(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Prediction {
     let line = Line::new(spec, silence, drives);
     let total = line.total(spec.format.baud);
     let (fast, slow) = line.cycles(&total);
+    let (fast_share, slow_share) = line.shares(&total);
     let present = |round: f64, cycle: f64| (round > 0.0).then(|| seconds(cycle));
     let mut prediction = Prediction {
         requests: line.requests(),
         fast_cycle: present(total.fast, fast),
         slow_cycle: present(total.slow, slow),
-        demand: line.demand(&total),
+        demand: fast_share + slow_share,
+        load: (total.fast / fast + total.slow / slow).min(1.0),
         shortage: None,
     };
     prediction.shortage = line.shortage(&prediction, &total);
@@ -125,6 +120,25 @@ pub fn predict(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Predic
 struct Rounds {
     fast: f64,
     slow: f64,
+    /// Requests of a slow round, and the longest of them.
+    slow_requests: f64,
+    longest_slow: f64,
+}
+
+impl Rounds {
+    fn and(self, other: &Rounds) -> Rounds {
+        Rounds {
+            fast: self.fast + other.fast,
+            slow: self.slow + other.slow,
+            slow_requests: self.slow_requests + other.slow_requests,
+            longest_slow: self.longest_slow.max(other.longest_slow),
+        }
+    }
+
+    /// Mean time of a slow request.
+    fn mean_slow(&self) -> f64 {
+        self.slow / self.slow_requests.max(1.0)
+    }
 }
 
 /// The line, its drives and what is asked of it.
@@ -166,24 +180,27 @@ impl<'a> Line<'a> {
             ..self.spec.format
         };
         let of = |(drive, plan): &(&DriveSpec, Plan)| {
-            let round = |class| {
-                let reads = plan.reads.iter().filter(|read| read.class == class);
-                reads.map(|read| self.wire(&format, drive, read).as_secs_f64()).sum()
-            };
-            Rounds {
-                fast: round(PollClass::Fast),
-                slow: round(PollClass::Slow),
+            let mut rounds = Rounds::default();
+            for read in &plan.reads {
+                let wire = self.wire(&format, drive, read).as_secs_f64();
+                match read.class {
+                    PollClass::Fast => rounds.fast += wire,
+                    PollClass::Slow => {
+                        rounds.slow += wire;
+                        rounds.slow_requests += 1.0;
+                        rounds.longest_slow = rounds.longest_slow.max(wire);
+                    }
+                    PollClass::Once | PollClass::Never => {}
+                }
             }
+            rounds
         };
         self.drives.iter().map(of).collect()
     }
 
     /// Rounds of all drives at that baud.
     fn total(&self, baud: u32) -> Rounds {
-        self.rounds(baud).iter().fold(Rounds::default(), |total, one| Rounds {
-            fast: total.fast + one.fast,
-            slow: total.slow + one.slow,
-        })
+        self.rounds(baud).iter().fold(Rounds::default(), Rounds::and)
     }
 
     /// Shares of the line that the classes ask for.
@@ -195,15 +212,22 @@ impl<'a> Line<'a> {
         )
     }
 
-    fn demand(&self, rounds: &Rounds) -> f64 {
-        let (fast, slow) = self.shares(rounds);
-        fast + slow
+    /// Share of the line that slow requests can have: the idle time of a round as far as whole requests fit, or
+    /// their share of the time that the line is busy.
+    fn room(&self, rounds: &Rounds) -> f64 {
+        if rounds.fast == 0.0 {
+            return 1.0;
+        }
+        let cycle = self.spec.cycle.as_secs_f64().max(1e-6);
+        let fitting = ((cycle - rounds.fast).max(0.0) / rounds.longest_slow.max(1e-6)).floor();
+        let busy = (rounds.fast / cycle).min(1.0 - SLOW_SHARE) / (1.0 - SLOW_SHARE);
+        (fitting * rounds.mean_slow() / cycle).max(SLOW_SHARE * busy)
     }
 
     /// Seconds from round to round, fast and slow.
     fn cycles(&self, rounds: &Rounds) -> (f64, f64) {
         let (fast, slow) = self.shares(rounds);
-        let granted = slow.min((1.0 - fast).max(SLOW_SHARE));
+        let granted = slow.min(self.room(rounds));
         let fast_cycle = if fast > 0.0 { rounds.fast / (1.0 - granted) } else { 0.0 };
         let slow_cycle = if slow > 0.0 { rounds.slow / granted } else { 0.0 };
         (
@@ -212,10 +236,16 @@ impl<'a> Line<'a> {
         )
     }
 
+    /// Whether both cadences are kept.
+    fn carries(&self, rounds: &Rounds) -> bool {
+        let (fast, slow) = self.cycles(rounds);
+        !late(fast, self.spec.cycle) && !late(slow, self.spec.slow_cycle)
+    }
+
     fn shortage(&self, prediction: &Prediction, total: &Rounds) -> Option<Shortage> {
         let missed = |class, wanted: Duration, achieved: Option<Duration>, round| {
-            let late = |achieved: &Duration| achieved.as_secs_f64() > wanted.as_secs_f64() * (1.0 + TOLERANCE);
-            achieved.filter(late).map(|achieved| Missed {
+            let missed = achieved.filter(|achieved| late(achieved.as_secs_f64(), wanted));
+            missed.map(|achieved| Missed {
                 wanted,
                 achieved,
                 requests: prediction.requests.iter().filter(|r| r.read.class == class).count(),
@@ -236,7 +266,7 @@ impl<'a> Line<'a> {
     /// of the cadence.
     fn other_lines(&self) -> Vec<Remedy> {
         let bauds = self.higher_bauds();
-        if let Some(baud) = bauds.iter().find(|baud| self.demand(&self.total(**baud)) <= 1.0) {
+        if let Some(baud) = bauds.iter().find(|baud| self.carries(&self.total(**baud))) {
             return vec![Remedy::Baud(*baud)];
         }
         let here = self.split(self.spec.format.baud).map(|buses| (buses, None));
@@ -271,37 +301,60 @@ impl<'a> Line<'a> {
         bauds
     }
 
-    /// Buses that the drives fit on, first fit by decreasing demand; none when one drive alone asks too much.
+    /// Buses that the drives fit on, first fit by decreasing time; none when one drive alone asks too much.
     fn split(&self, baud: u32) -> Option<usize> {
-        let mut demands: Vec<f64> = self.rounds(baud).iter().map(|one| self.demand(one)).collect();
-        demands.sort_by(|a, b| b.total_cmp(a));
-        let mut buses: Vec<f64> = Vec::new();
-        for demand in demands {
-            if demand > 1.0 {
+        let mut drives = self.rounds(baud);
+        let time = |one: &Rounds| one.fast + one.slow;
+        drives.sort_by(|a, b| time(b).total_cmp(&time(a)));
+        let mut buses: Vec<Rounds> = Vec::new();
+        for drive in drives {
+            if !self.carries(&drive) {
                 return None;
             }
-            match buses.iter_mut().find(|used| **used + demand <= 1.0) {
-                Some(used) => *used += demand,
-                None => buses.push(demand),
+            match buses.iter_mut().find(|bus| self.carries(&bus.and(&drive))) {
+                Some(bus) => *bus = bus.and(&drive),
+                None => buses.push(drive),
             }
         }
         Some(buses.len())
     }
 
-    /// The longer cadence, of the fast class if that is missed, with which the line as it is carries both.
-    fn longer(&self, fast_missed: bool, rounds: &Rounds) -> Option<Remedy> {
-        let (fast, _) = self.shares(rounds);
-        if !fast_missed && fast < 1.0 - SLOW_SHARE {
-            return Some(Remedy::SlowCycle(whole_milliseconds(rounds.slow / (1.0 - fast))));
+    /// The longer cadences with which the line as it is carries both classes.
+    fn longer(&self, fast_missed: bool, rounds: &Rounds) -> Vec<Remedy> {
+        let cycle = |cycle| Remedy::Cycle { cycle, baud: None };
+        if fast_missed {
+            return self.shortest_cycle(rounds).map(cycle).into_iter().collect();
         }
-        let cycle = self.shortest_cycle(rounds)?;
-        Some(Remedy::Cycle { cycle, baud: None })
+        let slow_cycle = Remedy::SlowCycle(whole_milliseconds(rounds.slow / self.room(rounds)));
+        let roomy = self.roomy_cycle(rounds).map(cycle);
+        [slow_cycle].into_iter().chain(roomy).collect()
     }
 
+    /// The shortest cadence of the fast class beside which the slow one is kept.
     fn shortest_cycle(&self, rounds: &Rounds) -> Option<Duration> {
         let (_, slow) = self.shares(rounds);
-        (rounds.fast > 0.0 && slow < 1.0 - SLOW_SHARE).then(|| whole_milliseconds(rounds.fast / (1.0 - slow)))
+        match slow {
+            _ if rounds.fast == 0.0 => None,
+            slow if slow <= SLOW_SHARE => Some(whole_milliseconds(rounds.fast / (1.0 - slow))),
+            _ => self.roomy_cycle(rounds),
+        }
     }
+
+    /// The shortest cadence whose idle time has room for the slow class: as many of its longest requests that
+    /// `fitting * mean / cycle` is the share it asks for.
+    fn roomy_cycle(&self, rounds: &Rounds) -> Option<Duration> {
+        let (_, slow) = self.shares(rounds);
+        let spare = rounds.mean_slow() - slow * rounds.longest_slow;
+        let fitting = (slow * rounds.fast / spare).ceil();
+        (spare > 0.0 && rounds.fast > 0.0)
+            .then(|| whole_milliseconds(rounds.fast + fitting * rounds.longest_slow))
+            .filter(|cycle| late(cycle.as_secs_f64(), self.spec.cycle))
+    }
+}
+
+/// Whether a cadence is missed.
+fn late(achieved: f64, wanted: Duration) -> bool {
+    achieved > wanted.as_secs_f64() * (1.0 + TOLERANCE)
 }
 
 fn seconds(time: f64) -> Duration {

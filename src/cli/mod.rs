@@ -1,28 +1,27 @@
 //! The command line, one file a command.
 //!
-//! A command is a module with `Args` (its options, its help, an example) and `run(Args)`, and a line in
-//! `commands!` below.
+//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
+//! line in `commands!` below.
 
 mod check;
 pub mod map;
-mod output;
 mod profiles;
+mod report;
 mod schema;
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use clap::Parser;
 
-use crate::config::{ENVIRONMENT, Settings};
-use crate::document::Problem;
-
-/// Exit code of a bad configuration (sysexits EX_CONFIG).
-const BAD_CONFIGURATION: u8 = 78;
-/// Exit code of a wrong command line, the same as clap's.
-const WRONG_COMMAND_LINE: u8 = 2;
 /// Exit code of what failed while working.
-const FAILED: u8 = 1;
+pub const EXIT_FAILED: u8 = 1;
+/// Exit code of a wrong command line, the same as clap's.
+pub const EXIT_USAGE: u8 = 2;
+/// Exit code of a bad configuration (sysexits EX_CONFIG).
+pub const EXIT_CONFIG: u8 = 78;
+/// The configuration when none is named.
+pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
 
 /// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
 #[derive(Debug, Parser)]
@@ -44,7 +43,7 @@ macro_rules! commands {
         }
 
         impl Command {
-            fn run(self) -> Result<(), Failure> {
+            fn run(&self) -> ExitCode {
                 match self {
                     $(Command::$variant(args) => $module::run(args),)*
                 }
@@ -64,82 +63,24 @@ commands! {
 #[derive(Debug, clap::Args)]
 struct ConfigFile {
     /// The configuration.
-    #[arg(
-        long = "config",
-        value_name = "FILE",
-        default_value = "/etc/drivegate/drivegate.toml"
-    )]
+    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
     path: PathBuf,
-}
-
-/// Why a command did not do what it should.
-#[derive(Debug)]
-enum Failure {
-    /// Errors of the configuration or of a profile.
-    Configuration(Vec<Problem>),
-    /// A bad configuration that the command has told in its own way.
-    ConfigurationTold,
-    /// An argument that names nothing.
-    CommandLine(Problem),
-    /// Something failed while working: what; where; what to do.
-    Work(String),
-}
-
-impl Failure {
-    fn tell(&self) -> ExitCode {
-        match self {
-            Failure::Configuration(problems) => {
-                output::problems("error", problems);
-                ExitCode::from(BAD_CONFIGURATION)
-            }
-            Failure::ConfigurationTold => ExitCode::from(BAD_CONFIGURATION),
-            Failure::CommandLine(problem) => {
-                output::problems("error", std::slice::from_ref(problem));
-                ExitCode::from(WRONG_COMMAND_LINE)
-            }
-            Failure::Work(message) => {
-                output::note(&format!("error: {message}"));
-                ExitCode::from(FAILED)
-            }
-        }
-    }
 }
 
 /// Reads the command line, does what it says and returns the exit code.
 pub fn main() -> ExitCode {
-    match Cli::parse().command.run() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(failure) => failure.tell(),
-    }
+    Cli::parse().command.run()
 }
 
-/// The settings in `path` and the environment; warnings go to stderr.
-fn settings(path: &Path) -> Result<Settings, Failure> {
-    let loaded = Settings::load(path, environment()?.into_iter());
-    output::problems("warning", &loaded.warnings);
-    loaded.settings.ok_or(Failure::Configuration(loaded.errors))
-}
-
-/// The variables that override the configuration.
-fn environment() -> Result<Vec<(String, String)>, Failure> {
-    let mut variables = Vec::new();
-    let mut problems = Vec::new();
-    for (name, value) in std::env::vars_os() {
-        let Some(name) = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT)) else {
-            continue;
-        };
-        match value.into_string() {
-            Ok(value) => variables.push((name, value)),
-            Err(_) => problems.push(Problem {
-                file: name,
-                line: None,
-                key: String::new(),
-                message: "the variable is no UTF-8 text; set it again".to_string(),
-            }),
+/// Runs `command` on a runtime of its own.
+pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
+    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime.block_on(command),
+        Err(why) => {
+            report::error(&format!(
+                "cannot start: {why}; the runtime; free memory, threads or file descriptors"
+            ));
+            ExitCode::from(EXIT_FAILED)
         }
-    }
-    match problems.is_empty() {
-        true => Ok(variables),
-        false => Err(Failure::Configuration(problems)),
     }
 }

@@ -2,9 +2,10 @@
 
 use std::fmt::Write;
 use std::path::PathBuf;
+use std::process::ExitCode;
 
-use super::{Failure, output, settings};
-use crate::config::unknown_profile;
+use super::{EXIT_CONFIG, EXIT_USAGE, report};
+use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Problem, format_duration};
 use crate::drive::profile::{AddressRange, Form, Profiles};
 use crate::drive::{Point, Profile, Source};
@@ -39,34 +40,42 @@ enum What {
     },
 }
 
-pub(super) fn run(args: Args) -> Result<(), Failure> {
+pub(super) fn run(args: &Args) -> ExitCode {
     let mut profiles = match &args.config {
-        Some(path) => settings(path)?.profiles,
         None => Profiles::built_in(),
+        Some(path) => {
+            let loaded = Settings::load(path, environment());
+            report::errors(&loaded.errors);
+            match loaded.settings {
+                Some(settings) => settings.profiles,
+                None => return ExitCode::from(EXIT_CONFIG),
+            }
+        }
     };
-    let mut problems = Vec::new();
-    for dir in &args.profile_dir {
-        problems.extend(profiles.load(dir));
-    }
+    let problems: Vec<Problem> = args.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
     if !problems.is_empty() {
-        return Err(Failure::Configuration(problems));
+        report::errors(&problems);
+        return ExitCode::from(EXIT_CONFIG);
     }
-    match args.what {
-        None => output::print(&list(&profiles)),
-        Some(What::Show { name }) => match profiles.get(&name) {
-            Some(profile) => output::print(&show(profile)),
-            None => Err(Failure::CommandLine(Problem {
+    let Some(What::Show { name }) = &args.what else {
+        return report::print(&list(&profiles));
+    };
+    match profiles.get(name) {
+        Some(profile) => report::print(&show(profile)),
+        None => {
+            report::errors(&[Problem {
                 file: "command line".to_string(),
                 line: None,
                 key: "NAME".to_string(),
-                message: unknown_profile(&name, &profiles, false),
-            })),
-        },
+                message: unknown_profile(name, &profiles, false),
+            }]);
+            ExitCode::from(EXIT_USAGE)
+        }
     }
 }
 
 fn list(profiles: &Profiles) -> String {
-    let mut table = output::table(["profile", "points", "protocols", "origin", "drives"]);
+    let mut table = report::table(["profile", "points", "protocols", "origin", "drives"]);
     for profile in profiles.iter() {
         table.add_row([
             profile.name.clone(),
@@ -76,7 +85,7 @@ fn list(profiles: &Profiles) -> String {
             profile.title.clone(),
         ]);
     }
-    output::lines(&table)
+    report::lines(&table)
 }
 
 fn protocols(profile: &Profile) -> String {
@@ -129,7 +138,7 @@ fn show(profile: &Profile) -> String {
 }
 
 fn points(profile: &Profile) -> String {
-    let mut table = output::table([
+    let mut table = report::table([
         "point", "at", "type", "scale", "unit", "class", "access", "range", "verified", "note",
     ]);
     for point in &profile.points {
@@ -155,7 +164,7 @@ fn points(profile: &Profile) -> String {
             note,
         ]);
     }
-    output::lines(&table)
+    report::lines(&table)
 }
 
 fn verified(verified: bool) -> &'static str {
@@ -204,7 +213,7 @@ fn name_of(profile: &Profile, point: usize) -> &str {
 }
 
 fn ranges(ranges: &[AddressRange]) -> String {
-    let mut table = output::table(["table", "first", "last", "per read", "per write", "holes", "note"]);
+    let mut table = report::table(["table", "first", "last", "per read", "per write", "holes", "note"]);
     for range in ranges {
         let write = match range.write {
             0 => "read-only".to_string(),
@@ -220,11 +229,11 @@ fn ranges(ranges: &[AddressRange]) -> String {
             range.note.clone(),
         ]);
     }
-    output::lines(&table)
+    report::lines(&table)
 }
 
 fn faults(profile: &Profile) -> String {
-    let mut table = output::table(["code", "text", "verified"]);
+    let mut table = report::table(["code", "text", "verified"]);
     for (code, fault) in &profile.faults {
         table.add_row([
             code.to_string(),
@@ -232,5 +241,5 @@ fn faults(profile: &Profile) -> String {
             verified(fault.verified).to_string(),
         ]);
     }
-    output::lines(&table)
+    report::lines(&table)
 }

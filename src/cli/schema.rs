@@ -1,6 +1,8 @@
 //! `drivegate schema`: JSON Schema of the configuration.
 
-use super::{Failure, output};
+use std::process::ExitCode;
+
+use super::report;
 use crate::config::schema::schema;
 
 /// Prints the JSON Schema (draft 2020-12) of the configuration, for editors and tools.
@@ -10,6 +12,6 @@ use crate::config::schema::schema;
     #:schema ./drivegate.schema.json")]
 pub(super) struct Args {}
 
-pub(super) fn run(_: Args) -> Result<(), Failure> {
-    output::print(&format!("{:#}\n", schema()))
+pub(super) fn run(_: &Args) -> ExitCode {
+    report::print(&format!("{:#}\n", schema()))
 }

@@ -84,7 +84,8 @@ pub struct Loaded {
 impl Settings {
     /// Reads the file `path`, lets the variables `DRIVEGATE__SECTION__KEY` of `env` override it, and checks
     /// everything.
-    pub fn load(path: &Path, env: impl Iterator<Item = (String, String)>) -> Loaded {
+    pub fn load(path: impl AsRef<Path>, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        let path = path.as_ref();
         match document::read_file(path) {
             Ok(source) => Settings::parse(path, &source, env),
             Err(problem) => Loaded {
@@ -96,8 +97,26 @@ impl Settings {
     }
 
     /// As [`Settings::load`], with `source` as the text of the file.
-    pub fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> Loaded {
-        parse(path, source, env).0
+    pub fn parse(path: impl AsRef<Path>, source: &str, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        parse(path.as_ref(), source, env).0
+    }
+}
+
+/// The variables of this process that override the configuration. What is no UTF-8 in them becomes U+FFFD, which
+/// [`Settings::load`] refuses.
+pub fn environment() -> impl Iterator<Item = (String, String)> {
+    std::env::vars_os().filter_map(|(name, value)| {
+        let name = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT))?;
+        Some((name, value.to_string_lossy().into_owned()))
+    })
+}
+
+fn not_text(name: &str) -> Problem {
+    Problem {
+        file: name.to_string(),
+        line: None,
+        key: String::new(),
+        message: "the variable is no UTF-8 text; set it again".to_string(),
     }
 }
 
@@ -107,13 +126,17 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
     for section in ["gateway", "log"] {
         document.ensure_section(section);
     }
-    document.overlay(ENVIRONMENT, env);
+    let (variables, broken): (Vec<_>, Vec<_>) = env
+        .filter(|(name, _)| name.starts_with(ENVIRONMENT))
+        .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
+    document.overlay(ENVIRONMENT, variables);
     let mut profile_errors = Vec::new();
     let base = path.parent().unwrap_or(Path::new(""));
     let settings = read(&document.reader(), base, &mut profile_errors);
     let known = document.known_keys().into_iter().collect();
     let (mut errors, warnings) = document.into_findings();
     errors.extend(profile_errors);
+    errors.extend(broken.iter().map(|(name, _)| not_text(name)));
     let loaded = Loaded {
         settings: settings.filter(|_| errors.is_empty()),
         errors,
@@ -154,7 +177,10 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     warn_of_emptiness(reader);
     let stale = modbus_tcp.as_ref().map(|m| (m.stale_after, &m.stale_place));
     let stale_after = stale.map_or(north::DEFAULT_STALE_AFTER, |(after, _)| after);
-    warn_of_cadence(reader, &buses, stale_after, stale.map(|(_, place)| place));
+    if reader.document().is_sound() {
+        // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
+        warn_of_cadence(reader, &buses, stale_after, stale.map(|(_, place)| place));
+    }
     let commanded = modbus_tcp.as_ref().is_some_and(|m| !m.options.write.is_empty())
         || mqtt.as_ref().is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
     if !commanded {
