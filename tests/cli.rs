@@ -84,6 +84,8 @@ fn exit_codes() {
         (vec!["profiles", "--config", "tests/bad/twice.toml"], 78),
         (vec!["profiles", "--profile-dir", "tests/bad/broken-profiles"], 78),
         (vec!["profiles", "--profile-dir", "tests/bad/no-such"], 78),
+        (vec!["map", "--config", &path], 0),
+        (vec!["map", "--config", "tests/bad/twice.toml"], 78),
         (vec!["schema"], 0),
         (vec!["--version"], 0),
         (vec!["--help"], 0),
@@ -286,6 +288,21 @@ fn profiles_are_listed_and_shown() {
 }
 
 #[test]
+fn the_map_names_every_unit() {
+    let (_dir, path) = sound();
+    let text = run(&["map", "--config", &path]).out;
+    assert!(
+        text.contains("Modbus TCP register map of pump-house") && text.contains("units 1, 2"),
+        "{text}"
+    );
+    let csv = run(&["map", "--config", &path, "--csv"]).out;
+    assert!(
+        csv.starts_with("unit,drive,") && csv.contains("\n2,pump-2,common,"),
+        "{csv}"
+    );
+}
+
+#[test]
 fn the_schema_is_json() {
     let schema: Value = serde_json::from_str(&run(&["schema"]).out).unwrap();
     assert_eq!(schema["$schema"], "https://json-schema.org/draft/2020-12/schema");
@@ -339,6 +356,7 @@ fn a_closed_pipe_ends_the_output_quietly() {
         vec!["check", "--config", &path, "--json"],
         vec!["profiles", "show", "vacon-nx"],
         vec!["profiles"],
+        vec!["map", "--config", &path],
         vec!["schema"],
         vec!["--help"],
     ] {

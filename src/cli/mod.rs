@@ -4,7 +4,7 @@
 //! line in `commands!` below.
 
 mod check;
-pub mod map;
+mod map;
 mod profiles;
 mod report;
 mod schema;
@@ -56,6 +56,7 @@ macro_rules! commands {
 commands! {
     Check => check,
     Profiles => profiles,
+    Map => map,
     Schema => schema,
 }
 
