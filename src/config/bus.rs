@@ -54,31 +54,8 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
     let port = read_port(reader, base);
     let protocol = read_protocol(reader);
     let format = read_format(reader, protocol.unwrap_or(DEFAULT_PROTOCOL));
-    let time = |key, default| values::duration(reader, key, default, &TIMES);
-    let (cycle, slow_cycle) = (time("cycle", DEFAULT_CYCLE), time("slow_cycle", DEFAULT_SLOW_CYCLE));
-    if slow_cycle < cycle {
-        reader.warning(
-            "slow_cycle",
-            format!(
-                "slow_cycle = {} is shorter than cycle = {}; swap them or raise slow_cycle",
-                format_duration(slow_cycle),
-                format_duration(cycle)
-            ),
-        );
-    }
-    let options = BusOptions {
-        response_timeout: time("response_timeout", DEFAULT_RESPONSE_TIMEOUT),
-        retries: values::number(reader, "retries", DEFAULT_RETRIES, &RETRIES),
-        silence: read_silence(reader, format.as_ref()),
-        rs485: values::choice(reader, "rs485", Rs485::Off, &RS485),
-    };
-    let device_server = port.as_deref().is_some_and(|p| p.starts_with("tcp://"));
-    if device_server && options.rs485 != Rs485::Off {
-        reader.warning(
-            "rs485",
-            "a tcp:// line switches its own direction; write \"off\" or leave the key out",
-        );
-    }
+    let (cycle, slow_cycle) = read_cadence(reader);
+    let options = read_options(reader, format.as_ref(), port.as_deref());
     let around = Surroundings {
         bus: name.as_ref().map_or("", |(name, _)| name),
         protocol: protocol.unwrap_or(DEFAULT_PROTOCOL),
@@ -125,6 +102,39 @@ fn read_port(reader: &Reader<'_>, base: &Path) -> Option<String> {
             None
         }
     }
+}
+
+fn read_cadence(reader: &Reader<'_>) -> (Duration, Duration) {
+    let cycle = values::duration(reader, "cycle", DEFAULT_CYCLE, &TIMES);
+    let slow_cycle = values::duration(reader, "slow_cycle", DEFAULT_SLOW_CYCLE, &TIMES);
+    if slow_cycle < cycle {
+        reader.warning(
+            "slow_cycle",
+            format!(
+                "slow_cycle = {} is shorter than cycle = {}; swap them or raise slow_cycle",
+                format_duration(slow_cycle),
+                format_duration(cycle)
+            ),
+        );
+    }
+    (cycle, slow_cycle)
+}
+
+fn read_options(reader: &Reader<'_>, format: Option<&LineFormat>, port: Option<&str>) -> BusOptions {
+    let options = BusOptions {
+        response_timeout: values::duration(reader, "response_timeout", DEFAULT_RESPONSE_TIMEOUT, &TIMES),
+        retries: values::number(reader, "retries", DEFAULT_RETRIES, &RETRIES),
+        silence: read_silence(reader, format),
+        rs485: values::choice(reader, "rs485", Rs485::Off, &RS485),
+    };
+    let device_server = port.is_some_and(|p| p.starts_with("tcp://"));
+    if device_server && options.rs485 != Rs485::Off {
+        reader.warning(
+            "rs485",
+            "a tcp:// line switches its own direction; write \"off\" or leave the key out",
+        );
+    }
+    options
 }
 
 /// Path of a device, seen from the directory of the file, or `tcp://host:port`.

@@ -171,33 +171,51 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let log = reader.table("log").map(|table| log::read(&table)).unwrap_or_default();
     reader.finish();
 
-    unique::check(reader.document(), &buses);
-    let listeners = modbus_tcp.iter().flat_map(|m| m.listeners.iter()).chain(&http_listener);
-    unique::check_listeners(reader.document(), listeners);
-    warn_of_emptiness(reader);
-    let stale = modbus_tcp.as_ref().map(|m| (m.stale_after, &m.stale_place));
-    let stale_after = stale.map_or(north::DEFAULT_STALE_AFTER, |(after, _)| after);
-    if reader.document().is_sound() {
-        // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
-        warn_of_cadence(reader, &buses, stale_after, stale.map(|(_, place)| place));
-    }
-    let commanded = modbus_tcp.as_ref().is_some_and(|m| !m.options.write.is_empty())
-        || mqtt.as_ref().is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
-    if !commanded {
-        warn_of_idle_control(reader, &buses);
-    }
+    judge(
+        reader,
+        &buses,
+        modbus_tcp.as_ref(),
+        mqtt.as_ref(),
+        http_listener.as_ref(),
+    );
 
     Some(Settings {
         gateway: name?,
         profile_dirs,
         profiles,
-        stale_after,
+        stale_after: modbus_tcp
+            .as_ref()
+            .map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
         modbus_tcp: modbus_tcp.map(|m| m.options),
         mqtt: flipped(mqtt)?,
         http: flipped(http)?,
         log,
     })
+}
+
+/// What only the sections together show to be wrong or doubtful.
+fn judge(
+    reader: &Reader<'_>,
+    buses: &[bus::Found],
+    modbus_tcp: Option<&north::ModbusTcp>,
+    mqtt: Option<&Option<mqtt_client::Options>>,
+    http: Option<&north::Listener>,
+) {
+    unique::check(reader.document(), buses);
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.listeners).chain(http);
+    unique::check_listeners(reader.document(), listeners);
+    warn_of_emptiness(reader);
+    let commanded = modbus_tcp.is_some_and(|m| !m.options.write.is_empty())
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
+    if !commanded {
+        warn_of_idle_control(reader, buses);
+    }
+    if reader.document().is_sound() {
+        // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
+        let stale_after = modbus_tcp.map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after);
+        warn_of_cadence(reader, buses, stale_after, modbus_tcp.map(|m| &m.stale_place));
+    }
 }
 
 /// A section that is there but wrong makes the whole wrong; one that is absent does not.
