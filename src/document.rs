@@ -6,6 +6,7 @@
 //! the nearest known one.
 
 use std::cell::{Cell, RefCell};
+use std::collections::BTreeSet;
 use std::fmt;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -33,7 +34,7 @@ impl fmt::Display for Problem {
             Some((what, remedy)) => (what, Some(remedy)),
             None => (self.message.as_str(), None),
         };
-        write!(f, "{what}; at {}", self.file)?;
+        write!(f, "{what}; {}", self.file)?;
         if let Some(line) = self.line {
             write!(f, ":{line}")?;
         }
@@ -65,6 +66,16 @@ pub struct Node {
     pub value: Raw,
     line: Option<usize>,
     env: Option<String>,
+}
+
+impl Node {
+    fn empty_table(env: Option<String>) -> Node {
+        Node {
+            value: Raw::Table(Vec::new()),
+            line: None,
+            env,
+        }
+    }
 }
 
 /// A TOML value.
@@ -108,6 +119,8 @@ pub struct Document {
     file: String,
     root: Node,
     problems: RefCell<Vec<Problem>>,
+    warnings: RefCell<Vec<Problem>>,
+    known: RefCell<BTreeSet<String>>,
 }
 
 impl Document {
@@ -125,6 +138,8 @@ impl Document {
             file,
             root,
             problems: RefCell::default(),
+            warnings: RefCell::default(),
+            known: RefCell::default(),
         };
         for error in errors {
             let place = Place {
@@ -139,7 +154,18 @@ impl Document {
         document
     }
 
+    /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
+    pub fn ensure_section(&mut self, name: &str) {
+        let Raw::Table(entries) = &mut self.root.value else {
+            return;
+        };
+        if !entries.iter().any(|(key, _, _)| key == name) {
+            entries.push((name.to_string(), None, Node::empty_table(None)));
+        }
+    }
+
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
+    /// The section must be there, tables inside it need not.
     pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
@@ -149,7 +175,16 @@ impl Document {
         variables.sort();
         for (name, value) in variables {
             let path: Vec<String> = name.split("__").skip(1).map(str::to_lowercase).collect();
-            if let Err(message) = set(&mut self.root, &path, &name, value) {
+            let absent = path
+                .first()
+                .filter(|section| path.len() > 1 && !self.has_section(section));
+            let outcome = match absent {
+                Some(section) => Err(format!(
+                    "there is no `{section}` in the file to override; add the section to the file first"
+                )),
+                None => set(&mut self.root, &path, &name, value),
+            };
+            if let Err(message) = outcome {
                 let problem = Problem {
                     file: name,
                     line: None,
@@ -174,14 +209,36 @@ impl Document {
 
     /// Adds a problem.
     pub fn problem(&self, place: &Place, message: impl Into<String>) {
-        let file = place.env.clone().unwrap_or_else(|| self.file.clone());
-        let problem = Problem {
-            file,
+        self.problems.borrow_mut().push(self.finding(place, message.into()));
+    }
+
+    /// Adds a warning: the document can be used, but something in it will not do what it seems to.
+    pub fn warning(&self, place: &Place, message: impl Into<String>) {
+        self.warnings.borrow_mut().push(self.finding(place, message.into()));
+    }
+
+    fn finding(&self, place: &Place, message: String) -> Problem {
+        Problem {
+            file: place.env.clone().unwrap_or_else(|| self.file.clone()),
             line: place.line,
             key: place.key.clone(),
-            message: message.into(),
-        };
-        self.problems.borrow_mut().push(problem);
+            message,
+        }
+    }
+
+    fn has_section(&self, name: &str) -> bool {
+        entries(&self.root).iter().any(|(key, _, _)| key == name)
+    }
+
+    /// Every key that any reader of this document asked for, as a path without the numbers of array
+    /// elements: `bus[].drive[].address`.
+    pub fn known_keys(&self) -> BTreeSet<String> {
+        self.known.borrow().clone()
+    }
+
+    /// Whether no problem was found so far.
+    pub fn is_sound(&self) -> bool {
+        self.problems.borrow().is_empty()
     }
 
     /// The file's name as it was given.
@@ -191,9 +248,16 @@ impl Document {
 
     /// Takes the problems, in the order of the lines.
     pub fn into_problems(self) -> Vec<Problem> {
-        let mut problems = self.problems.into_inner();
-        problems.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
-        problems
+        self.into_findings().0
+    }
+
+    /// Takes problems and warnings, each in the order of the lines.
+    pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
+        let sorted = |mut found: Vec<Problem>| {
+            found.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
+            found
+        };
+        (sorted(self.problems.into_inner()), sorted(self.warnings.into_inner()))
     }
 }
 
@@ -293,16 +357,8 @@ fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(),
             if let Some((_, _, child)) = entries.iter_mut().find(|(k, _, _)| k == key) {
                 return set(child, rest, name, text);
             }
-            if !rest.is_empty() {
-                return Err(format!(
-                    "there is no `{key}` in the file to override; add the section to the file first"
-                ));
-            }
-            let child = Node {
-                value: Raw::Env(text),
-                line: None,
-                env: Some(name.to_string()),
-            };
+            let mut child = Node::empty_table(Some(name.to_string()));
+            set(&mut child, rest, name, text)?;
             entries.push((key.clone(), None, child));
             Ok(())
         }
@@ -341,9 +397,11 @@ impl<'d> Reader<'d> {
     /// Where `key` stands, or the table when it is absent.
     pub fn place_of(&self, key: &str) -> Place {
         let node = self.find(key);
+        let env = node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone());
+        let line = node.and_then(|n| n.line).or(self.place.line);
         Place {
-            line: node.and_then(|n| n.line).or(self.place.line),
-            env: node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone()),
+            line: line.filter(|_| env.is_none()),
+            env,
             key: self.path(key),
         }
     }
@@ -351,6 +409,11 @@ impl<'d> Reader<'d> {
     /// Adds a problem at `key`.
     pub fn problem(&self, key: &str, message: impl Into<String>) {
         self.document.problem(&self.place_of(key), message);
+    }
+
+    /// Adds a warning at `key`.
+    pub fn warning(&self, key: &str, message: impl Into<String>) {
+        self.document.warning(&self.place_of(key), message);
     }
 
     /// All keys that stand in the table, known or not.
@@ -420,7 +483,7 @@ impl<'d> Reader<'d> {
                     format!(
                         "`{key}` is {}, not a table; write [{}]",
                         node.value.kind(),
-                        self.path(key)
+                        self.header(key)
                     ),
                 );
                 None
@@ -438,7 +501,10 @@ impl<'d> Reader<'d> {
                 let kind = other.kind();
                 self.problem(
                     key,
-                    format!("`{key}` is {kind}, not a list of tables; write [[{}]]", self.path(key)),
+                    format!(
+                        "`{key}` is {kind}, not a list of tables; write [[{}]]",
+                        self.header(key)
+                    ),
                 );
                 return Vec::new();
             }
@@ -506,7 +572,16 @@ impl<'d> Reader<'d> {
         let mut known = self.known.borrow_mut();
         if !known.iter().any(|k| k == key) {
             known.push(key.to_string());
+            self.document
+                .known
+                .borrow_mut()
+                .insert(without_numbers(&self.path(key)));
         }
+    }
+
+    /// The path as it stands in the header of a table.
+    fn header(&self, key: &str) -> String {
+        without_numbers(&self.path(key)).replace("[]", "")
     }
 
     fn path(&self, key: &str) -> String {
@@ -516,6 +591,17 @@ impl<'d> Reader<'d> {
             format!("{}.{key}", self.place.key)
         }
     }
+}
+
+/// `bus[0].drive[12].name` as `bus[].drive[].name`.
+fn without_numbers(path: &str) -> String {
+    let mut inside = false;
+    let keep = |c: &char| {
+        let number = inside && c.is_ascii_digit();
+        inside = *c == '[' || number;
+        !number
+    };
+    path.chars().filter(keep).collect()
 }
 
 /// The known word nearest to `word`, if one is near enough to be meant.
@@ -625,7 +711,7 @@ impl FromNode for f64 {
         if value.is_finite() {
             Ok(value)
         } else {
-            Err(wrong::<Self>(node))
+            Err(format!("{value} is no finite number; write {}", Self::WANTED))
         }
     }
 }
@@ -684,6 +770,17 @@ pub fn parse_duration(text: &str) -> Result<Duration, String> {
         _ => return Err(bad()),
     };
     Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
+}
+
+/// The text that [`parse_duration`] reads as `time`, in the unit that makes it short.
+pub fn format_duration(time: Duration) -> String {
+    match (time.as_secs(), time.subsec_nanos()) {
+        (0, 0) => "0s".to_string(),
+        (seconds, 0) if seconds % 3600 == 0 => format!("{}h", seconds / 3600),
+        (seconds, 0) if seconds % 60 == 0 => format!("{}min", seconds / 60),
+        (0, nanos) if nanos < 1000 => format!("{}us", f64::from(nanos) / 1e3),
+        _ => format!("{time:?}"),
+    }
 }
 
 /// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
@@ -748,11 +845,11 @@ mod tests {
         assert_eq!(
             found,
             [
-                "unknown key `nmae`; at f.toml:1, nmae; did you mean `name`?",
-                "an integer stands here; at f.toml:2, port; write a string in quotes",
-                "`fast` is not a whole number from 0 to 4294967295; at f.toml:5, bus[0].baud; write a whole number from 0 to 4294967295",
-                "-1 is out of range; at f.toml:7, bus[1].baud; write a whole number from 0 to 4294967295",
-                "`name` is missing; at f.toml, name; write a string in quotes",
+                "unknown key `nmae`; f.toml:1, nmae; did you mean `name`?",
+                "an integer stands here; f.toml:2, port; write a string in quotes",
+                "`fast` is not a whole number from 0 to 4294967295; f.toml:5, bus[0].baud; write a whole number from 0 to 4294967295",
+                "-1 is out of range; f.toml:7, bus[1].baud; write a whole number from 0 to 4294967295",
+                "`name` is missing; f.toml, name; write a string in quotes",
             ]
         );
     }
@@ -770,11 +867,14 @@ mod tests {
     fn environment_overrides() {
         let mut document = Document::parse("f.toml", "[mqtt]\nport = 1\n[[bus]]\nbaud = 9600\n");
         let set = |k: &str, v: &str| (k.to_string(), v.to_string());
+        document.ensure_section("log");
         document.overlay(
             "DRIVEGATE",
             [
                 set("DRIVEGATE__MQTT__PASSWORD", "1234"),
+                set("DRIVEGATE__MQTT__PUBLISH__MIN_INTERVAL", "1s"),
                 set("DRIVEGATE__BUS__0__BAUD", "19200"),
+                set("DRIVEGATE__LOG__LEVEL", "debug"),
                 set("DRIVEGATE__HTTP__LISTEN", "x"),
                 set("DRIVEGATE__BUS__3__BAUD", "1"),
                 set("OTHER", "x"),
@@ -783,7 +883,29 @@ mod tests {
         let reader = document.reader();
         let mqtt = reader.table("mqtt").unwrap();
         assert_eq!(mqtt.optional::<String>("password").as_deref(), Some("1234"));
+        let publish = mqtt.table("publish").unwrap();
+        assert_eq!(
+            publish.optional::<Duration>("min_interval"),
+            Some(Duration::from_secs(1))
+        );
         assert_eq!(reader.tables("bus")[0].optional::<u32>("baud"), Some(19_200));
+        let log = reader.table("log").unwrap();
+        assert_eq!(log.optional::<String>("level").as_deref(), Some("debug"));
+        assert_eq!(log.place_of("level").env.as_deref(), Some("DRIVEGATE__LOG__LEVEL"));
+        let known: Vec<String> = document.known_keys().into_iter().collect();
+        assert_eq!(
+            known,
+            [
+                "bus",
+                "bus[].baud",
+                "log",
+                "log.level",
+                "mqtt",
+                "mqtt.password",
+                "mqtt.publish",
+                "mqtt.publish.min_interval"
+            ]
+        );
         let found: Vec<String> = document.into_problems().iter().map(|p| p.file.clone()).collect();
         assert_eq!(found, ["DRIVEGATE__BUS__3__BAUD", "DRIVEGATE__HTTP__LISTEN"]);
     }
@@ -795,6 +917,9 @@ mod tests {
         assert_eq!(parse_duration("10 s"), Ok(Duration::from_secs(10)));
         for bad in ["", "10", "ms", "-1s", "1d", "1.2.3s", "1e3s"] {
             assert!(parse_duration(bad).is_err(), "{bad}");
+        }
+        for text in ["0s", "0.5us", "303.819µs", "10ms", "1.5s", "90s", "2min", "1h"] {
+            assert_eq!(format_duration(parse_duration(text).unwrap()), text);
         }
         assert_eq!(parse_size("64MiB"), Ok(64 << 20));
         for bad in ["", "64", "64MB", "-1B", "99999999999999999GiB"] {

@@ -4,6 +4,7 @@ pub mod cache;
 pub mod cli;
 pub mod codec;
 pub mod command;
+pub mod config;
 pub mod document;
 pub mod drive;
 pub mod event;

@@ -3,6 +3,7 @@
 pub mod debts;
 pub mod execute;
 pub mod leases;
+pub mod predict;
 mod report;
 pub mod schedule;
 mod task;

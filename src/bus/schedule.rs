@@ -14,7 +14,7 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 /// Commands in a row before a due poll goes first.
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
-const SLOW_SHARE: f64 = 0.05;
+pub const SLOW_SHARE: f64 = 0.05;
 /// Share of the line that a drive which does not answer costs at most.
 const DEAD_SHARE: f64 = 0.02;
 /// First and longest pause between two probes of a drive that does not answer.

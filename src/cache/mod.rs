@@ -61,7 +61,7 @@ pub enum OnShutdown {
 }
 
 /// A drive as configured.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct DriveSpec {
     /// Name, unique in the gateway.
     pub name: String,

@@ -1,27 +1,33 @@
 //! `drivegate map`: the Modbus TCP register map of a configuration, for the SCADA engineer.
 
 use std::fmt::Write as _;
+use std::io;
 use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
 
 use comfy_table::{Table as TextTable, presets};
 
-use crate::cache::{Access, DriveSpec};
+use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, report};
+use crate::cache::{Access, BusImage, DriveImage, DriveSpec};
 use crate::codec::Table;
+use crate::command::CommandQueue;
+use crate::config::{BusSettings, Settings, environment};
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile};
 use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, GATEWAY_UNIT};
-use crate::plant::Plant;
+use crate::plant::{BusHandle, Plant};
 
-/// Arguments of `drivegate map`.
+/// Prints the Modbus TCP register map of a configuration, for the SCADA engineer.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv")]
-pub struct Args {
+pub(super) struct Args {
     /// Configuration file
-    #[arg(long, value_name = "FILE", default_value = "/etc/drivegate/drivegate.toml")]
-    pub config: PathBuf,
+    #[arg(long, value_name = "FILE", default_value = DEFAULT_CONFIG)]
+    config: PathBuf,
     /// Comma-separated values, one line for each register of each unit
     #[arg(long)]
-    pub csv: bool,
+    csv: bool,
 }
 
 /// One line of the map.
@@ -79,9 +85,44 @@ impl Row {
     }
 }
 
+/// Prints the map.
+pub(super) fn run(args: &Args) -> ExitCode {
+    let loaded = Settings::load(&args.config, environment());
+    report::errors(&loaded.errors);
+    let Some(settings) = loaded.settings else {
+        return ExitCode::from(EXIT_CONFIG);
+    };
+    match plant(&settings) {
+        Ok(plant) => report::print(&render(&plant, args.csv)),
+        Err(why) => {
+            report::error(&format!("cannot lay out the map: {why}; map; free file descriptors"));
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}
+
+/// The plant of a configuration, at rest.
+fn plant(settings: &Settings) -> io::Result<Plant> {
+    let bus = |bus: &BusSettings| {
+        let drive = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle));
+        let drives = bus.drives.iter().map(drive).collect();
+        Ok(BusHandle {
+            image: Arc::new(BusImage::new(bus.spec.clone(), drives)),
+            queue: Arc::new(CommandQueue::new()?),
+        })
+    };
+    Ok(Plant {
+        gateway: settings.gateway.clone(),
+        stale_after: settings.stale_after,
+        buses: settings.buses.iter().map(bus).collect::<io::Result<_>>()?,
+        events: Default::default(),
+        writes: Default::default(),
+    })
+}
+
 /// The map of all units: with `csv` one line for each register of each unit, else tables for people, one for
 /// each profile.
-pub fn render(plant: &Plant, csv: bool) -> String {
+fn render(plant: &Plant, csv: bool) -> String {
     if csv { render_csv(plant) } else { render_text(plant) }
 }
 
@@ -362,15 +403,12 @@ fn reference(table: Table, address: u16) -> String {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-    use std::sync::Arc;
     use std::time::Duration;
 
     use super::*;
-    use crate::cache::{BusImage, BusSpec, DriveImage, OnShutdown};
+    use crate::cache::{BusSpec, OnShutdown};
     use crate::codec::{LineFormat, Protocol};
-    use crate::command::CommandQueue;
     use crate::drive::profile::Profiles;
-    use crate::plant::BusHandle;
 
     fn plant() -> Plant {
         let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();

@@ -1,4 +1,94 @@
-//! The command line: one file a command.
+//! The command line, one file a command.
+//!
+//! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
+//! line in `commands!` below.
 
-pub mod map;
-pub mod simulate;
+mod check;
+mod demo;
+mod log;
+mod map;
+mod profiles;
+mod report;
+mod run;
+mod schema;
+mod simulate;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// Exit code of what failed while working.
+pub const EXIT_FAILED: u8 = 1;
+/// Exit code of a wrong command line, the same as clap's.
+pub const EXIT_USAGE: u8 = 2;
+/// Exit code of a bad configuration (sysexits EX_CONFIG).
+pub const EXIT_CONFIG: u8 = 78;
+/// The configuration when none is named.
+pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
+
+/// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
+#[derive(Debug, Parser)]
+#[command(name = "drivegate", version, max_term_width = 100)]
+#[command(
+    after_help = "Example:\n  drivegate check --config /etc/drivegate/drivegate.toml\n\n\
+    Exit codes: 0 done, 1 failed while working, 2 wrong command line, 78 bad configuration."
+)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+macro_rules! commands {
+    ($($variant:ident => $module:ident,)*) => {
+        #[derive(Debug, clap::Subcommand)]
+        enum Command {
+            $($variant($module::Args),)*
+        }
+
+        impl Command {
+            fn run(&self) -> ExitCode {
+                match self {
+                    $(Command::$variant(args) => $module::run(args),)*
+                }
+            }
+        }
+    };
+}
+
+// In the order of the help.
+commands! {
+    Run => run,
+    Demo => demo,
+    Check => check,
+    Simulate => simulate,
+    Profiles => profiles,
+    Map => map,
+    Schema => schema,
+}
+
+/// The option that names the configuration.
+#[derive(Debug, clap::Args)]
+struct ConfigFile {
+    /// The configuration.
+    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
+    path: PathBuf,
+}
+
+/// Reads the command line, does what it says and returns the exit code.
+pub fn main() -> ExitCode {
+    Cli::parse().command.run()
+}
+
+/// Runs `command` on a runtime of its own.
+pub fn block_on(command: impl Future<Output = ExitCode>) -> ExitCode {
+    match tokio::runtime::Builder::new_multi_thread().enable_all().build() {
+        Ok(runtime) => runtime.block_on(command),
+        Err(why) => {
+            report::error(&format!(
+                "cannot start: {why}; the runtime; free memory, threads or file descriptors"
+            ));
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}

@@ -47,7 +47,7 @@ pub enum Decoded {
 }
 
 /// The protocols a bus can speak.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, schemars::JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Protocol {
     /// Modbus RTU: binary frames, CRC-16, silence between frames.

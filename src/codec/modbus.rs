@@ -10,7 +10,7 @@ use std::fmt;
 pub const MAX_PDU: usize = 253;
 
 /// The four tables of Modbus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize, schemars::JsonSchema)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 #[serde(rename_all = "kebab-case")]
 pub enum Table {
     /// Read and write bits, 0xxxx.

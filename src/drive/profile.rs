@@ -9,7 +9,7 @@ use super::model::{Kind, ModelPoint, Value};
 use crate::codec::{Protocol, Table};
 
 /// A validated profile.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Profile {
     /// Name in configurations.
     pub name: String,
@@ -95,7 +95,7 @@ impl PollClass {
 }
 
 /// One named value of a drive.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Point {
     /// Public name.
     pub name: String,
@@ -319,7 +319,7 @@ impl Profile {
 }
 
 /// The profiles of an installation by name: built-in ones and the user's.
-#[derive(Debug, Clone, Default)]
+#[derive(Debug, Clone, Default, PartialEq)]
 pub struct Profiles(BTreeMap<String, Arc<Profile>>);
 
 impl Profiles {

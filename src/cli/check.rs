@@ -1,0 +1,196 @@
+//! `drivegate check`: what is wrong with a configuration, and what its buses will do.
+
+use std::fmt::Write;
+use std::path::Path;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use comfy_table::CellAlignment;
+use serde::Serialize;
+
+use super::{ConfigFile, EXIT_CONFIG, report};
+use crate::bus::predict::{PredictedRequest, Prediction};
+use crate::config::{BusSettings, Loaded, Settings, environment};
+use crate::document::Problem;
+
+/// Checks a configuration and predicts wire times, cycles and load of each bus.
+///
+/// Nothing is opened but the files the configuration names. Errors and warnings go to stderr, with --json to
+/// stdout with all the rest.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  drivegate check --config /etc/drivegate/drivegate.toml\n  \
+    drivegate check --config drivegate.toml --json | jq '.buses[] | {name, load_ratio, fast_cycle_ms}'"
+)]
+pub(super) struct Args {
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Print one JSON object.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Serialize)]
+struct Report<'a> {
+    ok: bool,
+    errors: &'a [Problem],
+    warnings: &'a [Problem],
+    buses: Vec<Bus<'a>>,
+}
+
+#[derive(Serialize)]
+struct Bus<'a> {
+    name: &'a str,
+    load_ratio: f64,
+    fast_cycle_ms: Option<f64>,
+    slow_cycle_ms: Option<f64>,
+    requests: Vec<Request<'a>>,
+}
+
+#[derive(Serialize)]
+struct Request<'a> {
+    drive: &'a str,
+    class: &'static str,
+    function: u8,
+    address: u16,
+    count: u16,
+    wire_ms: f64,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    let path = &args.config.path;
+    let loaded = Settings::load(path, environment());
+    let printed = if args.json {
+        report::print(&json(&loaded))
+    } else {
+        report::problems(&loaded);
+        match &loaded.settings {
+            Some(settings) => report::print(&text(path, settings, loaded.warnings.len())),
+            None => ExitCode::SUCCESS,
+        }
+    };
+    match loaded.settings {
+        Some(_) => printed,
+        None => ExitCode::from(EXIT_CONFIG),
+    }
+}
+
+fn json(loaded: &Loaded) -> String {
+    let buses = loaded.settings.iter().flat_map(|settings| &settings.buses);
+    let report = Report {
+        ok: loaded.settings.is_some(),
+        errors: &loaded.errors,
+        warnings: &loaded.warnings,
+        buses: buses.map(bus_report).collect(),
+    };
+    // Only maps with keys that are no strings fail, and there is none.
+    serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
+}
+
+fn bus_report(bus: &BusSettings) -> Bus<'_> {
+    let prediction = bus.predict();
+    let request = |request: &PredictedRequest| Request {
+        drive: drive_name(bus, request),
+        class: request.read.class.name(),
+        function: request.read.table.read_function(),
+        address: request.read.start,
+        count: request.read.count,
+        wire_ms: milliseconds(request.wire),
+    };
+    Bus {
+        name: &bus.spec.name,
+        load_ratio: prediction.load,
+        fast_cycle_ms: prediction.fast_cycle.map(milliseconds),
+        slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
+        requests: prediction.requests.iter().map(request).collect(),
+    }
+}
+
+fn drive_name<'a>(bus: &'a BusSettings, request: &PredictedRequest) -> &'a str {
+    bus.drives.get(request.drive).map_or("", |drive| &drive.name)
+}
+
+fn milliseconds(time: Duration) -> f64 {
+    time.as_nanos() as f64 / 1e6
+}
+
+fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
+    let mut text = String::new();
+    for bus in &settings.buses {
+        text += &bus_text(bus);
+        text.push('\n');
+    }
+    let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
+    let warnings = match warnings {
+        0 => "no warnings".to_string(),
+        1 => "1 warning".to_string(),
+        more => format!("{more} warnings"),
+    };
+    // Writing to a String cannot fail.
+    let _ = writeln!(
+        text,
+        "{}: ok, {}, {}, {warnings}",
+        path.display(),
+        counted(settings.buses.len(), "bus", "buses"),
+        counted(drives, "drive", "drives"),
+    );
+    text
+}
+
+fn counted(count: usize, one: &str, many: &str) -> String {
+    format!("{count} {}", if count == 1 { one } else { many })
+}
+
+fn bus_text(bus: &BusSettings) -> String {
+    let spec = &bus.spec;
+    let there = spec.port.contains("://") || Path::new(&spec.port).exists();
+    let mut text = format!(
+        "Bus {}: {}{}, {}, {}, silence {:.2} ms\n\n",
+        spec.name,
+        spec.port,
+        if there { "" } else { " (not there now)" },
+        spec.protocol.name(),
+        spec.format,
+        milliseconds(bus.options.silence.on(&spec.format)),
+    );
+    let prediction = bus.predict();
+    let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);
+    for request in &prediction.requests {
+        let read = &request.read;
+        table.add_row([
+            drive_name(bus, request).to_string(),
+            read.class.name().to_string(),
+            format!("{:02} read {}", read.table.read_function(), read.table),
+            read.start.to_string(),
+            read.count.to_string(),
+            format!("{:.2}", milliseconds(request.wire)),
+        ]);
+    }
+    for column in 3..6 {
+        if let Some(column) = table.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
+    text += &report::lines(&table);
+    text.push('\n');
+    text += &summary(bus, &prediction);
+    text
+}
+
+fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
+    let cycle = |name: &str, achieved: Option<Duration>, wanted: Duration| match achieved {
+        Some(achieved) => format!(
+            "  {name} cycle  {:.1} ms (aimed at {:.1} ms)\n",
+            milliseconds(achieved),
+            milliseconds(wanted)
+        ),
+        None => format!("  {name} cycle  none, there is nothing to read\n"),
+    };
+    let wanted = match prediction.demand {
+        demand if demand > 1.0 => format!(" (the cadences ask for {:.0} %)", demand * 100.0),
+        _ => String::new(),
+    };
+    cycle("fast", prediction.fast_cycle, bus.spec.cycle)
+        + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)
+        + &format!("  line load   {:.1} %{wanted}\n", prediction.load * 100.0)
+}

@@ -1,0 +1,245 @@
+//! `drivegate profiles`: the drive families and their points.
+
+use std::fmt::Write;
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use super::{EXIT_CONFIG, EXIT_USAGE, report};
+use crate::config::{Settings, environment, unknown_profile};
+use crate::document::{Problem, format_duration};
+use crate::drive::profile::{AddressRange, Form, Profiles};
+use crate::drive::{Point, Profile, Source};
+
+/// What a point, a fault text or a place without a manual behind it is marked with.
+const NOT_VERIFIED: &str = "not verified";
+
+/// Lists the profiles, or shows the points of one.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  drivegate profiles\n  drivegate profiles show vacon-nx\n  \
+    drivegate profiles --profile-dir /etc/drivegate/profiles"
+)]
+pub(super) struct Args {
+    #[command(subcommand)]
+    what: Option<What>,
+    /// Take the profile_dirs of this configuration too.
+    #[arg(long, value_name = "FILE", global = true)]
+    config: Option<PathBuf>,
+    /// Take the profiles (*.toml) of this directory too; may be repeated.
+    #[arg(long, value_name = "DIR", global = true)]
+    profile_dir: Vec<PathBuf>,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum What {
+    /// Shows where the points of a profile lie, how they are scaled and what is known of them.
+    #[command(after_help = "Example:\n  drivegate profiles show vacon-nx")]
+    Show {
+        /// Name of the profile.
+        name: String,
+    },
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    let mut profiles = match &args.config {
+        None => Profiles::built_in(),
+        Some(path) => {
+            let loaded = Settings::load(path, environment());
+            report::errors(&loaded.errors);
+            match loaded.settings {
+                Some(settings) => settings.profiles,
+                None => return ExitCode::from(EXIT_CONFIG),
+            }
+        }
+    };
+    let problems: Vec<Problem> = args.profile_dir.iter().flat_map(|dir| profiles.load(dir)).collect();
+    if !problems.is_empty() {
+        report::errors(&problems);
+        return ExitCode::from(EXIT_CONFIG);
+    }
+    let Some(What::Show { name }) = &args.what else {
+        return report::print(&list(&profiles));
+    };
+    match profiles.get(name) {
+        Some(profile) => report::print(&show(profile)),
+        None => {
+            report::errors(&[Problem {
+                file: "command line".to_string(),
+                line: None,
+                key: "NAME".to_string(),
+                message: unknown_profile(name, &profiles, false),
+            }]);
+            ExitCode::from(EXIT_USAGE)
+        }
+    }
+}
+
+fn list(profiles: &Profiles) -> String {
+    let mut table = report::table(["profile", "points", "protocols", "origin", "drives"]);
+    for profile in profiles.iter() {
+        table.add_row([
+            profile.name.clone(),
+            profile.points.len().to_string(),
+            protocols(profile),
+            origin(profile).to_string(),
+            profile.title.clone(),
+        ]);
+    }
+    report::lines(&table)
+}
+
+fn protocols(profile: &Profile) -> String {
+    let names: Vec<&str> = profile.protocols.iter().map(|p| p.name()).collect();
+    names.join(", ")
+}
+
+fn origin(profile: &Profile) -> &'static str {
+    if profile.built_in { "built in" } else { "your own" }
+}
+
+fn show(profile: &Profile) -> String {
+    let bauds: Vec<String> = profile.bauds.iter().map(u32::to_string).collect();
+    let bauds = if bauds.is_empty() {
+        "any".to_string()
+    } else {
+        bauds.join(", ")
+    };
+    let mut text = format!("{}: {}\n\n", profile.name, profile.title);
+    for (what, value) in [
+        ("origin", origin(profile).to_string()),
+        ("source", profile.source.clone()),
+        ("protocols", protocols(profile)),
+        ("baud rates", bauds),
+        (
+            "addresses",
+            format!("{} to {}", profile.addresses.start(), profile.addresses.end()),
+        ),
+        (
+            "turnaround",
+            format!("{}, for the prediction only", format_duration(profile.turnaround)),
+        ),
+        ("update period", format_duration(profile.update_period)),
+    ] {
+        // Writing to a String cannot fail.
+        let _ = writeln!(text, "  {what:<14}{value}");
+    }
+    if profile.input_is_holding {
+        text += "  input registers read the same as holding registers\n";
+    }
+    text += "\nPoints; addresses are those of the PDU, counted from 0\n\n";
+    text += &points(profile);
+    text += "\nAddress ranges\n\n";
+    text += &ranges(&profile.ranges);
+    if !profile.faults.is_empty() {
+        text += "\nFault texts\n\n";
+        text += &faults(profile);
+    }
+    text
+}
+
+fn points(profile: &Profile) -> String {
+    let mut table = report::table([
+        "point", "at", "type", "scale", "unit", "class", "access", "range", "verified", "note",
+    ]);
+    for point in &profile.points {
+        let (at, form, scale) = place(profile, point);
+        let (class, note) = match &point.source {
+            Source::Raw(_) => (point.class.name(), point.note.clone()),
+            Source::Band { minimum, maximum, .. } => {
+                let (low, high) = (name_of(profile, *minimum), name_of(profile, *maximum));
+                ("", format!("percent of the band between {low} and {high}"))
+            }
+        };
+        let range = point.range.as_ref();
+        table.add_row([
+            point.name.clone(),
+            at,
+            form,
+            scale,
+            point.unit.clone(),
+            class.to_string(),
+            access(point).to_string(),
+            range.map_or_else(String::new, |r| format!("{} to {}", r.start(), r.end())),
+            verified(point.verified).to_string(),
+            note,
+        ]);
+    }
+    report::lines(&table)
+}
+
+fn verified(verified: bool) -> &'static str {
+    if verified { "yes" } else { NOT_VERIFIED }
+}
+
+fn access(point: &Point) -> &'static str {
+    match (point.write, point.pulse) {
+        (false, _) => "read",
+        (true, false) => "read, write",
+        (true, true) => "read, pulse",
+    }
+}
+
+/// Where a point lies, the form of its raw value, and the engineering value of one count.
+fn place(profile: &Profile, point: &Point) -> (String, String, String) {
+    match &point.source {
+        Source::Raw(raw) => {
+            let at = format!("{} {}", raw.table, raw.address);
+            let offset = if raw.offset == 0.0 {
+                String::new()
+            } else {
+                format!(" {:+}", raw.offset)
+            };
+            let scale = format!("{}{offset}", raw.scale);
+            match raw.form {
+                Form::Bit { .. } if raw.table.is_bits() => (at, "bit".to_string(), String::new()),
+                Form::Bit { bit, invert } => {
+                    let form = if invert { "bit, 0 is true" } else { "bit" };
+                    (format!("{at}.{bit}"), form.to_string(), String::new())
+                }
+                Form::U16 => (at, "u16".to_string(), scale),
+                Form::I16 => (at, "i16".to_string(), scale),
+            }
+        }
+        Source::Band { of, .. } => (
+            format!("from {}", name_of(profile, *of)),
+            "derived".to_string(),
+            String::new(),
+        ),
+    }
+}
+
+fn name_of(profile: &Profile, point: usize) -> &str {
+    profile.points.get(point).map_or("?", |point| point.name.as_str())
+}
+
+fn ranges(ranges: &[AddressRange]) -> String {
+    let mut table = report::table(["table", "first", "last", "per read", "per write", "holes", "note"]);
+    for range in ranges {
+        let write = match range.write {
+            0 => "read-only".to_string(),
+            items => items.to_string(),
+        };
+        table.add_row([
+            range.table.to_string(),
+            range.addresses.start().to_string(),
+            range.addresses.end().to_string(),
+            range.read.to_string(),
+            write,
+            if range.holes { "may be read" } else { "no" }.to_string(),
+            range.note.clone(),
+        ]);
+    }
+    report::lines(&table)
+}
+
+fn faults(profile: &Profile) -> String {
+    let mut table = report::table(["code", "text", "verified"]);
+    for (code, fault) in &profile.faults {
+        table.add_row([
+            code.to_string(),
+            fault.text.clone(),
+            verified(fault.verified).to_string(),
+        ]);
+    }
+    report::lines(&table)
+}

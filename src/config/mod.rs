@@ -1,0 +1,333 @@
+//! The configuration: a TOML file and environment variables become [`Settings`].
+//!
+//! Every fault is found in one run and told with file, line and key. Nothing is opened but the file itself,
+//! the profiles and the secrets it names. Relative paths are seen from the directory of the file.
+
+mod bus;
+mod drive;
+mod log;
+mod mqtt;
+mod north;
+pub mod schema;
+mod unique;
+mod values;
+
+pub use log::{LogFormat, LogSettings};
+
+pub(crate) use drive::unknown_profile;
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use crate::bus::BusOptions;
+use crate::bus::predict::{self, Prediction};
+use crate::cache::{Access, BusSpec, DriveSpec};
+use crate::document::{self, Document, Place, Problem, Reader};
+use crate::drive::profile::Profiles;
+use crate::north::{http, modbus_tcp, mqtt as mqtt_client};
+
+/// What variables of the environment begin with: `DRIVEGATE__MQTT__PASSWORD`.
+pub const ENVIRONMENT: &str = "DRIVEGATE";
+
+/// A valid configuration. Parts compare equal when a reload changes nothing in them.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Settings {
+    /// Name of the gateway.
+    pub gateway: String,
+    /// Directories of the user's profiles.
+    pub profile_dirs: Vec<PathBuf>,
+    /// Built-in profiles and the user's.
+    pub profiles: Profiles,
+    /// Age from which a sample of process data is stale.
+    pub stale_after: Duration,
+    /// In the order of the file.
+    pub buses: Vec<BusSettings>,
+    /// Absent: not started.
+    pub modbus_tcp: Option<modbus_tcp::Options>,
+    /// Absent: not started.
+    pub mqtt: Option<mqtt_client::Options>,
+    /// Absent: not started.
+    pub http: Option<http::Options>,
+    /// What is logged.
+    pub log: LogSettings,
+}
+
+/// One bus with its drives.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BusSettings {
+    /// What everybody may know.
+    pub spec: BusSpec,
+    /// What only the bus itself needs.
+    pub options: BusOptions,
+    /// In the order of the file.
+    pub drives: Vec<DriveSpec>,
+}
+
+impl BusSettings {
+    /// Wire times, cycles and load to be expected.
+    pub fn predict(&self) -> Prediction {
+        predict::predict(&self.spec, self.options.silence, &self.drives)
+    }
+}
+
+/// What became of a configuration file.
+#[derive(Debug)]
+pub struct Loaded {
+    /// The settings; absent when there is any error.
+    pub settings: Option<Settings>,
+    /// What must be mended.
+    pub errors: Vec<Problem>,
+    /// What can run but will probably not do what was meant.
+    pub warnings: Vec<Problem>,
+}
+
+impl Settings {
+    /// Reads the file `path`, lets the variables `DRIVEGATE__SECTION__KEY` of `env` override it, and checks
+    /// everything.
+    pub fn load(path: impl AsRef<Path>, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        let path = path.as_ref();
+        match document::read_file(path) {
+            Ok(source) => Settings::parse(path, &source, env),
+            Err(problem) => Loaded {
+                settings: None,
+                errors: vec![problem],
+                warnings: Vec::new(),
+            },
+        }
+    }
+
+    /// As [`Settings::load`], with `source` as the text of the file.
+    pub fn parse(path: impl AsRef<Path>, source: &str, env: impl Iterator<Item = (String, String)>) -> Loaded {
+        parse(path.as_ref(), source, env).0
+    }
+}
+
+/// The variables of this process that override the configuration. What is no UTF-8 in them becomes U+FFFD, which
+/// [`Settings::load`] refuses.
+pub fn environment() -> impl Iterator<Item = (String, String)> {
+    std::env::vars_os().filter_map(|(name, value)| {
+        let name = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT))?;
+        Some((name, value.to_string_lossy().into_owned()))
+    })
+}
+
+fn not_text(name: &str) -> Problem {
+    Problem {
+        file: name.to_string(),
+        line: None,
+        key: String::new(),
+        message: "the variable is no UTF-8 text; set it again".to_string(),
+    }
+}
+
+/// The outcome, and every key the loader knows.
+fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> (Loaded, Vec<String>) {
+    let mut document = Document::parse(path.display().to_string(), source);
+    for section in ["gateway", "log"] {
+        document.ensure_section(section);
+    }
+    let (variables, broken): (Vec<_>, Vec<_>) = env
+        .filter(|(name, _)| name.starts_with(ENVIRONMENT))
+        .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
+    document.overlay(ENVIRONMENT, variables);
+    let mut profile_errors = Vec::new();
+    let base = path.parent().unwrap_or(Path::new(""));
+    let settings = read(&document.reader(), base, &mut profile_errors);
+    let known = document.known_keys().into_iter().collect();
+    let (mut errors, warnings) = document.into_findings();
+    errors.extend(profile_errors);
+    errors.extend(broken.iter().map(|(name, _)| not_text(name)));
+    let loaded = Loaded {
+        settings: settings.filter(|_| errors.is_empty()),
+        errors,
+        warnings,
+    };
+    (loaded, known)
+}
+
+fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
+    let gateway = reader.table("gateway").map(|table| read_gateway(&table, base));
+    let (name, profile_dirs, profiles) = match gateway {
+        Some(gateway) => {
+            profile_errors.extend(gateway.errors);
+            (gateway.name, gateway.profile_dirs, gateway.profiles)
+        }
+        None => (None, Vec::new(), Profiles::built_in()),
+    };
+    let broken = !profile_errors.is_empty();
+    let tables = reader.tables("bus");
+    let buses: Vec<bus::Found> = tables
+        .iter()
+        .map(|table| bus::read(table, base, &profiles, broken))
+        .collect();
+    let modbus_tcp = reader.table("modbus_tcp").map(|table| north::read_modbus_tcp(&table));
+    let mqtt = reader
+        .table("mqtt")
+        .map(|table| mqtt::read(&table, base, name.as_deref()));
+    let (http, http_listener) = match reader.table("http").map(|table| north::read_http(&table)) {
+        Some((options, listener)) => (Some(options), listener),
+        None => (None, None),
+    };
+    let log = reader.table("log").map(|table| log::read(&table)).unwrap_or_default();
+    reader.finish();
+
+    judge(
+        reader,
+        &buses,
+        modbus_tcp.as_ref(),
+        mqtt.as_ref(),
+        http_listener.as_ref(),
+    );
+
+    Some(Settings {
+        gateway: name?,
+        profile_dirs,
+        profiles,
+        stale_after: modbus_tcp
+            .as_ref()
+            .map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after),
+        buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
+        modbus_tcp: modbus_tcp.map(|m| m.options),
+        mqtt: flipped(mqtt)?,
+        http: flipped(http)?,
+        log,
+    })
+}
+
+/// What only the sections together show to be wrong or doubtful.
+fn judge(
+    reader: &Reader<'_>,
+    buses: &[bus::Found],
+    modbus_tcp: Option<&north::ModbusTcp>,
+    mqtt: Option<&Option<mqtt_client::Options>>,
+    http: Option<&north::Listener>,
+) {
+    unique::check(reader.document(), buses);
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.listeners).chain(http);
+    unique::check_listeners(reader.document(), listeners);
+    warn_of_emptiness(reader);
+    let commanded = modbus_tcp.is_some_and(|m| !m.options.write.is_empty())
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
+    if !commanded {
+        warn_of_idle_control(reader, buses);
+    }
+    if reader.document().is_sound() {
+        // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
+        let stale_after = modbus_tcp.map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after);
+        warn_of_cadence(reader, buses, stale_after, modbus_tcp.map(|m| &m.stale_place));
+    }
+}
+
+/// A section that is there but wrong makes the whole wrong; one that is absent does not.
+fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
+    match section {
+        None => Some(None),
+        Some(options) => options.map(Some),
+    }
+}
+
+struct Gateway {
+    name: Option<String>,
+    profile_dirs: Vec<PathBuf>,
+    profiles: Profiles,
+    errors: Vec<Problem>,
+}
+
+fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
+    let name = values::name(reader, "-").map(|(name, _)| name);
+    let mut profiles = Profiles::built_in();
+    let mut errors = Vec::new();
+    let dirs: Vec<PathBuf> = reader.or("profile_dirs", Vec::new());
+    let profile_dirs: Vec<PathBuf> = dirs.into_iter().map(|dir| values::resolved(base, dir)).collect();
+    for dir in &profile_dirs {
+        match std::fs::read_dir(dir) {
+            Ok(_) => errors.extend(profiles.load(dir)),
+            Err(error) => reader.problem(
+                "profile_dirs",
+                format!(
+                    "cannot read {}: {error}; make the directory or remove it from profile_dirs",
+                    dir.display()
+                ),
+            ),
+        }
+    }
+    reader.finish();
+    Gateway {
+        name,
+        profile_dirs,
+        profiles,
+        errors,
+    }
+}
+
+fn warn_of_emptiness(reader: &Reader<'_>) {
+    let nowhere = |key: &str| Place {
+        key: key.to_string(),
+        ..Place::default()
+    };
+    if !reader.has("bus") {
+        reader.document().warning(
+            &nowhere("bus"),
+            "the configuration has no bus, so nothing is read; write [[bus]] with its drives",
+        );
+    }
+    if !["modbus_tcp", "mqtt", "http"].iter().any(|server| reader.has(server)) {
+        reader.document().warning(
+            &nowhere(""),
+            "no server is configured, so nobody can see the drives; write [modbus_tcp], [mqtt] or [http]",
+        );
+    }
+}
+
+/// Cadences that the line cannot carry, and samples that age faster than they are renewed.
+fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Duration, stale_place: Option<&Place>) {
+    for found in buses {
+        let Some(settings) = &found.settings else { continue };
+        let prediction = settings.predict();
+        if let Some(shortage) = &prediction.shortage {
+            let (fast, slow) = &found.cadence;
+            let place = if shortage.fast.is_some() { fast } else { slow };
+            reader.document().warning(place, shortage.message());
+        }
+        let place = stale_place.unwrap_or(&found.cadence.0);
+        for (class, cycle, limit) in [
+            ("process data", prediction.fast_cycle, stale_after),
+            (
+                "slow points",
+                prediction.slow_cycle,
+                stale_after + 2 * settings.spec.slow_cycle,
+            ),
+        ] {
+            if let Some(cycle) = cycle.filter(|cycle| *cycle > limit) {
+                let (cycle, limit) = (cycle.as_secs_f64() * 1e3, limit.as_secs_f64() * 1e3);
+                reader.document().warning(
+                    place,
+                    format!(
+                        "{class} of bus `{}` are renewed every {cycle:.0} ms and stale after {limit:.0} ms; \
+                         raise stale_after of [modbus_tcp] or lighten the bus",
+                        settings.spec.name
+                    ),
+                );
+            }
+        }
+    }
+}
+
+/// Drives that could be commanded, but by nobody.
+fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some((name, _)), (Access::Control, place)) = (&drive.name, &drive.access) else {
+            continue;
+        };
+        reader.document().warning(
+            place,
+            format!(
+                "drive `{name}` takes commands but no client may give any; set `write` of [modbus_tcp] or \
+                 `commands = true` of [mqtt]"
+            ),
+        );
+    }
+}
+
+#[cfg(test)]
+mod tests;

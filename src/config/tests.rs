@@ -1,0 +1,306 @@
+use std::collections::BTreeSet;
+use std::path::Path;
+
+use proptest::prelude::*;
+use serde_json::Value;
+
+use super::*;
+use crate::config::schema::schema;
+
+/// Every table of the configuration, so that the loader asks for every key it knows.
+const FULL: &str = r#"
+[gateway]
+name = "g"
+[[bus]]
+name = "b"
+port = "/dev/null"
+[[bus.drive]]
+name = "d"
+address = 1
+profile = "vacon-nx"
+limits = { speed_reference = [0.0, 100.0] }
+supervision = { timeout = "5s", action = { speed_reference = 20.0 } }
+[modbus_tcp]
+[mqtt]
+publish = {}
+buffer = {}
+[http]
+[log]
+"#;
+
+fn load(source: &str) -> (Loaded, Vec<String>) {
+    parse(Path::new("/etc/drivegate/t.toml"), source, std::iter::empty())
+}
+
+fn settings(source: &str) -> Settings {
+    let (loaded, _) = load(source);
+    assert_eq!(loaded.errors, []);
+    loaded.settings.unwrap()
+}
+
+/// Paths of all properties below `node`, in the form of `Document::known_keys`.
+fn properties(node: &Value, path: &str, found: &mut BTreeSet<String>) {
+    for alternative in node["anyOf"].as_array().into_iter().flatten() {
+        properties(alternative, path, found);
+    }
+    properties_of_table(node, path, found);
+    if node["items"].is_object() {
+        properties(&node["items"], &format!("{path}[]"), found);
+    }
+}
+
+fn properties_of_table(node: &Value, path: &str, found: &mut BTreeSet<String>) {
+    let join = |key: &str| {
+        if path.is_empty() {
+            key.to_string()
+        } else {
+            format!("{path}.{key}")
+        }
+    };
+    for (key, property) in node["properties"].as_object().into_iter().flatten() {
+        assert!(property["description"].is_string(), "{} has no description", join(key));
+        found.insert(join(key));
+        properties(property, &join(key), found);
+    }
+    match &node["additionalProperties"] {
+        Value::Null | Value::Bool(false) => {}
+        _ => {
+            found.insert(join("*"));
+        }
+    }
+}
+
+#[test]
+fn the_schema_has_the_keys_of_the_loader() {
+    let mut described = BTreeSet::new();
+    properties(&schema(), "", &mut described);
+    let (loaded, known) = load(FULL);
+    assert_eq!(loaded.errors, []);
+    let known: BTreeSet<String> = known
+        .into_iter()
+        .map(|key| key.replace("limits.speed_reference", "limits.*"))
+        .collect();
+    assert_eq!(described, known);
+}
+
+/// Writes the defaults of the schema into `document` wherever its table is there and the key is not.
+fn fill(document: &mut toml::Table, schema: &Value) {
+    for (key, property) in schema["properties"].as_object().into_iter().flatten() {
+        match document.get_mut(key) {
+            Some(toml::Value::Table(table)) => fill(table, property),
+            Some(toml::Value::Array(items)) => {
+                for item in items {
+                    if let toml::Value::Table(table) = item {
+                        fill(table, &property["items"]);
+                    }
+                }
+            }
+            Some(_) => {}
+            None => {
+                if let Some(default) = property.get("default") {
+                    document.insert(key.clone(), toml::Value::try_from(default).unwrap());
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn the_defaults_of_the_schema_are_those_of_the_loader() {
+    let mut document: toml::Table = FULL.parse().unwrap();
+    fill(&mut document, &schema());
+    let filled = toml::to_string(&document).unwrap();
+    assert!(
+        filled.contains("stale_after") && filled.contains("baud") && filled.contains("max_bytes"),
+        "{filled}"
+    );
+    assert_eq!(settings(&filled), settings(FULL));
+}
+
+#[test]
+fn a_full_configuration_says_what_is_meant() {
+    let source = r#"
+[gateway]
+name = "pump-house"
+[[bus]]
+name = "line1"
+port = "ttyS0"
+baud = 38400
+format = "8E1"
+rs485 = "kernel-inverted"
+cycle = "20ms"
+slow_cycle = "2s"
+response_timeout = "50ms"
+retries = 2
+silence = "3ms"
+[[bus.drive]]
+name = "pump-1"
+address = 7
+profile = "vacon-nx"
+access = "control"
+limits = { speed_reference = [0, 80.5] }
+supervision = { timeout = "5s", action = "hold" }
+on_shutdown = "stop"
+turnaround = "0.5ms"
+frequency_range = [10, 50]
+[[bus]]
+name = "line2"
+port = "tcp://10.0.0.9:4001"
+[[bus.drive]]
+name = "fan"
+address = 7
+unit = 8
+profile = "vacon-nx"
+[modbus_tcp]
+listen = ["127.0.0.1:0", "[::1]:1502"]
+write = ["127.0.0.1"]
+uncached = "refuse"
+stale_after = "2s"
+[mqtt]
+url = "mqtts://broker"
+commands = true
+publish = { min_interval = "0s" }
+buffer = { dir = "spool", max_bytes = "1MiB" }
+"#;
+    let all = settings(source);
+    assert_eq!(
+        (all.gateway.as_str(), all.stale_after),
+        ("pump-house", Duration::from_secs(2))
+    );
+    let line = &all.buses[0];
+    assert_eq!(line.spec.port, "/etc/drivegate/ttyS0");
+    assert_eq!(line.spec.format.to_string(), "38400 8E1");
+    assert_eq!(
+        line.options.silence,
+        crate::codec::wire::Silence::Fixed(Duration::from_millis(3))
+    );
+    assert_eq!(line.options.rs485, crate::line::Rs485::KernelInverted);
+    let drive = &line.drives[0];
+    assert_eq!(
+        (drive.unit, drive.bus.as_str(), drive.access),
+        (7, "line1", Access::Control)
+    );
+    assert_eq!(drive.limits["speed_reference"], 0.0..=80.5);
+    assert_eq!(drive.turnaround, Duration::from_micros(500));
+    assert_eq!(drive.frequency_range, Some(10.0..=50.0));
+    let fan = &all.buses[1].drives[0];
+    assert_eq!(
+        (fan.unit, fan.access, fan.turnaround),
+        (8, Access::Monitor, fan.profile.turnaround)
+    );
+    assert_eq!(all.buses[1].spec.port, "tcp://10.0.0.9:4001");
+    let modbus = all.modbus_tcp.as_ref().unwrap();
+    assert_eq!(
+        modbus.allow.iter().map(ToString::to_string).collect::<Vec<_>>(),
+        north::DEFAULT_ALLOW
+    );
+    assert_eq!(modbus.write[0].to_string(), "127.0.0.1/32");
+    let mqtt = all.mqtt.as_ref().unwrap();
+    assert_eq!((mqtt.host.as_str(), mqtt.port, mqtt.tls), ("broker", 8883, true));
+    assert_eq!(mqtt.client_id, "drivegate-pump-house");
+    assert_eq!(mqtt.buffer.as_ref().unwrap().dir, Path::new("/etc/drivegate/spool"));
+    assert_eq!(all.http, None);
+    assert_eq!(all.log, LogSettings::default());
+}
+
+#[test]
+fn a_reload_sees_what_changed() {
+    let one = settings(FULL);
+    assert_eq!(one, settings(FULL));
+    let two = settings(&FULL.replace("address = 1", "address = 2"));
+    assert_ne!(one.buses, two.buses);
+    assert_eq!(
+        (&one.mqtt, &one.modbus_tcp, &one.http),
+        (&two.mqtt, &two.modbus_tcp, &two.http)
+    );
+    let three = settings(&FULL.replace("[mqtt]", "[mqtt]\ncommands = true"));
+    assert_ne!(one.mqtt, three.mqtt);
+    assert_eq!(one.buses, three.buses);
+}
+
+#[test]
+fn the_environment_overrides_and_is_told_by_name() {
+    let load = |vars: &[(&str, &str)]| {
+        let vars: Vec<_> = vars.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect();
+        Settings::parse(Path::new("t.toml"), FULL, vars.into_iter())
+    };
+    let set = [
+        ("DRIVEGATE__GATEWAY__NAME", "other"),
+        ("DRIVEGATE__BUS__0__DRIVE__0__ADDRESS", "9"),
+        ("DRIVEGATE__MODBUS_TCP__LISTEN", "127.0.0.1:7000, 127.0.0.2:7000"),
+        ("DRIVEGATE__MQTT__USERNAME", "me"),
+        ("DRIVEGATE__MQTT__PASSWORD", "12345"),
+        ("DRIVEGATE__LOG__LEVEL", "debug"),
+    ];
+    let loaded = load(&set);
+    assert_eq!(loaded.errors, []);
+    let all = loaded.settings.unwrap();
+    assert_eq!(all.gateway, "other");
+    assert_eq!(all.buses[0].drives[0].address, 9);
+    assert_eq!(all.modbus_tcp.unwrap().listen.len(), 2);
+    assert_eq!(all.log.level, "debug");
+    let mqtt = all.mqtt.unwrap();
+    assert_eq!(mqtt.password.as_ref().unwrap().0, "12345");
+    assert!(!format!("{mqtt:?}").contains("12345"));
+
+    let loaded = load(&[
+        ("DRIVEGATE__BUS__0__BAUD", "fast"),
+        ("DRIVEGATE__MQTT__PASWORD", "secret"),
+        ("DRIVEGATE__BUSS__0__BAUD", "9600"),
+    ]);
+    let told: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
+    assert!(loaded.settings.is_none());
+    assert_eq!(told.len(), 3, "{told:#?}");
+    assert!(told.iter().all(|t| !t.contains("secret")), "{told:#?}");
+    for name in [
+        "DRIVEGATE__BUS__0__BAUD, bus[0].baud",
+        "DRIVEGATE__MQTT__PASWORD, mqtt.pasword",
+        "DRIVEGATE__BUSS__0__BAUD",
+    ] {
+        assert!(told.iter().any(|t| t.contains(name)), "{name} in {told:#?}");
+    }
+}
+
+/// A value of any kind, sound or not.
+fn any_value() -> impl Strategy<Value = String> {
+    prop_oneof![
+        any::<i64>().prop_map(|n| n.to_string()),
+        any::<f64>().prop_map(|n| format!("{n:?}").replace("NaN", "nan")),
+        "[a-z0-9:/.]{0,12}".prop_map(|text| format!("{text:?}")),
+        "[0-9.]{1,25}(us|ms|s|min|h|MiB)".prop_map(|text| format!("{text:?}")),
+        Just("true".to_string()),
+        Just("[]".to_string()),
+        Just("[1, 0.5]".to_string()),
+        Just("{}".to_string()),
+        Just("{ speed_reference = [0, 1] }".to_string()),
+        Just("2026-11-21".to_string()),
+        Just("= 1".to_string()),
+    ]
+}
+
+proptest! {
+    /// Whatever stands behind any key: no panic, and settings exactly when there is no error.
+    #[test]
+    fn any_value_of_any_key_is_judged(which in 0usize..100, value in any_value(), lines in 0usize..40) {
+        let mut document: toml::Table = FULL.parse().unwrap();
+        fill(&mut document, &schema());
+        let filled = toml::to_string(&document).unwrap();
+        let keys = filled.lines().filter(|line| line.contains('=')).count();
+        let mut key = 0;
+        let mut source = String::new();
+        for line in filled.lines() {
+            match line.split_once('=') {
+                Some((name, _)) => {
+                    source += &if key == which % keys { format!("{name}= {value}\n") } else { format!("{line}\n") };
+                    key += 1;
+                }
+                None => source += &format!("{line}\n"),
+            }
+        }
+        let (loaded, _) = load(&source);
+        prop_assert_eq!(loaded.settings.is_some(), loaded.errors.is_empty());
+        let half: Vec<&str> = source.lines().take(lines).collect();
+        let (loaded, _) = load(&half.join("\n"));
+        prop_assert_eq!(loaded.settings.is_some(), loaded.errors.is_empty());
+    }
+}

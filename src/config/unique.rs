@@ -1,0 +1,160 @@
+//! What must not occur twice: names, ports, addresses, units, listeners.
+
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
+use std::path::{Path, PathBuf};
+
+use super::bus::Found;
+use super::drive::UNITS;
+use super::north::Listener;
+use crate::document::{Document, Place};
+
+pub(super) fn check(document: &Document, buses: &[Found]) {
+    let names = buses.iter().filter_map(|bus| bus.name.as_ref());
+    check_names(document, "bus", "buses", names);
+    let drives = || buses.iter().flat_map(|bus| &bus.drives);
+    check_names(
+        document,
+        "drive",
+        "drives",
+        drives().filter_map(|drive| drive.name.as_ref()),
+    );
+    check_ports(document, buses);
+    check_addresses(document, buses);
+    check_units(document, buses);
+}
+
+/// ` (line 7)`, or nothing.
+fn line(place: &Place) -> String {
+    place.line.map_or_else(String::new, |line| format!(" (line {line})"))
+}
+
+fn check_names<'a>(document: &Document, what: &str, many: &str, names: impl Iterator<Item = &'a (String, Place)>) {
+    let mut seen: BTreeMap<&str, &Place> = BTreeMap::new();
+    for (name, place) in names {
+        match seen.get(name.as_str()) {
+            Some(first) => document.problem(
+                place,
+                format!(
+                    "there are two {many} `{name}`, the other one is {}{}; rename this {what}",
+                    first.key.trim_end_matches(".name"),
+                    line(first)
+                ),
+            ),
+            None => {
+                seen.insert(name, place);
+            }
+        }
+    }
+}
+
+fn check_ports(document: &Document, buses: &[Found]) {
+    let mut seen: Vec<(&str, PathBuf, String)> = Vec::new();
+    for bus in buses {
+        let Some((port, place)) = &bus.port else { continue };
+        let device = device(port);
+        let name = bus
+            .name
+            .as_ref()
+            .map_or(String::new(), |(name, _)| format!(" `{name}`"));
+        let Some((other, _, owner)) = seen.iter().find(|(_, other, _)| *other == device) else {
+            seen.push((port, device, name));
+            continue;
+        };
+        let how = if *other == port {
+            String::new()
+        } else {
+            format!(", as {other}, which is the same device")
+        };
+        document.problem(
+            place,
+            format!("the port {port} belongs to bus{owner} already{how}; give each bus a port of its own"),
+        );
+    }
+}
+
+/// The device behind a port: symbolic links resolved as far as they lead anywhere now.
+fn device(port: &str) -> PathBuf {
+    if port.contains("://") {
+        return PathBuf::from(port.to_ascii_lowercase());
+    }
+    std::fs::canonicalize(port).unwrap_or_else(|_| Path::new(port).to_path_buf())
+}
+
+fn check_addresses(document: &Document, buses: &[Found]) {
+    for bus in buses {
+        let mut seen: BTreeMap<u8, String> = BTreeMap::new();
+        for drive in &bus.drives {
+            let Some((address, place)) = &drive.address else {
+                continue;
+            };
+            match seen.get(address) {
+                Some(owner) => document.problem(
+                    place,
+                    format!("address {address} belongs to {owner} on this bus already; give each drive of a bus its own address"),
+                ),
+                None => {
+                    seen.insert(*address, owner(drive));
+                }
+            }
+        }
+    }
+}
+
+/// ``drive `pump-1` (line 12)``.
+fn owner(drive: &super::drive::Found) -> String {
+    match &drive.name {
+        Some((name, place)) => format!("drive `{name}`{}", line(place)),
+        None => "another drive".to_string(),
+    }
+}
+
+fn check_units(document: &Document, buses: &[Found]) {
+    let drives = || buses.iter().flat_map(|bus| &bus.drives);
+    let mut used: Vec<u8> = drives()
+        .filter_map(|d| d.unit.as_ref())
+        .map(|(unit, _)| *unit)
+        .collect();
+    let mut seen: BTreeMap<u8, String> = BTreeMap::new();
+    for drive in drives() {
+        let Some((unit, place)) = &drive.unit else { continue };
+        let Some(first) = seen.get(unit) else {
+            seen.insert(*unit, owner(drive));
+            continue;
+        };
+        let remedy = match UNITS.into_iter().find(|unit| !used.contains(unit)) {
+            Some(free) => {
+                used.push(free);
+                format!("write unit = {free}, or another free one")
+            }
+            None => "all 254 units are taken, so take a second gateway".to_string(),
+        };
+        document.problem(place, format!("unit {unit} belongs to {first} already; {remedy}"));
+    }
+}
+
+/// Two servers cannot listen on one address; `0.0.0.0` and `[::]` take the port of every address.
+pub(super) fn check_listeners<'a>(document: &Document, listeners: impl Iterator<Item = &'a Listener>) {
+    let mut seen: Vec<&Listener> = Vec::new();
+    for listener in listeners {
+        let (address, place) = listener;
+        if let Some((other, first)) = seen.iter().find(|(other, _)| collide(*other, *address)) {
+            document.problem(
+                place,
+                format!(
+                    "{address} collides with {other} of {}{}; give each server a port of its own",
+                    first.key,
+                    line(first)
+                ),
+            );
+        }
+        seen.push(listener);
+    }
+}
+
+fn collide(one: SocketAddr, other: SocketAddr) -> bool {
+    let everywhere = |a: SocketAddr, b: SocketAddr| a.ip().is_unspecified() && (a.is_ipv6() || b.is_ipv4());
+    one.port() == other.port()
+        && one.port() != 0
+        && (one.ip() == other.ip() || everywhere(one, other) || everywhere(other, one))
+}
