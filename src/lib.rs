@@ -10,3 +10,4 @@ pub mod event;
 pub mod line;
 pub mod north;
 pub mod plant;
+pub mod sim;
