@@ -58,7 +58,12 @@ impl Daemon {
         };
         let mut daemon = Daemon {
             plant: Arc::new(ArcSwap::from_pointee(plant)),
-            settings: Settings { modbus_tcp: None, mqtt: None, http: None, ..settings.clone() },
+            settings: Settings {
+                modbus_tcp: None,
+                mqtt: None,
+                http: None,
+                ..settings.clone()
+            },
             buses: Vec::new(),
             events,
             writes,
@@ -88,7 +93,10 @@ impl Daemon {
 
     /// Where the Modbus TCP server listens.
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
-        self.modbus_tcp.as_ref().map(|(_, server)| server.addresses().to_vec()).unwrap_or_default()
+        self.modbus_tcp
+            .as_ref()
+            .map(|(_, server)| server.addresses().to_vec())
+            .unwrap_or_default()
     }
 
     /// Whether every bus has moved since the last call; a bus that hangs must not be hidden by a watchdog that is fed.
@@ -152,13 +160,25 @@ impl Daemon {
 
     fn start_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error: std::io::Error| {
-            StartError(format!("cannot start bus `{}`: {error}; free memory or file descriptors", bus.spec.name))
+            StartError(format!(
+                "cannot start bus `{}`: {error}; free memory or file descriptors",
+                bus.spec.name
+            ))
         };
-        let drives = bus.drives.iter().map(|spec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle)));
+        let drives = bus
+            .drives
+            .iter()
+            .map(|spec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle)));
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives.collect()));
         let queue = Arc::new(CommandQueue::new().map_err(failed)?);
         let leases = Leases::new(self.events.clone(), self.writes.clone());
-        BusTask::start(BusHandle { image, queue }, bus.options.clone(), leases, self.events.clone()).map_err(failed)
+        BusTask::start(
+            BusHandle { image, queue },
+            bus.options.clone(),
+            leases,
+            self.events.clone(),
+        )
+        .map_err(failed)
     }
 
     async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
@@ -237,7 +257,9 @@ impl Daemon {
         let plant = self.plant.load_full();
         let wanted = |d: &DriveHandle| {
             let spec = &d.image.spec;
-            spec.on_shutdown == OnShutdown::Stop && spec.access == Access::Control && d.image.snapshot().link.is_online()
+            spec.on_shutdown == OnShutdown::Stop
+                && spec.access == Access::Control
+                && d.image.snapshot().link.is_online()
         };
         let stops = plant.drives().filter(wanted).map(|drive| self.stop_drive(drive));
         let all = futures_util::future::join_all(stops);
@@ -247,16 +269,27 @@ impl Daemon {
     }
 
     async fn stop_drive(&self, drive: DriveHandle) {
-        let Some(run) = drive.image.spec.profile.model_index(ModelPoint::Run) else { return };
+        let Some(run) = drive.image.spec.profile.model_index(ModelPoint::Run) else {
+            return;
+        };
         loop {
             let now = Instant::now();
-            let origin = Origin { kind: SourceKind::Shutdown, who: "on_shutdown".to_string() };
+            let origin = Origin {
+                kind: SourceKind::Shutdown,
+                who: "on_shutdown".to_string(),
+            };
             let name = &drive.image.spec.name;
             let (ticket, answer) = Ticket::new(origin, name, "run=false".to_string(), true, now, self.writes.clone());
             let order = Order::Points(vec![(run, Value::Bool(false))]);
             let expires = now + command::DEFAULT_EXPIRY;
-            let command =
-                Command { drive: drive.index, order, urgency: Urgency::Stop, reference_only: false, expires, ticket };
+            let command = Command {
+                drive: drive.index,
+                order,
+                urgency: Urgency::Stop,
+                reference_only: false,
+                expires,
+                ticket,
+            };
             drive.bus.queue.submit(command, now);
             match answer.await {
                 Ok(answer) if answer.outcome.is_ok() => return,

@@ -5,6 +5,7 @@ pub mod cli;
 pub mod codec;
 pub mod command;
 pub mod config;
+pub mod daemon;
 pub mod document;
 pub mod drive;
 pub mod event;

@@ -18,7 +18,7 @@ use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 /// Arguments of `drivegate demo`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate demo\n  drivegate demo --speed max")]
-pub struct Args {
+pub(super) struct Args {
     /// True wire times, or as fast as the programs are
     #[arg(long, value_enum, default_value_t = Speed::Real)]
     pub speed: Speed,
@@ -29,7 +29,7 @@ pub struct Args {
 
 /// How fast the simulated lines are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Speed {
+pub(super) enum Speed {
     /// Every character takes its time.
     Real,
     /// No time on the wire.
@@ -40,8 +40,11 @@ pub enum Speed {
 const LINES: [(&str, u32, &[&str]); 2] = [("line1", 38_400, &["pump-1", "pump-2"]), ("line2", 115_200, &["fan-1"])];
 
 /// Runs the demo until Ctrl-C.
-pub fn run(args: &Args) -> ExitCode {
-    super::log::start(&LogSettings { level: args.log.clone(), format: LogFormat::Auto });
+pub(super) fn run(args: &Args) -> ExitCode {
+    super::log::start(&LogSettings {
+        level: args.log.clone(),
+        format: LogFormat::Auto,
+    });
     super::block_on(async {
         match demo(args).await {
             Ok(()) => ExitCode::SUCCESS,
@@ -57,13 +60,16 @@ async fn demo(args: &Args) -> Result<(), String> {
     let lines = start_lines(args.speed).map_err(|e| format!("cannot make a simulated line: {e}"))?;
     let cancel = CancellationToken::new();
     let mqtt = free_port("MQTT broker", 1883)?;
-    let broker = Broker::start(mqtt, cancel.clone()).await.map_err(|e| format!("cannot start the MQTT broker: {e}"))?;
+    let broker = Broker::start(mqtt, cancel.clone())
+        .await
+        .map_err(|e| format!("cannot start the MQTT broker: {e}"))?;
     let modbus = free_port("Modbus TCP", 1502)?;
     let http = free_port("HTTP", 9488)?;
-    let ports: Vec<String> = lines.iter().map(SimulatedBus::address).collect();
+    let ports: Vec<String> = lines.iter().map(|line| line.address()).collect();
     let source = configuration(&ports, modbus, mqtt, http);
     let loaded = Settings::parse("demo.toml", &source, std::iter::empty());
-    report::problems(&loaded);
+    // Its warnings are known: a baud beyond the family's list and a cadence beyond the line are part of the show.
+    report::errors(&loaded.errors);
     let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
     let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
     println!("{}", welcome(&ports, modbus, mqtt, http));
@@ -87,10 +93,16 @@ fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
         let drives = (1..).zip(*drives).map(|(address, _)| {
             // Different seeds, so that the drives do not move in step.
             let seed = u64::from(*baud) + u64::from(address);
-            DriveOptions { autopilot: Some(seed), ..DriveOptions::nx(address) }
+            DriveOptions {
+                autopilot: Some(seed),
+                ..DriveOptions::nx(address)
+            }
         });
         let options = SimulatedBusOptions::new(name, rules, drives.collect());
-        SimulatedBus::start(SimulatedBusOptions { endpoint: EndpointOptions::Pty { link: None }, ..options })
+        SimulatedBus::start(SimulatedBusOptions {
+            endpoint: EndpointOptions::Pty { link: None },
+            ..options
+        })
     };
     LINES.iter().map(start).collect()
 }
@@ -106,7 +118,10 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
             return Ok(address);
         }
     }
-    Err(format!("no free port for {what} from {wanted} to {}; stop another program", wanted.saturating_add(99)))
+    Err(format!(
+        "no free port for {what} from {wanted} to {}; stop another program",
+        wanted.saturating_add(99)
+    ))
 }
 
 fn configuration(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: SocketAddr) -> String {

@@ -15,11 +15,11 @@ use crate::config::{LogFormat, LogSettings};
 
 /// Changes the level of a running program.
 #[derive(Debug, Clone)]
-pub struct LogHandle(reload::Handle<EnvFilter, Registry>);
+pub(super) struct LogHandle(reload::Handle<EnvFilter, Registry>);
 
 impl LogHandle {
     /// Takes a new level; a format change needs a restart.
-    pub fn set_level(&self, level: &str) {
+    pub(super) fn set_level(&self, level: &str) {
         if let Err(error) = self.0.reload(EnvFilter::new(level)) {
             tracing::error!("the log level stays as it is: {error}");
         }
@@ -27,7 +27,7 @@ impl LogHandle {
 }
 
 /// Starts logging to standard error.
-pub fn start(settings: &LogSettings) -> LogHandle {
+pub(super) fn start(settings: &LogSettings) -> LogHandle {
     let (filter, handle) = reload::Layer::new(EnvFilter::new(&settings.level));
     let terminal = std::io::stderr().is_terminal();
     let format = match settings.format {
@@ -43,7 +43,12 @@ pub fn start(settings: &LogSettings) -> LogHandle {
         LogFormat::Json | LogFormat::Auto => lines.json().flatten_event(true).boxed(),
     };
     // A second start in one process keeps the first subscriber.
-    if tracing_subscriber::registry().with(filter).with(lines).try_init().is_err() {
+    if tracing_subscriber::registry()
+        .with(filter)
+        .with(lines)
+        .try_init()
+        .is_err()
+    {
         tracing::debug!("logging was started before");
     }
     LogHandle(handle)

@@ -9,23 +9,25 @@ use tokio::signal::unix::{SignalKind, signal};
 
 use super::log::LogHandle;
 use super::{EXIT_CONFIG, EXIT_FAILED, report};
-use crate::config::Settings;
+use crate::config::{self, Settings};
 use crate::daemon::Daemon;
 
 /// Arguments of `drivegate run`.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate run --config /etc/drivegate/drivegate.toml")]
-pub struct Args {
+pub(super) struct Args {
     /// Configuration file
     #[arg(long, value_name = "FILE", default_value = super::DEFAULT_CONFIG)]
     pub config: PathBuf,
 }
 
 /// Runs the daemon until SIGTERM or SIGINT.
-pub fn run(args: &Args) -> ExitCode {
-    let loaded = Settings::load(&args.config, std::env::vars());
+pub(super) fn run(args: &Args) -> ExitCode {
+    let loaded = Settings::load(&args.config, config::environment());
     report::problems(&loaded);
-    let Some(settings) = loaded.settings else { return ExitCode::from(EXIT_CONFIG) };
+    let Some(settings) = loaded.settings else {
+        return ExitCode::from(EXIT_CONFIG);
+    };
     let log = super::log::start(&settings.log);
     super::block_on(serve(settings, &args.config, &log))
 }
@@ -61,7 +63,11 @@ async fn until_stopped(mut daemon: Daemon, path: &Path, log: &LogHandle) -> std:
     let mut interrupt = signal(SignalKind::interrupt())?;
     let mut hang_up = signal(SignalKind::hangup())?;
     let watchdog = sd_notify::watchdog_enabled();
-    let mut feed = tokio::time::interval(watchdog.map_or(Duration::from_secs(5), |t| t / 2).max(Duration::from_millis(500)));
+    let mut feed = tokio::time::interval(
+        watchdog
+            .map_or(Duration::from_secs(5), |t| t / 2)
+            .max(Duration::from_millis(500)),
+    );
     loop {
         tokio::select! {
             _ = terminate.recv() => break,
@@ -82,7 +88,7 @@ async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
     let mut states = vec![NotifyState::Reloading];
     states.extend(NotifyState::monotonic_usec_now());
     notify(&states);
-    let loaded = Settings::load(path, std::env::vars());
+    let loaded = Settings::load(path, config::environment());
     for problem in &loaded.errors {
         tracing::error!("{problem}");
     }

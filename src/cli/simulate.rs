@@ -1,6 +1,9 @@
 //! `drivegate simulate`: simulated drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults.
 
+use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use crate::cache::DriveSpec;
 use crate::codec::LineFormat;
+use crate::config::{self, BusSettings, Settings};
 use crate::document::{nearest, parse_duration};
 use crate::drive::profile::Profiles;
 use crate::sim::drive::{DriveOptions, ModelOptions};
@@ -26,7 +29,7 @@ use tokio::signal::unix::{SignalKind, signal};
 Faults: {NAMES}.
 
 A simulated drive obeys the bus. Writing a fault code to PDU address 1998 (ID 1999, which no real drive has) trips it."))]
-pub struct Args {
+pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "baud", "format"])]
     pub config: Option<PathBuf>,
@@ -76,7 +79,7 @@ pub struct Args {
 
 /// How fast the simulated lines are.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Speed {
+pub(super) enum Speed {
     /// Every character takes its time.
     Real,
     /// No time on the wire.
@@ -85,7 +88,7 @@ pub enum Speed {
 
 /// Addresses of drives, ascending, none twice.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Addresses(Vec<u8>);
+pub(super) struct Addresses(Vec<u8>);
 
 fn parse_addresses(text: &str) -> Result<Addresses, String> {
     let bad = || format!("`{text}` is no list of addresses; write numbers from 1 to 247, such as 1-10 or 1,2,7");
@@ -114,7 +117,7 @@ fn parse_addresses(text: &str) -> Result<Addresses, String> {
 ///
 /// # Errors
 /// A `tcp://` address that cannot be listened on by its text.
-pub fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
+fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
     let Some(address) = port.strip_prefix("tcp://") else {
         return Ok(EndpointOptions::Pty {
             link: Some(PathBuf::from(port)),
@@ -126,9 +129,42 @@ pub fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
         .ok_or_else(|| format!("`{port}` is no address to listen on; write it as tcp://127.0.0.1:4001"))
 }
 
-/// Simulates until Ctrl-C or SIGTERM. `configured` makes the lines of a configuration file, and tells what is wrong with
-/// it by itself: then its exit code is the command's.
-pub fn run(args: &Args, configured: impl FnOnce(&Path) -> Result<Vec<SimulatedBusOptions>, ExitCode>) -> ExitCode {
+/// The simulated lines of a configuration file, each in the place of its bus's port.
+fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
+    let loaded = Settings::load(file, config::environment());
+    report::problems(&loaded);
+    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
+    let lines: Result<Vec<SimulatedBusOptions>, String> = settings.buses.iter().map(line_of).collect();
+    lines.map_err(|message| failed(EXIT_CONFIG, &message))
+}
+
+fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
+    let drive = |spec: &DriveSpec| {
+        let model = spec
+            .profile
+            .simulator
+            .as_deref()
+            .and_then(ModelOptions::by_name)
+            .ok_or_else(|| {
+                let (name, profile) = (&spec.name, &spec.profile.name);
+                format!(
+                    "drives of the profile `{profile}` cannot be simulated; drive `{name}`; give it another profile"
+                )
+            })?;
+        Ok(DriveOptions {
+            address: spec.address,
+            model,
+            autopilot: None,
+        })
+    };
+    let drives = bus.drives.iter().map(drive).collect::<Result<_, String>>()?;
+    let mut line = SimulatedBusOptions::new(&bus.spec.name, LineRules::new(bus.spec.format), drives);
+    line.endpoint = endpoint_for(&bus.spec.port)?;
+    Ok(line)
+}
+
+/// Simulates until Ctrl-C or SIGTERM.
+pub(super) fn run(args: &Args) -> ExitCode {
     let lines = match &args.config {
         Some(file) => match configured(file) {
             Ok(lines) => lines,
@@ -136,7 +172,7 @@ pub fn run(args: &Args, configured: impl FnOnce(&Path) -> Result<Vec<SimulatedBu
         },
         None => match args.line() {
             Ok(line) => vec![line],
-            Err(message) => return failed(2, &message),
+            Err(message) => return failed(EXIT_USAGE, &message),
         },
     };
     let started: io::Result<Vec<SimulatedBus>> = lines
@@ -145,7 +181,7 @@ pub fn run(args: &Args, configured: impl FnOnce(&Path) -> Result<Vec<SimulatedBu
         .collect();
     match started.and_then(|lines| serve(&lines)) {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => failed(1, &format!("cannot simulate: {error}")),
+        Err(error) => failed(EXIT_FAILED, &format!("cannot simulate: {error}")),
     }
 }
 

@@ -9,6 +9,7 @@
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
 //! - [`bare_master`]: a measuring rod for benches, not a master to build on.
+//! - [`broker`]: a small MQTT broker for the demo and for tests.
 //!
 //! Everything but [`wire`], its endpoints and the measuring rod is pure and takes the time as an argument, so the same
 //! requests at the same times give the same bytes.
@@ -17,6 +18,7 @@ use std::time::Duration;
 
 pub mod autopilot;
 pub mod bare_master;
+pub mod broker;
 pub mod drive;
 pub mod endpoint;
 pub mod faults;
