@@ -1,0 +1,47 @@
+# Everything around the code in one place; `make help` lists the targets.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+# The test tools that apt does not have live in .tools; Debian keeps daemons such as mosquitto in /usr/sbin,
+# which is not on the PATH of an ordinary user.
+export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:/sbin
+
+# The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
+.NOTPARALLEL:
+.PHONY: help build test tools lint fmt deny advisories bench clean
+
+help: ## Show this list
+	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
+
+build: ## Build the optimised binary, target/release/drivegate
+	cargo build --release --locked
+
+# Documentation tests first, so that the output ends with the count of a suite that tests the product.
+test: tools lint deny ## Run every check and every test; installs missing test tools first
+	cargo test --locked --doc
+	cargo test --locked --tests --no-fail-fast
+
+tools: ## Install what the tests need (apt, PyPI, cargo); quick when nothing is missing
+	@tests/tools/install.sh
+
+lint: ## Check formatting and lints; any warning fails
+	cargo fmt --check
+	cargo clippy --locked --all-targets -- -D warnings
+
+fmt: ## Format the code
+	cargo fmt
+
+deny: tools ## Check licences, bans and sources of all dependencies
+	cargo deny --locked --log-level error check licenses bans sources
+
+advisories: tools ## Check dependencies for known vulnerabilities; fetches the advisory database
+	cargo deny --locked check advisories
+
+bench: ## Run the benchmarks
+	cargo bench --locked
+
+clean: ## Remove everything that was built or installed here
+	cargo clean
+	rm -rf .tools
