@@ -1,0 +1,118 @@
+//! What the documents say is true: commands, links, and every configuration they show.
+
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    reason = "a test may panic, its helpers too"
+)]
+
+mod tools;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use tempfile::TempDir;
+use tools::{root, run_well};
+
+const DRIVEGATE: &str = env!("CARGO_BIN_EXE_drivegate");
+
+fn read(path: &Path) -> String {
+    fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The documents for people.
+fn documents() -> Vec<PathBuf> {
+    let mut found = vec![root().join("README.md"), root().join("CHANGELOG.md")];
+    found.extend(files(&root().join("docs"), "md"));
+    found
+}
+
+/// All files below `dir` with that extension.
+fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path, extension));
+        } else if path.extension().is_some_and(|e| e == extension) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The fenced blocks of that language.
+fn blocks(text: &str, language: &str) -> Vec<String> {
+    let opening = format!("\n```{language}\n");
+    let inside = text.split(&opening).skip(1);
+    inside
+        .map(|rest| rest.split("\n```").next().unwrap().to_string() + "\n")
+        .collect()
+}
+
+#[test]
+fn every_configuration_that_ships_is_valid() {
+    let mut configurations = files(&root().join("deploy"), "toml");
+    assert!(configurations.len() >= 2);
+    let dir = TempDir::new().unwrap();
+    for document in documents() {
+        for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
+            let name = document.file_stem().unwrap().to_string_lossy().into_owned();
+            let path = dir.path().join(format!("{name}-{i}.toml"));
+            fs::write(&path, block).unwrap();
+            configurations.push(path);
+        }
+    }
+    for path in configurations {
+        run_well(
+            Path::new(DRIVEGATE),
+            &["check", "--config", &path.display().to_string()],
+        );
+    }
+}
+
+#[test]
+fn the_readme_quotes_the_shipped_configuration() {
+    let quoted = blocks(&read(&root().join("README.md")), "toml");
+    assert_eq!(quoted, [read(&root().join("deploy/drivegate.toml"))]);
+}
+
+#[test]
+fn the_two_commands_of_the_readme_exist() {
+    let readme = read(&root().join("README.md"));
+    assert!(readme.contains("\ncargo run --release -- demo "));
+    assert!(readme.contains("\nmake test "));
+    let makefile = read(&root().join("Makefile"));
+    assert!(makefile.contains("\ntest: "));
+    let ci = read(&root().join(".ci/run"));
+    assert!(ci.contains("make test"), "CI runs the same command");
+}
+
+#[test]
+fn the_commands_of_the_readme_exist() {
+    let readme = read(&root().join("README.md"));
+    let rows = readme.lines().filter_map(|line| line.strip_prefix("| `drivegate "));
+    let commands: Vec<&str> = rows
+        .map(|row| row.split(|c: char| !c.is_ascii_alphanumeric()).next().unwrap())
+        .collect();
+    assert!(commands.len() >= 7, "{commands:?}");
+    for command in commands {
+        run_well(Path::new(DRIVEGATE), &[command, "--help"]);
+    }
+}
+
+#[test]
+fn links_lead_somewhere() {
+    for document in documents() {
+        let text = read(&document);
+        for link in text.split("](").skip(1).map(|rest| rest.split(')').next().unwrap()) {
+            if link.starts_with("http") {
+                continue;
+            }
+            let target = document.parent().unwrap().join(link.split('#').next().unwrap());
+            assert!(target.exists(), "{}: {link}", document.display());
+        }
+    }
+}
