@@ -16,7 +16,8 @@ help: ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
 
 build: ## Build the optimised binary, target/release/drivegate
-	cargo build --release --locked
+	commit="$$(git rev-parse --short=12 HEAD 2>/dev/null || true)"; \
+	DRIVEGATE_COMMIT="$${commit:-unknown}" cargo build --release --locked
 
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
 test: tools lint deny ## Run every check and every test; installs missing test tools first
