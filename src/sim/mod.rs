@@ -11,8 +11,8 @@
 //! - [`bare_master`]: a measuring rod for benches, not a master to build on.
 //! - [`broker`]: a small MQTT broker for the demo and for tests.
 //!
-//! Everything but [`wire`], its endpoints and the measuring rod is pure and takes the time as an argument, so the same
-//! requests at the same times give the same bytes.
+//! Everything but [`wire`], its endpoints, the measuring rod and the broker is pure and takes the time as an argument,
+//! so the same requests at the same times give the same bytes.
 
 use std::time::Duration;
 
