@@ -39,6 +39,11 @@ pub(super) enum Speed {
 /// One simulated line of the demo: name, baud, drives by name.
 const LINES: [(&str, u32, &[&str]); 2] = [("line1", 38_400, &["pump-1", "pump-2"]), ("line2", 115_200, &["fan-1"])];
 
+/// The ports that the demo takes when they are free.
+const MQTT: u16 = 1883;
+const MODBUS_TCP: u16 = 1502;
+const HTTP: u16 = 9488;
+
 /// Runs the demo until Ctrl-C.
 pub(super) fn run(args: &Args) -> ExitCode {
     super::log::start(&LogSettings {
@@ -58,21 +63,22 @@ pub(super) fn run(args: &Args) -> ExitCode {
 
 async fn demo(args: &Args) -> Result<(), String> {
     let lines = start_lines(args.speed).map_err(|e| format!("cannot make a simulated line: {e}"))?;
-    let cancel = CancellationToken::new();
-    let mqtt = free_port("MQTT broker", 1883)?;
-    let broker = Broker::start(mqtt, cancel.clone())
-        .await
-        .map_err(|e| format!("cannot start the MQTT broker: {e}"))?;
-    let modbus = free_port("Modbus TCP", 1502)?;
-    let http = free_port("HTTP", 9488)?;
     let ports: Vec<String> = lines.iter().map(|line| line.address()).collect();
-    let source = configuration(&ports, modbus, mqtt, http);
-    let loaded = Settings::parse("demo.toml", &source, std::iter::empty());
-    // Its warnings are known: a baud beyond the family's list and a cadence beyond the line are part of the show.
-    report::errors(&loaded.errors);
-    let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
-    let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
-    println!("{}", welcome(&ports, modbus, mqtt, http));
+    let cancel = CancellationToken::new();
+    let mut started = start(&ports, &cancel).await;
+    // Another program may take a port between the look at it and its use.
+    for _ in 0..4 {
+        if started.is_err() {
+            started = start(&ports, &cancel).await;
+        }
+    }
+    let (daemon, broker, sides) = started?;
+    for (what, address, wanted) in sides.each() {
+        if address.port() != wanted {
+            println!("Port {wanted} is taken; {what} listens on {} instead.", address.port());
+        }
+    }
+    println!("{}", welcome(&ports, &sides));
     // Without a handler for Ctrl-C the process ends all the same.
     let _ = tokio::signal::ctrl_c().await;
     println!("\nThe demo ends.");
@@ -81,6 +87,43 @@ async fn demo(args: &Args) -> Result<(), String> {
     broker.stop().await;
     lines.into_iter().for_each(SimulatedBus::stop);
     Ok(())
+}
+
+/// Where the three north sides are reached.
+struct Sides {
+    mqtt: SocketAddr,
+    modbus: SocketAddr,
+    http: SocketAddr,
+}
+
+impl Sides {
+    /// Name, address and the port that was wanted.
+    fn each(&self) -> [(&'static str, SocketAddr, u16); 3] {
+        [
+            ("MQTT broker", self.mqtt, MQTT),
+            ("Modbus TCP", self.modbus, MODBUS_TCP),
+            ("HTTP", self.http, HTTP),
+        ]
+    }
+}
+
+async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
+    let mqtt = free_port("the MQTT broker", MQTT)?;
+    let broker = Broker::start(mqtt, cancel.child_token());
+    let broker = broker
+        .await
+        .map_err(|e| format!("cannot start the MQTT broker on {mqtt}: {e}"))?;
+    let sides = Sides {
+        mqtt,
+        modbus: free_port("Modbus TCP", MODBUS_TCP)?,
+        http: free_port("HTTP", HTTP)?,
+    };
+    let loaded = Settings::parse("demo.toml", &configuration(ports, &sides), std::iter::empty());
+    // Its warnings are known: a baud beyond the family's list and a cadence beyond the line are part of the show.
+    report::errors(&loaded.errors);
+    let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
+    let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
+    Ok((daemon, broker, sides))
 }
 
 fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
@@ -107,14 +150,11 @@ fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
     LINES.iter().map(start).collect()
 }
 
-/// The wanted port on loopback, or the next free one; says so when it is another.
+/// The wanted port on loopback, or the next free one.
 fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     for port in wanted..wanted.saturating_add(100) {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
         if TcpListener::bind(address).is_ok() {
-            if port != wanted {
-                println!("Port {wanted} is taken; {what} listens on {port} instead.");
-            }
             return Ok(address);
         }
     }
@@ -124,7 +164,8 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     ))
 }
 
-fn configuration(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: SocketAddr) -> String {
+fn configuration(ports: &[String], sides: &Sides) -> String {
+    let Sides { mqtt, modbus, http } = sides;
     let mut text = "[gateway]\nname = \"demo\"\n".to_string();
     let mut unit = 0;
     for ((name, baud, drives), port) in LINES.iter().zip(ports) {
@@ -141,14 +182,15 @@ fn configuration(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: S
     text + &format!("\n[http]\nlisten = \"{http}\"\n")
 }
 
-fn welcome(ports: &[String], modbus: SocketAddr, mqtt: SocketAddr, http: SocketAddr) -> String {
+fn welcome(ports: &[String], sides: &Sides) -> String {
+    let http = sides.http;
     let drives: Vec<&str> = LINES.iter().flat_map(|(_, _, drives)| drives.iter().copied()).collect();
     let lines: Vec<String> = LINES
         .iter()
         .zip(ports)
         .map(|((name, baud, drives), port)| format!("  {name}: {} at {baud} 8N1 on {port}", drives.join(", ")))
         .collect();
-    let (modbus, mqtt) = (modbus.port(), mqtt.port());
+    let (modbus, mqtt) = (sides.modbus.port(), sides.mqtt.port());
     format!(
         "\
 drivegate {version} demo: simulated Vacon NX drives, true wire timing, no hardware.

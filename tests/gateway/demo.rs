@@ -1,0 +1,78 @@
+//! `drivegate demo`, as the README promises it.
+
+use std::process::Command;
+use std::time::Duration;
+
+use crate::process::{Running, api, get, mbpoll_read, mbpoll_write, point, until, until_ready};
+use crate::tools::tool;
+
+/// The number behind `mark` in what the demo printed.
+fn port(printed: &str, mark: &str) -> u16 {
+    let rest = printed
+        .split_once(mark)
+        .unwrap_or_else(|| panic!("no `{mark}` in\n{printed}"))
+        .1;
+    rest.chars()
+        .take_while(char::is_ascii_digit)
+        .collect::<String>()
+        .parse()
+        .unwrap()
+}
+
+#[test]
+fn everything_it_prints_works_and_ctrl_c_ends_it() {
+    let mut demo = Running::drivegate(&["demo"]);
+    let printed = demo.until_printed("Ctrl-C ends the demo.");
+    let (http, mqtt, modbus) = (
+        port(&printed, "http://127.0.0.1:"),
+        port(&printed, "-h 127.0.0.1 -p "),
+        port(&printed, "tcp -p "),
+    );
+    until_ready(http);
+    let drives: Vec<serde_json::Value> = serde_json::from_str(&get(http, "/api/v1/drives").unwrap().1).unwrap();
+    assert_eq!(drives.len(), 3);
+    // By themselves the drives move.
+    until("a drive that runs by itself", || {
+        ["pump-1", "pump-2", "fan-1"]
+            .into_iter()
+            .find(|drive| api(http, drive)["state"] == "running")
+    });
+
+    let metrics = get(http, "/metrics").unwrap().1;
+    assert!(
+        metrics.contains("drivegate_drive_output_frequency_hertz{bus=\"line1\",drive=\"pump-1\"}"),
+        "{metrics}"
+    );
+    let payload = "{\"run\": true, \"speed_reference\": 50}";
+    let sent = Command::new(tool("mosquitto_pub"))
+        .args(["-h", "127.0.0.1", "-p", &mqtt.to_string(), "-q", "1"])
+        .args(["-t", "drivegate/demo/drive/pump-1/set", "-m", payload])
+        .status();
+    assert!(sent.unwrap().success());
+    until("pump-1 at its reference", || {
+        (point(http, "pump-1", "output_frequency") == 25.0).then_some(())
+    });
+
+    assert_eq!(mbpoll_read(modbus, 1, 32_768, 19).unwrap().get(5), Some(&2500));
+    mbpoll_write(modbus, 1, 33_024, &[0]).unwrap();
+    until("pump-1 stopped", || {
+        (api(http, "pump-1")["state"] == "ready").then_some(())
+    });
+
+    demo.signal("INT");
+    let (status, took) = demo.ended();
+    assert!(status.success(), "{status}");
+    assert!(took < Duration::from_secs(3), "it took {took:?}");
+}
+
+#[test]
+fn a_second_demo_takes_other_ports() {
+    let first = Running::drivegate(&["demo"]);
+    first.until_printed("Ctrl-C ends the demo.");
+    let second = Running::drivegate(&["demo"]);
+    let printed = second.until_printed("Ctrl-C ends the demo.");
+    for what in ["MQTT broker listens on", "Modbus TCP listens on", "HTTP listens on"] {
+        assert!(printed.contains(what), "{what} is not said in\n{printed}");
+    }
+    until_ready(port(&printed, "http://127.0.0.1:"));
+}

@@ -1,0 +1,15 @@
+//! The real program from outside: `demo`, `simulate` and `run` as processes, commanded by mbpoll and mosquitto.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests may panic"
+)]
+
+mod demo;
+mod operators;
+mod process;
+mod restart;
+#[path = "../tools/mod.rs"]
+mod tools;

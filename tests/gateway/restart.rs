@@ -1,0 +1,146 @@
+//! What is on the line when the gateway starts, dies and starts again; and a port that is not there.
+
+use std::path::Path;
+
+use drivegate::codec::LineFormat;
+use drivegate::sim::drive::DriveOptions;
+use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::statistics::Direction;
+use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+
+use crate::process::{Running, api, free_port, get, mbpoll_read, until, until_ready};
+use crate::tools::{run_well, tool};
+
+fn line(path: &Path) -> SimulatedBus {
+    let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
+    let options = SimulatedBusOptions::new("line1", rules, vec![DriveOptions::nx(1)]);
+    let endpoint = EndpointOptions::Pty {
+        link: Some(path.to_path_buf()),
+    };
+    SimulatedBus::start(SimulatedBusOptions {
+        endpoint,
+        transcript: 100_000,
+        ..options
+    })
+    .unwrap()
+}
+
+fn configure(folder: &Path, extra: &str) -> (String, u16, u16) {
+    let (modbus, http) = (free_port(), free_port());
+    let file = folder.join("drivegate.toml");
+    let text = format!(
+        "[gateway]\nname = \"test\"\n[[bus]]\nname = \"line1\"\nport = \"{}\"\nbaud = 38400\nsilence = \"chars\"\n\
+         [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n{extra}\
+         [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n\
+         [http]\nlisten = \"127.0.0.1:{http}\"\n",
+        folder.join("line1").display()
+    );
+    std::fs::write(&file, text).unwrap();
+    (file.display().to_string(), modbus, http)
+}
+
+/// Function codes of the requests on the line.
+fn functions(line: &SimulatedBus) -> Vec<u8> {
+    let frames = line.transcript();
+    frames
+        .iter()
+        .filter(|f| f.direction == Direction::ToDrives)
+        .filter_map(|f| f.bytes.get(1).copied())
+        .collect()
+}
+
+#[test]
+fn no_control_word_is_written_at_start_after_a_kill_or_from_a_retained_message() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = line(&folder.path().join("line1"));
+    let mqtt = free_port();
+    let broker_file = folder.path().join("mosquitto.conf");
+    std::fs::write(
+        &broker_file,
+        format!("listener {mqtt} 127.0.0.1\nallow_anonymous true\n"),
+    )
+    .unwrap();
+    let _broker = Running::start(&tool("mosquitto"), &["-c", &broker_file.display().to_string()]);
+    until("the broker listens", || {
+        std::net::TcpStream::connect(("127.0.0.1", mqtt)).ok()
+    });
+    let set = [
+        "-t",
+        "drivegate/test/drive/pump-1/set",
+        "-m",
+        "{\"run\": true}",
+        "-r",
+        "-q",
+        "1",
+    ];
+    run_well(
+        &tool("mosquitto_pub"),
+        &[&["-h", "127.0.0.1", "-p", &mqtt.to_string()], &set[..]].concat(),
+    );
+
+    let (file, _, http) = configure(folder.path(), "");
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(
+        &file,
+        format!("{text}[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n"),
+    )
+    .unwrap();
+    for _ in 0..2 {
+        line.record(100_000);
+        let mut gateway = Running::drivegate(&["run", "--config", &file]);
+        until_ready(http);
+        until("the refused retained message", || {
+            get(http, "/metrics")?
+                .1
+                .contains("drivegate_writes_total{source=\"mqtt\"")
+                .then_some(())
+        });
+        until("slow points were read", || {
+            api(http, "pump-1")["points"]["run"]["value"].is_boolean().then_some(())
+        });
+        gateway.signal("KILL");
+        gateway.ended();
+        let functions = functions(&line);
+        assert!(functions.len() > 10, "the drive was polled");
+        assert!(functions.iter().all(|f| *f == 3), "only reads: {functions:?}");
+    }
+    assert_eq!(line.statistics().silence_violations, 0);
+}
+
+#[test]
+fn on_shutdown_stop_stops_and_hold_holds() {
+    for (action, last) in [("stop", Some(6)), ("hold", None)] {
+        let folder = tempfile::tempdir().unwrap();
+        let line = line(&folder.path().join("line1"));
+        let (file, modbus, http) = configure(folder.path(), &format!("on_shutdown = \"{action}\"\n"));
+        let mut gateway = Running::drivegate(&["run", "--config", &file]);
+        until_ready(http);
+        crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+        until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
+        line.record(100_000);
+        gateway.signal("TERM");
+        let (status, _) = gateway.ended();
+        assert!(status.success(), "{status}");
+        let writes = functions(&line).into_iter().find(|f| *f != 3);
+        assert_eq!(writes, last, "on_shutdown = {action}");
+    }
+}
+
+#[test]
+fn a_port_that_is_not_there_is_waited_for() {
+    let folder = tempfile::tempdir().unwrap();
+    let (file, modbus, http) = configure(folder.path(), "");
+    let _gateway = Running::drivegate(&["run", "--config", &file]);
+    let (_, reasons) = until("503 from /readyz", || {
+        get(http, "/readyz").filter(|(status, _)| *status == 503)
+    });
+    assert!(reasons.contains("line1"), "{reasons}");
+    assert_eq!(get(http, "/healthz").unwrap().0, 200);
+    assert_eq!(api(http, "pump-1")["state"], "offline");
+    let refused = mbpoll_read(modbus, 1, 2100, 11).unwrap_err();
+    assert!(refused.contains("path unavailable"), "{refused}");
+    let _line = line(&folder.path().join("line1"));
+    until_ready(http);
+    until("values", || mbpoll_read(modbus, 1, 2100, 11).ok());
+}
