@@ -68,11 +68,16 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
 #[test]
 fn a_second_demo_takes_other_ports() {
     let first = Running::drivegate(&["demo"]);
-    first.until_printed("Ctrl-C ends the demo.");
+    let taken = first.until_printed("Ctrl-C ends the demo.");
     let second = Running::drivegate(&["demo"]);
     let printed = second.until_printed("Ctrl-C ends the demo.");
-    for what in ["MQTT broker listens on", "Modbus TCP listens on", "HTTP listens on"] {
-        assert!(printed.contains(what), "{what} is not said in\n{printed}");
+    for (mark, what) in [
+        ("http://127.0.0.1:", "HTTP"),
+        ("-h 127.0.0.1 -p ", "MQTT broker"),
+        ("tcp -p ", "Modbus TCP"),
+    ] {
+        assert_ne!(port(&printed, mark), port(&taken, mark), "{what}");
     }
+    assert!(printed.contains(" is taken; "), "it says so:\n{printed}");
     until_ready(port(&printed, "http://127.0.0.1:"));
 }

@@ -132,12 +132,8 @@ fn by_mbpoll() {
     assert_eq!(common[0] & 0xC000, 0x8000, "online, not stale");
     let raw = mbpoll_read(modbus, 1, 2100, 11).unwrap();
     assert_eq!((raw[2], raw[3]), (5000, 2500));
-    assert_eq!(
-        mbpoll_read(modbus, 1, 6000, 5)
-            .unwrap_err()
-            .contains("Illegal data address"),
-        true
-    );
+    let unknown = mbpoll_read(modbus, 1, 6000, 5).unwrap_err();
+    assert!(unknown.contains("Illegal data address"), "{unknown}");
 
     mbpoll_write(modbus, 1, TRIP, &[9]).unwrap();
     plant.until_state("pump-1", "fault");
