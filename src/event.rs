@@ -28,6 +28,8 @@ pub enum EventKind {
     Supervision,
     /// A command was refused.
     RefusedCommand,
+    /// An acknowledged command showed no effect in time.
+    NotConfirmed,
     /// The port of a bus was opened.
     BusUp,
     /// The port of a bus was lost or cannot be opened.
@@ -45,6 +47,7 @@ impl EventKind {
             EventKind::Restarted => "restarted",
             EventKind::Supervision => "supervision",
             EventKind::RefusedCommand => "refused_command",
+            EventKind::NotConfirmed => "not_confirmed",
             EventKind::BusUp => "bus_up",
             EventKind::BusDown => "bus_down",
         }

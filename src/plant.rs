@@ -4,9 +4,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
+use tokio::sync::oneshot;
 
 use crate::cache::{BusImage, DriveImage, Reading};
-use crate::command::{self, Answer, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats};
+use crate::codec::Table;
+use crate::command::{
+    self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats,
+};
 use crate::drive::Value;
 use crate::event::{Event, EventKind, Events};
 
@@ -49,6 +53,55 @@ pub struct DriveHandle {
     stale_after: Duration,
     events: Events,
     writes: Arc<WriteStats>,
+}
+
+/// An order that was given.
+struct Placed {
+    accepted: Instant,
+    answer: oneshot::Receiver<Answer>,
+}
+
+impl Placed {
+    async fn answered(self) -> Answer {
+        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        self.answer.await.unwrap_or(Answer {
+            outcome: Outcome::ShuttingDown,
+            latency: self.accepted.elapsed(),
+        })
+    }
+}
+
+/// What an order sets, with the values that are known before it.
+fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
+    match order {
+        Order::Points(values) => values
+            .iter()
+            .map(|(index, new)| Change {
+                point: reading
+                    .spec
+                    .profile
+                    .points
+                    .get(*index)
+                    .map_or_else(|| format!("point {index}"), |p| p.name.clone()),
+                old: reading.sample(*index).good(),
+                new: *new,
+            })
+            .collect(),
+        Order::Write(pdu) => {
+            let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
+            let number = |word: u16| Value::Integer(i64::from(word));
+            let change = |(address, word): (u16, u16)| Change {
+                point: format!("{table} {address}"),
+                old: reading
+                    .words(table, address, 1)
+                    .ok()
+                    .and_then(|words| words.first().copied().map(number)),
+                new: number(word),
+            };
+            items.into_iter().map(change).collect()
+        }
+        Order::Read(_) => Vec::new(),
+    }
 }
 
 impl Plant {
@@ -108,6 +161,35 @@ impl DriveHandle {
     /// `may_write` says whether the client may write at all; the order is refused at once when it is not
     /// admitted, the bus is down or the drive is offline. Refused writes are audited and told as an event.
     pub async fn order(&self, order: Order, origin: Origin, may_write: bool, expiry: Duration) -> Answer {
+        self.begin(order, origin, may_write, expiry).0.answered().await
+    }
+
+    /// As [`DriveHandle::order`], and waits further for the read that shows the effect: the time from acceptance to
+    /// it, or `None` when no read showed it within the time that the profile gives.
+    pub async fn order_confirmed(
+        &self,
+        order: Order,
+        origin: Origin,
+        may_write: bool,
+        expiry: Duration,
+    ) -> (Answer, Option<Duration>) {
+        let (placed, confirmation) = self.begin(order, origin, may_write, expiry);
+        let answer = placed.answered().await;
+        let confirmed = if answer.outcome.is_ok() {
+            confirmation.await.ok()
+        } else {
+            None
+        };
+        (answer, confirmed)
+    }
+
+    fn begin(
+        &self,
+        order: Order,
+        origin: Origin,
+        may_write: bool,
+        expiry: Duration,
+    ) -> (Placed, oneshot::Receiver<Duration>) {
         let accepted = Instant::now();
         let reading = self.reading(accepted);
         let write = !matches!(order, Order::Read(_));
@@ -120,6 +202,8 @@ impl DriveHandle {
             accepted,
             self.writes.clone(),
         );
+        let mut ticket = ticket.with_changes(changes(&reading, &order));
+        let confirmation = ticket.confirmation();
         match command::admit(order, &reading, may_write) {
             Err(refusal) => {
                 self.tell_refusal(&what, &refusal.to_string(), ticket.origin());
@@ -142,11 +226,7 @@ impl DriveHandle {
                 self.bus.queue.submit(command, accepted);
             }
         }
-        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
-        answer.await.unwrap_or(Answer {
-            outcome: Outcome::ShuttingDown,
-            latency: accepted.elapsed(),
-        })
+        (Placed { accepted, answer }, confirmation)
     }
 
     /// Refuses a command before it became an order; audited, counted and told like any other refusal.

@@ -3,8 +3,9 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
+use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Order, Outcome, Ticket, Urgency};
+use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Profile, Raw, Value};
 
@@ -70,7 +71,10 @@ pub struct Execution {
     actions: VecDeque<Action>,
     not_before: Option<Instant>,
     ticket: Ticket,
-    purged: bool,
+    effects: Vec<Effect>,
+    expires: Instant,
+    /// Set when it ends before all was sent.
+    cut: Option<Outcome>,
     reply: Reply,
     failures: u32,
 }
@@ -84,8 +88,10 @@ impl Execution {
             order,
             urgency,
             ticket,
+            expires,
             ..
         } = command;
+        let effects = confirm::effects(profile, &order);
         let actions = match order {
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
@@ -96,14 +102,25 @@ impl Execution {
             actions,
             not_before: None,
             ticket,
-            purged: false,
+            effects,
+            expires,
+            cut: None,
             reply: Reply::Written,
             failures: 0,
         }
     }
 
-    /// What the command needs next. `running` is what the drive last said.
+    /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
+    /// sent any more, but a reset bit that is set is taken away.
     pub fn next(&mut self, shadow: &Shadow, profile: &Profile, running: bool, now: Instant) -> Next {
+        if now >= self.expires && self.cut.is_none() {
+            let outcome = if self.failures > 0 {
+                Outcome::TimedOut
+            } else {
+                Outcome::Expired
+            };
+            self.cut_off(outcome);
+        }
         if let Some(at) = self.not_before {
             if now < at {
                 return Next::Wait(at);
@@ -167,21 +184,40 @@ impl Execution {
     /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
     /// Whether the command is over by that.
     pub fn purge(&mut self) -> bool {
+        self.cut_off(Outcome::Purged);
+        self.actions.is_empty()
+    }
+
+    fn cut_off(&mut self, outcome: Outcome) {
         let before = self.actions.len();
+        // A bit whose setting was sent and not answered may be set.
+        if self.failures > 0 && matches!(self.actions.front(), Some(Action::PulseHigh { .. })) {
+            self.actions.pop_front();
+        }
         let high = self.actions.iter().any(|a| matches!(a, Action::PulseHigh { .. }));
         self.actions
             .retain(|a| !high && matches!(a, Action::PulseEnd { .. } | Action::Hold(_)));
-        self.purged = before != self.actions.len();
-        self.actions.is_empty()
+        // A hold without the end of a pulse behind it holds nothing.
+        if !self.actions.iter().any(|a| matches!(a, Action::PulseEnd { .. })) {
+            self.actions.clear();
+        }
+        if before != self.actions.len() {
+            self.cut = Some(outcome);
+            self.failures = 0;
+        }
     }
 
     /// How the command ends when nothing is left to do.
     pub fn success(&self) -> Outcome {
-        if self.purged {
-            Outcome::Purged
-        } else {
-            Outcome::Acknowledged(self.reply.clone())
+        match &self.cut {
+            Some(outcome) => outcome.clone(),
+            None => Outcome::Acknowledged(self.reply.clone()),
         }
+    }
+
+    /// Answers a command that the drive took; what a read must show, and the receipt that tells so.
+    pub fn acknowledge(self, outcome: Outcome, now: Instant) -> (Vec<Effect>, Receipt) {
+        (self.effects, self.ticket.acknowledge(outcome, now))
     }
 
     /// Answers the command.

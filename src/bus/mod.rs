@@ -1,6 +1,8 @@
 //! The bus: one owner of the line, one transaction at a time.
 
+pub mod confirm;
 pub mod debts;
+pub mod desk;
 pub mod execute;
 pub mod leases;
 pub mod predict;

@@ -3,6 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use super::confirm::NotConfirmed;
 use super::task::{counted, time_of_day};
 use super::transaction::{Ended, Transaction};
 use crate::cache::{BusImage, Direction, FrameRecord, Link, PollCycle};
@@ -123,6 +124,14 @@ impl Report {
             drive.spec.name
         );
         self.tell(EventKind::Offline, Some(index), None, text);
+    }
+
+    pub(super) fn not_confirmed(&self, late: &NotConfirmed) {
+        let Some(drive) = self.image.drives.get(late.drive) else {
+            return;
+        };
+        let text = format!("drive {} {}", drive.spec.name, late.text);
+        self.tell(EventKind::NotConfirmed, Some(late.drive), None, text);
     }
 
     pub(super) fn unavailable(&self, index: usize, read: &PlannedRead, exception: Exception) {

@@ -90,6 +90,8 @@ struct Item {
     failures: u32,
     /// A read of the once class that is still to be done.
     wanted: bool,
+    /// A command changed what it reads: it goes before the round, so that the command is confirmed soon.
+    asked: bool,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -130,6 +132,8 @@ pub struct Schedule {
     slow_credit: Duration,
     commands_in_a_row: u32,
     stops_in_a_row: u32,
+    /// The last poll was one that a command had asked for.
+    asked_last: bool,
 }
 
 impl Schedule {
@@ -162,6 +166,7 @@ impl Schedule {
             slow_credit: Duration::ZERO,
             commands_in_a_row: 0,
             stops_in_a_row: 0,
+            asked_last: false,
         }
     }
 
@@ -211,6 +216,10 @@ impl Schedule {
         self.commands_in_a_row = 0;
         self.stops_in_a_row = 0;
         self.earn(took);
+        let item = self.drives.get_mut(poll.drive);
+        let item = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read));
+        // Two of them never follow one another while a round waits.
+        self.asked_last = item.is_some_and(|item| std::mem::take(&mut item.asked));
         if poll.read.class == PollClass::Fast {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
@@ -258,6 +267,7 @@ impl Schedule {
         {
             item.due = item.due.min(now);
             item.wanted = true;
+            item.asked = !item.refused;
         }
     }
 
@@ -316,6 +326,12 @@ impl Schedule {
         if let Some(probe) = self.due_probe(now) {
             return Some(probe);
         }
+        if let Some(asked) = self
+            .due_asked(now)
+            .filter(|_| !self.asked_last || self.round.is_empty())
+        {
+            return Some(asked);
+        }
         let slow = self.due_slow(now);
         if let Some((due, poll, cost)) = slow
             && self.slow_credit >= cost
@@ -357,6 +373,19 @@ impl Schedule {
                 read,
                 probe: true,
             })
+        })
+    }
+
+    /// The read that a command asked for, waiting longest.
+    fn due_asked(&self, now: Instant) -> Option<Poll> {
+        let online = self.drives.iter().enumerate();
+        let online = online.filter(|(_, d)| d.presence == Presence::Online);
+        let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
+        let due = asked.filter(|(_, item)| item.asked && item.is_slow() && item.due <= now);
+        due.min_by_key(|(_, item)| item.due).map(|(drive, item)| Poll {
+            drive,
+            read: item.read,
+            probe: false,
         })
     }
 
@@ -508,6 +537,7 @@ impl Item {
             refused: false,
             failures: 0,
             wanted: true,
+            asked: false,
         }
     }
 

@@ -5,29 +5,24 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant, SystemTime};
 
 use super::BusOptions;
-use super::debts::Debts;
-use super::execute::{Execution, Next, Shadow};
+use super::desk::{Desk, Job};
 use super::leases::Leases;
 use super::report::Report;
-use super::schedule::{Cadence, Change, Decision, Poll, Polled, Schedule};
+use super::schedule::{Cadence, Change, Poll, Polled, Schedule};
 use super::transaction::{Ended, Step, Transaction};
 use crate::cache::{Outcome as Counted, Snapshot};
 use crate::codec::{Reply, Request, RequestPdu, Table};
 use crate::command::{Command, Outcome, Urgency};
 use crate::drive::plan::WireTime;
-use crate::drive::{ModelPoint, Plan, PlannedRead, PollClass};
+use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::event::Events;
 use crate::line::{self, Line, Lost, Woken};
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
-/// Commands begun at one time (a reset pulse is held while others go on).
-const BEGUN: usize = 8;
 /// A line that never falls silent is spoken on after this time: a stop must get out.
 const BABBLE: Duration = Duration::from_millis(500);
-/// A status older than this does not tell whether the motor runs.
-const FRESH: Duration = Duration::from_secs(2);
 /// The bus looks around at least this often.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 
@@ -92,20 +87,12 @@ impl Drop for BusTask {
     }
 }
 
-/// Who speaks next.
-enum Job {
-    Poll(Poll),
-    Command { index: usize, pdu: RequestPdu },
-}
-
 struct Worker {
     handle: BusHandle,
     options: BusOptions,
     silence: Duration,
     schedule: Schedule,
-    begun: Vec<Execution>,
-    shadow: Shadow,
-    debts: Debts,
+    desk: Desk,
     leases: Leases,
     report: Report,
     stop: Arc<AtomicBool>,
@@ -147,9 +134,7 @@ impl Worker {
             options,
             silence,
             schedule,
-            begun: Vec::new(),
-            shadow: Shadow::default(),
-            debts: Debts::default(),
+            desk: Desk::default(),
             leases,
             report,
             stop,
@@ -179,10 +164,7 @@ impl Worker {
             self.rest(pause);
             pause = (pause * 2).min(REOPEN.1);
         }
-        let now = Instant::now();
-        for execution in self.begun.drain(..) {
-            execution.finish(Outcome::ShuttingDown, now);
-        }
+        self.desk.close(&Outcome::ShuttingDown, Instant::now());
     }
 
     fn stopping(&self) -> bool {
@@ -214,11 +196,9 @@ impl Worker {
     fn lost(&mut self, why: &str) {
         let now = Instant::now();
         self.handle.queue.close(Outcome::BusDown, now);
-        for execution in self.begun.drain(..) {
-            execution.finish(Outcome::BusDown, now);
-        }
+        self.desk.close(&Outcome::BusDown, now);
         for index in 0..self.handle.image.drives.len() {
-            self.shadow.forget(index);
+            self.desk.shadow.forget(index);
             self.report.offline(index, "its bus is down");
         }
         self.report.bus_down(why);
@@ -232,7 +212,11 @@ impl Worker {
                 Ok(job) => self.work(line, job)?,
                 Err(until) => self.idle(line, until.min(now + LOOK_ROUND))?,
             }
-            self.report.tick(Instant::now());
+            let now = Instant::now();
+            for late in self.desk.not_confirmed(&self.handle.image.drives, now) {
+                self.report.not_confirmed(&late);
+            }
+            self.report.tick(now);
         }
         Ok(())
     }
@@ -261,121 +245,24 @@ impl Worker {
 
     /// What goes on the line next, or until when nothing does.
     fn decide(&mut self, now: Instant) -> Result<Job, Instant> {
-        let (begun, mut wake_at) = self.begun_next(now);
-        let queued = self.handle.queue.lock().next_urgency(now);
-        // A full hand of begun commands takes only a stop besides.
-        let queued = queued.filter(|u| self.begun.len() < BEGUN || *u == Urgency::Stop);
-        let waiting = [begun.as_ref().map(|(u, _, _)| *u), queued].into_iter().flatten().min();
-        let decision = self.schedule.next(now, waiting);
+        let drives = &self.handle.image.drives;
+        let decided = self
+            .desk
+            .decide(drives, &mut self.handle.queue.lock(), &mut self.schedule, now);
         if let Some(round) = self.schedule.take_round() {
             self.report.fast_round(round.cycle);
         }
-        match decision {
-            Decision::Poll(poll) => match self.debts.blocks(poll.drive, &poll.read.pdu(), now) {
-                None => Ok(Job::Poll(poll)),
-                Some(until) => {
-                    self.schedule.postpone(&poll, until);
-                    Err(now)
-                }
-            },
-            Decision::Idle(until) => {
-                wake_at = wake_at.map(|at| at.min(until)).or(Some(until));
-                Err(wake_at.unwrap_or(until))
-            }
-            Decision::Command(urgency) => match begun {
-                Some((of_begun, index, pdu)) if queued.is_none_or(|q| of_begun <= q) => Ok(Job::Command { index, pdu }),
-                _ => {
-                    self.begin(urgency, now);
-                    // What was begun is decided on anew: it may wait, or another one may go first.
-                    Err(now)
-                }
-            },
-        }
-    }
-
-    /// The begun command that can go on, of the highest rank; else when one can.
-    fn begun_next(&mut self, now: Instant) -> (Option<(Urgency, usize, RequestPdu)>, Option<Instant>) {
-        let mut best: Option<(Urgency, usize, RequestPdu)> = None;
-        let mut wake_at: Option<Instant> = None;
-        let mut done = Vec::new();
-        for (index, execution) in self.begun.iter_mut().enumerate() {
-            let Some(drive) = self.handle.image.drives.get(execution.drive) else {
-                continue;
-            };
-            let running = drive.reading(now, FRESH).is_set(ModelPoint::Running);
-            match execution.next(&self.shadow, &drive.spec.profile, running, now) {
-                Next::Send(pdu) => {
-                    // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
-                    let blocked = self.debts.blocks(execution.drive, &pdu, now);
-                    if let Some(until) = blocked.filter(|_| execution.urgency != Urgency::Stop) {
-                        wake_at = Some(wake_at.map_or(until, |at| at.min(until)));
-                        continue;
-                    }
-                    if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
-                        best = Some((execution.urgency, index, pdu));
-                    }
-                }
-                Next::Wait(until) => wake_at = Some(wake_at.map_or(until, |at| at.min(until))),
-                Next::Done => done.push(index),
-            }
-        }
-        if !done.is_empty() {
-            for index in done.into_iter().rev() {
-                let execution = self.begun.remove(index);
-                let outcome = execution.success();
-                execution.finish(outcome, now);
-            }
-            return self.begun_next(now);
-        }
-        (best, wake_at)
-    }
-
-    /// Takes the next command from the queue.
-    fn begin(&mut self, at_least: Urgency, now: Instant) {
-        let Some(command) = self.handle.queue.lock().pop(at_least, now) else {
-            return;
-        };
-        let profile = self
-            .handle
-            .image
-            .drives
-            .get(command.drive)
-            .map(|d| d.spec.profile.clone());
-        let Some(profile) = profile else {
-            command.ticket.answer(Outcome::Offline, now);
-            return;
-        };
-        if !self.schedule.is_online(command.drive) {
-            command.ticket.answer(Outcome::Offline, now);
-            return;
-        }
-        if command.urgency == Urgency::Stop {
-            self.purge(command.drive, now);
-        }
-        self.begun.push(Execution::new(command, &profile));
-    }
-
-    /// Nothing that was begun for a drive goes on behind a stop.
-    fn purge(&mut self, drive: usize, now: Instant) {
-        let mut index = 0;
-        while let Some(execution) = self.begun.get_mut(index) {
-            let over = execution.drive == drive && execution.urgency == Urgency::Command && execution.purge();
-            if over {
-                self.begun.remove(index).finish(Outcome::Purged, now);
-            } else {
-                index += 1;
-            }
-        }
+        decided
     }
 
     fn work(&mut self, line: &Line, job: Job) -> Result<(), Lost> {
         let (drive, pdu, urgency) = match &job {
             Job::Poll(poll) => (poll.drive, poll.read.pdu(), None),
             Job::Command { index, pdu } => {
-                let Some(execution) = self.begun.get(*index) else {
+                let Some((drive, urgency)) = self.desk.begun(*index) else {
                     return Ok(());
                 };
-                (execution.drive, pdu.clone(), Some(execution.urgency))
+                (drive, pdu.clone(), Some(urgency))
             }
         };
         let Some(address) = self.handle.image.drives.get(drive).map(|d| d.spec.address) else {
@@ -485,7 +372,7 @@ impl Worker {
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(poll.drive, &poll.read.pdu(), now);
+                self.desk.debts.given_up(poll.drive, &poll.read.pdu(), now);
                 Polled::Failed
             }
         };
@@ -496,7 +383,7 @@ impl Worker {
         match change {
             Change::Online => self.report.online(poll.drive),
             Change::Offline => {
-                self.shadow.forget(poll.drive);
+                self.desk.shadow.forget(poll.drive);
                 self.report.offline(poll.drive, "it does not answer");
                 let gone = |c: &Command| c.drive == poll.drive;
                 self.handle.queue.lock().remove(now, &Outcome::Offline, gone);
@@ -506,6 +393,7 @@ impl Worker {
         }
         if matches!(ended, Ended::Reply(_)) {
             self.report.look(poll.drive, began);
+            self.desk.look(poll.drive, &self.handle.image.drives, now);
         }
     }
 
@@ -522,7 +410,7 @@ impl Worker {
         for (address, word) in (read.start..).zip(&words) {
             let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.address == address);
             if drive.spec.profile.points.iter().any(commanded) {
-                self.shadow.learn(poll.drive, read.table, address, *word);
+                self.desk.shadow.learn(poll.drive, read.table, address, *word);
             }
         }
         drive.update(|snapshot: &mut Snapshot| {
@@ -535,27 +423,22 @@ impl Worker {
 
     fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, took: Duration) {
         let now = Instant::now();
-        let Some(execution) = self.begun.get_mut(index) else {
+        let Some((drive, urgency)) = self.desk.begun(index) else {
             return;
         };
-        let drive = execution.drive;
-        self.schedule.command_done(execution.urgency, took);
-        let outcome = match ended {
+        self.schedule.command_done(urgency, took);
+        let reply = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
-                execution.answered(pdu, reply, &mut self.shadow)
+                Some(reply)
             }
-            Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(drive, pdu, now);
-                execution.failed(self.options.retries)
-            }
+            Ended::Silent | Ended::Corrupt(_) => None,
         };
+        let drives = &self.handle.image.drives;
+        self.desk.ended(index, pdu, reply, self.options.retries, drives, now);
         if pdu.is_write() {
             self.schedule
                 .refresh(drive, |read| written(pdu).any(|a| read.covers(Table::Holding, a)), now);
-        }
-        if let Some(outcome) = outcome {
-            self.begun.remove(index).finish(outcome, now);
         }
     }
 }

@@ -164,8 +164,8 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     }
 }
 
-/// The registers that a raw write sets, as address and value.
-fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {
+/// The registers (or coils, as 0 and 1) that a raw write sets, as address and value.
+pub fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {
     let many = |start: u16, values: &mut dyn Iterator<Item = u16>| -> Vec<(u16, u16)> {
         (0u16..)
             .zip(values)

@@ -5,12 +5,14 @@
 //! so a command can neither be answered twice nor be forgotten.
 
 mod admit;
+mod audit;
 mod queue;
 mod ticket;
 
-pub use admit::{Admitted, admit};
+pub use admit::{Admitted, admit, written};
+pub use audit::{AUDIT_KEPT, AUDIT_SHARE, Audit, AuditRecord, Change};
 pub use queue::{CAPACITY, CommandQueue, Pending};
-pub use ticket::{Ticket, WriteStats};
+pub use ticket::{Receipt, Ticket, WriteStats};
 
 use std::fmt;
 use std::time::{Duration, Instant};
@@ -20,6 +22,9 @@ use crate::drive::Value;
 
 /// Time after which a command is not sent any more, unless it says otherwise.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
+
+/// The result code of an acknowledged command whose effect a read showed.
+pub const CONFIRMED: &str = "confirmed";
 
 /// Where a command comes from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
@@ -174,7 +179,9 @@ impl fmt::Display for Outcome {
             Outcome::Exception(code) => write!(f, "the drive refused it with {code}"),
             Outcome::Refused(refusal) => refusal.fmt(f),
             Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
-            Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
+            Outcome::Expired => {
+                f.write_str("its time ran out before its turn came; what was not sent by then is not sent any more")
+            }
             Outcome::Replaced => f.write_str("a newer reference took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
@@ -226,4 +233,40 @@ pub struct Answer {
     pub outcome: Outcome,
     /// From acceptance to answer.
     pub latency: Duration,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_documentation_tells_every_answer() {
+        let page = include_str!("../../docs/commands.md");
+        let refusals = [Refusal::NotAllowed, Refusal::NotWritable, Refusal::BadValue];
+        let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
+        outcomes.extend([
+            Outcome::Acknowledged(Reply::Written),
+            Outcome::TimedOut,
+            Outcome::Expired,
+            Outcome::Replaced,
+            Outcome::Purged,
+            Outcome::BusDown,
+            Outcome::Offline,
+            Outcome::QueueFull,
+            Outcome::ShuttingDown,
+        ]);
+        for outcome in outcomes {
+            let exception = outcome
+                .exception()
+                .map_or("none".to_string(), |e| format!("{:02X}", e.0));
+            let row = format!("| `{}` | {exception} |", outcome.code());
+            assert!(page.contains(&row), "docs/commands.md lacks {row}");
+        }
+        assert!(page.contains(&format!("| `{}` |", Outcome::Exception(Exception::BUSY).code())));
+        assert_eq!(
+            Outcome::Exception(Exception(0x33)).exception(),
+            Some(Exception::DEVICE_FAILURE)
+        );
+        assert_eq!(Outcome::Exception(Exception::BUSY).exception(), Some(Exception::BUSY));
+    }
 }

@@ -2,18 +2,20 @@
 
 use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
+use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::oneshot;
 
-use super::{Answer, Origin, Outcome, SourceKind};
+use super::audit::{Audit, AuditRecord, Change};
+use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind};
 use crate::cache::{Histogram, HistogramSnapshot};
 
-/// Counters of commands, for the metrics.
+/// Counters of commands, for the metrics, and the audit.
 #[derive(Debug, Default)]
 pub struct WriteStats {
     results: Mutex<BTreeMap<(SourceKind, &'static str), u64>>,
     seconds: Histogram,
+    audit: Audit,
 }
 
 impl WriteStats {
@@ -27,6 +29,11 @@ impl WriteStats {
         self.seconds.snapshot()
     }
 
+    /// The last commands.
+    pub fn audit(&self) -> &Audit {
+        &self.audit
+    }
+
     fn note(&self, source: SourceKind, answer: &Answer) {
         let mut results = self.results.lock().unwrap_or_else(PoisonError::into_inner);
         *results.entry((source, answer.outcome.code())).or_default() += 1;
@@ -34,16 +41,21 @@ impl WriteStats {
     }
 }
 
-/// Answers a command exactly once: by [`Ticket::answer`], or as "shutting down" when it is dropped.
+/// Answers a command exactly once: by [`Ticket::answer`] or [`Ticket::acknowledge`], or as "shutting down" when it
+/// is dropped. The audit follows when nothing more is to be told of the command.
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
     drive: String,
     what: String,
+    changes: Vec<Change>,
     write: bool,
     accepted: Instant,
     stats: Arc<WriteStats>,
     sender: Option<oneshot::Sender<Answer>>,
+    confirmation: Option<oneshot::Sender<Duration>>,
+    answered: Option<(Outcome, Duration)>,
+    confirmed: Option<Duration>,
 }
 
 impl Ticket {
@@ -62,12 +74,30 @@ impl Ticket {
             origin,
             drive: drive.to_string(),
             what,
+            changes: Vec::new(),
             write,
             accepted,
             stats,
             sender: Some(sender),
+            confirmation: None,
+            answered: None,
+            confirmed: None,
         };
         (ticket, receiver)
+    }
+
+    /// The values that the command sets, for the audit.
+    pub fn with_changes(mut self, changes: Vec<Change>) -> Ticket {
+        self.changes = changes;
+        self
+    }
+
+    /// Where the time arrives from acceptance to the read that showed the effect. Closed without a time when no read
+    /// showed it, always within the time of the profile after the acknowledgement.
+    pub fn confirmation(&mut self) -> oneshot::Receiver<Duration> {
+        let (sender, receiver) = oneshot::channel();
+        self.confirmation = Some(sender);
+        receiver
     }
 
     /// Who commanded.
@@ -75,32 +105,52 @@ impl Ticket {
         &self.origin
     }
 
-    /// Answers the command.
+    /// Answers the command; nothing more is to be told of it.
     pub fn answer(mut self, outcome: Outcome, now: Instant) {
         self.settle(outcome, now);
     }
 
+    /// Answers the command; whether it shows its effect is told later.
+    pub fn acknowledge(mut self, outcome: Outcome, now: Instant) -> Receipt {
+        self.settle(outcome, now);
+        Receipt(self)
+    }
+
     fn settle(&mut self, outcome: Outcome, now: Instant) {
         let Some(sender) = self.sender.take() else { return };
-        let answer = Answer {
-            outcome,
-            latency: now.saturating_duration_since(self.accepted),
-        };
+        let latency = now.saturating_duration_since(self.accepted);
+        self.answered = Some((outcome.clone(), latency));
+        let answer = Answer { outcome, latency };
         if self.write {
             self.stats.note(self.origin.kind, &answer);
-            tracing::info!(
-                target: "audit",
-                source = self.origin.kind.name(),
-                who = %self.origin.who,
-                drive = %self.drive,
-                command = %self.what,
-                result = answer.outcome.code(),
-                latency_us = answer.latency.as_micros() as u64,
-                "{}", answer.outcome
-            );
         }
         // The client may have gone: the command was answered all the same.
         let _ = sender.send(answer);
+    }
+
+    fn audit(&mut self) {
+        let Some((outcome, latency)) = self.answered.take().filter(|_| self.write) else {
+            return;
+        };
+        let (result, text) = match self.confirmed {
+            Some(_) => (CONFIRMED, "the drive acknowledged it and shows its effect".to_string()),
+            None => (outcome.code(), outcome.to_string()),
+        };
+        let record = AuditRecord {
+            time: SystemTime::now(),
+            source: self.origin.kind.name(),
+            share: self.origin.client(),
+            client: std::mem::take(&mut self.origin.who),
+            drive: std::mem::take(&mut self.drive),
+            command: std::mem::take(&mut self.what),
+            points: std::mem::take(&mut self.changes),
+            result,
+            text,
+            latency,
+            confirmed: self.confirmed,
+        };
+        record.log();
+        self.stats.audit.keep(record);
     }
 }
 
@@ -109,6 +159,28 @@ impl Drop for Ticket {
         if self.sender.is_some() {
             self.settle(Outcome::ShuttingDown, Instant::now());
         }
+        self.audit();
+    }
+}
+
+/// A command that was answered and may still be confirmed. Dropped, it stays "acknowledged".
+#[derive(Debug)]
+pub struct Receipt(Ticket);
+
+impl Receipt {
+    /// A read showed the effect.
+    pub fn confirm(mut self, now: Instant) {
+        let time = now.saturating_duration_since(self.0.accepted);
+        self.0.confirmed = Some(time);
+        if let Some(sender) = self.0.confirmation.take() {
+            // The client may have gone, or never asked.
+            let _ = sender.send(time);
+        }
+    }
+
+    /// The command in one line.
+    pub fn what(&self) -> &str {
+        &self.0.what
     }
 }
 
@@ -136,5 +208,30 @@ pub(super) mod tests {
         assert_eq!(dropped.try_recv().unwrap().outcome, Outcome::ShuttingDown);
         assert_eq!(stats.results().values().sum::<u64>(), 2);
         assert_eq!(stats.seconds().count, 2);
+        let audited: Vec<_> = stats.audit().recent().iter().map(|r| r.result).collect();
+        assert_eq!(audited, ["timeout", "shutting_down"]);
+    }
+
+    #[test]
+    fn a_confirmation_comes_after_the_one_answer() {
+        let stats = Arc::new(WriteStats::default());
+        let now = Instant::now();
+        let acknowledged = Outcome::Acknowledged(crate::codec::Reply::Written);
+        let (mut ticket, mut answer) = ticket(&stats, now);
+        let mut confirmation = ticket.confirmation();
+        let receipt = ticket.acknowledge(acknowledged.clone(), now + Duration::from_millis(5));
+        assert_eq!(answer.try_recv().unwrap().outcome, acknowledged);
+        assert!(stats.audit().recent().is_empty(), "one line tells both");
+        receipt.confirm(now + Duration::from_millis(9));
+        assert_eq!(confirmation.try_recv(), Ok(Duration::from_millis(9)));
+        let record = &stats.audit().recent()[0];
+        assert_eq!((record.result, record.latency.as_millis()), ("confirmed", 5));
+        assert_eq!(record.confirmed, Some(Duration::from_millis(9)));
+        let (mut ticket, _answer) = self::ticket(&stats, now);
+        let mut confirmation = ticket.confirmation();
+        drop(ticket.acknowledge(acknowledged, now));
+        assert!(confirmation.try_recv().is_err());
+        assert_eq!(stats.audit().recent()[1].result, "acknowledged");
+        assert_eq!(stats.results().values().sum::<u64>(), 2);
     }
 }

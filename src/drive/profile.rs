@@ -29,6 +29,8 @@ pub struct Profile {
     pub turnaround: Duration,
     /// Period at which the drive takes over its process data; a reset pulse is held for two of them.
     pub update_period: Duration,
+    /// Time after an acknowledged command within which a read must show its effect.
+    pub confirm_within: Duration,
     /// Function 04 reads the same registers as function 03.
     pub input_is_holding: bool,
     /// Name of the behaviour that a simulated drive of this profile has.

@@ -140,6 +140,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
         addresses,
         turnaround: reader.or("turnaround", Duration::from_millis(2)),
         update_period: reader.or("update_period", Duration::from_millis(10)),
+        confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
         input_is_holding,
         simulator: reader.optional("simulator"),
         ranges,

@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 use crate::client::{PATIENCE, get, raw, request};
 use crate::plant::{self, HOLDING, STALE_AFTER, Server};
 
-const PLACES: [&str; 12] = [
+const PLACES: [&str; 13] = [
     "/",
     "/assets/style.css",
     "/assets/page.js",
@@ -29,6 +29,7 @@ const PLACES: [&str; 12] = [
     "/api/v1/drives",
     "/api/v1/drives/pump-1",
     "/api/v1/buses",
+    "/api/v1/audit",
     "/api/v1/events",
     "/api/v1/trace",
 ];

@@ -54,6 +54,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/buses", get(buses))
+        .route("/api/v1/audit", get(audit))
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/trace", get(streams::trace))
         .fallback(unknown)
@@ -169,6 +170,12 @@ async fn buses(State(served): State<Arc<Served>>) -> Response {
     let plant = served.plant.load();
     let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
     Json(all).into_response()
+}
+
+/// The last commands, newest last.
+async fn audit(State(served): State<Arc<Served>>) -> Response {
+    let records = served.plant.load().writes.audit().recent();
+    Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
 async fn unknown(uri: Uri) -> Response {

@@ -12,7 +12,7 @@ use super::connection::is_topic;
 use super::outbox::Message;
 use super::payload::{self, Topics};
 use super::request::{self, Incoming, MAX_NAME, excerpt};
-use crate::command::{Answer, Order, Origin, Outcome, SourceKind};
+use crate::command::{Answer, CONFIRMED, Order, Origin, Outcome, SourceKind};
 use crate::document::nearest;
 use crate::plant::Plant;
 
@@ -74,13 +74,14 @@ impl Commands {
             Ok((points, expiry)) => {
                 self.remember(fingerprint);
                 self.running.spawn(async move {
-                    let answer = drive.order(Order::Points(points), origin, true, expiry).await;
-                    (fingerprint, reply.answer(request.id, &answer))
+                    let order = Order::Points(points);
+                    let (answer, confirmed) = drive.order_confirmed(order, origin, true, expiry).await;
+                    (fingerprint, reply.answer(request.id, &answer, confirmed))
                 });
                 return None;
             }
         };
-        Some(reply.answer(request.id, &answer))
+        Some(reply.answer(request.id, &answer, None))
     }
 
     fn remember(&mut self, fingerprint: u64) {
@@ -139,6 +140,9 @@ struct ResultObject<'r> {
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<ErrorObject<'r>>,
     latency_ms: f64,
+    /// From acceptance to the read that showed the effect.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    confirmed_ms: Option<f64>,
     time: String,
 }
 
@@ -159,12 +163,28 @@ impl Reply {
         }
     }
 
-    fn answer(&self, id: Option<Json>, answer: &Answer) -> Message {
+    /// The one result: `confirmed` when a read showed the effect in time, else how the bus answered.
+    fn answer(&self, id: Option<Json>, answer: &Answer, confirmed: Option<Duration>) -> Message {
         let text = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
-        self.message(id, answer.outcome.code(), text, answer.latency)
+        let code = match confirmed {
+            Some(_) => CONFIRMED,
+            None => answer.outcome.code(),
+        };
+        self.put(id, code, text, answer.latency, confirmed)
     }
 
     fn message(&self, id: Option<Json>, code: &str, error: Option<String>, latency: Duration) -> Message {
+        self.put(id, code, error, latency, None)
+    }
+
+    fn put(
+        &self,
+        id: Option<Json>,
+        code: &str,
+        error: Option<String>,
+        latency: Duration,
+        confirmed: Option<Duration>,
+    ) -> Message {
         let object = ResultObject {
             id,
             drive: &self.drive,
@@ -172,6 +192,7 @@ impl Reply {
             result: code,
             error: error.map(|message| ErrorObject { code, message }),
             latency_ms: payload::milliseconds(latency),
+            confirmed_ms: confirmed.map(payload::milliseconds),
             time: payload::rfc3339(SystemTime::now()),
         };
         // Strings, figures and what was JSON before: this cannot fail.
