@@ -255,6 +255,10 @@ impl Daemon {
     /// Writes the stop to the drives that are configured so, and waits for their acknowledgements.
     async fn stop_drives(&self) {
         let plant = self.plant.load_full();
+        for bus in &plant.buses {
+            // A command that comes by MQTT now must not start again what is stopped.
+            bus.queue.stops_only(Instant::now());
+        }
         let wanted = |d: &DriveHandle| {
             let spec = &d.image.spec;
             spec.on_shutdown == OnShutdown::Stop

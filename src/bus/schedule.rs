@@ -1,7 +1,8 @@
 //! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls (public contract, section 8).
-//! Three rules soften it: after eight commands in a row a due poll goes first; slow polls that had less than 5 %
+//! Four rules soften it: after eight commands in a row a due poll goes first; commands other than stops have half of
+//! a line that is busy with polls at most; slow polls that had less than 5 %
 //! of the line go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 use std::collections::VecDeque;
@@ -132,6 +133,10 @@ pub struct Schedule {
     slow_credit: Duration,
     commands_in_a_row: u32,
     stops_in_a_row: u32,
+    /// Time of the line that commands had more than polls, since polls last had nothing to do.
+    command_lead: Duration,
+    /// Time of the last command: eight of it are the lead that a burst may have.
+    command_took: Duration,
     /// The last poll was one that a command had asked for.
     asked_last: bool,
 }
@@ -166,6 +171,8 @@ impl Schedule {
             slow_credit: Duration::ZERO,
             commands_in_a_row: 0,
             stops_in_a_row: 0,
+            command_lead: Duration::ZERO,
+            command_took: Duration::ZERO,
             asked_last: false,
         }
     }
@@ -174,16 +181,21 @@ impl Schedule {
     pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
         self.start_round(now);
         let poll = self.due_poll(now);
+        if poll.is_none() {
+            self.command_lead = Duration::ZERO;
+        }
         if let Some(urgency) = waiting {
             let row = if urgency == Urgency::Stop {
                 self.stops_in_a_row
             } else {
                 self.commands_in_a_row
             };
-            if poll.is_none() || row < COMMANDS_IN_A_ROW {
+            let share = urgency == Urgency::Stop || self.command_lead < COMMANDS_IN_A_ROW * self.command_took;
+            if poll.is_none() || (row < COMMANDS_IN_A_ROW && (share || self.command_lead.is_zero())) {
                 return Decision::Command(urgency);
             }
         }
+
         match poll {
             Some(poll) => Decision::Poll(poll),
             None => Decision::Idle(self.next_due(now)),
@@ -203,6 +215,10 @@ impl Schedule {
     /// A command (or a step of one) was on the line for `took`.
     pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
         self.commands_in_a_row += 1;
+        if urgency != Urgency::Stop {
+            self.command_lead += took;
+            self.command_took = took;
+        }
         self.stops_in_a_row = if urgency == Urgency::Stop {
             self.stops_in_a_row + 1
         } else {
@@ -215,6 +231,7 @@ impl Schedule {
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         self.commands_in_a_row = 0;
         self.stops_in_a_row = 0;
+        self.command_lead = self.command_lead.saturating_sub(took);
         self.earn(took);
         let item = self.drives.get_mut(poll.drive);
         let item = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read));

@@ -137,9 +137,11 @@ fn eight_commands_then_a_poll() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     bench.run(Duration::from_secs(1));
     bench.log.clear();
-    for _ in 0..90 {
+    for _ in 0..108 {
         bench.step(Some(Urgency::Command));
     }
+    let first = bench.log.iter().take_while(|(_, d)| matches!(d, Decision::Command(_)));
+    assert_eq!(first.count(), 8);
     let mut row = 0;
     for (_, decision) in &bench.log {
         row = if matches!(decision, Decision::Command(_)) {
@@ -150,7 +152,38 @@ fn eight_commands_then_a_poll() {
         assert!(row <= 8);
     }
     let polls = bench.log.iter().filter(|(_, d)| matches!(d, Decision::Poll(_))).count();
-    assert_eq!(polls, 10);
+    assert_eq!(polls, 50, "behind the first eight, each has its half");
+}
+
+proptest::proptest! {
+    #[test]
+    fn a_flood_leaves_polls_half_of_a_saturated_line(
+        costs in proptest::collection::vec((1u64..40, 1u64..40, proptest::bool::weighted(0.8)), 200..600),
+        drives in 1usize..12,
+    ) {
+        let mut bench = Bench::new(drives, Duration::from_millis(1));
+        bench.run(Duration::from_secs(1));
+        let (mut commands, mut polls) = (Duration::ZERO, Duration::ZERO);
+        for (command, poll, waiting) in costs {
+            let rank = waiting.then_some(Urgency::Command);
+            let (command, poll_took) = (Duration::from_millis(command), Duration::from_millis(poll));
+            match bench.schedule.next(bench.now, rank) {
+                Decision::Command(urgency) => {
+                    bench.now += command;
+                    commands += command;
+                    bench.schedule.command_done(urgency, command);
+                }
+                Decision::Poll(poll) => {
+                    bench.now += poll_took;
+                    polls += poll_took;
+                    bench.schedule.poll_done(&poll, Polled::Ok, poll_took, bench.now);
+                }
+                Decision::Idle(until) => bench.now = until,
+            }
+            // A burst of eight and one command on top.
+            proptest::prop_assert!(commands <= polls + Duration::from_millis(9 * 40), "{commands:?} {polls:?}");
+        }
+    }
 }
 
 #[test]

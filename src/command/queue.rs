@@ -19,15 +19,24 @@ pub struct Pending {
     waiting: VecDeque<Command>,
     /// Set when the queue takes nothing any more: the answer that every command gets.
     closed: Option<Outcome>,
+    /// The gateway is about to stop: only stops get in.
+    stops_only: bool,
+    /// Clients in the order in which they were served, the last one last.
+    served: VecDeque<String>,
 }
 
 impl Pending {
     /// Takes a command in. A stop removes the queued run and reference commands of its drive; a newer
-    /// reference takes the place of an older one; when 64 wait, only a stop still gets in, in place of the
-    /// youngest forwarded read or command.
+    /// reference takes the place of an older one. When 64 wait, a stop takes the place of the youngest command or
+    /// forwarded read of the client that has the most of them; anything takes the place of the youngest of a client
+    /// that has more waiting than its own client would have.
     pub fn push(&mut self, command: Command, now: Instant) {
         if let Some(outcome) = &self.closed {
             command.ticket.answer(outcome.clone(), now);
+            return;
+        }
+        if self.stops_only && command.urgency != Urgency::Stop {
+            command.ticket.answer(Outcome::ShuttingDown, now);
             return;
         }
         if command.urgency == Urgency::Stop {
@@ -41,13 +50,9 @@ impl Pending {
             });
         }
         if self.waiting.len() >= CAPACITY {
-            let victim = self.waiting.iter().rposition(|c| c.urgency > Urgency::Stop);
-            match (command.urgency, victim.and_then(|i| self.waiting.remove(i))) {
-                (Urgency::Stop, Some(victim)) => victim.ticket.answer(Outcome::QueueFull, now),
-                (_, restored) => {
-                    if let (Some(restored), Some(i)) = (restored, victim) {
-                        self.waiting.insert(i, restored);
-                    }
+            match self.victim(&command).and_then(|index| self.waiting.remove(index)) {
+                Some(victim) => victim.ticket.answer(Outcome::QueueFull, now),
+                None => {
                     command.ticket.answer(Outcome::QueueFull, now);
                     return;
                 }
@@ -56,17 +61,56 @@ impl Pending {
         self.waiting.push_back(command);
     }
 
+    /// Whose place a command takes in a full queue.
+    fn victim(&self, command: &Command) -> Option<usize> {
+        let held = |client: &str, least: Urgency| {
+            let of_client = |c: &&Command| c.ticket.client() == client && c.urgency >= least;
+            self.waiting.iter().filter(of_client).count()
+        };
+        let youngest = |least: Urgency| {
+            let candidates = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency >= least);
+            candidates.max_by_key(|(index, c)| (held(c.ticket.client(), least), *index))
+        };
+        if command.urgency == Urgency::Stop
+            && let Some((index, _)) = youngest(Urgency::Command)
+        {
+            return Some(index);
+        }
+        // Stops are never pushed out by less than a stop.
+        let least = if command.urgency == Urgency::Stop {
+            Urgency::Stop
+        } else {
+            Urgency::Command
+        };
+        let own = held(command.ticket.client(), Urgency::Stop) + 1;
+        youngest(least)
+            .filter(|(_, c)| held(c.ticket.client(), least) > own)
+            .map(|(index, _)| index)
+    }
+
     /// Rank of the command that would come next, expired ones answered and removed.
     pub fn next_urgency(&mut self, now: Instant) -> Option<Urgency> {
         self.remove(now, &Outcome::Expired, |c| c.expires <= now);
         self.waiting.iter().map(|c| c.urgency).min()
     }
 
-    /// Takes the next command of at least that rank: the oldest of the highest rank.
+    /// Takes the next command of at least that rank: of the highest rank, the oldest of the client that was served
+    /// longest ago.
     pub fn pop(&mut self, at_least: Urgency, now: Instant) -> Option<Command> {
         let urgency = self.next_urgency(now).filter(|u| *u <= at_least)?;
-        let index = self.waiting.iter().position(|c| c.urgency == urgency)?;
-        self.waiting.remove(index)
+        let served = |c: &Command| self.served.iter().position(|s| s == c.ticket.client());
+        let of_rank = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency == urgency);
+        // `None`, never served, comes before any place.
+        let (index, _) = of_rank.min_by_key(|(index, c)| (served(c), *index))?;
+        let command = self.waiting.remove(index)?;
+        let client = command.ticket.client();
+        self.served.retain(|s| s != client);
+        // Only clients that wait are told apart; more of them than commands can wait there are not.
+        if self.served.len() >= CAPACITY {
+            self.served.pop_front();
+        }
+        self.served.push_back(client.to_string());
+        Some(command)
     }
 
     /// Answers and removes the commands that `which` names.
@@ -145,6 +189,14 @@ impl CommandQueue {
         pending.closed = Some(outcome);
     }
 
+    /// From now on only stops get in: the gateway is about to stop, and nothing may start a drive again. What waits
+    /// is answered, stops apart.
+    pub fn stops_only(&self, now: Instant) {
+        let mut pending = self.lock();
+        pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
+        pending.stops_only = true;
+    }
+
     /// Takes commands again.
     pub fn open(&self) {
         self.lock().closed = None;
@@ -177,7 +229,7 @@ mod tests {
     use tokio::sync::oneshot::Receiver;
 
     use super::super::ticket::tests::ticket;
-    use super::super::{Answer, WriteStats};
+    use super::super::{Answer, Origin, SourceKind, Ticket, WriteStats};
     use super::*;
     use crate::drive::Value;
 
@@ -211,6 +263,25 @@ mod tests {
                 },
                 self.now,
             );
+            receiver
+        }
+
+        fn push_from(&mut self, who: &str, drive: usize, points: &[usize]) -> Receiver<Answer> {
+            let origin = Origin {
+                kind: SourceKind::Mqtt,
+                who: who.to_string(),
+            };
+            let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
+            let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
+            let command = Command {
+                drive,
+                order,
+                urgency: Urgency::Command,
+                reference_only: false,
+                expires: self.now + Duration::from_secs(2),
+                ticket,
+            };
+            self.pending.push(command, self.now);
             receiver
         }
 
@@ -268,6 +339,59 @@ mod tests {
         assert_eq!(outcome(waiting.first_mut().unwrap()), None);
         assert_eq!(bench.pending.len(), CAPACITY);
         assert_eq!(bench.pop(), Some((2, Urgency::Stop)));
+    }
+
+    #[test]
+    fn clients_take_turns_and_each_keeps_its_order() {
+        let mut bench = Bench::new();
+        let mut flood: Vec<_> = (0..CAPACITY).map(|i| bench.push_from("flood", 1, &[i])).collect();
+        let mut quiet: Vec<_> = (0..3).map(|i| bench.push_from("quiet", 2, &[i])).collect();
+        assert_eq!(bench.pending.len(), CAPACITY);
+        assert_eq!(flood.iter_mut().filter_map(outcome).count(), 3, "the flood made room");
+        assert!(quiet.iter_mut().all(|q| outcome(q).is_none()));
+        let popped: Vec<_> = (0..8)
+            .map(|_| bench.pending.pop(Urgency::Read, bench.now).unwrap())
+            .map(|c| (c.drive, c.order))
+            .collect();
+        let of = |drive: usize, point: usize| (drive, Order::Points(vec![(point, Value::Bool(true))]));
+        assert_eq!(
+            popped[..6],
+            [of(1, 0), of(2, 0), of(1, 1), of(2, 1), of(1, 2), of(2, 2)]
+        );
+        assert_eq!(popped[6..], [of(1, 3), of(1, 4)]);
+    }
+
+    #[test]
+    fn many_clients_get_equal_places() {
+        let mut bench = Bench::new();
+        let mut all: Vec<(usize, Receiver<Answer>)> = Vec::new();
+        for round in 0..CAPACITY {
+            for client in 0..4 {
+                all.push((client, bench.push_from(&client.to_string(), client, &[round])));
+            }
+        }
+        for client in 0..4 {
+            let waiting = all.iter_mut().filter(|(c, _)| *c == client);
+            assert_eq!(
+                waiting.filter_map(|(_, r)| outcome(r).is_none().then_some(())).count(),
+                CAPACITY / 4
+            );
+        }
+    }
+
+    #[test]
+    fn before_the_end_only_stops_get_in() {
+        let queue = CommandQueue::new().unwrap();
+        let mut bench = Bench::new();
+        std::mem::swap(&mut *queue.lock(), &mut bench.pending);
+        queue.stops_only(bench.now);
+        std::mem::swap(&mut *queue.lock(), &mut bench.pending);
+        let mut run = bench.push(1, Urgency::Command, &[1], false);
+        let mut stop = bench.push(1, Urgency::Stop, &[1], false);
+        assert_eq!(
+            (outcome(&mut run), outcome(&mut stop)),
+            (Some(Outcome::ShuttingDown), None)
+        );
     }
 
     #[test]

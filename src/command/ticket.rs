@@ -46,6 +46,7 @@ impl WriteStats {
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
+    client: String,
     drive: String,
     what: String,
     changes: Vec<Change>,
@@ -71,6 +72,7 @@ impl Ticket {
     ) -> (Ticket, oneshot::Receiver<Answer>) {
         let (sender, receiver) = oneshot::channel();
         let ticket = Ticket {
+            client: origin.client(),
             origin,
             drive: drive.to_string(),
             what,
@@ -103,6 +105,11 @@ impl Ticket {
     /// Who commanded.
     pub fn origin(&self) -> &Origin {
         &self.origin
+    }
+
+    /// The client, as shares are reckoned: see [`Origin::client`].
+    pub fn client(&self) -> &str {
+        &self.client
     }
 
     /// Answers the command; nothing more is to be told of it.
@@ -139,7 +146,7 @@ impl Ticket {
         let record = AuditRecord {
             time: SystemTime::now(),
             source: self.origin.kind.name(),
-            share: self.origin.client(),
+            share: std::mem::take(&mut self.client),
             client: std::mem::take(&mut self.origin.who),
             drive: std::mem::take(&mut self.drive),
             command: std::mem::take(&mut self.what),
