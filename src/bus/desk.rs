@@ -141,7 +141,8 @@ impl Desk {
         while let Some(execution) = self.begun.get_mut(index) {
             let over = execution.drive == drive && execution.urgency == Urgency::Command && execution.purge();
             if over {
-                self.begun.remove(index).finish(Outcome::Purged, now);
+                let execution = self.begun.remove(index);
+                self.end(execution, Outcome::Purged, &[], now);
             } else {
                 index += 1;
             }
@@ -170,7 +171,7 @@ impl Desk {
             Some(reply) => execution.answered(pdu, reply, &mut self.shadow),
             None => {
                 self.debts.given_up(execution.drive, pdu, now);
-                execution.failed(retries)
+                execution.failed(pdu, retries)
             }
         };
         if let Some(outcome) = outcome {
@@ -181,6 +182,10 @@ impl Desk {
 
     fn end(&mut self, execution: Execution, outcome: Outcome, drives: &[Arc<DriveImage>], now: Instant) {
         let drive = execution.drive;
+        if execution.in_doubt() {
+            // A bit of another command must not bring back what an unanswered stop took away.
+            self.shadow.forget(drive);
+        }
         let reading = drives.get(drive).map(|d| d.reading(now, FRESH));
         match reading.filter(|_| outcome.is_ok()) {
             Some(reading) => {
@@ -221,3 +226,7 @@ impl Desk {
         self.begun.is_empty()
     }
 }
+
+#[cfg(test)]
+#[path = "desk_tests.rs"]
+mod tests;

@@ -77,6 +77,8 @@ pub struct Execution {
     cut: Option<Outcome>,
     reply: Reply,
     failures: u32,
+    /// A write was sent and not answered: whether the drive took it is not known.
+    in_doubt: bool,
 }
 
 impl Execution {
@@ -107,6 +109,7 @@ impl Execution {
             cut: None,
             reply: Reply::Written,
             failures: 0,
+            in_doubt: false,
         }
     }
 
@@ -153,6 +156,9 @@ impl Execution {
     /// The drive answered the request that [`Execution::next`] gave. The outcome, when the command is over.
     pub fn answered(&mut self, sent: &RequestPdu, reply: Reply, shadow: &mut Shadow) -> Option<Outcome> {
         self.failures = 0;
+        if sent.is_write() {
+            self.in_doubt = false;
+        }
         if let Reply::Exception(code) = reply {
             return Some(Outcome::Exception(code));
         }
@@ -176,9 +182,15 @@ impl Execution {
     }
 
     /// No believable answer came. The outcome, when the tries are used up.
-    pub fn failed(&mut self, retries: u32) -> Option<Outcome> {
+    pub fn failed(&mut self, sent: &RequestPdu, retries: u32) -> Option<Outcome> {
         self.failures += 1;
-        (self.failures > retries).then_some(Outcome::TimedOut)
+        self.in_doubt |= sent.is_write();
+        (self.failures > retries).then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
+    }
+
+    /// Whether the drive may have taken a write that it did not answer: its words are not known then.
+    pub fn in_doubt(&self) -> bool {
+        self.in_doubt
     }
 
     /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
@@ -552,7 +564,7 @@ mod tests {
         let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut shadow);
         assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
         let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
-        assert_eq!(command.failed(1), None);
-        assert_eq!(command.failed(1), Some(Outcome::TimedOut));
+        assert_eq!(command.failed(&sent, 1), None);
+        assert_eq!(command.failed(&sent, 1), Some(Outcome::TimedOut));
     }
 }
