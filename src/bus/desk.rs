@@ -154,6 +154,11 @@ impl Desk {
         self.begun.get(index).map(|e| (e.drive, e.urgency))
     }
 
+    /// Whether the time of a begun command ran out since it was decided on: nothing is sent then.
+    pub fn is_late(&self, index: usize, now: Instant) -> bool {
+        self.begun.get(index).is_some_and(|e| e.is_late(now))
+    }
+
     /// A step of a begun command is over: with the drive's reply, or without one to be believed.
     pub fn ended(
         &mut self,

@@ -75,6 +75,8 @@ pub struct Execution {
     expires: Instant,
     /// Set when it ends before all was sent.
     cut: Option<Outcome>,
+    /// Nothing is left but the end of a pulse, which is sent whatever happens.
+    only_ends: bool,
     reply: Reply,
     failures: u32,
     /// A write was sent and not answered: whether the drive took it is not known.
@@ -107,6 +109,7 @@ impl Execution {
             effects,
             expires,
             cut: None,
+            only_ends: false,
             reply: Reply::Written,
             failures: 0,
             in_doubt: false,
@@ -116,7 +119,7 @@ impl Execution {
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
     /// sent any more, but a reset bit that is set is taken away.
     pub fn next(&mut self, shadow: &Shadow, profile: &Profile, running: bool, now: Instant) -> Next {
-        if now >= self.expires && self.cut.is_none() {
+        if self.is_late(now) {
             let outcome = if self.failures > 0 {
                 Outcome::TimedOut
             } else {
@@ -151,6 +154,11 @@ impl Execution {
                 }
             }
         }
+    }
+
+    /// Its time ran out, and what is left of it was not cut off yet.
+    pub fn is_late(&self, now: Instant) -> bool {
+        now >= self.expires && !self.only_ends
     }
 
     /// The drive answered the request that [`Execution::next`] gave. The outcome, when the command is over.
@@ -213,6 +221,7 @@ impl Execution {
         if !self.actions.iter().any(|a| matches!(a, Action::PulseEnd { .. })) {
             self.actions.clear();
         }
+        self.only_ends = true;
         if before != self.actions.len() {
             self.cut = Some(outcome);
             self.failures = 0;

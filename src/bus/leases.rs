@@ -16,6 +16,9 @@ use crate::plant::BusHandle;
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);
 
+/// Process data older than this does not tell whether the motor runs.
+const FRESH: Duration = Duration::from_secs(2);
+
 /// Watches the leases of one bus.
 #[derive(Debug)]
 pub struct Leases {
@@ -45,7 +48,12 @@ impl Leases {
     /// Looks for leases that ran out and for actions that are still owed.
     pub fn look(&mut self, bus: &BusHandle, now: Instant) {
         for (index, drive) in bus.image.drives.iter().enumerate() {
-            if drive.lease_ran_out(now) && drive.reading(now, Duration::from_secs(60)).is_set(ModelPoint::Running) {
+            // Of a drive that does not answer nobody knows whether it runs: its lease stays until it is back.
+            let Some(running) = drive.reading(now, FRESH).model(ModelPoint::Running).good() else {
+                continue;
+            };
+            if drive.lease_ran_out(now) && running.as_bool() {
+                drive.count_supervision();
                 self.ran_out(bus, index, now);
             }
         }

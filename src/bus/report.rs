@@ -6,9 +6,9 @@ use std::time::{Duration, Instant, SystemTime};
 use super::confirm::NotConfirmed;
 use super::task::{counted, time_of_day};
 use super::transaction::{Ended, Transaction};
-use crate::cache::{BusImage, Direction, FrameRecord, Link, PollCycle};
+use crate::cache::{Access, BusImage, Direction, FrameRecord, Link, PollCycle};
 use crate::codec::{Exception, Reply};
-use crate::drive::{ModelPoint, PlannedRead, Value};
+use crate::drive::{FIELDBUS_FAULT_RESPONSE, ModelPoint, PlannedRead, Value};
 use crate::event::{Event, EventKind, Events};
 
 /// The load of the line is reckoned over this time.
@@ -23,6 +23,8 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last told; `None` is no fault.
     faults: Vec<Option<i64>>,
+    /// Drives whose own response to a silent master was looked at since they came online.
+    looked_at: Vec<bool>,
     up: bool,
     reason: String,
 }
@@ -35,6 +37,7 @@ impl Report {
             events,
             window: Instant::now(),
             busy: Duration::ZERO,
+            looked_at: vec![false; faults.len()],
             faults,
             up: false,
             reason: String::new(),
@@ -103,6 +106,9 @@ impl Report {
             return;
         };
         drive.update(|s| s.link = Link::Online(SystemTime::now()));
+        if let Some(looked_at) = self.looked_at.get_mut(index) {
+            *looked_at = false;
+        }
         self.tell(
             EventKind::Online,
             Some(index),
@@ -143,6 +149,33 @@ impl Report {
             bus = %self.image.spec.name, drive = %drive.spec.name,
             "the drive refuses {} {} with {exception}; its points are bad, asked again every minute", read.table, read.start
         );
+    }
+
+    /// Tells once of a controlled drive that nothing stops when its clients, or the gateway, fall silent.
+    pub(super) fn look_at_supervision(&mut self, index: usize) {
+        let (Some(drive), Some(looked_at)) = (self.image.drives.get(index), self.looked_at.get_mut(index)) else {
+            return;
+        };
+        if *looked_at || drive.spec.access == Access::Monitor {
+            return;
+        }
+        let reading = drive.reading(Instant::now(), Duration::from_secs(60));
+        let point = drive.spec.profile.point_index(FIELDBUS_FAULT_RESPONSE);
+        let Some(response) = point.and_then(|p| reading.sample(p).good()) else {
+            return;
+        };
+        *looked_at = true;
+        if response.as_f64() == 0.0 {
+            let lease = match drive.spec.supervision {
+                Some(_) => "its lease stops it only while the gateway works",
+                None => "and it has no lease: nothing stops it when its client falls silent",
+            };
+            tracing::warn!(
+                bus = %self.image.spec.name, drive = %drive.spec.name,
+                "the drive does not respond to a silent master ({FIELDBUS_FAULT_RESPONSE} = 0), {lease}; \
+                 set the parameter to a stop if the process allows it"
+            );
+        }
     }
 
     /// Faults that came or went with the last poll.

@@ -273,7 +273,10 @@ impl Worker {
         frame.clear();
         self.handle.image.spec.protocol.encode(&request, &mut frame);
         let clear = self.wait_for_silence(line, urgency == Some(Urgency::Stop));
+        let late = matches!(&job, Job::Command { index, .. } if self.desk.is_late(*index, Instant::now()));
         let result = match clear {
+            // What came too late while the line fell silent is not sent.
+            Ok(true) if late => Ok(None),
             Ok(true) => self.exchange(line, drive, &request, &frame).map(Some),
             // A command came in meanwhile: what goes next is decided anew.
             Ok(false) => Ok(None),
@@ -393,6 +396,7 @@ impl Worker {
         }
         if matches!(ended, Ended::Reply(_)) {
             self.report.look(poll.drive, began);
+            self.report.look_at_supervision(poll.drive);
             self.desk.look(poll.drive, &self.handle.image.drives, now);
         }
     }

@@ -118,6 +118,7 @@ pub struct DriveImage {
     /// Last turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
     lease: Mutex<Option<Instant>>,
+    supervisions: AtomicU64,
 }
 
 impl DriveImage {
@@ -134,6 +135,7 @@ impl DriveImage {
             outcomes,
             turnaround: AtomicU64::new(0),
             lease: Mutex::default(),
+            supervisions: AtomicU64::new(0),
         }
     }
 
@@ -194,6 +196,16 @@ impl DriveImage {
         if self.spec.supervision.is_some() {
             *self.lease.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
         }
+    }
+
+    /// Counts a lease that ran out while the drive ran.
+    pub fn count_supervision(&self) {
+        self.supervisions.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Leases that ran out while the drive ran, so far.
+    pub fn supervisions(&self) -> u64 {
+        self.supervisions.load(Ordering::Relaxed)
     }
 
     /// Ends the lease if it ran out; true exactly once for each lease.

@@ -208,7 +208,9 @@ fn judge(
     warn_of_emptiness(reader);
     let commanded = modbus_tcp.is_some_and(|m| !m.options.write.is_empty())
         || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
-    if !commanded {
+    if commanded {
+        warn_of_missing_leases(reader, buses);
+    } else {
         warn_of_idle_control(reader, buses);
     }
     if reader.document().is_sound() {
@@ -324,6 +326,30 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
             format!(
                 "drive `{name}` takes commands but no client may give any; set `write` of [modbus_tcp] or \
                  `commands = true` of [mqtt]"
+            ),
+        );
+    }
+}
+
+/// Drives that are commanded and that nothing stops when whoever commands them falls silent.
+fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {
+            continue;
+        };
+        if spec.supervision.is_some() {
+            continue;
+        }
+        let own = match spec.profile.point_index(crate::drive::FIELDBUS_FAULT_RESPONSE) {
+            Some(_) => "its own response to a silent master, P2.7.22, is 0 by default and sees the gateway poll",
+            None => "no parameter for its own response to a silent master is known",
+        };
+        reader.document().warning(
+            place,
+            format!(
+                "drive `{}` has no lease, so it runs on when its client falls silent; {own}; set \
+                 supervision = {{ timeout = \"5s\", action = \"stop\" }}",
+                spec.name
             ),
         );
     }

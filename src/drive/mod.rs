@@ -8,3 +8,7 @@ mod profile_file;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
 pub use plan::{Plan, PlannedRead};
 pub use profile::{Point, PollClass, Profile, Raw, Source};
+
+/// Name of the point that tells how a drive itself responds to a silent master; 0 is no response. For Vacon NX
+/// parameter P2.7.22.
+pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";

@@ -7,6 +7,7 @@
     reason = "tests may panic"
 )]
 
+mod commands;
 mod demo;
 mod operators;
 mod process;

@@ -107,10 +107,16 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         "drivegate_drive_turnaround_seconds",
         "Time from the end of the last request to the beginning of the drive's answer.",
     );
+    let mut supervision = Family::new(
+        Kind::Counter,
+        "drivegate_supervision_actions_total",
+        "Leases that ran out while the drive ran.",
+    );
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
+        supervision.add(labels.clone(), Figure::Count(image.supervisions()));
         up.add(labels.clone(), yes(reading.snapshot.link.is_online()));
         let current = reading.state();
         for one in State::ALL {
@@ -130,7 +136,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     }
     all.extend([up, state, age]);
     all.append(&mut model);
-    all.extend([point, transactions, turnaround]);
+    all.extend([point, transactions, turnaround, supervision]);
 }
 
 /// The good points of a drive; `model` has the families of [`MODEL`], in its order.

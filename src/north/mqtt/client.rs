@@ -293,7 +293,7 @@ impl Client {
         };
         let plant = self.plant.load();
         if self.options.commands
-            && let Some(result) = self.commands.take(incoming, &plant)
+            && let Some(result) = self.commands.take(incoming, &plant, Instant::now())
         {
             self.outbox.push_result(result);
         }

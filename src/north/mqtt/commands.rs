@@ -2,7 +2,7 @@
 
 use std::collections::VecDeque;
 use std::hash::{BuildHasher, RandomState};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 use serde_json::Value as Json;
@@ -14,12 +14,17 @@ use super::payload::{self, Topics};
 use super::request::{self, Incoming, MAX_NAME, excerpt};
 use crate::command::{Answer, CONFIRMED, Order, Origin, Outcome, SourceKind};
 use crate::document::nearest;
+use crate::drive::ModelPoint;
 use crate::plant::Plant;
 
 /// Commands that wait for their answer.
 const MAX_RUNNING: usize = 64;
+/// Commands that wait for their answer besides, if they are stops.
+const MAX_STOPS: usize = 64;
 /// Messages remembered to recognise a repetition.
 const REMEMBERED: usize = 256;
+/// Time for which a command with an `id` is recognised when it comes again.
+const REPLAYED: Duration = Duration::from_secs(60);
 
 /// Takes commands and gives their results.
 #[derive(Debug)]
@@ -27,8 +32,23 @@ pub(super) struct Commands {
     topics: Topics,
     running: JoinSet<(u64, Message)>,
     hasher: RandomState,
-    /// Commands taken, oldest first: fingerprint, and the result once it is there.
-    recent: VecDeque<(u64, Option<Message>)>,
+    /// Commands taken, oldest first.
+    recent: VecDeque<Taken>,
+    /// Commands taken so far: their numbers.
+    taken: u64,
+}
+
+/// A command that was taken.
+#[derive(Debug)]
+struct Taken {
+    number: u64,
+    fingerprint: u64,
+    packet: u16,
+    /// Hash of topic and `id`, where it has one.
+    identity: Option<u64>,
+    at: Instant,
+    /// Once it is there.
+    result: Option<Message>,
 }
 
 impl Commands {
@@ -38,12 +58,14 @@ impl Commands {
             running: JoinSet::new(),
             hasher: RandomState::new(),
             recent: VecDeque::new(),
+            taken: 0,
         }
     }
 
-    /// Takes a message; returns its result if it is there at once. A repetition of a command (QoS 1) is
-    /// answered from memory and not carried out again.
-    pub(super) fn take(&mut self, incoming: Incoming, plant: &Plant) -> Option<Message> {
+    /// Takes a message; returns its result if it is there at once. A repetition of a command is answered from memory
+    /// and not carried out again: one that the broker marks as such, or the same message with the same `id` within a
+    /// minute. A stop is carried out whenever it comes.
+    pub(super) fn take(&mut self, incoming: Incoming, plant: &Plant, now: Instant) -> Option<Message> {
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
             return None; // somebody takes a retained message away
@@ -54,51 +76,85 @@ impl Commands {
             tracing::warn!(topic = %incoming.topic, "command refused: {text}");
             return Some(reply.message(None, "unknown_drive", Some(text), Duration::ZERO));
         };
-        let fingerprint = self
-            .hasher
-            .hash_one((incoming.packet, &incoming.topic, &incoming.payload));
-        if incoming.dup
-            && let Some((_, result)) = self.recent.iter().find(|(known, _)| *known == fingerprint)
-        {
-            return result.clone();
-        }
         let origin = Origin {
             kind: SourceKind::Mqtt,
             who: incoming.topic.clone(),
         };
-        let request = request::read(&incoming, target.point, &drive.image.spec.profile);
+        let profile = &drive.image.spec.profile;
+        let request = request::read(&incoming, target.point, profile);
         let what = || excerpt(&incoming.payload);
-        let answer = match request.order {
-            Err(refusal) => drive.refuse(&what(), refusal, origin),
-            Ok(_) if self.running.len() >= MAX_RUNNING => drive.turn_away(&what(), Outcome::QueueFull, origin),
-            Ok((points, expiry)) => {
-                self.remember(fingerprint);
-                self.running.spawn(async move {
-                    let order = Order::Points(points);
-                    let (answer, confirmed) = drive.order_confirmed(order, origin, true, expiry).await;
-                    (fingerprint, reply.answer(request.id, &answer, confirmed))
-                });
-                return None;
-            }
+        let (points, expiry) = match request.order {
+            Err(refusal) => return Some(reply.answer(request.id, &drive.refuse(&what(), refusal, origin), None)),
+            Ok(order) => order,
         };
-        Some(reply.answer(request.id, &answer, None))
+        let run = profile.model_index(ModelPoint::Run);
+        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
+        let fingerprint = self.fingerprint(&incoming);
+        let id = request.id.as_ref().map(Json::to_string);
+        let identity = id.map(|id| self.hasher.hash_one((&incoming.topic, id)));
+        if !stop && let Some(known) = self.repeated(&incoming, fingerprint, identity, now) {
+            return known.result.clone();
+        }
+        let most = if stop { MAX_RUNNING + MAX_STOPS } else { MAX_RUNNING };
+        if self.running.len() >= most {
+            let answer = drive.turn_away(&what(), Outcome::QueueFull, origin);
+            return Some(reply.answer(request.id, &answer, None));
+        }
+        let number = self.remember(fingerprint, &incoming, identity, now);
+        self.running.spawn(async move {
+            let order = Order::Points(points);
+            let (answer, confirmed) = drive.order_confirmed(order, origin, true, expiry).await;
+            (number, reply.answer(request.id, &answer, confirmed))
+        });
+        None
     }
 
-    fn remember(&mut self, fingerprint: u64) {
+    fn fingerprint(&self, incoming: &Incoming) -> u64 {
+        let Incoming {
+            topic,
+            payload,
+            response_topic,
+            correlation,
+            ..
+        } = incoming;
+        self.hasher.hash_one((topic, payload, response_topic, correlation))
+    }
+
+    /// The command that a message repeats. An `id` that was used for something else since is no sign of a repetition.
+    fn repeated(&self, incoming: &Incoming, fingerprint: u64, identity: Option<u64>, now: Instant) -> Option<&Taken> {
+        let newest_first = || self.recent.iter().rev();
+        let same = |known: &&Taken| known.fingerprint == fingerprint;
+        let marked = newest_first().find(|known| incoming.dup && known.packet == incoming.packet && same(known));
+        let by_id = || {
+            let last = newest_first().find(|known| identity.is_some() && known.identity == identity);
+            last.filter(|known| now.saturating_duration_since(known.at) < REPLAYED && same(known))
+        };
+        marked.or_else(by_id)
+    }
+
+    fn remember(&mut self, fingerprint: u64, incoming: &Incoming, identity: Option<u64>, now: Instant) -> u64 {
         if self.recent.len() == REMEMBERED {
             self.recent.pop_front();
         }
-        self.recent.push_back((fingerprint, None));
+        self.taken += 1;
+        self.recent.push_back(Taken {
+            number: self.taken,
+            fingerprint,
+            packet: incoming.packet,
+            identity,
+            at: now,
+            result: None,
+        });
+        self.taken
     }
 
     /// The next result; waits for ever when no command is running. May be cancelled without loss.
     pub(super) async fn finished(&mut self) -> Message {
         loop {
             match self.running.join_next().await {
-                Some(Ok((fingerprint, message))) => {
-                    let known = self.recent.iter_mut().find(|(f, _)| *f == fingerprint);
-                    if let Some((_, result)) = known {
-                        *result = Some(message.clone());
+                Some(Ok((number, message))) => {
+                    if let Some(known) = self.recent.iter_mut().find(|known| known.number == number) {
+                        known.result = Some(message.clone());
                     }
                     return message;
                 }
@@ -210,11 +266,10 @@ mod tests {
     use super::*;
     use crate::codec::Reply as BusReply;
     use crate::command::Urgency;
-    use std::time::Instant;
-
     struct Bench {
         plant: Plant,
         commands: Commands,
+        now: Instant,
         events: tokio::sync::broadcast::Receiver<std::sync::Arc<crate::event::Event>>,
     }
 
@@ -225,12 +280,13 @@ mod tests {
             Bench {
                 events: plant.events.subscribe(),
                 commands: Commands::new(Topics::new("drivegate", "hall")),
+                now: Instant::now(),
                 plant,
             }
         }
 
         fn take(&mut self, incoming: Incoming) -> Option<Message> {
-            self.commands.take(incoming, &self.plant)
+            self.commands.take(incoming, &self.plant, self.now)
         }
 
         fn queued(&self) -> usize {
@@ -369,11 +425,50 @@ mod tests {
         let result = bench.acknowledge().await;
         assert_eq!(json(&bench.take(repeated.clone()).unwrap()), result);
         assert!(bench.commands.is_idle() && bench.queued() == 0);
-        // Not marked as a repetition, or another message: a new command, whatever its id.
-        assert_eq!(bench.take(first), None);
-        assert_eq!(bench.take(Incoming { packet: 2, ..repeated }), None);
+        // Published again by a client that did not see the acknowledgement: the same id, not marked by the broker.
+        let again = Incoming {
+            packet: 2,
+            ..first.clone()
+        };
+        assert_eq!(json(&bench.take(again.clone()).unwrap()), result);
+        // Another order under the same id, and the same one a minute later, are new commands.
+        assert_eq!(
+            bench.take(set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#)),
+            None
+        );
         bench.acknowledge().await;
+        assert_eq!(
+            bench.take(again.clone()),
+            None,
+            "the id was used for something else since"
+        );
         bench.acknowledge().await;
+        assert!(bench.take(again.clone()).is_some());
+        bench.now += REPLAYED;
+        assert_eq!(bench.take(again), None);
+        bench.acknowledge().await;
+        // Without an id only the broker's mark tells a repetition.
+        let bare = set("p1/set", r#"{"speed_reference": 5}"#);
+        for _ in 0..2 {
+            assert_eq!(bench.take(bare.clone()), None);
+            bench.acknowledge().await;
+        }
+        assert!(bench.take(Incoming { dup: true, ..bare }).is_some());
+    }
+
+    #[tokio::test]
+    async fn a_stop_is_carried_out_whenever_it_comes() {
+        let mut bench = Bench::new();
+        let stop = set("p1/set", r#"{"id": 2, "run": false}"#);
+        for _ in 0..2 {
+            assert_eq!(bench.take(stop.clone()), None);
+            bench.acknowledge().await;
+        }
+        for _ in 0..MAX_RUNNING {
+            assert_eq!(bench.take(set("p1/set/run", "1")), None);
+        }
+        assert!(bench.take(set("p1/set/run", "1")).is_some(), "full");
+        assert_eq!(bench.take(stop), None, "a stop still gets in");
     }
 
     #[tokio::test]
