@@ -115,7 +115,7 @@ pub struct DriveImage {
     slow_cycle: Duration,
     snapshot: ArcSwap<Snapshot>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
-    /// Last turnaround measured, ns; 0 is none yet.
+    /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
     lease: Mutex<Option<Instant>>,
 }
@@ -175,13 +175,15 @@ impl DriveImage {
             .map_or(0, |c| c.load(Ordering::Relaxed))
     }
 
-    /// Notes the time from the end of a request to the beginning of its answer.
+    /// Notes a time from the end of a request to the beginning of its answer; single late wake-ups are smoothed out.
     pub fn set_turnaround(&self, time: Duration) {
-        self.turnaround
-            .store(time.as_nanos().clamp(1, u128::from(u64::MAX)) as u64, Ordering::Relaxed);
+        let last = self.turnaround.load(Ordering::Relaxed);
+        let time = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1);
+        let smooth = if last == 0 { time } else { last - last / 8 + time / 8 };
+        self.turnaround.store(smooth.max(1), Ordering::Relaxed);
     }
 
-    /// The last turnaround measured.
+    /// The turnaround measured, a mean over some eight answers.
     pub fn turnaround(&self) -> Option<Duration> {
         match self.turnaround.load(Ordering::Relaxed) {
             0 => None,
