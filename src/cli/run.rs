@@ -12,7 +12,7 @@ use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::config::{self, Settings};
 use crate::daemon::Daemon;
 
-/// Arguments of `drivegate run`.
+/// Runs the gateway until SIGTERM or Ctrl-C; SIGHUP reloads the configuration
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate run --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
