@@ -163,15 +163,6 @@ fn modules_of(file: &Path) -> Vec<String> {
     if modules.last().is_some_and(|last| last == "mod") {
         modules.pop();
     }
-    // The tests of a module in a file beside it.
-    if let Some(stem) = modules
-        .last()
-        .and_then(|last| last.strip_suffix("_tests"))
-        .map(str::to_string)
-    {
-        modules.pop();
-        modules.extend([stem, "tests".to_string()]);
-    }
     modules
 }
 
