@@ -2,7 +2,7 @@
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls (public contract, section 8).
 //! Three rules soften it: after eight commands in a row a due poll goes first; slow polls that had less than 5 %
-//! of the line go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! of the time go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -15,6 +15,8 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
 pub const SLOW_SHARE: f64 = 0.05;
+/// Credit that slow polls gather while none is due, in requests of the longest kind.
+const MOST_CREDIT: f64 = 1.5;
 /// Share of the line that a drive which does not answer costs at most.
 const DEAD_SHARE: f64 = 0.02;
 /// First and longest pause between two probes of a drive that does not answer.
@@ -127,7 +129,13 @@ pub struct Schedule {
     new_round: Option<RoundStart>,
     slow_started: Option<Instant>,
     new_slow: Option<RoundStart>,
+    /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
+    /// Until when the credit is reckoned.
+    earned_until: Instant,
+    /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
+    /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
+    most_credit: Duration,
     commands_in_a_row: u32,
     stops_in_a_row: u32,
 }
@@ -150,9 +158,12 @@ impl Schedule {
                 .map(|read| Item::new(*read, *read, cost(index, read), now))
                 .collect(),
         });
+        let drives: Vec<DriveSchedule> = drives.collect();
+        let slow = drives.iter().flat_map(|d| &d.items).filter(|i| i.is_slow());
+        let longest = slow.map(|i| i.cost).max().unwrap_or_default();
         Schedule {
             cadence,
-            drives: drives.collect(),
+            drives,
             round: VecDeque::new(),
             round_due: now,
             round_started: None,
@@ -160,6 +171,8 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
+            earned_until: now,
+            most_credit: longest.mul_f64(MOST_CREDIT),
             commands_in_a_row: 0,
             stops_in_a_row: 0,
         }
@@ -167,6 +180,7 @@ impl Schedule {
 
     /// What comes next. `waiting` is the rank of the command that would be next.
     pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
+        self.earn(now);
         self.start_round(now);
         let poll = self.due_poll(now);
         if let Some(urgency) = waiting {
@@ -195,22 +209,20 @@ impl Schedule {
         self.new_slow.take()
     }
 
-    /// A command (or a step of one) was on the line for `took`.
-    pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
+    /// A command (or a step of one) was on the line.
+    pub fn command_done(&mut self, urgency: Urgency) {
         self.commands_in_a_row += 1;
         self.stops_in_a_row = if urgency == Urgency::Stop {
             self.stops_in_a_row + 1
         } else {
             0
         };
-        self.earn(took);
     }
 
     /// A poll is over.
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         self.commands_in_a_row = 0;
         self.stops_in_a_row = 0;
-        self.earn(took);
         if poll.read.class == PollClass::Fast {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
@@ -278,9 +290,12 @@ impl Schedule {
         }
     }
 
-    fn earn(&mut self, took: Duration) {
-        // A quarter of a second of slow polls at most: more would be a burst.
-        self.slow_credit = (self.slow_credit + took.mul_f64(SLOW_SHARE)).min(Duration::from_millis(250));
+    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
+    /// the line rests where none of them fits.
+    fn earn(&mut self, now: Instant) {
+        let passed = now.saturating_duration_since(self.earned_until);
+        self.earned_until = now;
+        self.slow_credit = (self.slow_credit + passed.mul_f64(SLOW_SHARE)).min(self.most_credit);
     }
 
     fn start_round(&mut self, now: Instant) {

@@ -62,7 +62,7 @@ impl Bench {
             }
             Decision::Command(urgency) => {
                 self.now += COST;
-                self.schedule.command_done(urgency, COST);
+                self.schedule.command_done(urgency);
             }
             Decision::Poll(poll) => {
                 let dead = self.dead.contains(&poll.drive);
@@ -115,6 +115,37 @@ fn a_saturated_line_is_never_idle_and_fair() {
 }
 
 #[test]
+fn slow_polls_get_their_share_where_the_idle_time_fits_none() {
+    // Two fast polls take 24 of 30 ms: no slow one fits behind them. They would take 2.4 % of the line, which has room.
+    let mut bench = Bench::new(2, Duration::from_millis(30));
+    bench.run(Duration::from_secs(5));
+    bench.log.clear();
+    bench.run(Duration::from_secs(60));
+    let (slow, fast) = (bench.polls(PollClass::Slow), bench.polls(PollClass::Fast));
+    assert!(slow.values().all(|n| (59..=61).contains(n)), "{slow:?}");
+    assert!(fast.values().all(|n| (1990..=2001).contains(n)), "{fast:?}");
+}
+
+#[test]
+fn slow_polls_that_fit_into_idle_time_delay_no_round() {
+    // Six slow polls are due at once each second; two of them fit behind the six fast ones of a round.
+    let mut bench = Bench::new(6, Duration::from_millis(100));
+    bench.run(Duration::from_secs(5));
+    let begin = bench.now;
+    bench.log.clear();
+    bench.run(Duration::from_secs(60));
+    let first = |d: &Decision| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast && p.drive == 0);
+    let rounds: Vec<Instant> = bench.log.iter().filter(|(_, d)| first(d)).map(|(at, _)| *at).collect();
+    let cycles: Vec<Duration> = rounds.windows(2).map(|w| w[1] - w[0]).collect();
+    assert!(cycles.iter().all(|c| *c == Duration::from_millis(100)), "{cycles:?}");
+    assert!(
+        bench.polls(PollClass::Slow).values().all(|n| *n >= 59),
+        "{:?}",
+        bench.now - begin
+    );
+}
+
+#[test]
 fn the_grid_is_kept_without_drift() {
     let mut bench = Bench::new(1, Duration::from_millis(30));
     bench.run(Duration::from_secs(30));
@@ -162,7 +193,7 @@ fn a_stop_goes_before_the_due_poll_even_after_eight_commands() {
             bench.schedule.next(bench.now, Some(Urgency::Command)),
             Decision::Command(Urgency::Command)
         );
-        bench.schedule.command_done(Urgency::Command, COST);
+        bench.schedule.command_done(Urgency::Command);
         bench.now += COST;
     }
     assert!(matches!(

@@ -398,7 +398,7 @@ impl Worker {
         };
         match job {
             Job::Poll(poll) => self.polled(&poll, ended, began, took),
-            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, took),
+            Job::Command { index, pdu } => self.commanded(index, &pdu, ended),
         }
         Ok(())
     }
@@ -533,13 +533,13 @@ impl Worker {
         });
     }
 
-    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, took: Duration) {
+    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended) {
         let now = Instant::now();
         let Some(execution) = self.begun.get_mut(index) else {
             return;
         };
         let drive = execution.drive;
-        self.schedule.command_done(execution.urgency, took);
+        self.schedule.command_done(execution.urgency);
         let outcome = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);

@@ -4,16 +4,18 @@
 //! The port is opened through tokio-serial's builder and then driven by the bus's own thread with `ppoll`: the timer
 //! of an async runtime ticks at a millisecond, which is longer than the silence of a frame at 38400 baud.
 
+mod clock;
 mod sys;
+
+pub use clock::{poll_until, sharpen_timers, wait_until};
 
 use std::fmt;
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
-use std::num::NonZeroU64;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::event::{PollFd, PollFlags};
 use rustix::termios::{ControlModes, tcgetattr};
 use tokio_serial::{DataBits, FlowControl, Parity as SerialParity, StopBits};
 
@@ -130,12 +132,11 @@ impl Line {
                 Ok(taken) => frame = frame.get(taken..).unwrap_or_default(),
                 Err(rustix::io::Errno::INTR) => {}
                 Err(rustix::io::Errno::AGAIN) => {
-                    let now = Instant::now();
-                    if now >= deadline {
+                    if Instant::now() >= deadline {
                         return Err(Lost("it takes no more bytes".to_string()));
                     }
                     let mut fds = [PollFd::from_borrowed_fd(self.fd(), PollFlags::OUT)];
-                    ppoll(&mut fds, deadline - now)?;
+                    poll_port(&mut fds, deadline)?;
                 }
                 Err(error) => return Err(Lost(error.to_string())),
             }
@@ -162,66 +163,39 @@ impl Line {
     /// # Errors
     /// When the system refuses to wait, which only a closed descriptor can cause.
     pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>, precise: bool) -> Result<Woken, Lost> {
-        let early = if precise { SPIN } else { Duration::ZERO };
-        loop {
-            let now = Instant::now();
-            if now >= until {
-                return Ok(Woken::Time);
-            }
-            let time = (until - now).saturating_sub(early);
-            let port = PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
-            let ready = match wake {
-                None => {
-                    let mut fds = [port];
-                    ppoll(&mut fds, time)?;
-                    fds.map(|f| !f.revents().is_empty())
-                        .first()
-                        .copied()
-                        .unwrap_or(false)
-                        .then_some(Woken::Readable)
-                }
+        let asleep = if precise {
+            until.checked_sub(SPIN).unwrap_or(until)
+        } else {
+            until
+        };
+        let port = || PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
+        while Instant::now() < until {
+            let woken = match wake {
+                None => poll_port(&mut [port()], asleep)?.then_some(Woken::Readable),
                 Some(wake) => {
-                    let mut fds = [port, PollFd::from_borrowed_fd(wake, PollFlags::IN)];
-                    ppoll(&mut fds, time)?;
-                    let [port, wake] = fds.map(|f| !f.revents().is_empty());
-                    if port {
-                        Some(Woken::Readable)
-                    } else {
-                        wake.then_some(Woken::Command)
-                    }
+                    let mut fds = [port(), PollFd::from_borrowed_fd(wake, PollFlags::IN)];
+                    let ready = poll_port(&mut fds, asleep)?;
+                    let [port, _] = fds.map(|fd| !fd.revents().is_empty());
+                    ready.then_some(if port { Woken::Readable } else { Woken::Command })
                 }
             };
-            if let Some(woken) = ready {
+            if let Some(woken) = woken {
                 return Ok(woken);
             }
         }
+        Ok(Woken::Time)
     }
 }
 
 /// Waits for a command or for the time, with no port to listen to.
 pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>) {
-    let time = until.saturating_duration_since(Instant::now());
     let mut fds = [PollFd::from_borrowed_fd(wake, PollFlags::IN)];
     // An error ends the wait early, which is harmless.
-    let _ = ppoll(&mut fds, time);
+    let _ = poll_until(&mut fds, until);
 }
 
-/// Lets this thread's timers fire to the nanosecond instead of 50 µs late.
-pub fn sharpen_timers() {
-    if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
-        tracing::debug!("timer slack stays as it is: {error}");
-    }
-}
-
-fn ppoll(fds: &mut [PollFd<'_>], time: Duration) -> Result<(), Lost> {
-    let time = Timespec {
-        tv_sec: time.as_secs() as _,
-        tv_nsec: time.subsec_nanos() as _,
-    };
-    match poll(fds, Some(&time)) {
-        Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
-        Err(error) => Err(Lost(error.to_string())),
-    }
+fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {
+    poll_until(fds, until).map_err(|error| Lost(error.to_string()))
 }
 
 fn open_tcp(port: &str, address: &str) -> Result<Port, OpenError> {

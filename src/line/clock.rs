@@ -1,4 +1,4 @@
-//! Waits that are exact to some ten microseconds, for the simulated wire and the measuring rod.
+//! Waits that are exact to some ten microseconds, for the line, the simulated line and the measuring rod.
 
 use rustix::event::{PollFd, Timespec, poll};
 use rustix::io::Errno;
@@ -8,12 +8,17 @@ use std::time::{Duration, Instant};
 
 /// Asks the kernel to wake this thread at the time it named: by default it may be 50 microseconds late, to save power.
 /// Where that is refused, waits are later and nothing else changes.
-pub(super) fn exact_timers() {
-    let _ = rustix::thread::set_current_timer_slack(NonZeroU64::new(1));
+pub fn sharpen_timers() {
+    if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
+        tracing::debug!("timer slack stays as it is: {error}");
+    }
 }
 
-/// Waits until one of `fds` is ready or it is `until`; whether one is ready.
-pub(super) fn poll_until(fds: &mut [PollFd<'_>], until: Instant) -> io::Result<bool> {
+/// Waits until one of `fds` is ready or it is `until`; whether one is ready. A signal ends the wait early.
+///
+/// # Errors
+/// When the system refuses to wait, which only a closed descriptor can cause.
+pub fn poll_until(fds: &mut [PollFd<'_>], until: Instant) -> io::Result<bool> {
     let left = until.saturating_duration_since(Instant::now());
     let timeout = Timespec::try_from(left).map_err(|_| io::ErrorKind::InvalidInput)?;
     match poll(fds, Some(&timeout)) {
@@ -24,7 +29,7 @@ pub(super) fn poll_until(fds: &mut [PollFd<'_>], until: Instant) -> io::Result<b
 }
 
 /// Waits until `at`: sleeps, and watches the clock for the last `spin` of it.
-pub(super) fn wait_until(at: Instant, spin: Duration) {
+pub fn wait_until(at: Instant, spin: Duration) {
     let asleep = at.checked_sub(spin).unwrap_or(at);
     while Instant::now() < asleep {
         if poll_until(&mut [], asleep).is_err() {
