@@ -469,10 +469,13 @@ impl Worker {
                 }
             }
         };
-        self.echo |= transaction.echo_seen();
+        self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
+        if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
+            self.report.noise(transaction.rest());
+        }
         Ok((ended, began, took))
     }
 
