@@ -484,11 +484,12 @@ impl Worker {
         let polled = match &ended {
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
             Ended::Reply(reply) => {
+                self.debts.answered(poll.drive, &poll.read.pdu(), now);
                 self.store(poll, reply, now);
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(poll.drive, &poll.read.pdu(), now);
+                self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
                 Polled::Failed
             }
         };
@@ -546,10 +547,13 @@ impl Worker {
         let outcome = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
+                if !matches!(reply, Reply::Exception(_)) {
+                    self.debts.answered(drive, pdu, now);
+                }
                 execution.answered(pdu, reply, &mut self.shadow)
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(drive, pdu, now);
+                self.debts.given_up(drive, pdu, now - took, now);
                 execution.failed(self.options.retries)
             }
         };

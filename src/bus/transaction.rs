@@ -165,10 +165,19 @@ impl<'r> Transaction<'r> {
         matches!(self.request.pdu, RequestPdu::Read { .. })
     }
 
+    /// Whether an echo of the request cannot pass for its reply.
+    fn is_unlike_its_reply(&self) -> bool {
+        use RequestPdu::{Diagnostics, MaskWrite, WriteCoil, WriteRegister};
+        !matches!(
+            self.request.pdu,
+            WriteCoil { .. } | WriteRegister { .. } | Diagnostics { .. } | MaskWrite { .. }
+        )
+    }
+
     /// An adapter that hears itself sends the request back before the reply. A read cannot be answered by its own
-    /// frame, so it shows the echo; the reply to a write can, so there the echo must be known already.
+    /// frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known already.
     fn strip_echo(&mut self) -> bool {
-        let tells = !self.echo_seen && (self.echo || self.is_read());
+        let tells = !self.echo_seen && (self.echo || self.is_unlike_its_reply());
         if !tells || !self.received.starts_with(self.frame) {
             return false;
         }
@@ -178,12 +187,12 @@ impl<'r> Transaction<'r> {
         true
     }
 
-    /// Whether the adapter sends back what it is given, as far as this exchange, which ended so, tells. Only an answered
-    /// read tells: a reply without an echo before it means that an earlier echo was a freak, and believing in it would
+    /// Whether the adapter sends back what it is given, as far as this exchange, which ended so, tells. Only an
+    /// answered request whose reply looks otherwise tells: a reply without an echo before it means that an earlier echo was a freak, and believing in it would
     /// swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));
-        (self.is_read() && (self.echo_seen || answered)).then_some(self.echo_seen)
+        (self.is_unlike_its_reply() && (self.echo_seen || answered)).then_some(self.echo_seen)
     }
 
     /// When the first byte of the (last) frame came.
