@@ -469,10 +469,13 @@ impl Worker {
                 }
             }
         };
-        self.echo |= transaction.echo_seen();
+        self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
+        if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
+            self.report.noise(transaction.rest());
+        }
         Ok((ended, began, took))
     }
 
@@ -481,11 +484,12 @@ impl Worker {
         let polled = match &ended {
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
             Ended::Reply(reply) => {
+                self.debts.answered(poll.drive, &poll.read.pdu(), now);
                 self.store(poll, reply, now);
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(poll.drive, &poll.read.pdu(), now);
+                self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
                 Polled::Failed
             }
         };
@@ -543,10 +547,13 @@ impl Worker {
         let outcome = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
+                if !matches!(reply, Reply::Exception(_)) {
+                    self.debts.answered(drive, pdu, now);
+                }
                 execution.answered(pdu, reply, &mut self.shadow)
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(drive, pdu, now);
+                self.debts.given_up(drive, pdu, now - took, now);
                 execution.failed(self.options.retries)
             }
         };
