@@ -101,7 +101,10 @@ impl Debts {
     /// Until when `pdu` must wait because a reply that is owed could pass for its own.
     pub fn blocks(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let mut until = None;
-        let owed = self.0.iter_mut().filter(|debt| debt.drive == drive && debt.ends() > now);
+        let owed = self
+            .0
+            .iter_mut()
+            .filter(|debt| debt.drive == drive && debt.ends() > now);
         for debt in owed {
             if debt.blocks(pdu, now) {
                 until = until.max(Some(debt.ends()));

@@ -2,7 +2,7 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::debts::Debts;
@@ -253,8 +253,10 @@ impl Worker {
         let mut buffer = [0u8; 512];
         let count = line.receive(&mut buffer)?;
         if count > 0 {
-            self.quiet_since = Instant::now();
-            self.report.noise(buffer.get(..count).unwrap_or_default());
+            let now = Instant::now();
+            self.report
+                .noise(buffer.get(..count).unwrap_or_default(), self.quiet_since, now);
+            self.quiet_since = now;
         }
         Ok(())
     }
@@ -436,7 +438,7 @@ impl Worker {
         let wire = WireTime::of(spec.protocol, &spec.format, &request.pdu);
         let began = Instant::now();
         line.send(frame)?;
-        self.report.sent(frame, self.quiet_since, began);
+        let mut tap = self.report.tap(drive, request, frame, self.quiet_since, began);
         let sent = began + spec.format.chars(frame.len());
         let mut transaction = Transaction::new(
             spec.protocol,
@@ -462,7 +464,11 @@ impl Worker {
                             if count > 0 {
                                 self.quiet_since = self.quiet_since.max(now);
                             }
-                            transaction.on_bytes(now, buffer.get(..count).unwrap_or_default())
+                            let bytes = buffer.get(..count).unwrap_or_default();
+                            if let Some(tap) = &mut tap {
+                                tap.heard(bytes, now);
+                            }
+                            transaction.on_bytes(now, bytes)
                         }
                         _ => transaction.on_time(now),
                     };
@@ -474,7 +480,10 @@ impl Worker {
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
         if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
-            self.report.noise(transaction.rest());
+            self.report.foreign();
+        }
+        if let Some(tap) = tap {
+            tap.ended(&ended, Instant::now());
         }
         Ok((ended, began, took))
     }
@@ -585,9 +594,4 @@ pub(super) fn counted(ended: &Ended) -> Counted {
         Ended::Silent => Counted::Timeout,
         Ended::Corrupt(_) => Counted::Corrupt,
     }
-}
-
-/// The time of day of an instant in the near past.
-pub(super) fn time_of_day(at: Instant) -> SystemTime {
-    SystemTime::now() - Instant::now().saturating_duration_since(at)
 }

@@ -129,7 +129,10 @@ impl<'r> Transaction<'r> {
             return None;
         }
         let (at, used, reply) = (1..self.received.len()).find_map(|at| {
-            let rest = self.received.get(at..).filter(|rest| rest.first() == Some(&self.request.address))?;
+            let rest = self
+                .received
+                .get(at..)
+                .filter(|rest| rest.first() == Some(&self.request.address))?;
             match self.protocol.decode(self.request, rest) {
                 Decoded::Reply { reply, .. } if matches!(reply, Reply::Exception(_)) => None,
                 Decoded::Reply { used, reply } => Some((at, used, reply)),
@@ -149,7 +152,9 @@ impl<'r> Transaction<'r> {
 
     /// Time went by.
     pub fn on_time(&mut self, now: Instant) -> Step {
-        let until = self.garbage.map_or(self.deadline, |(_, until)| until.min(self.deadline));
+        let until = self
+            .garbage
+            .map_or(self.deadline, |(_, until)| until.min(self.deadline));
         if now < until {
             return Step::Wait(until);
         }
@@ -311,7 +316,11 @@ mod tests {
         let mut transaction = start(&request, &frame, now);
         assert_eq!(transaction.echoes(&Ended::Silent), None);
         assert_eq!(transaction.on_bytes(now, &reply(2)), done(2));
-        assert_eq!(transaction.echoes(&answered), Some(false), "an echo that is gone is forgotten");
+        assert_eq!(
+            transaction.echoes(&answered),
+            Some(false),
+            "an echo that is gone is forgotten"
+        );
     }
 
     #[test]
@@ -376,7 +385,10 @@ mod tests {
         let now = Instant::now();
         for noise in [&[0x37][..], &[0x01, 0x83, 0x02], &[0x01, 0x03, 0xFE], &[1, 3, 2, 0, 1]] {
             let mut transaction = start(&request, &frame, now);
-            assert!(matches!(transaction.on_bytes(now, noise), Step::Wait(_)), "{noise:02X?}");
+            assert!(
+                matches!(transaction.on_bytes(now, noise), Step::Wait(_)),
+                "{noise:02X?}"
+            );
             assert_eq!(transaction.on_bytes(now, &reply(9)), done(9), "{noise:02X?}");
             assert_eq!(transaction.foreign(), 1);
         }

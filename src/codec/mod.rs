@@ -4,6 +4,7 @@
 //! [`Codec::decode`] takes that request. Nothing can go stale between two exchanges.
 
 mod checksum;
+pub mod describe;
 pub mod modbus;
 pub mod rtu;
 pub mod wire;
