@@ -400,7 +400,7 @@ impl Worker {
         };
         match job {
             Job::Poll(poll) => self.polled(&poll, ended, began, took),
-            Job::Command { index, pdu } => self.commanded(index, &pdu, ended),
+            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, began),
         }
         Ok(())
     }
@@ -546,7 +546,7 @@ impl Worker {
         });
     }
 
-    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended) {
+    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, began: Instant) {
         let now = Instant::now();
         let Some(execution) = self.begun.get_mut(index) else {
             return;
@@ -562,7 +562,7 @@ impl Worker {
                 execution.answered(pdu, reply, &mut self.shadow)
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(drive, pdu, now - took, now);
+                self.debts.given_up(drive, pdu, began, now);
                 execution.failed(self.options.retries)
             }
         };
