@@ -9,7 +9,7 @@ use tokio::sync::broadcast;
 const IN_FLIGHT: usize = 1024;
 
 /// Who sent a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
     /// The gateway.
