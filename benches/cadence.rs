@@ -66,13 +66,13 @@ fn record(baud: u32, drives: u8, time: Duration) -> Result<(Vec<Recorded>, u64),
         .build()?;
     let daemon = runtime.block_on(Daemon::start(settings))?;
     let modbus = daemon.modbus_tcp_addresses().first().copied();
-    let readers = Readers::start(modbus, daemon.http_address().ok_or("no HTTP")?, drives, TENTH);
     let plant = daemon.plant().load_full();
     let bus = plant.buses.first().ok_or("no bus")?.image.clone();
     let patience = Instant::now() + Duration::from_secs(20);
     while bus.online() < usize::from(drives) && Instant::now() < patience {
         std::thread::sleep(Duration::from_millis(10));
     }
+    let readers = Readers::start(modbus, daemon.http_address().ok_or("no HTTP")?, drives, TENTH);
     // The class `once` is read first.
     std::thread::sleep(Duration::from_secs(1));
     line.record((time.as_secs_f64() * 2000.0) as usize);

@@ -32,13 +32,13 @@ pub(super) fn run(line: &SimulatedBus, format: LineFormat, time: Duration) -> Re
         .build()?;
     let daemon = runtime.block_on(Daemon::start(settings))?;
     let modbus = daemon.modbus_tcp_addresses().first().copied();
-    let readers = Readers::start(modbus, daemon.http_address().ok_or("no HTTP")?, *DRIVES.end(), TENTH);
     let plant = daemon.plant().load_full();
     let bus = plant.buses.first().ok_or("no bus")?.image.clone();
     let patience = Instant::now() + Duration::from_secs(20);
     while bus.online() < DRIVES.count() && Instant::now() < patience {
         std::thread::sleep(Duration::from_millis(10));
     }
+    let readers = Readers::start(modbus, daemon.http_address().ok_or("no HTTP")?, *DRIVES.end(), TENTH);
     let before = record(line, time, format);
     std::thread::sleep(time);
     runtime.block_on(daemon.stop());

@@ -100,10 +100,17 @@ fn read_north(modbus: Option<SocketAddr>, http: SocketAddr, units: u8) -> std::i
     if let Some(modbus) = modbus {
         let mut client = TcpStream::connect(modbus)?;
         client.set_read_timeout(Some(Duration::from_secs(1)))?;
-        let mut reply = [0u8; 9 + 22];
+        let mut head = [0u8; 6];
+        let mut body = [0u8; 256];
         for unit in (1..=units).cycle().take(100) {
             client.write_all(&[0, 1, 0, 0, 0, 6, unit, 3, 0x08, 0x34, 0, 11])?;
-            client.read_exact(&mut reply)?;
+            client.read_exact(&mut head)?;
+            let body = body.get_mut(..usize::from(head[5])).unwrap_or_default();
+            client.read_exact(body)?;
+            // Function 3, not its exception.
+            if body.get(1) != Some(&3) {
+                return Err(std::io::ErrorKind::InvalidData.into());
+            }
         }
     }
     scrape(http).map(|_| ())

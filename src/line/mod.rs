@@ -7,8 +7,10 @@
 mod clock;
 mod sys;
 
+use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 
+use std::cell::Cell;
 use std::fmt;
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
@@ -23,8 +25,6 @@ use crate::codec::{LineFormat, Parity};
 
 /// Time to reach a device server; the bus stops for no longer.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
-/// A wait ends this much before its time in the kernel; the rest is spun.
-const SPIN: Duration = Duration::from_micros(60);
 
 /// Who switches the direction of an RS-485 line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -100,6 +100,7 @@ impl fmt::Debug for Port {
 #[derive(Debug)]
 pub struct Line {
     port: Port,
+    wake_ups: Cell<WakeUps>,
 }
 
 impl Line {
@@ -109,9 +110,14 @@ impl Line {
     /// When the port cannot be opened or cannot do what is asked of it.
     pub fn open(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, Vec<String>), OpenError> {
         match port.strip_prefix("tcp://") {
-            Some(address) => open_tcp(port, address).map(|port| (Line { port }, Vec::new())),
+            Some(address) => open_tcp(port, address).map(|port| (Line::new(port), Vec::new())),
             None => open_serial(port, format, rs485),
         }
+    }
+
+    fn new(port: Port) -> Line {
+        let wake_ups = Cell::new(WakeUps::new());
+        Line { port, wake_ups }
     }
 
     fn fd(&self) -> BorrowedFd<'_> {
@@ -163,11 +169,13 @@ impl Line {
     /// # Errors
     /// When the system refuses to wait, which only a closed descriptor can cause.
     pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>, precise: bool) -> Result<Woken, Lost> {
-        let asleep = if precise {
-            until.checked_sub(SPIN).unwrap_or(until)
+        let spin = if precise {
+            self.wake_ups.get().spin()
         } else {
-            until
+            Duration::ZERO
         };
+        let asleep = until.checked_sub(spin).unwrap_or(until);
+        let mut sleeps = precise && Instant::now() < asleep;
         let port = || PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
         while Instant::now() < until {
             let woken = match wake {
@@ -181,6 +189,13 @@ impl Line {
             };
             if let Some(woken) = woken {
                 return Ok(woken);
+            }
+            if std::mem::take(&mut sleeps) {
+                let mut wake_ups = self.wake_ups.get();
+                if let Some(late) = Instant::now().checked_duration_since(asleep) {
+                    wake_ups.note(late);
+                    self.wake_ups.set(wake_ups);
+                }
             }
         }
         Ok(Woken::Time)
@@ -263,7 +278,7 @@ fn open_serial(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, V
             "{port} reports {read_back} where {format} was asked for; check that the adapter can do it"
         ));
     }
-    let line = Line { port: Port::Serial(fd) };
+    let line = Line::new(Port::Serial(fd));
     line.clear();
     Ok((line, warnings))
 }
