@@ -23,7 +23,11 @@ const PATIENCE: Duration = Duration::from_secs(1);
 
 /// What the drives of a bus owe.
 #[derive(Debug, Default)]
-pub struct Debts(Vec<Debt>);
+pub struct Debts {
+    owed: Vec<Debt>,
+    /// What was answered last.
+    last: Option<(usize, RequestPdu)>,
+}
 
 #[derive(Debug)]
 struct Debt {
@@ -59,14 +63,18 @@ impl Debt {
 impl Debts {
     /// No believable answer to `pdu` came in an exchange from `began` to `now`.
     pub fn given_up(&mut self, drive: usize, pdu: &RequestPdu, began: Instant, now: Instant) {
-        self.0.retain(|debt| debt.ends() > now);
+        self.owed.retain(|debt| debt.ends() > now);
         let until = now + FORGOTTEN_AFTER;
-        match self.0.iter_mut().find(|debt| debt.drive == drive && debt.pdu == *pdu) {
+        match self
+            .owed
+            .iter_mut()
+            .find(|debt| debt.drive == drive && debt.pdu == *pdu)
+        {
             Some(debt) => {
                 debt.until = until;
                 debt.since.get_or_insert(began);
             }
-            None => self.0.push(Debt {
+            None => self.owed.push(Debt {
                 drive,
                 pdu: pdu.clone(),
                 since: Some(began),
@@ -81,11 +89,9 @@ impl Debts {
 
     /// An answer to `pdu` came.
     pub fn answered(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) {
-        if self.0.is_empty() {
-            return;
-        }
-        self.0.retain(|debt| debt.ends() > now);
-        for debt in self.0.iter_mut().filter(|debt| debt.drive == drive) {
+        self.last = Some((drive, pdu.clone()));
+        self.owed.retain(|debt| debt.ends() > now);
+        for debt in self.owed.iter_mut().filter(|debt| debt.drive == drive) {
             if debt.pdu == *pdu {
                 // The newer reply will be about as late as the older one was, if it was the older one.
                 if let Some(since) = debt.since.take() {
@@ -98,11 +104,22 @@ impl Debts {
         }
     }
 
+    /// Whether the last reply, if it came once more, could pass for the reply to `pdu`.
+    pub fn could_be_doubled(&self, drive: usize, pdu: &RequestPdu) -> bool {
+        let last = self.last.as_ref().filter(|(of, _)| *of == drive);
+        last.is_some_and(|(_, last)| Look::of(last) == Look::of(pdu))
+    }
+
+    /// Whether a drive owes anything.
+    pub fn owes(&self, drive: usize, now: Instant) -> bool {
+        self.owed.iter().any(|debt| debt.drive == drive && debt.ends() > now)
+    }
+
     /// Until when `pdu` must wait because a reply that is owed could pass for its own.
     pub fn blocks(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let mut until = None;
         let owed = self
-            .0
+            .owed
             .iter_mut()
             .filter(|debt| debt.drive == drive && debt.ends() > now);
         for debt in owed {

@@ -10,7 +10,7 @@ use super::execute::{Execution, Next, Shadow};
 use super::leases::Leases;
 use super::report::Report;
 use super::schedule::{Cadence, Change, Decision, Poll, Polled, Schedule};
-use super::transaction::{Ended, Step, Transaction};
+use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
 use crate::cache::{Outcome as Counted, Snapshot};
 use crate::codec::{Reply, Request, RequestPdu, Table};
 use crate::command::{Command, Outcome, Urgency};
@@ -114,6 +114,10 @@ struct Worker {
     quiet_since: Instant,
     /// The adapter sends back what it is given.
     echo: bool,
+    /// Replies come faster than the wire could carry them: a simulation, or another baud rate behind a device server.
+    untimed: bool,
+    /// The last exchange ended with the drive's reply, mangled: it owes none.
+    paid: bool,
     frame: Vec<u8>,
 }
 
@@ -156,6 +160,8 @@ impl Worker {
             beats,
             quiet_since: now,
             echo: false,
+            untimed: false,
+            paid: false,
             frame: Vec::with_capacity(260),
         }
     }
@@ -205,6 +211,7 @@ impl Worker {
         }
         self.quiet_since = now;
         self.echo = false;
+        self.untimed = false;
         self.schedule.reset(now);
         self.handle.queue.open();
         self.report.bus_up();
@@ -449,6 +456,12 @@ impl Worker {
             wire.reply,
             self.echo,
         );
+        // A reply cannot be whole before its own time on the wire is over; baud rates are off by 2 % at most.
+        let earliest = sent + wire.reply.mul_f64(0.9);
+        let doubtful = self.debts.could_be_doubled(drive, &request.pdu) || !is_unlike_its_reply(&request.pdu);
+        if doubtful && !self.untimed {
+            transaction.doubt_before(earliest);
+        }
         self.quiet_since = sent;
         let mut buffer = [0u8; 512];
         let mut step = transaction.on_time(began);
@@ -476,6 +489,12 @@ impl Worker {
             }
         };
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
+        self.untimed |= match &ended {
+            Ended::Reply(Reply::Exception(_)) => false,
+            Ended::Reply(_) => !doubtful && Instant::now() < earliest,
+            Ended::Silent | Ended::Corrupt(_) => transaction.doubted(),
+        };
+        self.paid = matches!(ended, Ended::Corrupt(_)) && transaction.is_paid();
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
@@ -498,7 +517,9 @@ impl Worker {
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
+                if !self.paid || self.debts.owes(poll.drive, now) {
+                    self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
+                }
                 Polled::Failed
             }
         };
@@ -562,7 +583,9 @@ impl Worker {
                 execution.answered(pdu, reply, &mut self.shadow)
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.debts.given_up(drive, pdu, began, now);
+                if !self.paid || self.debts.owes(drive, now) {
+                    self.debts.given_up(drive, pdu, began, now);
+                }
                 execution.failed(self.options.retries)
             }
         };

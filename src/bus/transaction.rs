@@ -2,9 +2,9 @@
 //!
 //! Garbage does not end an exchange at once: noise may have run into the beginning of a sound reply, and the rest of a
 //! broken one may still be on the line. The exchange goes on until as many characters came as a reply has, or nothing
-//! more came for their time, never beyond the deadline. A whole reply to a read that stands behind the garbage is
-//! believed: address, function, length and check code fit, which random bytes do once in 2^40. Exceptions and
-//! acknowledgements of writes are shorter and weigh more: behind garbage they are not believed, the request is repeated.
+//! more came for their time, never beyond the deadline. A whole reply that stands behind the garbage is believed:
+//! address, function, length and check code fit, which random bytes do once in 2^40. An exception is shorter and may
+//! split a block: behind garbage it is not believed, the request is repeated.
 
 use std::time::{Duration, Instant};
 
@@ -51,6 +51,9 @@ pub struct Transaction<'r> {
     foreign: u32,
     echo: bool,
     echo_seen: bool,
+    /// A reply that is whole before then was not made for this request.
+    doubted_before: Option<Instant>,
+    doubted: bool,
 }
 
 impl<'r> Transaction<'r> {
@@ -78,7 +81,25 @@ impl<'r> Transaction<'r> {
             foreign: 0,
             echo,
             echo_seen: false,
+            doubted_before: None,
+            doubted: false,
         }
+    }
+
+    /// A reply that is whole before `earliest`, when the request and a reply cannot both have been on the wire, is not
+    /// believed: it is the last reply once more, or the echo of a write.
+    pub fn doubt_before(&mut self, earliest: Instant) {
+        self.doubted_before = Some(earliest);
+    }
+
+    /// Whether a reply came too early to be believed.
+    pub fn doubted(&self) -> bool {
+        self.doubted
+    }
+
+    /// Whether the bytes that could not be believed are as many as the reply has: nothing is owed any more.
+    pub fn is_paid(&self) -> bool {
+        self.received.len() >= self.protocol.reply_chars(&self.request.pdu)
     }
 
     /// Bytes came in.
@@ -95,8 +116,8 @@ impl<'r> Transaction<'r> {
                 continue;
             }
             match self.protocol.decode(self.request, &self.received) {
-                Decoded::Reply { used, reply } => return self.replied(used, reply),
-                Decoded::Foreign { used } => {
+                Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => return self.replied(used, reply),
+                Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
                     self.first_byte = (!self.received.is_empty()).then_some(now);
@@ -107,9 +128,9 @@ impl<'r> Transaction<'r> {
                 }
                 // The echo of the request can look like a broken reply until it is whole.
                 _ if self.frame.starts_with(&self.received) => return self.on_time(now),
-                Decoded::Incomplete => return self.behind_garbage().unwrap_or_else(|| self.on_time(now)),
+                Decoded::Incomplete => return self.behind_garbage(now).unwrap_or_else(|| self.on_time(now)),
                 Decoded::Corrupt(why) => {
-                    return self.behind_garbage().unwrap_or_else(|| {
+                    return self.behind_garbage(now).unwrap_or_else(|| {
                         self.garbage = Some((why, now + self.rest_time()));
                         self.on_time(now)
                     });
@@ -118,14 +139,21 @@ impl<'r> Transaction<'r> {
         }
     }
 
+    fn is_too_early(&mut self, reply: &Reply, now: Instant) -> bool {
+        let early = self.doubted_before.is_some_and(|earliest| now < earliest);
+        self.doubted |= early && !matches!(reply, Reply::Exception(_));
+        early && !matches!(reply, Reply::Exception(_))
+    }
+
     fn replied(&mut self, used: usize, reply: Reply) -> Step {
         self.received.drain(..used.min(self.received.len()));
         Step::Done(Ended::Reply(reply))
     }
 
-    /// The reply to a read that stands whole behind garbage.
-    fn behind_garbage(&mut self) -> Option<Step> {
-        if !self.is_read() {
+    /// The reply that stands whole behind garbage.
+    fn behind_garbage(&mut self, now: Instant) -> Option<Step> {
+        if self.echo && !self.echo_seen {
+            // It could be the echo of a write.
             return None;
         }
         let (at, used, reply) = (1..self.received.len()).find_map(|at| {
@@ -135,6 +163,7 @@ impl<'r> Transaction<'r> {
                 .filter(|rest| rest.first() == Some(&self.request.address))?;
             match self.protocol.decode(self.request, rest) {
                 Decoded::Reply { reply, .. } if matches!(reply, Reply::Exception(_)) => None,
+                Decoded::Reply { .. } if self.doubted_before.is_some_and(|earliest| now < earliest) => None,
                 Decoded::Reply { used, reply } => Some((at, used, reply)),
                 _ => None,
             }
@@ -166,17 +195,8 @@ impl<'r> Transaction<'r> {
         Step::Done(ended)
     }
 
-    fn is_read(&self) -> bool {
-        matches!(self.request.pdu, RequestPdu::Read { .. })
-    }
-
-    /// Whether an echo of the request cannot pass for its reply.
     fn is_unlike_its_reply(&self) -> bool {
-        use RequestPdu::{Diagnostics, MaskWrite, WriteCoil, WriteRegister};
-        !matches!(
-            self.request.pdu,
-            WriteCoil { .. } | WriteRegister { .. } | Diagnostics { .. } | MaskWrite { .. }
-        )
+        is_unlike_its_reply(&self.request.pdu)
     }
 
     /// An adapter that hears itself sends the request back before the reply. A read cannot be answered by its own
@@ -219,6 +239,15 @@ impl<'r> Transaction<'r> {
     pub fn rest(&self) -> &[u8] {
         &self.received
     }
+}
+
+/// Whether an echo of the request cannot pass for its reply.
+pub fn is_unlike_its_reply(pdu: &RequestPdu) -> bool {
+    use RequestPdu::{Diagnostics, MaskWrite, WriteCoil, WriteRegister};
+    !matches!(
+        pdu,
+        WriteCoil { .. } | WriteRegister { .. } | Diagnostics { .. } | MaskWrite { .. }
+    )
 }
 
 #[cfg(test)]
@@ -380,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn a_reply_behind_noise_is_found_unless_it_is_too_short_to_be_sure_of() {
+    fn a_reply_behind_noise_is_found_but_no_exception_and_no_echo() {
         let (request, frame) = request();
         let now = Instant::now();
         for noise in [&[0x37][..], &[0x01, 0x83, 0x02], &[0x01, 0x03, 0xFE], &[1, 3, 2, 0, 1]] {
@@ -396,26 +425,40 @@ mod tests {
         rtu::encode_frame(1, &[0x83, 2], &mut exception);
         let mut transaction = start(&request, &frame, now);
         assert!(matches!(transaction.on_bytes(now, &exception), Step::Wait(_)));
-        let write = Request {
-            address: 1,
-            pdu: RequestPdu::WriteRegister {
-                address: 2000,
-                value: 1,
-            },
+        let pdu = RequestPdu::WriteRegister {
+            address: 2000,
+            value: 1,
         };
-        let mut acknowledgement = vec![0x37];
-        rtu::encode_request(&write, &mut acknowledgement);
-        let ms = Duration::from_millis;
-        let mut transaction = Transaction::new(
-            Protocol::ModbusRtu,
-            &write,
-            &acknowledgement[1..],
-            now,
-            ms(100),
-            ms(5),
-            false,
+        let write = Request { address: 1, pdu };
+        let mut bytes = vec![0x37];
+        rtu::encode_request(&write, &mut bytes);
+        let (ms, protocol) = (Duration::from_millis, Protocol::ModbusRtu);
+        let begin = |echo| Transaction::new(protocol, &write, &bytes[1..], now, ms(100), ms(5), echo);
+        assert_eq!(
+            begin(false).on_bytes(now, &bytes),
+            Step::Done(Ended::Reply(Reply::Written))
         );
-        assert!(matches!(transaction.on_bytes(now, &acknowledgement), Step::Wait(_)));
+        assert!(matches!(begin(true).on_bytes(now, &bytes), Step::Wait(_)));
+    }
+
+    #[test]
+    fn the_last_reply_once_more_and_a_stray_echo_are_told_by_their_time() {
+        let (request, frame) = request();
+        let now = Instant::now();
+        let ms = Duration::from_millis;
+        let mut transaction = start(&request, &frame, now);
+        transaction.doubt_before(now + ms(5));
+        assert!(matches!(transaction.on_bytes(now + ms(1), &reply(1)), Step::Wait(_)));
+        assert!(transaction.doubted());
+        assert_eq!(transaction.on_bytes(now + ms(6), &reply(2)), done(2));
+        let mut transaction = start(&request, &frame, now);
+        transaction.doubt_before(now + ms(5));
+        let mut exception = Vec::new();
+        rtu::encode_frame(1, &[0x83, 2], &mut exception);
+        assert!(matches!(
+            transaction.on_bytes(now + ms(4), &exception),
+            Step::Done(Ended::Reply(Reply::Exception(_)))
+        ));
     }
 
     #[test]

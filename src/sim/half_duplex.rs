@@ -328,11 +328,12 @@ impl HalfDuplex {
         let mut reply = Vec::with_capacity(64);
         match fault {
             Some(Fault::Deaf) => return,
+            Some(Fault::DeafEcho) => {}
             Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
             _ => self.slaves.answer(asked, now, &mut reply),
         }
         let bursts = self.faults.shape(fault, &frame.bytes, reply, self.silence());
-        self.statistics.replies += u64::from(!bursts.is_empty());
+        self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
         let mut at = now + self.rules.turnaround;
         for burst in bursts {
             if burst.kind == Kind::Echo {
