@@ -20,6 +20,7 @@ use std::time::{Duration, Instant};
 use drivegate::codec::LineFormat;
 use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
@@ -113,9 +114,9 @@ fn line(text: &str) -> Shown {
     let clock: Vec<u64> = fields[0].split([':', '.']).map(|n| n.parse().unwrap()).collect();
     // Two blanks divide the bytes from their meaning.
     let (_, rest) = text.split_once(fields[3]).unwrap();
-    let (hex, meaning) = rest.trim_start().split_once("  ").unwrap();
+    let (hex, meaning) = rest.trim_start().split_once("  ").unwrap_or(("", rest));
     let bytes = hex
-        .split(' ')
+        .split_whitespace()
         .map(|byte| u8::from_str_radix(byte, 16).unwrap())
         .collect();
     Shown {
@@ -238,6 +239,48 @@ fn silence_of_a_drive_is_shown() {
     });
     let fields: Vec<&str> = text.split_whitespace().collect();
     assert_eq!(fields[1..], ["-", "line1", "<", "pump-2", "timeout"]);
+}
+
+/// What goes wrong on the line is told as such, and what follows is right again.
+#[test]
+fn faults_are_told_apart() {
+    let plant = Plant::start();
+    let url = plant.url();
+    let check = |fault: &str, expected: &[&str]| {
+        let trace = Running::drivegate(&["trace", "--url", &url, "--bus", "line1"]);
+        trace.until_printed("read holding");
+        let rates = format!("{fault}=1").parse().unwrap();
+        plant.line.set_faults(FaultPlan::new(rates, 1).only(&[1]));
+        // A request of drive 1 and what came between it and the next one.
+        until(&format!("{fault}: {expected:?}"), || {
+            let output = trace.output();
+            let whole = output.rsplit_once('\n').map_or("", |(whole, _)| whole);
+            let frames = shown(whole);
+            let exchanges = frames.split_inclusive(|frame| frame.request);
+            let replies = exchanges.zip(frames.split(|frame| frame.request).skip(1));
+            replies
+                .filter(|(up_to_request, _)| up_to_request.last().is_some_and(|frame| frame.drive == "pump-1"))
+                .any(|(_, replies)| {
+                    replies.len() == expected.len()
+                        && replies
+                            .iter()
+                            .zip(expected)
+                            .all(|(frame, word)| frame.meaning.contains(word))
+                })
+                .then_some(())
+        });
+        plant.line.set_faults(FaultPlan::default());
+        until("both drives answer", || {
+            let drives = get(plant.http, "/api/v1/drives")?.1;
+            (drives.matches("\"online\":true").count() == 2).then_some(())
+        });
+    };
+    check("echo", &["the request comes back  echo", "  ok"]);
+    check("stray-address", &["foreign: address ", "  ok"]);
+    check("exception:2", &["exception 02 (illegal data address)"]);
+    check("corrupt", &["no sound frame  corrupt: "]);
+    check("truncate", &["corrupt: the reply is incomplete"]);
+    check("drop", &["timeout"]);
 }
 
 #[test]

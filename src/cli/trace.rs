@@ -27,9 +27,9 @@ const FLUSH: Duration = Duration::from_secs(1);
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  drivegate trace --bus line1\n  \
     drivegate trace --bus line1 --count 1000 --pcap line1.pcap\n\n\
-    The capture has the link type RTAC Serial (250). In Wireshark: Analyze, Decode As, field \"RTAC Serial payload\",\n\
-    current \"Modbus RTU\"; in tshark: tshark -r line1.pcap -d rtacser.data,mbrtu\n\
-    The preference mbrtu.crc_verification checks the CRC of each frame.")]
+    The capture has the link type RTAC Serial (250). Wireshark shows Modbus after Analyze, Decode As,\n\
+    field \"RTAC Serial Data Subdissector\", current \"Modbus RTU\"; tshark by -d rtacser.data,mbrtu\n\n\
+    Exit codes: 0 after Ctrl-C, --count or a closed pipe, 1 when no frames can be had (any more).")]
 pub(super) struct Args {
     /// The gateway's HTTP server.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]

@@ -40,10 +40,12 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
     let mut echo_seen = false;
     while let Some(rest) = bytes.get(at..).filter(|rest| !rest.is_empty()) {
         let (kind, used) = match protocol.decode(request, rest) {
-            _ if !echo_seen && is_echo(request, frame, rest, answered) => (Kind::Echo, frame.len()),
+            _ if !echo_seen && is_echo(protocol, request, frame, rest, answered) => (Kind::Echo, frame.len()),
             Decoded::Reply { used, .. } => (Kind::Reply, used),
             Decoded::Foreign { used } => (Kind::Foreign, used),
-            Decoded::Incomplete | Decoded::Corrupt(_) => (Kind::Garbage, garbage_len(protocol, request, rest)),
+            Decoded::Incomplete | Decoded::Corrupt(_) => {
+                (Kind::Garbage, garbage_len(protocol, request, rest, answered))
+            }
         };
         echo_seen |= kind == Kind::Echo;
         // Never empty, so that the loop ends.
@@ -63,21 +65,29 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
     parts
 }
 
-/// A read cannot be answered by its own frame; a write is, so there only a second frame, or the lack of an answer, tells.
-fn is_echo(request: &Request, frame: &[u8], rest: &[u8], answered: bool) -> bool {
+/// Most requests cannot be answered by their own frame; the write of one register is, so there only a second frame, or
+/// the lack of an answer, tells.
+fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], answered: bool) -> bool {
     let Some(more) = rest.strip_prefix(frame).filter(|_| !frame.is_empty()) else {
         return false;
     };
-    matches!(request.pdu, RequestPdu::Read { .. }) || !answered || more.starts_with(frame)
+    let like_its_reply = matches!(protocol.decode(request, frame), Decoded::Reply { .. });
+    !like_its_reply || !answered || more.starts_with(frame)
 }
 
-/// Bytes until the reply that stands behind garbage, or all.
-fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8]) -> usize {
+/// Bytes until the reply that was believed although it stands behind garbage, or all. Exceptions and acknowledgements are
+/// not believed there.
+fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: bool) -> usize {
     let is_reply = |at: &usize| {
         let behind = rest.get(*at..).unwrap_or_default();
-        matches!(protocol.decode(request, behind), Decoded::Reply { .. })
+        match protocol.decode(request, behind) {
+            Decoded::Reply { reply, .. } => !matches!(reply, Reply::Exception(_)),
+            _ => false,
+        }
     };
-    (1..rest.len()).find(is_reply).unwrap_or(rest.len())
+    let believed = answered && matches!(request.pdu, RequestPdu::Read { .. });
+    let at = (1..rest.len()).find(is_reply).filter(|_| believed);
+    at.unwrap_or(rest.len())
 }
 
 fn behind(protocol: Protocol, bytes: &[u8]) -> Kind {
@@ -452,6 +462,14 @@ mod tests {
         assert_eq!(kinds(&write, &frame, false), [(Kind::Echo, 8)]);
         let twice = [frame.as_slice(), &frame].concat();
         assert_eq!(kinds(&write, &twice, true), [(Kind::Echo, 8), (Kind::Reply, 8)]);
+        let write = asked("01 10 07 D0 00 02 04 00 01 00 10 88 CF");
+        let all = [
+            hex("01 10 07 D0 00 02 04 00 01 00 10 88 CF"),
+            framed(1, "10 07 D0 00 02"),
+        ]
+        .concat();
+        assert_eq!(kinds(&write, &all, true), [(Kind::Echo, 13), (Kind::Reply, 8)]);
+        assert_eq!(kinds(&read, &noisy, false), [(Kind::Garbage, 16)]);
     }
 
     proptest! {
