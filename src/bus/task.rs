@@ -563,7 +563,7 @@ impl Worker {
             }
             Ended::Silent | Ended::Corrupt(_) => {
                 self.debts.given_up(drive, pdu, began, now);
-                execution.failed(self.options.retries)
+                execution.failed(pdu, self.options.retries)
             }
         };
         if pdu.is_write() {
