@@ -7,7 +7,7 @@
 //!  drives ◀─line─── codec ◀── bus ◀────── command queue ◀────────────── north
 //! ```
 //!
-//! Values go up: the thread of a bus ([`bus`]) owns its [`line`], asks one drive after the other and puts each reply
+//! Values go up: the thread of a bus ([`bus`]) owns its [`mod@line`], asks one drive after the other and puts each reply
 //! into the process image ([`cache`]) as a whole. The servers ([`north`]) look at the image whenever they like; no
 //! reader costs the line anything. Orders go down: a server gives an order to the drive's handle ([`plant`]), which
 //! checks authority, limits and presence ([`mod@command`]) and queues it for the bus; whoever ordered gets exactly one
@@ -24,7 +24,7 @@
 //! - [`cache`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`plant`]: all images and queues, as the north sides see them.
-//! - [`line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
+//! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
 //! - [`bus`]: one exchange, what comes next, and the task that does it.
 //! - [`north`]: the servers, and the public register map.
 //! - [`sim`]: simulated drives on a simulated wire, and the broker of the demo.
