@@ -586,7 +586,7 @@ impl Worker {
                 if !self.paid || self.debts.owes(drive, now) {
                     self.debts.given_up(drive, pdu, began, now);
                 }
-                execution.failed(self.options.retries)
+                execution.failed(pdu, self.options.retries)
             }
         };
         if pdu.is_write() {

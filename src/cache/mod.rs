@@ -198,6 +198,14 @@ impl DriveImage {
         }
     }
 
+    /// Goes on with the lease of the image that this one replaces.
+    pub fn take_over_lease(&self, from: &DriveImage) {
+        let renewed = *from.lease.lock().unwrap_or_else(PoisonError::into_inner);
+        if let (Some(renewed), true) = (renewed, self.spec.supervision.is_some()) {
+            self.renew_lease(renewed);
+        }
+    }
+
     /// Ends the lease if it ran out; true exactly once for each lease.
     pub fn lease_ran_out(&self, now: Instant) -> bool {
         let Some(supervision) = &self.spec.supervision else {

@@ -101,7 +101,7 @@ async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
             log.set_level(&settings.log.level);
             match daemon.reload(settings).await {
                 Ok(()) => tracing::info!(config = %path.display(), "the new configuration is taken"),
-                Err(error) => tracing::error!("the new configuration is taken in part: {error}"),
+                Err(error) => tracing::error!("the new configuration is not taken: {error}"),
             }
         }
     }
