@@ -65,7 +65,11 @@ impl Debts {
     pub fn given_up(&mut self, drive: usize, pdu: &RequestPdu, began: Instant, now: Instant) {
         self.owed.retain(|debt| debt.ends() > now);
         let until = now + FORGOTTEN_AFTER;
-        match self.owed.iter_mut().find(|debt| debt.drive == drive && debt.pdu == *pdu) {
+        match self
+            .owed
+            .iter_mut()
+            .find(|debt| debt.drive == drive && debt.pdu == *pdu)
+        {
             Some(debt) => {
                 debt.until = until;
                 debt.since.get_or_insert(began);
@@ -114,7 +118,10 @@ impl Debts {
     /// Until when `pdu` must wait because a reply that is owed could pass for its own.
     pub fn blocks(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
         let mut until = None;
-        let owed = self.owed.iter_mut().filter(|debt| debt.drive == drive && debt.ends() > now);
+        let owed = self
+            .owed
+            .iter_mut()
+            .filter(|debt| debt.drive == drive && debt.ends() > now);
         for debt in owed {
             if debt.blocks(pdu, now) {
                 until = until.max(Some(debt.ends()));

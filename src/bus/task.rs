@@ -421,7 +421,13 @@ impl Worker {
                     tracing::warn!(bus = %self.handle.image.spec.name, "the line does not fall silent; speaking all the same");
                     return Ok(true);
                 }
-                Woken::Time => return Ok(true),
+                Woken::Time => {
+                    // A thread that was held up may not have seen the last bytes.
+                    self.hear_noise(line)?;
+                    if self.quiet_since + self.silence <= free {
+                        return Ok(true);
+                    }
+                }
                 Woken::Readable => self.hear_noise(line)?,
                 Woken::Command => {
                     self.handle.queue.clear_wake();
@@ -511,7 +517,10 @@ impl Worker {
                 if !self.paid || self.debts.owes(poll.drive, now) {
                     self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
                 }
-                Polled::Failed
+                match ended {
+                    Ended::Corrupt(_) => Polled::Garbled,
+                    _ => Polled::Failed,
+                }
             }
         };
         let change = self.schedule.poll_done(poll, polled, took, now);

@@ -157,7 +157,10 @@ impl<'r> Transaction<'r> {
             return None;
         }
         let (at, used, reply) = (1..self.received.len()).find_map(|at| {
-            let rest = self.received.get(at..).filter(|rest| rest.first() == Some(&self.request.address))?;
+            let rest = self
+                .received
+                .get(at..)
+                .filter(|rest| rest.first() == Some(&self.request.address))?;
             match self.protocol.decode(self.request, rest) {
                 Decoded::Reply { reply, .. } if matches!(reply, Reply::Exception(_)) => None,
                 Decoded::Reply { .. } if self.doubted_before.is_some_and(|earliest| now < earliest) => None,
@@ -178,7 +181,9 @@ impl<'r> Transaction<'r> {
 
     /// Time went by.
     pub fn on_time(&mut self, now: Instant) -> Step {
-        let until = self.garbage.map_or(self.deadline, |(_, until)| until.min(self.deadline));
+        let until = self
+            .garbage
+            .map_or(self.deadline, |(_, until)| until.min(self.deadline));
         if now < until {
             return Step::Wait(until);
         }
@@ -340,7 +345,11 @@ mod tests {
         let mut transaction = start(&request, &frame, now);
         assert_eq!(transaction.echoes(&Ended::Silent), None);
         assert_eq!(transaction.on_bytes(now, &reply(2)), done(2));
-        assert_eq!(transaction.echoes(&answered), Some(false), "an echo that is gone is forgotten");
+        assert_eq!(
+            transaction.echoes(&answered),
+            Some(false),
+            "an echo that is gone is forgotten"
+        );
     }
 
     #[test]
@@ -565,6 +574,7 @@ mod tests {
                 let (request, frame) = request();
                 let now = Instant::now();
                 let mut bytes = Vec::new();
+                let strange = strangers.len() as u32;
                 for (address, value) in strangers {
                     let [high, low] = value.to_be_bytes();
                     rtu::encode_frame(address, &[3, 2, high, low], &mut bytes);
@@ -579,7 +589,8 @@ mod tests {
                     }
                     step = transaction.on_bytes(now, piece);
                 }
-                prop_assert_eq!(step, done(0x4711));
+                // Noise and the first bytes of the reply make a sound frame of nobody once in some ten thousand cases.
+                prop_assert!(step == done(0x4711) || transaction.foreign() > strange, "{:?}", step);
             }
         }
     }
