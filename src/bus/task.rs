@@ -173,9 +173,13 @@ impl Worker {
             let spec = &self.handle.image.spec;
             match Line::open(&spec.port, &spec.format, self.options.rs485) {
                 Ok((line, warnings)) => {
-                    pause = REOPEN.0;
                     self.opened(warnings);
+                    let opened = Instant::now();
                     let why = self.serve(&line);
+                    // A port that goes again at once is opened ever less often.
+                    if opened.elapsed() >= REOPEN.1 {
+                        pause = REOPEN.0;
+                    }
                     if let Err(lost) = why {
                         self.lost(&lost.to_string());
                     }
