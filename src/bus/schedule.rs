@@ -21,8 +21,12 @@ const MOST_CREDIT: f64 = 1.5;
 const DEAD_SHARE: f64 = 0.02;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Pause before a request that the drive refused, or never answers, is tried again.
+/// Pause before a request that the drive refused is tried again.
 const REFUSED_PAUSE: Duration = Duration::from_secs(60);
+/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
+const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
+const MOST_GARBLED: u32 = 8;
 
 /// A planned read of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -53,8 +57,10 @@ pub enum Polled {
     Ok,
     /// The drive refused it.
     Refused(Exception),
-    /// No answer, or none to be believed.
+    /// No answer.
     Failed,
+    /// An answer that cannot be believed: tried again, but the drive is not taken for dead so soon.
+    Garbled,
 }
 
 /// What changed by a poll.
@@ -92,6 +98,8 @@ struct Item {
     failures: u32,
     /// A read of the once class that is still to be done.
     wanted: bool,
+    /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
+    whole_again: Option<Instant>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -106,6 +114,7 @@ struct DriveSchedule {
     presence: Presence,
     tried: bool,
     failures: u32,
+    garbled: u32,
     items: Vec<Item>,
 }
 
@@ -136,6 +145,8 @@ pub struct Schedule {
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
     /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
     most_credit: Duration,
+    /// A probe found nobody since the last fast poll.
+    probed: bool,
     commands_in_a_row: u32,
     stops_in_a_row: u32,
 }
@@ -152,6 +163,7 @@ impl Schedule {
             presence: Presence::Away(now, Duration::ZERO),
             tried: false,
             failures: 0,
+            garbled: 0,
             items: plan
                 .reads
                 .iter()
@@ -159,8 +171,9 @@ impl Schedule {
                 .collect(),
         });
         let drives: Vec<DriveSchedule> = drives.collect();
-        let slow = drives.iter().flat_map(|d| &d.items).filter(|i| i.is_slow());
-        let longest = slow.map(|i| i.cost).max().unwrap_or_default();
+        let slow = drives.iter().flat_map(|drive| &drive.items);
+        let slow = slow.filter(|item| item.read.class != PollClass::Fast);
+        let longest = slow.map(|item| item.cost).max().unwrap_or_default();
         Schedule {
             cadence,
             drives,
@@ -173,6 +186,7 @@ impl Schedule {
             slow_credit: Duration::ZERO,
             earned_until: now,
             most_credit: longest.mul_f64(MOST_CREDIT),
+            probed: false,
             commands_in_a_row: 0,
             stops_in_a_row: 0,
         }
@@ -227,13 +241,16 @@ impl Schedule {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
             }
+            self.probed = false;
         } else {
             self.slow_credit = self.slow_credit.saturating_sub(took);
             self.note_slow(now);
         }
+        self.probed |= poll.probe && matches!(polled, Polled::Failed | Polled::Garbled);
         match polled {
             Polled::Ok | Polled::Refused(_) => self.answered(poll, polled, now),
             Polled::Failed => self.failed(poll, took, now),
+            Polled::Garbled => self.garbled(poll, took, now),
         }
     }
 
@@ -302,6 +319,9 @@ impl Schedule {
         if !self.round.is_empty() || now < self.round_due {
             return;
         }
+        self.join_again(now);
+        // The first reads of all drives, then the second ones: a reply that comes twice meets another drive's request.
+        let mut reads: Vec<(usize, usize, PlannedRead)> = Vec::new();
         for (index, drive) in self
             .drives
             .iter()
@@ -312,8 +332,11 @@ impl Schedule {
                 .items
                 .iter()
                 .filter(|i| i.read.class == PollClass::Fast && i.due <= now);
-            self.round.extend(due.map(|i| (index, i.read)));
+            reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
         }
+        reads.sort_by_key(|(place, index, _)| (*place, *index));
+        self.round
+            .extend(reads.into_iter().map(|(_, index, read)| (index, read)));
         if self.round.is_empty() {
             self.round_due = now + self.cadence.fast;
             self.round_started = None;
@@ -327,8 +350,20 @@ impl Schedule {
         self.round_due = if next + self.cadence.fast < now { now } else { next };
     }
 
+    /// Parts of a block that was refused long ago, by mistake perhaps, are read as one again.
+    fn join_again(&mut self, now: Instant) {
+        for drive in &mut self.drives {
+            let due = |item: &&Item| item.whole_again.is_some_and(|at| at <= now);
+            while let Some(origin) = drive.items.iter().find(due).map(|item| item.origin) {
+                drive.join(origin, now);
+            }
+        }
+    }
+
     fn due_poll(&mut self, now: Instant) -> Option<Poll> {
-        if let Some(probe) = self.due_probe(now) {
+        // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
+        let hold = self.probed && !self.round.is_empty();
+        if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);
         }
         let slow = self.due_slow(now);
@@ -430,6 +465,7 @@ impl Schedule {
             return Change::None;
         };
         drive.failures = 0;
+        drive.garbled = 0;
         drive.tried = true;
         let came = drive.presence != Presence::Online;
         if came {
@@ -448,7 +484,10 @@ impl Schedule {
             change = drive.refused(poll.read, exception, now);
         } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.failures = 0;
-            item.refused = false;
+            if std::mem::take(&mut item.refused) {
+                // The bad point is sound again: it is read with its neighbours.
+                item.whole_again = Some(now);
+            }
             item.wanted = item.read.class != PollClass::Once;
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
@@ -479,10 +518,9 @@ impl Schedule {
             // A request that is never answered must not take the drive away while its process data comes.
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
-                item.due = if item.failures > retries {
-                    now + REFUSED_PAUSE
-                } else {
-                    now
+                item.due = match item.failures.checked_sub(retries + 1) {
+                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
+                    None => now,
                 };
             }
             return Change::None;
@@ -496,8 +534,33 @@ impl Schedule {
         }
         drive.presence = away(now, Duration::ZERO, took);
         drive.failures = 0;
+        drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);
         Change::Offline
+    }
+
+    fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
+        let retries = self.cadence.retries;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
+            return self.failed(poll, took, now);
+        }
+        drive.garbled += 1;
+        if poll.read.class == PollClass::Fast {
+            if drive.garbled <= retries {
+                self.round.push_front((poll.drive, poll.read));
+            }
+        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.due = if drive.garbled <= retries {
+                now
+            } else {
+                now + MUTE_PAUSE.0
+            };
+        }
+        Change::None
     }
 }
 
@@ -523,6 +586,7 @@ impl Item {
             refused: false,
             failures: 0,
             wanted: true,
+            whole_again: None,
         }
     }
 
@@ -567,7 +631,10 @@ impl DriveSchedule {
             return Change::Unavailable(read, exception);
         };
         let (origin, cost) = (item.origin, item.cost);
-        let halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
+        let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
+        for half in &mut halves {
+            half.whole_again = Some(now + REFUSED_PAUSE);
+        }
         self.items.splice(index..=index, halves);
         Change::None
     }
@@ -587,8 +654,12 @@ impl DriveSchedule {
                     last.read.count += item.read.count;
                     last.wanted = true;
                     last.due = last.due.min(now);
+                    last.whole_again = None;
                 }
-                _ => joined.push(item),
+                _ => joined.push(Item {
+                    whole_again: item.whole_again.filter(|_| item.origin != origin),
+                    ..item
+                }),
             }
         }
         self.items = joined;

@@ -173,9 +173,13 @@ impl Worker {
             let spec = &self.handle.image.spec;
             match Line::open(&spec.port, &spec.format, self.options.rs485) {
                 Ok((line, warnings)) => {
-                    pause = REOPEN.0;
                     self.opened(warnings);
+                    let opened = Instant::now();
                     let why = self.serve(&line);
+                    // A port that goes again at once is opened ever less often.
+                    if opened.elapsed() >= REOPEN.1 {
+                        pause = REOPEN.0;
+                    }
                     if let Err(lost) = why {
                         self.lost(&lost.to_string());
                     }
@@ -423,7 +427,13 @@ impl Worker {
                     tracing::warn!(bus = %self.handle.image.spec.name, "the line does not fall silent; speaking all the same");
                     return Ok(true);
                 }
-                Woken::Time => return Ok(true),
+                Woken::Time => {
+                    // A thread that was held up may not have seen the last bytes.
+                    self.hear_noise(line)?;
+                    if self.quiet_since + self.silence <= free {
+                        return Ok(true);
+                    }
+                }
                 Woken::Readable => self.hear_noise(line)?,
                 Woken::Command => {
                     self.handle.queue.clear_wake();
@@ -520,7 +530,10 @@ impl Worker {
                 if !self.paid || self.debts.owes(poll.drive, now) {
                     self.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
                 }
-                Polled::Failed
+                match ended {
+                    Ended::Corrupt(_) => Polled::Garbled,
+                    _ => Polled::Failed,
+                }
             }
         };
         let change = self.schedule.poll_done(poll, polled, took, now);

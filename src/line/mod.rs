@@ -318,13 +318,17 @@ fn read_back(fd: &OwnedFd) -> Option<String> {
 fn explain(error: &tokio_serial::Error) -> String {
     let text = error.to_string();
     let remedy = match error.kind() {
-        tokio_serial::ErrorKind::Io(io::ErrorKind::NotFound) | tokio_serial::ErrorKind::NoDevice => {
-            "check that the adapter is plugged in and the path is right, and that no other program has the port"
+        tokio_serial::ErrorKind::Io(io::ErrorKind::NotFound) => {
+            "check that the adapter is plugged in and the path is right"
         }
         tokio_serial::ErrorKind::Io(io::ErrorKind::PermissionDenied) => {
             "add the user to the group of the port (dialout)"
         }
-        _ => "check that the path is a serial port and no other program has it",
+        // A lock, or the kernel's exclusive mode.
+        tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(io::ErrorKind::WouldBlock) => {
+            "another program has it; end that program, or give this bus another port"
+        }
+        _ => "it is no serial port or does not work as one; give the path of the adapter, such as /dev/serial/by-id/…",
     };
     format!("{text}; {remedy}")
 }
