@@ -193,7 +193,10 @@ fn run(
         Master::Gateway => {}
         Master::Bare => {
             let requests: Vec<Request> = DRIVES.map(request).collect();
-            bare_master::run(Path::new(&port), &rod(format), &requests, time)?;
+            // In a thread of its own, which takes the precedence that it gives itself with it.
+            let measured =
+                std::thread::spawn(move || bare_master::run(Path::new(&port), &rod(format), &requests, time));
+            measured.join().map_err(|_| "the bare master panicked")??;
         }
         Master::TokioModbus { pause: wanted } => peers::tokio_modbus(&port, format.baud, pause(wanted), time)?,
         Master::Libmodbus { pause: wanted } => {
