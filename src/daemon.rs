@@ -115,9 +115,16 @@ impl Daemon {
     /// Takes a new configuration: what is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// When a server cannot listen on its new address; buses and other servers are as configured anew.
+    /// When a server cannot listen on its new address: everything is as it was before, the old servers are open again.
+    /// When the system gives no thread for a bus.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
-        self.take_servers(&settings).await?;
+        let before = self.settings.clone();
+        if let Err(error) = self.take_servers(&settings).await {
+            return Err(match self.take_servers(&before).await {
+                Ok(()) => error,
+                Err(back) => StartError(format!("{error}; the old servers cannot be opened again: {back}")),
+            });
+        }
         self.take_buses(&settings)?;
         self.take_mqtt(&settings).await;
         self.settings = settings;
@@ -165,10 +172,18 @@ impl Daemon {
                 bus.spec.name
             ))
         };
-        let drives = bus
-            .drives
-            .iter()
-            .map(|spec| Arc::new(DriveImage::new(spec.clone(), bus.spec.slow_cycle)));
+        let before = self.plant.load();
+        let drives = bus.drives.iter().map(|spec| {
+            let image = DriveImage::new(spec.clone(), bus.spec.slow_cycle);
+            // A bus that starts anew does not set a running drive free of its supervision.
+            if let Some(same) = before
+                .drive(&spec.name)
+                .filter(|d| d.image.spec.address == spec.address)
+            {
+                image.take_over_lease(&same.image);
+            }
+            Arc::new(image)
+        });
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives.collect()));
         let queue = Arc::new(CommandQueue::new().map_err(failed)?);
         let leases = Leases::new(self.events.clone(), self.writes.clone());
@@ -183,6 +198,7 @@ impl Daemon {
 
     async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
         if settings.modbus_tcp != self.settings.modbus_tcp {
+            self.settings.modbus_tcp = None;
             if let Some((cancel, server)) = self.modbus_tcp.take() {
                 cancel.cancel();
                 within(STOP_SERVER, "Modbus TCP", server.stopped()).await;
@@ -195,6 +211,7 @@ impl Daemon {
             self.settings.modbus_tcp = settings.modbus_tcp.clone();
         }
         if settings.http != self.settings.http {
+            self.settings.http = None;
             if let Some((cancel, server)) = self.http.take() {
                 cancel.cancel();
                 within(STOP_SERVER, "HTTP", server.stopped()).await;

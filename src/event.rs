@@ -1,14 +1,18 @@
 //! What happened: state changes that people and the cloud want to hear of, each told once.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::SystemTime;
+use std::time::{Duration, Instant, SystemTime};
 
 use serde::Serialize;
 use tokio::sync::broadcast;
 
 /// Events kept for late readers, and in flight for each subscriber.
 const KEPT: usize = 256;
+/// Refused commands told of one drive within [`REFUSALS_IN`]: a client without authority can send them at any rate.
+const REFUSALS: u32 = 10;
+/// The time for which refused commands are counted.
+const REFUSALS_IN: Duration = Duration::from_secs(1);
 
 /// What kind of thing happened.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
@@ -87,6 +91,32 @@ pub fn rfc3339<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,
     kept: Arc<Mutex<(u64, VecDeque<Arc<Event>>)>>,
+    /// By drive; names come from the configuration, so they are few.
+    refusals: Arc<Mutex<BTreeMap<String, Refusals>>>,
+}
+
+/// Refused commands of a drive.
+#[derive(Debug)]
+struct Refusals {
+    since: Instant,
+    told: u32,
+    untold: u64,
+}
+
+impl Refusals {
+    /// Whether one may be told now, and how many were not told before it.
+    fn admit(&mut self, now: Instant) -> Option<u64> {
+        if now.saturating_duration_since(self.since) >= REFUSALS_IN {
+            self.since = now;
+            self.told = 0;
+        }
+        if self.told == REFUSALS {
+            self.untold += 1;
+            return None;
+        }
+        self.told += 1;
+        Some(std::mem::take(&mut self.untold))
+    }
 }
 
 impl Default for Events {
@@ -94,6 +124,7 @@ impl Default for Events {
         Events {
             sender: broadcast::channel(KEPT).0,
             kept: Arc::default(),
+            refusals: Arc::default(),
         }
     }
 }
@@ -115,6 +146,33 @@ impl Events {
         let _ = self.sender.send(event);
     }
 
+    /// Tells that a command to `drive` was refused: ten a second at most, the next one tells how many were left out.
+    /// The audit has them all.
+    pub fn tell_refusal(&self, bus: &str, drive: &str, mut text: String, now: Instant) {
+        let untold = {
+            let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
+            let of_drive = refusals.entry(drive.to_string()).or_insert(Refusals {
+                since: now,
+                told: 0,
+                untold: 0,
+            });
+            of_drive.admit(now)
+        };
+        let Some(untold) = untold else { return };
+        if untold > 0 {
+            text = format!("{text} ({untold} more refused before are in the audit log)");
+        }
+        self.tell(Event {
+            id: 0,
+            time: SystemTime::now(),
+            kind: EventKind::RefusedCommand,
+            bus: bus.to_string(),
+            drive: Some(drive.to_string()),
+            fault_code: None,
+            text,
+        });
+    }
+
     /// Hears all events from now on; a listener that is 256 behind loses the oldest.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
         self.sender.subscribe()
@@ -129,5 +187,28 @@ impl Events {
             .iter()
             .cloned()
             .collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_flood_of_refusals_is_counted_not_told() {
+        let events = Events::default();
+        let now = Instant::now();
+        for _ in 0..1000 {
+            events.tell_refusal("line1", "pump-1", "refused".to_string(), now);
+        }
+        events.tell_refusal("line1", "pump-2", "refused".to_string(), now);
+        assert_eq!(
+            events.recent().len(),
+            11,
+            "ten of one drive, none of them at the cost of another drive"
+        );
+        events.tell_refusal("line1", "pump-1", "refused".to_string(), now + REFUSALS_IN);
+        let last = events.recent().last().map(|e| e.text.clone()).unwrap();
+        assert_eq!(last, "refused (990 more refused before are in the audit log)");
     }
 }

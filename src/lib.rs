@@ -1,4 +1,48 @@
-//! drivegate.
+//! drivegate: frequency converters on RS-485 on one side, Modbus TCP, MQTT and HTTP on the other.
+//!
+//! # The one flow
+//!
+//! ```text
+//!  drives ──line──▶ codec ──▶ bus (transaction, schedule) ──▶ cache ──▶ north (Modbus TCP, MQTT, HTTP)
+//!  drives ◀─line─── codec ◀── bus ◀────── command queue ◀────────────── north
+//! ```
+//!
+//! Values go up: the thread of a bus ([`bus`]) owns its [`mod@line`], asks one drive after the other and puts each reply
+//! into the process image ([`cache`]) as a whole. The servers ([`north`]) look at the image whenever they like; no
+//! reader costs the line anything. Orders go down: a server gives an order to the drive's handle ([`plant`]), which
+//! checks authority, limits and presence ([`mod@command`]) and queues it for the bus; whoever ordered gets exactly one
+//! answer. North and bus never name each other.
+//!
+//! # The parts
+//!
+//! In the order in which they may use each other, a later one the earlier ones; `tests/layering.rs` holds them to it.
+//!
+//! - [`document`]: TOML that knows the line of every key and collects all faults.
+//! - [`codec`]: requests and replies to and from bytes. Pure.
+//! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); which requests read them. Pure.
+//! - [`event`]: what happened, told once.
+//! - [`cache`]: the process image; many readers, one writer a bus.
+//! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
+//! - [`plant`]: all images and queues, as the north sides see them.
+//! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
+//! - [`bus`]: one exchange, what comes next, and the task that does it.
+//! - [`north`]: the servers, and the public register map.
+//! - [`sim`]: simulated drives on a simulated wire, and the broker of the demo.
+//! - [`config`]: file and environment to settings, every fault in one run.
+//! - [`daemon`]: wiring, reload, the order of stopping.
+//! - [`cli`]: one file a command.
+//!
+//! # Deliberately absent
+//!
+//! - A safety function: leases and stops here are conveniences; emergency stop and safe torque off are wired.
+//! - Writes that nobody ordered: none at start, at reconnect or at reload. What the gateway writes of itself are the
+//!   lease action and the stop at shutdown, and both only where they are configured.
+//! - Values without quality, and old values served as good ones.
+//! - A database, a user interface that writes, and plug-ins: profiles are declarative.
+//! - The async runtime on the way of the line: 3.5 characters are shorter than its timer's step.
+//!
+//! Why things are as they are stands in `docs/architecture.md`.
+
 pub mod bus;
 pub mod cache;
 pub mod cli;

@@ -12,7 +12,7 @@ use crate::command::{
     self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats,
 };
 use crate::drive::Value;
-use crate::event::{Event, EventKind, Events};
+use crate::event::Events;
 
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
@@ -247,17 +247,12 @@ impl DriveHandle {
         }
     }
 
-    /// Tells that a command was refused.
+    /// Tells that a command was refused; a flood of them is counted, not told.
     pub fn tell_refusal(&self, what: &str, why: &str, origin: &Origin) {
-        self.events.tell(Event {
-            id: 0,
-            time: std::time::SystemTime::now(),
-            kind: EventKind::RefusedCommand,
-            bus: self.image.spec.bus.clone(),
-            drive: Some(self.image.spec.name.clone()),
-            fault_code: None,
-            text: format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who),
-        });
+        let what = if what.is_empty() { "an empty command" } else { what };
+        let text = format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who);
+        let spec = &self.image.spec;
+        self.events.tell_refusal(&spec.bus, &spec.name, text, Instant::now());
     }
 
     fn describe(&self, order: &Order) -> String {

@@ -105,7 +105,18 @@ fn the_commands_of_the_readme_exist() {
         .collect();
     assert!(commands.len() >= 7, "{commands:?}");
     for command in commands {
-        run_well(Path::new(DRIVEGATE), &[command, "--help"]);
+        let help = run_well(Path::new(DRIVEGATE), &[command, "--help"]);
+        assert!(help.contains(&format!("Usage: drivegate {command}")), "{help}");
+    }
+}
+
+/// Somebody who looks for a page must find it.
+#[test]
+fn the_index_names_every_page() {
+    let index = read(&root().join("docs/README.md"));
+    for page in files(&root().join("docs"), "md") {
+        let name = page.file_name().unwrap().to_string_lossy().into_owned();
+        assert!(name == "README.md" || index.contains(&format!("]({name})")), "{name}");
     }
 }
 

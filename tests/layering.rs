@@ -10,6 +10,7 @@
     reason = "a test may panic, its helpers too"
 )]
 
+use std::collections::BTreeMap;
 use std::fs;
 use std::path::{Path, PathBuf};
 
@@ -25,13 +26,21 @@ const STRANGERS: [(&str, &str); 2] = [("north", "bus"), ("bus", "north")];
 #[test]
 fn no_file_imports_from_a_room_below_it() {
     let src = Path::new(env!("CARGO_MANIFEST_DIR")).join("src");
+    let texts: BTreeMap<PathBuf, String> = rust_files(&src)
+        .into_iter()
+        .map(|file| {
+            (
+                file.strip_prefix(&src).unwrap().to_path_buf(),
+                fs::read_to_string(&file).unwrap(),
+            )
+        })
+        .collect();
+    let modules = modules_of_all(&texts);
     let mut faults = Vec::new();
     let mut paths_seen = 0;
-    for file in rust_files(&src) {
-        let relative = file.strip_prefix(&src).unwrap();
-        let text = fs::read_to_string(&file).unwrap();
-        paths_seen += crate_paths(&modules_of(relative), &text).len();
-        faults.extend(check(relative, &text));
+    for (file, text) in &texts {
+        paths_seen += crate_paths(&modules[file], text).len();
+        faults.extend(check(file, &modules[file], text));
     }
     assert!(
         paths_seen > 20,
@@ -72,7 +81,7 @@ fn an_upward_import_is_caught() {
         ("daemon.rs", "use crate::cli::run;"),
     ];
     for (file, text) in upward {
-        assert_eq!(check(Path::new(file), text).len(), 1, "{file}: {text}");
+        assert_eq!(check_alone(file, text).len(), 1, "{file}: {text}");
     }
 }
 
@@ -106,8 +115,28 @@ fn a_downward_import_is_fine() {
         ("bin/measure.rs", "use drivegate::sim::Wire;"),
     ];
     for (file, text) in downward {
-        assert_eq!(check(Path::new(file), text), Vec::<String>::new(), "{file}: {text}");
+        assert_eq!(check_alone(file, text), Vec::<String>::new(), "{file}: {text}");
     }
+}
+
+#[test]
+fn a_path_attribute_moves_a_file() {
+    let text = |text: &str| text.to_string();
+    let texts = BTreeMap::from([
+        (
+            PathBuf::from("bus/plan.rs"),
+            text("#[cfg(test)]\n#[path = \"plan_tests.rs\"]\nmod tests;\n"),
+        ),
+        (
+            PathBuf::from("bus/plan_tests.rs"),
+            text("use super::super::schedule::Job; use super::super::super::north;"),
+        ),
+    ]);
+    let file = Path::new("bus/plan_tests.rs");
+    let modules = &modules_of_all(&texts)[file];
+    assert_eq!(modules.join("::"), "bus::plan::tests");
+    let faults = check(file, modules, &texts[file]);
+    assert_eq!(faults, ["src/bus/plan_tests.rs:1: `bus` must not name `north`"]);
 }
 
 fn rust_files(dir: &Path) -> Vec<PathBuf> {
@@ -134,21 +163,33 @@ fn modules_of(file: &Path) -> Vec<String> {
     if modules.last().is_some_and(|last| last == "mod") {
         modules.pop();
     }
-    // The tests of a module in a file beside it.
-    if let Some(stem) = modules
-        .last()
-        .and_then(|last| last.strip_suffix("_tests"))
-        .map(str::to_string)
-    {
-        modules.pop();
-        modules.extend([stem, "tests".to_string()]);
-    }
     modules
 }
 
-/// The faults of one file, given by its path below `src`.
-fn check(file: &Path, text: &str) -> Vec<String> {
-    let modules = modules_of(file);
+/// The module path of every file: by its place, or where a `#[path = "…"]` puts it.
+fn modules_of_all(texts: &BTreeMap<PathBuf, String>) -> BTreeMap<PathBuf, Vec<String>> {
+    let mut all: BTreeMap<PathBuf, Vec<String>> = texts.keys().map(|file| (file.clone(), modules_of(file))).collect();
+    for (file, text) in texts {
+        for rest in text.split("#[path = \"").skip(1) {
+            let (path, rest) = rest.split_once("\"]").unwrap();
+            let mut words = rest
+                .split(|c: char| !c.is_alphanumeric() && c != '_')
+                .filter(|w| !w.is_empty());
+            let name = words.by_ref().skip_while(|w| *w != "mod").nth(1).unwrap();
+            let mut modules = modules_of(file);
+            modules.push(name.to_string());
+            all.insert(file.parent().unwrap().join(path), modules);
+        }
+    }
+    all
+}
+
+fn check_alone(file: &str, text: &str) -> Vec<String> {
+    check(Path::new(file), &modules_of(Path::new(file)), text)
+}
+
+/// The faults of one file, given by its path below `src` and its module path.
+fn check(file: &Path, modules: &[String], text: &str) -> Vec<String> {
     let room = match modules.first().map(String::as_str) {
         // The house itself names all its rooms.
         Some("lib") => return Vec::new(),
@@ -169,7 +210,7 @@ fn check(file: &Path, text: &str) -> Vec<String> {
         };
         Some(format!("src/{}:{line}: {why}", file.display()))
     };
-    crate_paths(&modules, text).into_iter().filter_map(fault).collect()
+    crate_paths(modules, text).into_iter().filter_map(fault).collect()
 }
 
 /// Line and first segment of every path that starts at the root of the crate.

@@ -162,7 +162,9 @@ fn pymodbus_commands_a_drive() {
     let line = line();
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut command = Command::new(root.join(".tools/venv/bin/python"));
-    command.arg(root.join("tests/sim_peers.py")).arg(line.address());
+    command
+        .arg(root.join("tests/peers/simulated_line.py"))
+        .arg(line.address());
     let (done, text) = run(&mut command, "make the Python environment .tools/venv with pymodbus");
     let minus = |value: i16| (value as u16).to_string();
     let running = format!(

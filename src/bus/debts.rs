@@ -4,6 +4,13 @@
 //! during a later exchange. It is told apart by address, function and length; only a request to the same drive whose
 //! reply would look the same could be answered wrongly. Such a request waits until the debt is forgotten. The same
 //! request may be sent again at once: whichever reply comes, it tells the truth about the same registers.
+//!
+//! But the reply that comes then may be the older one, and the newer is owed in its place: a drive that is always a
+//! little slower than the deadline stays one reply behind as long as the same request follows upon itself. So while a
+//! look-alike waits, the request that is in debt is held back too after a while: the drive gets the time to pay.
+//!
+//! A write acknowledged late is worth nothing once another write to that drive was acknowledged in between: the same
+//! write then waits as a look-alike does.
 
 use std::time::{Duration, Instant};
 
@@ -11,36 +18,119 @@ use crate::codec::RequestPdu;
 
 /// A reply that has not come by then will not come.
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
+/// A look-alike waits no longer than that before the request in debt is held back for it.
+const PATIENCE: Duration = Duration::from_secs(1);
 
 /// What the drives of a bus owe.
 #[derive(Debug, Default)]
-pub struct Debts(Vec<Debt>);
+pub struct Debts {
+    owed: Vec<Debt>,
+    /// What was answered last.
+    last: Option<(usize, RequestPdu)>,
+}
 
 #[derive(Debug)]
 struct Debt {
     drive: usize,
     pdu: RequestPdu,
+    /// When the first of the exchanges that were given up in a row began; `None` once the request was answered.
+    since: Option<Instant>,
     until: Instant,
+    /// How late the answer was, if it was the older reply.
+    late: Duration,
+    /// Until when the newer reply may come.
+    newer: Option<Instant>,
+    /// Since when a look-alike waits.
+    wanted: Option<Instant>,
+    /// Another write was acknowledged meanwhile.
+    overtaken: bool,
+}
+
+impl Debt {
+    fn ends(&self) -> Instant {
+        self.newer.map_or(self.until, |newer| newer.max(self.until))
+    }
+
+    fn blocks(&self, pdu: &RequestPdu, now: Instant) -> bool {
+        if self.pdu == *pdu {
+            self.overtaken || self.wanted.is_some_and(|since| now >= since + PATIENCE)
+        } else {
+            Look::of(&self.pdu) == Look::of(pdu)
+        }
+    }
 }
 
 impl Debts {
-    /// No believable answer to `pdu` came.
-    pub fn given_up(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) {
-        self.0
-            .retain(|debt| debt.until > now && !(debt.drive == drive && debt.pdu == *pdu));
-        self.0.push(Debt {
-            drive,
-            pdu: pdu.clone(),
-            until: now + FORGOTTEN_AFTER,
-        });
+    /// No believable answer to `pdu` came in an exchange from `began` to `now`.
+    pub fn given_up(&mut self, drive: usize, pdu: &RequestPdu, began: Instant, now: Instant) {
+        self.owed.retain(|debt| debt.ends() > now);
+        let until = now + FORGOTTEN_AFTER;
+        match self
+            .owed
+            .iter_mut()
+            .find(|debt| debt.drive == drive && debt.pdu == *pdu)
+        {
+            Some(debt) => {
+                debt.until = until;
+                debt.since.get_or_insert(began);
+            }
+            None => self.owed.push(Debt {
+                drive,
+                pdu: pdu.clone(),
+                since: Some(began),
+                until,
+                late: Duration::ZERO,
+                newer: None,
+                wanted: None,
+                overtaken: false,
+            }),
+        }
+    }
+
+    /// An answer to `pdu` came.
+    pub fn answered(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) {
+        self.last = Some((drive, pdu.clone()));
+        self.owed.retain(|debt| debt.ends() > now);
+        for debt in self.owed.iter_mut().filter(|debt| debt.drive == drive) {
+            if debt.pdu == *pdu {
+                // The newer reply will be about as late as the older one was, if it was the older one.
+                if let Some(since) = debt.since.take() {
+                    debt.late = now.saturating_duration_since(since).max(debt.late).min(FORGOTTEN_AFTER);
+                }
+                debt.newer = Some(now + debt.late);
+            } else if pdu.is_write() && debt.pdu.is_write() {
+                debt.overtaken = true;
+            }
+        }
+    }
+
+    /// Whether the last reply, if it came once more, could pass for the reply to `pdu`.
+    pub fn could_be_doubled(&self, drive: usize, pdu: &RequestPdu) -> bool {
+        let last = self.last.as_ref().filter(|(of, _)| *of == drive);
+        last.is_some_and(|(_, last)| Look::of(last) == Look::of(pdu))
+    }
+
+    /// Whether a drive owes anything.
+    pub fn owes(&self, drive: usize, now: Instant) -> bool {
+        self.owed.iter().any(|debt| debt.drive == drive && debt.ends() > now)
     }
 
     /// Until when `pdu` must wait because a reply that is owed could pass for its own.
-    pub fn blocks(&self, drive: usize, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
-        let blocking = |debt: &&Debt| {
-            debt.drive == drive && debt.until > now && debt.pdu != *pdu && Look::of(&debt.pdu) == Look::of(pdu)
-        };
-        self.0.iter().filter(blocking).map(|debt| debt.until).max()
+    pub fn blocks(&mut self, drive: usize, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
+        let mut until = None;
+        let owed = self
+            .owed
+            .iter_mut()
+            .filter(|debt| debt.drive == drive && debt.ends() > now);
+        for debt in owed {
+            if debt.blocks(pdu, now) {
+                until = until.max(Some(debt.ends()));
+                if debt.pdu != *pdu {
+                    debt.wanted.get_or_insert(now);
+                }
+            }
+        }
+        until
     }
 }
 
@@ -71,6 +161,8 @@ mod tests {
     use super::*;
     use crate::codec::Table;
 
+    const DEADLINE: Duration = Duration::from_millis(105);
+
     fn read(start: u16, count: u16) -> RequestPdu {
         RequestPdu::Read {
             table: Table::Holding,
@@ -83,7 +175,7 @@ mod tests {
     fn only_what_could_be_mistaken_waits() {
         let now = Instant::now();
         let mut debts = Debts::default();
-        debts.given_up(1, &read(2100, 11), now);
+        debts.given_up(1, &read(2100, 11), now - DEADLINE, now);
         assert_eq!(debts.blocks(1, &read(2100, 11), now), None, "the same request");
         assert_eq!(debts.blocks(1, &read(2000, 3), now), None, "another length");
         assert_eq!(debts.blocks(2, &read(0, 11), now), None, "another drive");
@@ -110,6 +202,7 @@ mod tests {
                 address: 2000,
                 value: 1,
             },
+            now - DEADLINE,
             now,
         );
         assert_eq!(
@@ -129,6 +222,7 @@ mod tests {
                 start: 2000,
                 values: vec![1, 2],
             },
+            now - DEADLINE,
             now,
         );
         let other = RequestPdu::WriteRegisters {
@@ -136,5 +230,83 @@ mod tests {
             values: vec![0, 2],
         };
         assert!(debts.blocks(0, &other, now).is_some());
+    }
+
+    /// A drive that answers each request 110 ms after it was sent, where the deadline is 105 ms: it is one reply behind
+    /// all the time. Two reads that look alike are due all the time.
+    #[test]
+    fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
+        let (a, b) = (read(2100, 3), read(2104, 3));
+        let late = Duration::from_millis(110);
+        let start = Instant::now();
+        let (mut now, mut debts) = (start, Debts::default());
+        let mut coming: std::collections::VecDeque<(Instant, RequestPdu)> = std::collections::VecDeque::new();
+        let mut answered = [0, 0];
+        let mut turn = 0;
+        while now < start + Duration::from_secs(20) {
+            turn += 1;
+            let order = if turn % 2 == 0 { [&a, &b] } else { [&b, &a] };
+            let Some(asked) = order.into_iter().find(|pdu| debts.blocks(0, pdu, now).is_none()) else {
+                now += Duration::from_millis(1);
+                coming.retain(|(at, _)| *at > now);
+                continue;
+            };
+            // What came while nobody listened is noise.
+            coming.retain(|(at, _)| *at > now);
+            coming.push_back((now + late, asked.clone()));
+            let deadline = now + DEADLINE;
+            match coming.front().cloned().filter(|(at, _)| *at <= deadline) {
+                Some((at, of)) => {
+                    coming.pop_front();
+                    now = at;
+                    assert_eq!(&of, asked, "after {:?}", now - start);
+                    answered[usize::from(of == b)] += 1;
+                    debts.answered(0, asked, now);
+                }
+                None => {
+                    now = deadline;
+                    debts.given_up(0, asked, now - DEADLINE, now);
+                }
+            }
+            now += Duration::from_millis(2);
+        }
+        assert!(answered.iter().all(|count| *count > 5), "both are read: {answered:?}");
+    }
+
+    #[test]
+    fn a_request_in_debt_is_not_held_back_for_ever() {
+        let start = Instant::now();
+        let mut debts = Debts::default();
+        let (a, b) = (read(2100, 3), read(2104, 3));
+        debts.given_up(0, &a, start - DEADLINE, start);
+        let ms = Duration::from_millis;
+        let mut longest = Duration::ZERO;
+        let (mut last_a, mut first_b) = (start, None);
+        for millisecond in 0..5000 {
+            let now = start + ms(millisecond);
+            if first_b.is_none() && debts.blocks(0, &b, now).is_none() {
+                first_b = Some(now - start);
+            }
+            if millisecond % 12 == 0 && debts.blocks(0, &a, now).is_none() {
+                longest = longest.max(now - last_a);
+                last_a = now;
+                debts.answered(0, &a, now);
+            }
+        }
+        assert!(first_b.is_some_and(|at| at < ms(2200)), "{first_b:?}");
+        assert!(longest < ms(1200), "{longest:?}");
+        assert!(start + ms(5000) - last_a < ms(20), "the debt is forgotten");
+    }
+
+    #[test]
+    fn a_late_acknowledgement_does_not_stand_for_a_write_that_another_overtook() {
+        let now = Instant::now();
+        let write = |value| RequestPdu::WriteRegister { address: 2000, value };
+        let mut debts = Debts::default();
+        debts.given_up(0, &write(1), now - DEADLINE, now);
+        assert_eq!(debts.blocks(0, &write(1), now), None, "tried again at once");
+        debts.answered(0, &write(0), now);
+        assert_eq!(debts.blocks(0, &write(1), now), Some(now + FORGOTTEN_AFTER));
+        assert_eq!(debts.blocks(0, &write(0), now), None);
     }
 }

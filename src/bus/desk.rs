@@ -57,6 +57,9 @@ impl Desk {
         schedule: &mut Schedule,
         now: Instant,
     ) -> Result<Job, Instant> {
+        for drive in pending.take_stopped() {
+            self.purge(drive, now);
+        }
         let (begun, mut wake_at) = self.begun_next(drives, now);
         let queued = pending.next_urgency(now);
         // A full hand of begun commands takes only a stop besides.
@@ -129,9 +132,6 @@ impl Desk {
             command.ticket.answer(Outcome::Offline, now);
             return;
         };
-        if command.urgency == Urgency::Stop {
-            self.purge(command.drive, now);
-        }
         self.begun.push(Execution::new(command, &drive.spec.profile));
     }
 
@@ -174,10 +174,7 @@ impl Desk {
         };
         let outcome = match reply {
             Some(reply) => execution.answered(pdu, reply, &mut self.shadow),
-            None => {
-                self.debts.given_up(execution.drive, pdu, now);
-                execution.failed(pdu, retries)
-            }
+            None => execution.failed(pdu, retries),
         };
         if let Some(outcome) = outcome {
             let execution = self.begun.remove(index);

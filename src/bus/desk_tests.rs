@@ -294,8 +294,14 @@ impl Model {
             }
             Line::RequestLost => None,
         };
+        let began = self.now;
         let took = Duration::from_millis(if reply.is_some() { 5 } else { 50 });
         self.now += took;
+        match &reply {
+            None => self.desk.debts.given_up(drive, &pdu, began, self.now),
+            Some(Reply::Exception(_)) => {}
+            Some(_) => self.desk.debts.answered(drive, &pdu, self.now),
+        }
         match job {
             Job::Poll(poll) => self.polled(&poll, reply, took),
             Job::Command { index, pdu } => {
@@ -322,10 +328,7 @@ impl Model {
                 Polled::Ok
             }
             Some(_) => Polled::Refused(Exception::BUSY),
-            None => {
-                self.desk.debts.given_up(poll.drive, &poll.read.pdu(), now);
-                Polled::Failed
-            }
+            None => Polled::Failed,
         };
         let link = match self.schedule.poll_done(poll, polled, took, now) {
             Change::Online => Link::Online(std::time::SystemTime::UNIX_EPOCH),
@@ -394,7 +397,7 @@ impl Model {
 }
 
 proptest! {
-    #![proptest_config(ProptestConfig { cases: 300, failure_persistence: None, ..ProptestConfig::default() })]
+    #![proptest_config(ProptestConfig { cases: 500, failure_persistence: None, ..ProptestConfig::default() })]
 
     #[test]
     fn one_answer_each_and_nothing_runs_behind_a_stop(steps in steps()) {

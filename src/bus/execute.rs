@@ -7,7 +7,7 @@ use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency};
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Profile, Raw, Value};
+use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
 
 /// The registers of all drives of a bus whose bits are commanded, as the drives have them.
 ///
@@ -81,6 +81,12 @@ pub struct Execution {
     failures: u32,
     /// A write was sent and not answered: whether the drive took it is not known.
     in_doubt: bool,
+    /// It sets every bit that can be commanded, reset bits apart.
+    whole: bool,
+    /// What the drive last said of its motor.
+    running: bool,
+    /// The drive does not tell its own word: bits that the command does not set are written as 0.
+    blind: bool,
 }
 
 impl Execution {
@@ -96,6 +102,7 @@ impl Execution {
             ..
         } = command;
         let effects = confirm::effects(profile, &order);
+        let whole = matches!(&order, Order::Points(values) if sets_all_bits(profile, values));
         let actions = match order {
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
@@ -113,12 +120,16 @@ impl Execution {
             reply: Reply::Written,
             failures: 0,
             in_doubt: false,
+            whole,
+            running: true,
+            blind: false,
         }
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
     /// sent any more, but a reset bit that is set is taken away.
     pub fn next(&mut self, shadow: &Shadow, profile: &Profile, running: bool, now: Instant) -> Next {
+        self.running = running;
         if self.is_late(now) {
             let outcome = if self.failures > 0 {
                 Outcome::TimedOut
@@ -143,7 +154,7 @@ impl Execution {
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
-            match request(action, self.drive, shadow, profile, running) {
+            match request(action, self.drive, shadow, profile, running, self.blind) {
                 Some(pdu) => return Next::Send(pdu),
                 // Nothing to take away: the pulse starts at once, without the pause behind.
                 None => {
@@ -164,15 +175,20 @@ impl Execution {
     /// The drive answered the request that [`Execution::next`] gave. The outcome, when the command is over.
     pub fn answered(&mut self, sent: &RequestPdu, reply: Reply, shadow: &mut Shadow) -> Option<Outcome> {
         self.failures = 0;
-        if sent.is_write() {
+        // An exception tells nothing of an earlier try that was not answered.
+        if sent.is_write() && !matches!(reply, Reply::Exception(_)) {
             self.in_doubt = false;
         }
         if let Reply::Exception(code) = reply {
+            let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
+            if self.reads_word(sent) && (kept_back || self.urgency == Urgency::Stop) {
+                return self.without_word(Outcome::Exception(code));
+            }
             return Some(Outcome::Exception(code));
         }
         note_write(self.drive, sent, shadow);
-        if let (RequestPdu::Read { table, start, .. }, Some(action)) = (sent, self.actions.front())
-            && !matches!(action, Action::Send(_))
+        if let RequestPdu::Read { table, start, .. } = sent
+            && self.reads_word(sent)
         {
             // The drive's own word, read because the shadow did not have it.
             return match reply {
@@ -193,12 +209,33 @@ impl Execution {
     pub fn failed(&mut self, sent: &RequestPdu, retries: u32) -> Option<Outcome> {
         self.failures += 1;
         self.in_doubt |= sent.is_write();
-        (self.failures > retries).then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
+        let over = self.failures > retries;
+        if self.reads_word(sent) && (over || self.urgency == Urgency::Stop) {
+            return self.without_word(Outcome::TimedOut);
+        }
+        over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
     }
 
     /// Whether the drive may have taken a write that it did not answer: its words are not known then.
     pub fn in_doubt(&self) -> bool {
         self.in_doubt
+    }
+
+    /// Whether that request reads the drive's own word, which the shadow did not have.
+    fn reads_word(&self, sent: &RequestPdu) -> bool {
+        matches!(sent, RequestPdu::Read { .. }) && !matches!(self.actions.front(), Some(Action::Send(_)) | None)
+    }
+
+    /// The drive does not tell its own word. A stop goes out all the same: no read stands in its way. So does a
+    /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
+    /// and ends with `outcome`.
+    fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
+        if self.urgency != Urgency::Stop && self.running && !self.whole {
+            return Some(outcome);
+        }
+        self.blind = true;
+        self.failures = 0;
+        None
     }
 
     /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
@@ -249,6 +286,13 @@ impl Execution {
 
 /// A word and the bits of it that change.
 type WordChange = (Raw, Vec<(u8, bool)>);
+
+/// Whether a command sets every bit of the profile that can be commanded, reset bits apart.
+fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> bool {
+    let level = |p: &Point| p.write && !p.pulse && p.raw().is_some_and(|r| matches!(r.form, Form::Bit { .. }));
+    let mut bits = profile.points.iter().enumerate().filter(|(_, p)| level(p));
+    bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
+}
 
 fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque<Action> {
     let mut numbers = VecDeque::new();
@@ -308,8 +352,15 @@ fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque
 }
 
 /// The request of an action with the shadow as it is now; a read where the shadow does not know the word;
-/// `None` where there is nothing to do.
-fn request(action: &Action, drive: usize, shadow: &Shadow, profile: &Profile, running: bool) -> Option<RequestPdu> {
+/// `None` where there is nothing to do. `blind`: the word cannot be read.
+fn request(
+    action: &Action,
+    drive: usize,
+    shadow: &Shadow,
+    profile: &Profile,
+    running: bool,
+    blind: bool,
+) -> Option<RequestPdu> {
     let (raw, changes) = match action {
         Action::Send(pdu) => return Some(pdu.clone()),
         Action::Hold(_) => return None,
@@ -332,7 +383,7 @@ fn request(action: &Action, drive: usize, shadow: &Shadow, profile: &Profile, ru
             on,
         });
     }
-    let Some(old) = shadow.get(drive, raw.address) else {
+    let Some(old) = shadow.get(drive, raw.address).or(blind.then_some(0)) else {
         return Some(RequestPdu::Read {
             table: raw.table,
             start: raw.address,
@@ -575,5 +626,79 @@ mod tests {
         let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
         assert_eq!(command.failed(&sent, 1), None);
         assert_eq!(command.failed(&sent, 1), Some(Outcome::TimedOut));
+    }
+
+    /// What the command sends next.
+    fn sends(bench: &Bench, command: &mut Execution) -> RequestPdu {
+        match command.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
+            Next::Send(pdu) => pdu,
+            other => panic!("{other:?}"),
+        }
+    }
+
+    fn word(value: u16) -> RequestPdu {
+        RequestPdu::WriteRegister { address: 2000, value }
+    }
+
+    #[test]
+    fn a_stop_does_not_depend_on_a_read() {
+        let mut bench = Bench::new(1);
+        bench.running = true;
+        let refused = Reply::Exception(Exception::BUSY);
+        for answer in [Some(refused), None] {
+            let (mut stop, _a) = bench.begin(&[("run", 0.0)], Urgency::Stop);
+            let read = sends(&bench, &mut stop);
+            assert!(!read.is_write());
+            let ended = match answer {
+                Some(reply) => stop.answered(&read, reply, &mut bench.shadow),
+                None => stop.failed(&read, 3),
+            };
+            assert_eq!(ended, None);
+            assert_eq!(sends(&bench, &mut stop), word(0));
+        }
+    }
+
+    #[test]
+    fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
+        let mut bench = Bench::new(0);
+        let refused = || Reply::Exception(Exception::ADDRESS);
+        let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        let read = sends(&bench, &mut start);
+        assert_eq!(start.answered(&read, refused(), &mut bench.shadow), None);
+        assert_eq!(sends(&bench, &mut start), word(1));
+        assert!(start.answered(&word(1), Reply::Written, &mut bench.shadow).is_some());
+        assert_eq!(
+            bench.shadow.get(0, 2000),
+            Some(1),
+            "known from the acknowledged write on"
+        );
+        // A read that is never answered: after the tries.
+        let mut bench = Bench::new(0);
+        let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        assert_eq!(start.failed(&read, 1), None);
+        assert_eq!(sends(&bench, &mut start), read);
+        assert_eq!(start.failed(&read, 1), None);
+        assert_eq!(sends(&bench, &mut start), word(1));
+        // A drive that is only busy is not overruled.
+        let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        let busy = start.answered(&read, Reply::Exception(Exception::BUSY), &mut bench.shadow);
+        assert_eq!(busy, Some(Outcome::Exception(Exception::BUSY)));
+    }
+
+    #[test]
+    fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
+        let mut bench = Bench::new(1);
+        bench.running = true;
+        let refused = || Reply::Exception(Exception::ADDRESS);
+        for points in [&[("reverse", 1.0)][..], &[("run", 1.0)], &[("fault_reset", 1.0)]] {
+            let (mut command, _a) = bench.begin(points, Urgency::Command);
+            let read = sends(&bench, &mut command);
+            let ended = command.answered(&read, refused(), &mut bench.shadow);
+            assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
+        }
+        let (mut both, _a) = bench.begin(&[("run", 1.0), ("reverse", 1.0)], Urgency::Command);
+        let read = sends(&bench, &mut both);
+        assert_eq!(both.answered(&read, refused(), &mut bench.shadow), None);
+        assert_eq!(sends(&bench, &mut both), word(3));
     }
 }

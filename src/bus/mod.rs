@@ -8,6 +8,7 @@ pub mod leases;
 pub mod predict;
 mod report;
 pub mod schedule;
+mod tap;
 mod task;
 pub mod transaction;
 

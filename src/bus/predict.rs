@@ -213,15 +213,14 @@ impl<'a> Line<'a> {
     }
 
     /// Share of the line that slow requests can have: the idle time of a round as far as whole requests fit, or
-    /// their share of the time that the line is busy.
+    /// the share that they get in any case.
     fn room(&self, rounds: &Rounds) -> f64 {
         if rounds.fast == 0.0 {
             return 1.0;
         }
         let cycle = self.spec.cycle.as_secs_f64().max(1e-6);
         let fitting = ((cycle - rounds.fast).max(0.0) / rounds.longest_slow.max(1e-6)).floor();
-        let busy = (rounds.fast / cycle).min(1.0 - SLOW_SHARE) / (1.0 - SLOW_SHARE);
-        (fitting * rounds.mean_slow() / cycle).max(SLOW_SHARE * busy)
+        (fitting * rounds.mean_slow() / cycle).max(SLOW_SHARE)
     }
 
     /// Seconds from round to round, fast and slow.

@@ -1,13 +1,14 @@
-//! What the bus tells: health and figures of the image, events, and the frames for whoever listens.
+//! What the bus tells: health and figures of the image, and events.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::confirm::NotConfirmed;
-use super::task::{counted, time_of_day};
+use super::tap::{self, Tap};
+use super::task::counted;
 use super::transaction::{Ended, Transaction};
-use crate::cache::{Access, BusImage, Direction, FrameRecord, Link, PollCycle};
-use crate::codec::{Exception, Reply};
+use crate::cache::{Access, BusImage, Link, PollCycle};
+use crate::codec::{Exception, Reply, Request};
 use crate::drive::{FIELDBUS_FAULT_RESPONSE, ModelPoint, PlannedRead, Value};
 use crate::event::{Event, EventKind, Events};
 
@@ -238,28 +239,36 @@ impl Report {
         });
     }
 
-    pub(super) fn sent(&self, frame: &[u8], quiet_since: Instant, began: Instant) {
-        self.image.trace.tell(|| FrameRecord {
-            time: time_of_day(began),
-            gap: Some(began.saturating_duration_since(quiet_since)),
-            direction: Direction::Request,
-            bytes: frame.to_vec(),
-            verdict: String::new(),
-        });
+    /// Looks at an exchange for whoever listens to the frames; `None` while nobody does. The request was given to the
+    /// line at `began`, which had been silent since `quiet_since`.
+    pub(super) fn tap<'r>(
+        &self,
+        index: usize,
+        request: &'r Request,
+        frame: &'r [u8],
+        quiet_since: Instant,
+        began: Instant,
+    ) -> Option<Tap<'r>> {
+        if !self.image.trace.wanted() {
+            return None;
+        }
+        let tap = Tap::new(self.image.clone(), index, request, frame, began);
+        tap.sent(quiet_since, began);
+        Some(tap)
     }
 
-    pub(super) fn noise(&self, bytes: &[u8]) {
+    /// Bytes that are nobody's answer came in an exchange.
+    pub(super) fn foreign(&self) {
         self.image.update_health(|h| h.foreign += 1);
-        self.image.trace.tell(|| FrameRecord {
-            time: SystemTime::now(),
-            gap: None,
-            direction: Direction::Reply,
-            bytes: bytes.to_vec(),
-            verdict: "not asked for".to_string(),
-        });
     }
 
-    /// An exchange is over: counters, turnaround, load, trace. `sent` is when the drive knew that the request was over.
+    /// Bytes that nobody asked for came at `now`, on a line that had been silent since `quiet_since`.
+    pub(super) fn noise(&self, bytes: &[u8], quiet_since: Instant, now: Instant) {
+        self.foreign();
+        tap::noise(&self.image, bytes, quiet_since, now);
+    }
+
+    /// An exchange is over: counters, turnaround, load. `sent` is when the drive knew that the request was over.
     pub(super) fn exchanged(
         &mut self,
         index: usize,
@@ -288,20 +297,6 @@ impl Report {
                 drive.set_turnaround(by_first.min(by_last));
             }
         }
-        self.image.trace.tell(|| FrameRecord {
-            time: SystemTime::now(),
-            gap: transaction
-                .first_byte()
-                .map(|first| first.saturating_duration_since(sent)),
-            direction: Direction::Reply,
-            bytes: transaction.seen().to_vec(),
-            verdict: match ended {
-                Ended::Reply(Reply::Exception(code)) => code.to_string(),
-                Ended::Reply(_) => "ok".to_string(),
-                Ended::Silent => "no answer".to_string(),
-                Ended::Corrupt(why) => format!("corrupt: {why}"),
-            },
-        });
     }
 
     /// Reckons the load once a second.

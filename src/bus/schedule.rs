@@ -2,8 +2,8 @@
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls (public contract, section 8).
 //! Four rules soften it: after eight commands in a row a due poll goes first; commands other than stops have half of
-//! a line that is busy with polls at most; slow polls that had less than 5 %
-//! of the line go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! a line that is busy with polls at most; slow polls that had less than 5 % of the time go before fast ones; a drive
+//! that does not answer is asked so seldom that it costs at most 2 %.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
@@ -16,12 +16,18 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
 pub const SLOW_SHARE: f64 = 0.05;
+/// Credit that slow polls gather while none is due, in requests of the longest kind.
+const MOST_CREDIT: f64 = 1.5;
 /// Share of the line that a drive which does not answer costs at most.
 const DEAD_SHARE: f64 = 0.02;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Pause before a request that the drive refused, or never answers, is tried again.
+/// Pause before a request that the drive refused is tried again.
 const REFUSED_PAUSE: Duration = Duration::from_secs(60);
+/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
+const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
+const MOST_GARBLED: u32 = 8;
 
 /// A planned read of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,8 +58,10 @@ pub enum Polled {
     Ok,
     /// The drive refused it.
     Refused(Exception),
-    /// No answer, or none to be believed.
+    /// No answer.
     Failed,
+    /// An answer that cannot be believed: tried again, but the drive is not taken for dead so soon.
+    Garbled,
 }
 
 /// What changed by a poll.
@@ -93,6 +101,8 @@ struct Item {
     wanted: bool,
     /// A command changed what it reads: it goes before the round, so that the command is confirmed soon.
     asked: bool,
+    /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
+    whole_again: Option<Instant>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -107,6 +117,7 @@ struct DriveSchedule {
     presence: Presence,
     tried: bool,
     failures: u32,
+    garbled: u32,
     items: Vec<Item>,
 }
 
@@ -130,7 +141,15 @@ pub struct Schedule {
     new_round: Option<RoundStart>,
     slow_started: Option<Instant>,
     new_slow: Option<RoundStart>,
+    /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
+    /// Until when the credit is reckoned.
+    earned_until: Instant,
+    /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
+    /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
+    most_credit: Duration,
+    /// A probe found nobody since the last fast poll.
+    probed: bool,
     commands_in_a_row: u32,
     stops_in_a_row: u32,
     /// Time of the line that commands had more than polls, since polls last had nothing to do.
@@ -153,15 +172,20 @@ impl Schedule {
             presence: Presence::Away(now, Duration::ZERO),
             tried: false,
             failures: 0,
+            garbled: 0,
             items: plan
                 .reads
                 .iter()
                 .map(|read| Item::new(*read, *read, cost(index, read), now))
                 .collect(),
         });
+        let drives: Vec<DriveSchedule> = drives.collect();
+        let slow = drives.iter().flat_map(|drive| &drive.items);
+        let slow = slow.filter(|item| item.read.class != PollClass::Fast);
+        let longest = slow.map(|item| item.cost).max().unwrap_or_default();
         Schedule {
             cadence,
-            drives: drives.collect(),
+            drives,
             round: VecDeque::new(),
             round_due: now,
             round_started: None,
@@ -169,6 +193,9 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
+            earned_until: now,
+            most_credit: longest.mul_f64(MOST_CREDIT),
+            probed: false,
             commands_in_a_row: 0,
             stops_in_a_row: 0,
             command_lead: Duration::ZERO,
@@ -179,6 +206,7 @@ impl Schedule {
 
     /// What comes next. `waiting` is the rank of the command that would be next.
     pub fn next(&mut self, now: Instant, waiting: Option<Urgency>) -> Decision {
+        self.earn(now);
         self.start_round(now);
         let poll = self.due_poll(now);
         if poll.is_none() {
@@ -224,7 +252,6 @@ impl Schedule {
         } else {
             0
         };
-        self.earn(took);
     }
 
     /// A poll is over.
@@ -232,7 +259,6 @@ impl Schedule {
         self.commands_in_a_row = 0;
         self.stops_in_a_row = 0;
         self.command_lead = self.command_lead.saturating_sub(took);
-        self.earn(took);
         let item = self.drives.get_mut(poll.drive);
         let item = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read));
         // Two of them never follow one another while a round waits.
@@ -241,13 +267,16 @@ impl Schedule {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
             }
+            self.probed = false;
         } else {
             self.slow_credit = self.slow_credit.saturating_sub(took);
             self.note_slow(now);
         }
+        self.probed |= poll.probe && matches!(polled, Polled::Failed | Polled::Garbled);
         match polled {
             Polled::Ok | Polled::Refused(_) => self.answered(poll, polled, now),
             Polled::Failed => self.failed(poll, took, now),
+            Polled::Garbled => self.garbled(poll, took, now),
         }
     }
 
@@ -305,15 +334,21 @@ impl Schedule {
         }
     }
 
-    fn earn(&mut self, took: Duration) {
-        // A quarter of a second of slow polls at most: more would be a burst.
-        self.slow_credit = (self.slow_credit + took.mul_f64(SLOW_SHARE)).min(Duration::from_millis(250));
+    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
+    /// the line rests where none of them fits.
+    fn earn(&mut self, now: Instant) {
+        let passed = now.saturating_duration_since(self.earned_until);
+        self.earned_until = now;
+        self.slow_credit = (self.slow_credit + passed.mul_f64(SLOW_SHARE)).min(self.most_credit);
     }
 
     fn start_round(&mut self, now: Instant) {
         if !self.round.is_empty() || now < self.round_due {
             return;
         }
+        self.join_again(now);
+        // The first reads of all drives, then the second ones: a reply that comes twice meets another drive's request.
+        let mut reads: Vec<(usize, usize, PlannedRead)> = Vec::new();
         for (index, drive) in self
             .drives
             .iter()
@@ -324,8 +359,11 @@ impl Schedule {
                 .items
                 .iter()
                 .filter(|i| i.read.class == PollClass::Fast && i.due <= now);
-            self.round.extend(due.map(|i| (index, i.read)));
+            reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
         }
+        reads.sort_by_key(|(place, index, _)| (*place, *index));
+        self.round
+            .extend(reads.into_iter().map(|(_, index, read)| (index, read)));
         if self.round.is_empty() {
             self.round_due = now + self.cadence.fast;
             self.round_started = None;
@@ -339,8 +377,20 @@ impl Schedule {
         self.round_due = if next + self.cadence.fast < now { now } else { next };
     }
 
+    /// Parts of a block that was refused long ago, by mistake perhaps, are read as one again.
+    fn join_again(&mut self, now: Instant) {
+        for drive in &mut self.drives {
+            let due = |item: &&Item| item.whole_again.is_some_and(|at| at <= now);
+            while let Some(origin) = drive.items.iter().find(due).map(|item| item.origin) {
+                drive.join(origin, now);
+            }
+        }
+    }
+
     fn due_poll(&mut self, now: Instant) -> Option<Poll> {
-        if let Some(probe) = self.due_probe(now) {
+        // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
+        let hold = self.probed && !self.round.is_empty();
+        if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);
         }
         if let Some(asked) = self
@@ -461,6 +511,7 @@ impl Schedule {
             return Change::None;
         };
         drive.failures = 0;
+        drive.garbled = 0;
         drive.tried = true;
         let came = drive.presence != Presence::Online;
         if came {
@@ -479,7 +530,10 @@ impl Schedule {
             change = drive.refused(poll.read, exception, now);
         } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.failures = 0;
-            item.refused = false;
+            if std::mem::take(&mut item.refused) {
+                // The bad point is sound again: it is read with its neighbours.
+                item.whole_again = Some(now);
+            }
             item.wanted = item.read.class != PollClass::Once;
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
@@ -510,10 +564,9 @@ impl Schedule {
             // A request that is never answered must not take the drive away while its process data comes.
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
-                item.due = if item.failures > retries {
-                    now + REFUSED_PAUSE
-                } else {
-                    now
+                item.due = match item.failures.checked_sub(retries + 1) {
+                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
+                    None => now,
                 };
             }
             return Change::None;
@@ -527,8 +580,33 @@ impl Schedule {
         }
         drive.presence = away(now, Duration::ZERO, took);
         drive.failures = 0;
+        drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);
         Change::Offline
+    }
+
+    fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
+        let retries = self.cadence.retries;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
+            return self.failed(poll, took, now);
+        }
+        drive.garbled += 1;
+        if poll.read.class == PollClass::Fast {
+            if drive.garbled <= retries {
+                self.round.push_front((poll.drive, poll.read));
+            }
+        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.due = if drive.garbled <= retries {
+                now
+            } else {
+                now + MUTE_PAUSE.0
+            };
+        }
+        Change::None
     }
 }
 
@@ -555,6 +633,7 @@ impl Item {
             failures: 0,
             wanted: true,
             asked: false,
+            whole_again: None,
         }
     }
 
@@ -599,7 +678,10 @@ impl DriveSchedule {
             return Change::Unavailable(read, exception);
         };
         let (origin, cost) = (item.origin, item.cost);
-        let halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
+        let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
+        for half in &mut halves {
+            half.whole_again = Some(now + REFUSED_PAUSE);
+        }
         self.items.splice(index..=index, halves);
         Change::None
     }
@@ -619,8 +701,12 @@ impl DriveSchedule {
                     last.read.count += item.read.count;
                     last.wanted = true;
                     last.due = last.due.min(now);
+                    last.whole_again = None;
                 }
-                _ => joined.push(item),
+                _ => joined.push(Item {
+                    whole_again: item.whole_again.filter(|_| item.origin != origin),
+                    ..item
+                }),
             }
         }
         self.items = joined;

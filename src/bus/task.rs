@@ -2,14 +2,14 @@
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::desk::{Desk, Job};
 use super::leases::Leases;
 use super::report::Report;
 use super::schedule::{Cadence, Change, Poll, Polled, Schedule};
-use super::transaction::{Ended, Step, Transaction};
+use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
 use crate::cache::{Outcome as Counted, Snapshot};
 use crate::codec::{Reply, Request, RequestPdu, Table};
 use crate::command::{Command, Outcome, Urgency};
@@ -101,6 +101,10 @@ struct Worker {
     quiet_since: Instant,
     /// The adapter sends back what it is given.
     echo: bool,
+    /// Replies come faster than the wire could carry them: a simulation, or another baud rate behind a device server.
+    untimed: bool,
+    /// The last exchange ended with the drive's reply, mangled: it owes none.
+    paid: bool,
     frame: Vec<u8>,
 }
 
@@ -141,6 +145,8 @@ impl Worker {
             beats,
             quiet_since: now,
             echo: false,
+            untimed: false,
+            paid: false,
             frame: Vec::with_capacity(260),
         }
     }
@@ -152,9 +158,13 @@ impl Worker {
             let spec = &self.handle.image.spec;
             match Line::open(&spec.port, &spec.format, self.options.rs485) {
                 Ok((line, warnings)) => {
-                    pause = REOPEN.0;
                     self.opened(warnings);
+                    let opened = Instant::now();
                     let why = self.serve(&line);
+                    // A port that goes again at once is opened ever less often.
+                    if opened.elapsed() >= REOPEN.1 {
+                        pause = REOPEN.0;
+                    }
                     if let Err(lost) = why {
                         self.lost(&lost.to_string());
                     }
@@ -187,6 +197,7 @@ impl Worker {
         }
         self.quiet_since = now;
         self.echo = false;
+        self.untimed = false;
         self.schedule.reset(now);
         self.handle.queue.open();
         self.report.bus_up();
@@ -237,8 +248,10 @@ impl Worker {
         let mut buffer = [0u8; 512];
         let count = line.receive(&mut buffer)?;
         if count > 0 {
-            self.quiet_since = Instant::now();
-            self.report.noise(buffer.get(..count).unwrap_or_default());
+            let now = Instant::now();
+            self.report
+                .noise(buffer.get(..count).unwrap_or_default(), self.quiet_since, now);
+            self.quiet_since = now;
         }
         Ok(())
     }
@@ -288,7 +301,7 @@ impl Worker {
         };
         match job {
             Job::Poll(poll) => self.polled(&poll, ended, began, took),
-            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, took),
+            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, began, took),
         }
         Ok(())
     }
@@ -304,7 +317,13 @@ impl Worker {
                     tracing::warn!(bus = %self.handle.image.spec.name, "the line does not fall silent; speaking all the same");
                     return Ok(true);
                 }
-                Woken::Time => return Ok(true),
+                Woken::Time => {
+                    // A thread that was held up may not have seen the last bytes.
+                    self.hear_noise(line)?;
+                    if self.quiet_since + self.silence <= free {
+                        return Ok(true);
+                    }
+                }
                 Woken::Readable => self.hear_noise(line)?,
                 Woken::Command => {
                     self.handle.queue.clear_wake();
@@ -326,7 +345,7 @@ impl Worker {
         let wire = WireTime::of(spec.protocol, &spec.format, &request.pdu);
         let began = Instant::now();
         line.send(frame)?;
-        self.report.sent(frame, self.quiet_since, began);
+        let mut tap = self.report.tap(drive, request, frame, self.quiet_since, began);
         let sent = began + spec.format.chars(frame.len());
         let mut transaction = Transaction::new(
             spec.protocol,
@@ -337,6 +356,12 @@ impl Worker {
             wire.reply,
             self.echo,
         );
+        // A reply cannot be whole before its own time on the wire is over; baud rates are off by 2 % at most.
+        let earliest = sent + wire.reply.mul_f64(0.9);
+        let doubtful = self.desk.debts.could_be_doubled(drive, &request.pdu) || !is_unlike_its_reply(&request.pdu);
+        if doubtful && !self.untimed {
+            transaction.doubt_before(earliest);
+        }
         self.quiet_since = sent;
         let mut buffer = [0u8; 512];
         let mut step = transaction.on_time(began);
@@ -352,17 +377,33 @@ impl Worker {
                             if count > 0 {
                                 self.quiet_since = self.quiet_since.max(now);
                             }
-                            transaction.on_bytes(now, buffer.get(..count).unwrap_or_default())
+                            let bytes = buffer.get(..count).unwrap_or_default();
+                            if let Some(tap) = &mut tap {
+                                tap.heard(bytes, now);
+                            }
+                            transaction.on_bytes(now, bytes)
                         }
                         _ => transaction.on_time(now),
                     };
                 }
             }
         };
-        self.echo |= transaction.echo_seen();
+        self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
+        self.untimed |= match &ended {
+            Ended::Reply(Reply::Exception(_)) => false,
+            Ended::Reply(_) => !doubtful && Instant::now() < earliest,
+            Ended::Silent | Ended::Corrupt(_) => transaction.doubted(),
+        };
+        self.paid = matches!(ended, Ended::Corrupt(_)) && transaction.is_paid();
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
+        if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
+            self.report.foreign();
+        }
+        if let Some(tap) = tap {
+            tap.ended(&ended, Instant::now());
+        }
         Ok((ended, began, took))
     }
 
@@ -371,12 +412,18 @@ impl Worker {
         let polled = match &ended {
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
             Ended::Reply(reply) => {
+                self.desk.debts.answered(poll.drive, &poll.read.pdu(), now);
                 self.store(poll, reply, now);
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                self.desk.debts.given_up(poll.drive, &poll.read.pdu(), now);
-                Polled::Failed
+                if !self.paid || self.desk.debts.owes(poll.drive, now) {
+                    self.desk.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
+                }
+                match ended {
+                    Ended::Corrupt(_) => Polled::Garbled,
+                    _ => Polled::Failed,
+                }
             }
         };
         let change = self.schedule.poll_done(poll, polled, took, now);
@@ -425,7 +472,7 @@ impl Worker {
         });
     }
 
-    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, took: Duration) {
+    fn commanded(&mut self, index: usize, pdu: &RequestPdu, ended: Ended, began: Instant, took: Duration) {
         let now = Instant::now();
         let Some((drive, urgency)) = self.desk.begun(index) else {
             return;
@@ -434,9 +481,17 @@ impl Worker {
         let reply = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
+                if !matches!(reply, Reply::Exception(_)) {
+                    self.desk.debts.answered(drive, pdu, now);
+                }
                 Some(reply)
             }
-            Ended::Silent | Ended::Corrupt(_) => None,
+            Ended::Silent | Ended::Corrupt(_) => {
+                if !self.paid || self.desk.debts.owes(drive, now) {
+                    self.desk.debts.given_up(drive, pdu, began, now);
+                }
+                None
+            }
         };
         let drives = &self.handle.image.drives;
         self.desk.ended(index, pdu, reply, self.options.retries, drives, now);
@@ -465,9 +520,4 @@ pub(super) fn counted(ended: &Ended) -> Counted {
         Ended::Silent => Counted::Timeout,
         Ended::Corrupt(_) => Counted::Corrupt,
     }
-}
-
-/// The time of day of an instant in the near past.
-pub(super) fn time_of_day(at: Instant) -> SystemTime {
-    SystemTime::now() - Instant::now().saturating_duration_since(at)
 }

@@ -115,7 +115,7 @@ pub struct DriveImage {
     slow_cycle: Duration,
     snapshot: ArcSwap<Snapshot>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
-    /// Last turnaround measured, ns; 0 is none yet.
+    /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
     lease: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
@@ -177,13 +177,15 @@ impl DriveImage {
             .map_or(0, |c| c.load(Ordering::Relaxed))
     }
 
-    /// Notes the time from the end of a request to the beginning of its answer.
+    /// Notes a time from the end of a request to the beginning of its answer; single late wake-ups are smoothed out.
     pub fn set_turnaround(&self, time: Duration) {
-        self.turnaround
-            .store(time.as_nanos().clamp(1, u128::from(u64::MAX)) as u64, Ordering::Relaxed);
+        let last = self.turnaround.load(Ordering::Relaxed);
+        let time = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1);
+        let smooth = if last == 0 { time } else { last - last / 8 + time / 8 };
+        self.turnaround.store(smooth.max(1), Ordering::Relaxed);
     }
 
-    /// The last turnaround measured.
+    /// The turnaround measured, a mean over some eight answers.
     pub fn turnaround(&self) -> Option<Duration> {
         match self.turnaround.load(Ordering::Relaxed) {
             0 => None,
@@ -206,6 +208,14 @@ impl DriveImage {
     /// Leases that ran out while the drive ran, so far.
     pub fn supervisions(&self) -> u64 {
         self.supervisions.load(Ordering::Relaxed)
+    }
+
+    /// Goes on with the lease of the image that this one replaces.
+    pub fn take_over_lease(&self, from: &DriveImage) {
+        let renewed = *from.lease.lock().unwrap_or_else(PoisonError::into_inner);
+        if let (Some(renewed), true) = (renewed, self.spec.supervision.is_some()) {
+            self.renew_lease(renewed);
+        }
     }
 
     /// Ends the lease if it ran out; true exactly once for each lease.

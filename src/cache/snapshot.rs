@@ -61,7 +61,8 @@ pub struct Snapshot {
     pub link: Link,
     /// When the process data (fast class) was last read.
     pub fast_at: Option<Instant>,
-    spans: Vec<Span>,
+    /// Shared with the snapshots before, as far as nothing in them changed.
+    spans: Vec<Arc<Span>>,
 }
 
 /// Why words cannot be served.
@@ -78,11 +79,13 @@ pub enum Unavailable {
 impl Snapshot {
     /// Nothing is known of the plan's addresses yet.
     pub fn empty(plan: &Plan) -> Snapshot {
-        let spans = plan.reads.iter().map(|read| Span {
-            table: read.table,
-            start: read.start,
-            class: read.class,
-            cells: vec![Cell::default(); usize::from(read.count)],
+        let spans = plan.reads.iter().map(|read| {
+            Arc::new(Span {
+                table: read.table,
+                start: read.start,
+                class: read.class,
+                cells: vec![Cell::default(); usize::from(read.count)],
+            })
         });
         Snapshot {
             link: Link::Untried,
@@ -116,8 +119,9 @@ impl Snapshot {
                 return;
             };
             for span in &mut self.spans {
-                let place = span.offset(table, address);
-                if let Some(cell) = place.and_then(|p| span.cells.get_mut(p)) {
+                if let Some(place) = span.offset(table, address)
+                    && let Some(cell) = Arc::make_mut(span).cells.get_mut(place)
+                {
                     change(cell, offset);
                 }
             }

@@ -9,7 +9,7 @@ use tokio::sync::broadcast;
 const IN_FLIGHT: usize = 1024;
 
 /// Who sent a frame.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, serde::Serialize, serde::Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Direction {
     /// The gateway.
@@ -21,15 +21,21 @@ pub enum Direction {
 /// One frame, or bytes that are none.
 #[derive(Debug, Clone, PartialEq)]
 pub struct FrameRecord {
-    /// Beginning of a request, arrival of the last byte of a reply.
+    /// A request: when it was given to the port. A reply: when its last byte arrived. Silence instead of a reply: when
+    /// it was given up.
     pub time: SystemTime,
-    /// Time since the end of the frame before.
+    /// From the end of the frame before (the opening of the port, if there is none) to the beginning of this one; none
+    /// where nothing came. Ends of requests and beginnings of replies are reckoned from the time on the wire.
     pub gap: Option<Duration>,
     /// Who sent it.
     pub direction: Direction,
-    /// The bytes on the wire.
+    /// The drive that was asked; none for bytes that came between two exchanges.
+    pub drive: Option<String>,
+    /// The bytes on the wire; empty where nothing came.
     pub bytes: Vec<u8>,
-    /// What became of it: `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `timeout`.
+    /// The bytes in plain words ([`crate::codec::describe`]).
+    pub decode: String,
+    /// What became of it: empty for a request, then `ok`, `exception 02 …`, `corrupt: …`, `foreign`, `echo`, `timeout`.
     pub verdict: String,
 }
 

@@ -15,7 +15,7 @@ use crate::sim::endpoint::EndpointOptions;
 use crate::sim::half_duplex::{LineRules, Wire};
 use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 
-/// Arguments of `drivegate demo`.
+/// Shows the whole product with simulated drives: no hardware, nothing to install
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate demo\n  drivegate demo --speed max")]
 pub(super) struct Args {

@@ -4,6 +4,7 @@
 //! line in `commands!` below.
 
 mod check;
+mod client;
 mod demo;
 mod log;
 mod map;
@@ -12,6 +13,7 @@ mod report;
 mod run;
 mod schema;
 mod simulate;
+mod trace;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -61,6 +63,7 @@ commands! {
     Run => run,
     Demo => demo,
     Check => check,
+    Trace => trace,
     Simulate => simulate,
     Profiles => profiles,
     Map => map,

@@ -12,7 +12,7 @@ use super::{EXIT_CONFIG, EXIT_FAILED, report};
 use crate::config::{self, Settings};
 use crate::daemon::Daemon;
 
-/// Arguments of `drivegate run`.
+/// Runs the gateway until SIGTERM or Ctrl-C; SIGHUP reloads the configuration
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Example:\n  drivegate run --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
@@ -101,7 +101,7 @@ async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
             log.set_level(&settings.log.level);
             match daemon.reload(settings).await {
                 Ok(()) => tracing::info!(config = %path.display(), "the new configuration is taken"),
-                Err(error) => tracing::error!("the new configuration is taken in part: {error}"),
+                Err(error) => tracing::error!("the new configuration is not taken: {error}"),
             }
         }
     }

@@ -19,7 +19,7 @@ use std::process::ExitCode;
 use std::time::{Duration, Instant};
 use tokio::signal::unix::{SignalKind, signal};
 
-/// Arguments of `drivegate simulate`.
+/// Simulates drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("Examples:
   drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400

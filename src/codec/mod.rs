@@ -1,9 +1,10 @@
 //! Bytes on the wire to and from requests and replies: pure, without I/O and without a clock.
 //!
 //! On a half-duplex line a reply means something only against the outstanding request, so
-//! [`Codec::decode`] takes that request. Nothing can go stale between two exchanges.
+//! [`Protocol::decode`] takes that request. Nothing can go stale between two exchanges.
 
 mod checksum;
+pub mod describe;
 pub mod modbus;
 pub mod rtu;
 pub mod wire;

@@ -23,6 +23,8 @@ pub struct Pending {
     stops_only: bool,
     /// Clients in the order in which they were served, the last one last.
     served: VecDeque<String>,
+    /// Drives for which a stop came in since the bus last asked, each once.
+    stopped: Vec<usize>,
 }
 
 impl Pending {
@@ -43,6 +45,9 @@ impl Pending {
             self.remove(now, &Outcome::Purged, |c| {
                 c.drive == command.drive && c.urgency == Urgency::Command
             });
+            if !self.stopped.contains(&command.drive) {
+                self.stopped.push(command.drive);
+            }
         }
         if command.reference_only {
             self.remove(now, &Outcome::Replaced, |c| {
@@ -86,6 +91,12 @@ impl Pending {
         youngest(least)
             .filter(|(_, c)| held(c.ticket.client(), least) > own)
             .map(|(index, _)| index)
+    }
+
+    /// Drives for which a stop came in since the last call: nothing that was begun for them goes on, whatever becomes of
+    /// the stop itself.
+    pub fn take_stopped(&mut self) -> Vec<usize> {
+        std::mem::take(&mut self.stopped)
     }
 
     /// Rank of the command that would come next, expired ones answered and removed.

@@ -203,6 +203,10 @@ fn judge(
     http: Option<&north::Listener>,
 ) {
     unique::check(reader.document(), buses);
+    // Without Modbus TCP nobody is reached by a unit, and a gateway may have more drives than there are units.
+    if reader.has("modbus_tcp") {
+        unique::check_units(reader.document(), buses);
+    }
     let listeners = modbus_tcp.into_iter().flat_map(|m| &m.listeners).chain(http);
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);

@@ -204,6 +204,29 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
 }
 
 #[test]
+fn units_are_unique_where_modbus_tcp_serves_them() {
+    let mut source = "[gateway]\nname = \"g\"\n".to_string();
+    for bus in 1..=32 {
+        source += &format!("[[bus]]\nname = \"b{bus}\"\nport = \"/dev/tty{bus}\"\n");
+        for address in 1..=31 {
+            source +=
+                &format!("[[bus.drive]]\nname = \"d{bus}-{address}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
+        }
+    }
+    assert_eq!(
+        settings(&source).buses.iter().map(|b| b.drives.len()).sum::<usize>(),
+        992
+    );
+    let (served, _) = load(&(source + "[modbus_tcp]\n"));
+    assert_eq!(served.errors.len(), 961);
+    assert!(
+        served.errors[0].message.contains("unit 1 belongs to"),
+        "{:?}",
+        served.errors[0]
+    );
+}
+
+#[test]
 fn a_reload_sees_what_changed() {
     let one = settings(FULL);
     assert_eq!(one, settings(FULL));

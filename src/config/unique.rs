@@ -21,7 +21,6 @@ pub(super) fn check(document: &Document, buses: &[Found]) {
     );
     check_ports(document, buses);
     check_addresses(document, buses);
-    check_units(document, buses);
 }
 
 /// ` (line 7)`, or nothing.
@@ -109,7 +108,8 @@ fn owner(drive: &super::drive::Found) -> String {
     }
 }
 
-fn check_units(document: &Document, buses: &[Found]) {
+/// A unit id reaches one drive.
+pub(super) fn check_units(document: &Document, buses: &[Found]) {
     let drives = || buses.iter().flat_map(|bus| &bus.drives);
     let mut used: Vec<u8> = drives()
         .filter_map(|d| d.unit.as_ref())
@@ -127,7 +127,7 @@ fn check_units(document: &Document, buses: &[Found]) {
                 used.push(free);
                 format!("write unit = {free}, or another free one")
             }
-            None => "all 254 units are taken, so take a second gateway".to_string(),
+            None => "all 254 units are taken, so take a second gateway, or one without [modbus_tcp]".to_string(),
         };
         document.problem(place, format!("unit {unit} belongs to {first} already; {remedy}"));
     }

@@ -4,16 +4,20 @@
 //! The port is opened through tokio-serial's builder and then driven by the bus's own thread with `ppoll`: the timer
 //! of an async runtime ticks at a millisecond, which is longer than the silence of a frame at 38400 baud.
 
+mod clock;
 mod sys;
 
+use clock::WakeUps;
+pub use clock::{poll_until, sharpen_timers, wait_until};
+
+use std::cell::Cell;
 use std::fmt;
 use std::io;
 use std::net::{TcpStream, ToSocketAddrs};
-use std::num::NonZeroU64;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
-use rustix::event::{PollFd, PollFlags, Timespec, poll};
+use rustix::event::{PollFd, PollFlags};
 use rustix::termios::{ControlModes, tcgetattr};
 use tokio_serial::{DataBits, FlowControl, Parity as SerialParity, StopBits};
 
@@ -21,8 +25,6 @@ use crate::codec::{LineFormat, Parity};
 
 /// Time to reach a device server; the bus stops for no longer.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
-/// A wait ends this much before its time in the kernel; the rest is spun.
-const SPIN: Duration = Duration::from_micros(60);
 
 /// Who switches the direction of an RS-485 line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -98,6 +100,7 @@ impl fmt::Debug for Port {
 #[derive(Debug)]
 pub struct Line {
     port: Port,
+    wake_ups: Cell<WakeUps>,
 }
 
 impl Line {
@@ -107,9 +110,14 @@ impl Line {
     /// When the port cannot be opened or cannot do what is asked of it.
     pub fn open(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, Vec<String>), OpenError> {
         match port.strip_prefix("tcp://") {
-            Some(address) => open_tcp(port, address).map(|port| (Line { port }, Vec::new())),
+            Some(address) => open_tcp(port, address).map(|port| (Line::new(port), Vec::new())),
             None => open_serial(port, format, rs485),
         }
+    }
+
+    fn new(port: Port) -> Line {
+        let wake_ups = Cell::new(WakeUps::new());
+        Line { port, wake_ups }
     }
 
     fn fd(&self) -> BorrowedFd<'_> {
@@ -130,12 +138,11 @@ impl Line {
                 Ok(taken) => frame = frame.get(taken..).unwrap_or_default(),
                 Err(rustix::io::Errno::INTR) => {}
                 Err(rustix::io::Errno::AGAIN) => {
-                    let now = Instant::now();
-                    if now >= deadline {
+                    if Instant::now() >= deadline {
                         return Err(Lost("it takes no more bytes".to_string()));
                     }
                     let mut fds = [PollFd::from_borrowed_fd(self.fd(), PollFlags::OUT)];
-                    ppoll(&mut fds, deadline - now)?;
+                    poll_port(&mut fds, deadline)?;
                 }
                 Err(error) => return Err(Lost(error.to_string())),
             }
@@ -162,66 +169,48 @@ impl Line {
     /// # Errors
     /// When the system refuses to wait, which only a closed descriptor can cause.
     pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>, precise: bool) -> Result<Woken, Lost> {
-        let early = if precise { SPIN } else { Duration::ZERO };
-        loop {
-            let now = Instant::now();
-            if now >= until {
-                return Ok(Woken::Time);
-            }
-            let time = (until - now).saturating_sub(early);
-            let port = PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
-            let ready = match wake {
-                None => {
-                    let mut fds = [port];
-                    ppoll(&mut fds, time)?;
-                    fds.map(|f| !f.revents().is_empty())
-                        .first()
-                        .copied()
-                        .unwrap_or(false)
-                        .then_some(Woken::Readable)
-                }
+        let spin = if precise {
+            self.wake_ups.get().spin()
+        } else {
+            Duration::ZERO
+        };
+        let asleep = until.checked_sub(spin).unwrap_or(until);
+        let mut sleeps = precise && Instant::now() < asleep;
+        let port = || PollFd::from_borrowed_fd(self.fd(), PollFlags::IN);
+        while Instant::now() < until {
+            let woken = match wake {
+                None => poll_port(&mut [port()], asleep)?.then_some(Woken::Readable),
                 Some(wake) => {
-                    let mut fds = [port, PollFd::from_borrowed_fd(wake, PollFlags::IN)];
-                    ppoll(&mut fds, time)?;
-                    let [port, wake] = fds.map(|f| !f.revents().is_empty());
-                    if port {
-                        Some(Woken::Readable)
-                    } else {
-                        wake.then_some(Woken::Command)
-                    }
+                    let mut fds = [port(), PollFd::from_borrowed_fd(wake, PollFlags::IN)];
+                    let ready = poll_port(&mut fds, asleep)?;
+                    let [port, _] = fds.map(|fd| !fd.revents().is_empty());
+                    ready.then_some(if port { Woken::Readable } else { Woken::Command })
                 }
             };
-            if let Some(woken) = ready {
+            if let Some(woken) = woken {
                 return Ok(woken);
             }
+            if std::mem::take(&mut sleeps) {
+                let mut wake_ups = self.wake_ups.get();
+                if let Some(late) = Instant::now().checked_duration_since(asleep) {
+                    wake_ups.note(late);
+                    self.wake_ups.set(wake_ups);
+                }
+            }
         }
+        Ok(Woken::Time)
     }
 }
 
 /// Waits for a command or for the time, with no port to listen to.
 pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>) {
-    let time = until.saturating_duration_since(Instant::now());
     let mut fds = [PollFd::from_borrowed_fd(wake, PollFlags::IN)];
     // An error ends the wait early, which is harmless.
-    let _ = ppoll(&mut fds, time);
+    let _ = poll_until(&mut fds, until);
 }
 
-/// Lets this thread's timers fire to the nanosecond instead of 50 µs late.
-pub fn sharpen_timers() {
-    if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
-        tracing::debug!("timer slack stays as it is: {error}");
-    }
-}
-
-fn ppoll(fds: &mut [PollFd<'_>], time: Duration) -> Result<(), Lost> {
-    let time = Timespec {
-        tv_sec: time.as_secs() as _,
-        tv_nsec: time.subsec_nanos() as _,
-    };
-    match poll(fds, Some(&time)) {
-        Ok(_) | Err(rustix::io::Errno::INTR) => Ok(()),
-        Err(error) => Err(Lost(error.to_string())),
-    }
+fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {
+    poll_until(fds, until).map_err(|error| Lost(error.to_string()))
 }
 
 fn open_tcp(port: &str, address: &str) -> Result<Port, OpenError> {
@@ -289,7 +278,7 @@ fn open_serial(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, V
             "{port} reports {read_back} where {format} was asked for; check that the adapter can do it"
         ));
     }
-    let line = Line { port: Port::Serial(fd) };
+    let line = Line::new(Port::Serial(fd));
     line.clear();
     Ok((line, warnings))
 }
@@ -329,13 +318,17 @@ fn read_back(fd: &OwnedFd) -> Option<String> {
 fn explain(error: &tokio_serial::Error) -> String {
     let text = error.to_string();
     let remedy = match error.kind() {
-        tokio_serial::ErrorKind::Io(io::ErrorKind::NotFound) | tokio_serial::ErrorKind::NoDevice => {
-            "check that the adapter is plugged in and the path is right, and that no other program has the port"
+        tokio_serial::ErrorKind::Io(io::ErrorKind::NotFound) => {
+            "check that the adapter is plugged in and the path is right"
         }
         tokio_serial::ErrorKind::Io(io::ErrorKind::PermissionDenied) => {
             "add the user to the group of the port (dialout)"
         }
-        _ => "check that the path is a serial port and no other program has it",
+        // A lock, or the kernel's exclusive mode.
+        tokio_serial::ErrorKind::NoDevice | tokio_serial::ErrorKind::Io(io::ErrorKind::WouldBlock) => {
+            "another program has it; end that program, or give this bus another port"
+        }
+        _ => "it is no serial port or does not work as one; give the path of the adapter, such as /dev/serial/by-id/…",
     };
     format!("{text}; {remedy}")
 }

@@ -4,8 +4,8 @@
 //! It schedules nothing, retries nothing and trusts whatever comes; its rate on a simulated line is what operating system
 //! and pseudo-terminal leave of the wire's limit, and so the rate that a bus task is measured against.
 
-use super::wait::{exact_timers, poll_until, wait_until};
 use crate::codec::{Decoded, LineFormat, Request, rtu};
+use crate::line::{poll_until, sharpen_timers, wait_until};
 use rustix::event::{PollFd, PollFlags};
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -57,7 +57,7 @@ pub fn wire_limit(options: &BareOptions, request: &Request, turnaround: Duration
 /// # Errors
 /// The port cannot be opened, or it is gone.
 pub fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Duration) -> io::Result<BareReport> {
-    exact_timers();
+    sharpen_timers();
     let flags = rustix::fs::OFlags::NOCTTY | rustix::fs::OFlags::NONBLOCK;
     let mut port = OpenOptions::new()
         .read(true)

@@ -39,6 +39,8 @@ pub enum Fault {
     Stray(Foreign),
     /// The master hears its own request before the reply.
     Echo,
+    /// The master hears its own request, the drive does not.
+    DeafEcho,
     /// Noise runs into the beginning of the reply.
     NoiseBefore,
     /// Noise follows the reply.
@@ -51,7 +53,7 @@ pub enum Fault {
 
 /// Every name that a fault has in text, for messages.
 pub const NAMES: &str = "deaf, drop, truncate, corrupt, double, late:50ms, foreign-address, foreign-function, \
-    foreign-length, stray-address, stray-function, stray-length, echo, noise-before, noise-after, split, exception:4, busy";
+    foreign-length, stray-address, stray-function, stray-length, echo, deaf-echo, noise-before, noise-after, split, exception:4, busy";
 
 impl FromStr for Fault {
     type Err = String;
@@ -76,6 +78,7 @@ impl FromStr for Fault {
             ("stray-function", None) => Fault::Stray(Foreign::Function),
             ("stray-length", None) => Fault::Stray(Foreign::Length),
             ("echo", None) => Fault::Echo,
+            ("deaf-echo", None) => Fault::DeafEcho,
             ("noise-before", None) => Fault::NoiseBefore,
             ("noise-after", None) => Fault::NoiseAfter,
             ("split", None) => Fault::Split,
@@ -227,6 +230,10 @@ impl FaultPlan {
                 },
                 burst(reply),
             ],
+            Some(Fault::DeafEcho) => vec![Burst {
+                kind: Kind::Echo,
+                ..burst(request.to_vec())
+            }],
             Some(Fault::NoiseBefore) => vec![burst(noise(random)), burst(reply)],
             Some(Fault::NoiseAfter) => vec![burst(reply), provoked(noise(random))],
             Some(Fault::Split) => vec![Burst {

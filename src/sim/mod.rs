@@ -28,7 +28,6 @@ pub mod pty;
 pub mod random;
 pub mod slave;
 pub mod statistics;
-mod wait;
 pub mod wire;
 
 /// Time since the simulated line was switched on.

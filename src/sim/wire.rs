@@ -10,7 +10,7 @@ use super::faults::FaultPlan;
 use super::half_duplex::{HalfDuplex, LineRules, Wire};
 use super::slave::Slaves;
 use super::statistics::{Recorded, Statistics, Transcript};
-use super::wait::{exact_timers, poll_until, wait_until};
+use crate::line::{poll_until, sharpen_timers, wait_until};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd};
 use std::io;
 use std::ops::Deref;
@@ -354,7 +354,7 @@ struct Runner<F> {
 
 impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
     fn run(mut self, mut endpoint: Option<Endpoint>) {
-        exact_timers();
+        sharpen_timers();
         loop {
             let wanted = self.shared.port().wanted;
             match (wanted, endpoint.as_mut()) {

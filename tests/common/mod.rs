@@ -12,14 +12,15 @@ use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, OnShutd
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate::command::{CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate::drive::profile::Profiles;
+use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::drive::{ModelPoint, Sample, State, Value};
 use drivegate::event::Events;
 use drivegate::line::Rs485;
 use drivegate::plant::{BusHandle, DriveHandle, Plant};
-use drivegate::sim::drive::DriveOptions;
+use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::endpoint::EndpointOptions;
-use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::half_duplex::{Delivery, LineRules};
+use drivegate::sim::nx::{NxOptions, Values};
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 
 /// Longest wait for something that must come.
@@ -38,6 +39,47 @@ pub struct Rig {
 /// Name of the drive at an address.
 pub fn drive(address: u8) -> String {
     format!("drive-{address}")
+}
+
+/// How a rig differs from the usual one: one pseudo-terminal at 38400 8N1, process data every 10 ms.
+pub struct Setup {
+    pub drives: Vec<DriveOptions>,
+    pub format: LineFormat,
+    pub profile: Arc<Profile>,
+    /// Where the simulated line is; the bus opens that, unless `port` says otherwise.
+    pub endpoint: Option<EndpointOptions>,
+    pub port: Option<String>,
+    pub rs485: Rs485,
+    pub slow_cycle: Duration,
+    pub delivery: Delivery,
+    pub transcript: usize,
+}
+
+impl Setup {
+    pub fn new(addresses: &[u8], baud: u32) -> Setup {
+        Setup {
+            drives: addresses.iter().map(|a| DriveOptions::nx(*a)).collect(),
+            format: LineFormat::new(baud, "8N1").unwrap(),
+            profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
+            endpoint: None,
+            port: None,
+            rs485: Rs485::Off,
+            slow_cycle: Duration::from_millis(500),
+            delivery: Delivery::Whole,
+            transcript: 0,
+        }
+    }
+
+    /// Read-only registers carry the drive's address in the high byte and their own in the low byte.
+    pub fn tagged(mut self) -> Setup {
+        for drive in &mut self.drives {
+            drive.model = ModelOptions::Nx(NxOptions {
+                values: Values::Tagged(drive.address),
+                ..NxOptions::default()
+            });
+        }
+        self
+    }
 }
 
 fn spec(address: u8) -> DriveSpec {
@@ -70,28 +112,43 @@ impl Rig {
     }
 
     fn build(addresses: &[u8], baud: u32, transcript: usize, change: impl Fn(&mut DriveSpec)) -> Rig {
-        let format = LineFormat::new(baud, "8N1").unwrap();
-        let link = tempfile::tempdir().unwrap();
-        let path = link.path().join("line1");
-        let drives = addresses.iter().map(|a| DriveOptions::nx(*a)).collect();
-        let options = SimulatedBusOptions {
-            endpoint: EndpointOptions::Pty {
-                link: Some(path.clone()),
-            },
+        let setup = Setup {
             transcript,
-            ..SimulatedBusOptions::new("line1", LineRules::new(format), drives)
+            ..Setup::new(addresses, baud)
+        };
+        Rig::of(setup, change)
+    }
+
+    pub fn of(setup: Setup, change: impl Fn(&mut DriveSpec)) -> Rig {
+        let format = setup.format;
+        let link = tempfile::tempdir().unwrap();
+        let pty = EndpointOptions::Pty {
+            link: Some(link.path().join("line1")),
+        };
+        let addresses: Vec<u8> = setup.drives.iter().map(|d| d.address).collect();
+        let rules = LineRules {
+            delivery: setup.delivery,
+            ..LineRules::new(format)
+        };
+        let options = SimulatedBusOptions {
+            endpoint: setup.endpoint.unwrap_or(pty),
+            transcript: setup.transcript,
+            ..SimulatedBusOptions::new("line1", rules, setup.drives)
         };
         let line = SimulatedBus::start(options).unwrap();
         let bus_spec = BusSpec {
             name: "line1".to_string(),
-            port: path.display().to_string(),
+            port: setup.port.unwrap_or_else(|| line.address()),
             protocol: Protocol::ModbusRtu,
             format,
             cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_millis(500),
+            slow_cycle: setup.slow_cycle,
         };
         let images = addresses.iter().map(|address| {
-            let mut spec = spec(*address);
+            let mut spec = DriveSpec {
+                profile: setup.profile.clone(),
+                ..spec(*address)
+            };
             change(&mut spec);
             Arc::new(DriveImage::new(spec, bus_spec.slow_cycle))
         });
@@ -105,7 +162,7 @@ impl Rig {
             response_timeout: Duration::from_millis(100),
             retries: 1,
             silence: Silence::Chars,
-            rs485: Rs485::Off,
+            rs485: setup.rs485,
         };
         let leases = Leases::new(events.clone(), writes.clone());
         let bus = BusTask::start(handle.clone(), options, leases, events.clone()).unwrap();

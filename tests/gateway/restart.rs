@@ -144,3 +144,42 @@ fn a_port_that_is_not_there_is_waited_for() {
     until_ready(http);
     until("values", || mbpoll_read(modbus, 1, 2100, 11).ok());
 }
+
+#[test]
+fn a_reload_that_cannot_listen_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), "");
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let text = std::fs::read_to_string(&file).unwrap();
+    let other = text
+        .replace(&modbus.to_string(), &taken.local_addr().unwrap().port().to_string())
+        .replace("pump-1", "pump-2");
+    std::fs::write(&file, other).unwrap();
+    gateway.signal("HUP");
+    let log = gateway.until_printed("the new configuration is not taken");
+    assert!(log.contains("another program has it"), "{log}");
+    until("the old address", || mbpoll_read(modbus, 1, 2100, 1).ok());
+    assert_eq!(api(http, "pump-1")["online"], true);
+    drop(line);
+}
+
+#[test]
+fn a_reload_does_not_end_supervision() {
+    let folder = tempfile::tempdir().unwrap();
+    let _line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), "supervision = { timeout = \"3s\", action = \"stop\" }\n");
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
+    gateway.signal("HUP");
+    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("no commanding client of pump-1");
+    until("the stop", || {
+        (crate::process::point(http, "pump-1", "run") == false).then_some(())
+    });
+}

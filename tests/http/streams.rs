@@ -93,7 +93,9 @@ fn frame(direction: Direction, byte: u8) -> FrameRecord {
         time: UNIX_EPOCH + Duration::from_micros(1_700_000_000_123_456),
         gap: (direction == Direction::Reply).then_some(Duration::from_nanos(1_912_345)),
         direction,
+        drive: Some("saw-4".to_string()),
         bytes: vec![1, 3, byte],
+        decode: "read holding 2100..2110".to_string(),
         verdict: "ok".to_string(),
     }
 }
@@ -114,7 +116,7 @@ async fn frames_of_one_bus() {
     assert_eq!(
         next(&mut stream).await.json(),
         json!({"bus": "line1", "time": "2023-11-14T22:13:20.123456Z", "gap_us": null, "direction": "request",
-            "hex": "01 03 AB", "verdict": "ok"})
+            "drive": "saw-4", "hex": "01 03 AB", "decode": "read holding 2100..2110", "verdict": "ok"})
     );
     let reply = next(&mut stream).await.json();
     assert_eq!((&reply["gap_us"], &reply["direction"]), (&json!(1912), &json!("reply")));

@@ -13,6 +13,7 @@ needed=(
     "promtool prometheus"
     "mbpoll mbpoll"
     "socat socat"
+    "tshark tshark"
     "chromium chromium"
     "systemd-analyze systemd"
     "/usr/include/modbus/modbus.h libmodbus-dev"

@@ -184,7 +184,9 @@ struct Frame<'f> {
     time: String,
     gap_us: Option<u64>,
     direction: Direction,
+    drive: Option<&'f str>,
     hex: String,
+    decode: &'f str,
     verdict: &'f str,
 }
 
@@ -194,7 +196,9 @@ fn frame_message(bus: &str, record: &FrameRecord) -> Message {
         time: humantime::format_rfc3339_micros(record.time).to_string(),
         gap_us: record.gap.map(|gap| u64::try_from(gap.as_micros()).unwrap_or(u64::MAX)),
         direction: record.direction,
+        drive: record.drive.as_deref(),
         hex: hex(&record.bytes),
+        decode: &record.decode,
         verdict: &record.verdict,
     };
     json(Message::default(), &frame)

@@ -18,7 +18,7 @@
 //!
 //! Everything is bounded, see the constants. A client that does not take its messages loses the
 //! oldest QoS 0 ones first, then its connection; so does one that accepts no byte for
-//! [`STALL_LIMIT`]. A malformed packet closes the connection it came from and nothing else.
+//! `STALL_LIMIT`. A malformed packet closes the connection it came from and nothing else.
 
 mod connection;
 mod packet;

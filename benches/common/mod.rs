@@ -1,0 +1,127 @@
+//! What the benches share: medians, what a transcript tells, and clients of the north sides.
+// Each bench uses its own part.
+#![allow(dead_code, unreachable_pub)]
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpStream};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use drivegate::sim::SimTime;
+use drivegate::sim::statistics::{Direction, Recorded};
+
+/// The value of the option `name` on the command line of the bench, or `default`.
+pub fn option<T: std::str::FromStr>(name: &str, default: T) -> Result<T, String> {
+    let given = std::env::args().skip_while(|argument| argument != name).nth(1);
+    given.map_or(Ok(default), |text| {
+        text.parse()
+            .map_err(|_| format!("`{text}` is no value for {name}; write a number"))
+    })
+}
+
+/// The value in the middle; 0 of none.
+pub fn median(values: &[f64]) -> f64 {
+    quantile(values, 0.5)
+}
+
+/// The value that a share `of` of all does not exceed.
+pub fn quantile(values: &[f64], of: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let last = sorted.len().saturating_sub(1);
+    sorted
+        .get((of * last as f64).round() as usize)
+        .copied()
+        .unwrap_or_default()
+}
+
+/// Start times, s, of the frames in that direction.
+pub fn starts(frames: &[Recorded], direction: Direction) -> Vec<f64> {
+    let wanted = frames.iter().filter(|frame| frame.direction == direction);
+    wanted.map(|frame| frame.start.as_secs_f64()).collect()
+}
+
+/// Frames a second, from the first to the last: not a whole exchange more or less, whatever the time measured over.
+pub fn rate(starts: &[f64]) -> f64 {
+    match (starts.first(), starts.last()) {
+        (Some(first), Some(last)) if last > first => (starts.len() - 1) as f64 / (last - first),
+        _ => 0.0,
+    }
+}
+
+/// Silence before each request, s: from the end of any frame to the start of the next request.
+pub fn silences(frames: &[Recorded]) -> Vec<f64> {
+    let mut end = SimTime::ZERO;
+    let mut silences = Vec::new();
+    for frame in frames {
+        if frame.direction == Direction::ToDrives && !end.is_zero() {
+            silences.push(frame.start.saturating_sub(end).as_secs_f64());
+        }
+        end = end.max(frame.end);
+    }
+    silences
+}
+
+/// Pause of clients that read ten times a second.
+pub const TENTH: Duration = Duration::from_millis(100);
+
+/// Clients of the north sides: 100 Modbus TCP reads, where there is such a server, and one scrape of the metrics, again
+/// and again.
+pub struct Readers {
+    end: Arc<AtomicBool>,
+    thread: std::thread::JoinHandle<u64>,
+}
+
+impl Readers {
+    /// Reads `units` from unit 1 on, with a pause before the next turn.
+    pub fn start(modbus: Option<SocketAddr>, http: SocketAddr, units: u8, pause: Duration) -> Readers {
+        let end = Arc::new(AtomicBool::new(false));
+        let ended = end.clone();
+        let thread = std::thread::spawn(move || {
+            let mut answered = 0;
+            while !ended.load(Ordering::Relaxed) {
+                answered += u64::from(read_north(modbus, http, units).is_ok());
+                std::thread::sleep(pause);
+            }
+            answered
+        });
+        Readers { end, thread }
+    }
+
+    /// Ends them and returns how often both servers answered.
+    pub fn stop(self) -> u64 {
+        self.end.store(true, Ordering::Relaxed);
+        self.thread.join().unwrap_or_default()
+    }
+}
+
+fn read_north(modbus: Option<SocketAddr>, http: SocketAddr, units: u8) -> std::io::Result<()> {
+    if let Some(modbus) = modbus {
+        let mut client = TcpStream::connect(modbus)?;
+        client.set_read_timeout(Some(Duration::from_secs(1)))?;
+        let mut head = [0u8; 6];
+        let mut body = [0u8; 256];
+        for unit in (1..=units).cycle().take(100) {
+            client.write_all(&[0, 1, 0, 0, 0, 6, unit, 3, 0x08, 0x34, 0, 11])?;
+            client.read_exact(&mut head)?;
+            let body = body.get_mut(..usize::from(head[5])).unwrap_or_default();
+            client.read_exact(body)?;
+            // Function 3, not its exception.
+            if body.get(1) != Some(&3) {
+                return Err(std::io::ErrorKind::InvalidData.into());
+            }
+        }
+    }
+    scrape(http).map(|_| ())
+}
+
+/// The metrics as text.
+pub fn scrape(http: SocketAddr) -> std::io::Result<String> {
+    let mut client = TcpStream::connect(http)?;
+    client.set_read_timeout(Some(Duration::from_secs(5)))?;
+    client.write_all(b"GET /metrics HTTP/1.1\r\nHost: bench\r\nConnection: close\r\n\r\n")?;
+    let mut text = String::new();
+    client.read_to_string(&mut text)?;
+    Ok(text)
+}

@@ -1,0 +1,232 @@
+//! The frames of a line, for whoever listens: what was sent, what came back, when, and what it means.
+//!
+//! Time on the wire is reckoned from the bytes: a driver may hand a reply over byte by byte, or whole when its last byte
+//! is there.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::transaction::Ended;
+use crate::cache::{BusImage, Direction, FrameRecord};
+use crate::codec::describe::{self, Kind, Part};
+use crate::codec::{LineFormat, Reply, Request};
+
+/// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
+const KEPT: usize = 2048;
+
+/// One exchange that somebody listens to.
+#[derive(Debug)]
+pub(super) struct Tap<'r> {
+    image: Arc<BusImage>,
+    drive: Option<String>,
+    request: &'r Request,
+    frame: &'r [u8],
+    hearing: Hearing,
+}
+
+impl<'r> Tap<'r> {
+    /// The exchange whose request was given to the line at `began`.
+    pub(super) fn new(
+        image: Arc<BusImage>,
+        index: usize,
+        request: &'r Request,
+        frame: &'r [u8],
+        began: Instant,
+    ) -> Tap<'r> {
+        let format = image.spec.format;
+        let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
+        Tap {
+            image,
+            drive,
+            request,
+            frame,
+            hearing: Hearing::new(format, began + format.chars(frame.len())),
+        }
+    }
+
+    /// Tells the request.
+    pub(super) fn sent(&self, quiet_since: Instant, began: Instant) {
+        self.image.trace.tell(|| FrameRecord {
+            time: time_of_day(began),
+            gap: Some(began.saturating_duration_since(quiet_since)),
+            direction: Direction::Request,
+            drive: self.drive.clone(),
+            bytes: self.frame.to_vec(),
+            decode: describe::request(&self.request.pdu),
+            verdict: String::new(),
+        });
+    }
+
+    /// Bytes arrived.
+    pub(super) fn heard(&mut self, bytes: &[u8], now: Instant) {
+        self.hearing.add(bytes, now);
+    }
+
+    /// Tells what came back, a record for each frame.
+    pub(super) fn ended(self, ended: &Ended, now: Instant) {
+        let protocol = self.image.spec.protocol;
+        let answered = matches!(ended, Ended::Reply(_));
+        let parts = describe::parts(protocol, self.request, self.frame, &self.hearing.bytes, answered);
+        // The outcome stands at its own part; where there is none (nothing came, or only foreign frames) at nothing.
+        let its_kind = if answered { Kind::Reply } else { Kind::Garbage };
+        let its_part = parts.iter().rposition(|part| part.kind == its_kind);
+        let mut quiet_since = self.hearing.sent;
+        for (place, part) in parts.into_iter().enumerate() {
+            let (gap, end) = self.hearing.times(&part, quiet_since);
+            quiet_since = end;
+            let bytes = self.hearing.bytes.get(part.range).unwrap_or_default();
+            let (decode, verdict) = match part.kind {
+                _ if its_part == Some(place) => (describe::reply(protocol, self.request, bytes), verdict(ended)),
+                Kind::Echo => ("the request comes back".to_string(), "echo".to_string()),
+                _ => (describe::stray(protocol, bytes), "foreign".to_string()),
+            };
+            self.reply(end, Some(gap), bytes, decode, verdict);
+        }
+        if its_part.is_none() && !answered {
+            self.reply(now, None, &[], String::new(), verdict(ended));
+        }
+    }
+
+    fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {
+        self.image.trace.tell(|| FrameRecord {
+            time: time_of_day(at),
+            gap,
+            direction: Direction::Reply,
+            drive: self.drive.clone(),
+            bytes: bytes.to_vec(),
+            decode,
+            verdict,
+        });
+    }
+}
+
+/// Tells bytes that came between two exchanges.
+pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
+    image.trace.tell(|| {
+        let mut hearing = Hearing::new(image.spec.format, quiet_since);
+        hearing.add(bytes, now);
+        let part = Part {
+            kind: Kind::Foreign,
+            range: 0..bytes.len(),
+        };
+        FrameRecord {
+            time: time_of_day(now),
+            gap: Some(hearing.times(&part, quiet_since).0),
+            direction: Direction::Reply,
+            drive: None,
+            bytes: bytes.to_vec(),
+            decode: describe::stray(image.spec.protocol, bytes),
+            verdict: "foreign".to_string(),
+        }
+    });
+}
+
+fn verdict(ended: &Ended) -> String {
+    match ended {
+        Ended::Reply(Reply::Exception(code)) => code.to_string(),
+        Ended::Reply(_) => "ok".to_string(),
+        Ended::Silent => "timeout".to_string(),
+        Ended::Corrupt(why) => format!("corrupt: {why}"),
+    }
+}
+
+/// Bytes with the times of their arrival.
+#[derive(Debug)]
+struct Hearing {
+    format: LineFormat,
+    /// End of the request on the wire.
+    sent: Instant,
+    bytes: Vec<u8>,
+    /// Bytes that were there at each arrival.
+    arrivals: Vec<(usize, Instant)>,
+}
+
+impl Hearing {
+    fn new(format: LineFormat, sent: Instant) -> Hearing {
+        Hearing {
+            format,
+            sent,
+            bytes: Vec::new(),
+            arrivals: Vec::new(),
+        }
+    }
+
+    fn add(&mut self, bytes: &[u8], now: Instant) {
+        let room = KEPT.saturating_sub(self.bytes.len());
+        self.bytes.extend(bytes.iter().take(room));
+        if !bytes.is_empty() && room > 0 {
+            self.arrivals.push((self.bytes.len(), now));
+        }
+    }
+
+    /// Silence before a part, and when its last byte arrived.
+    fn times(&self, part: &Part, quiet_since: Instant) -> (Duration, Instant) {
+        let last = part.range.end.saturating_sub(1);
+        let first = self.arrival(part.range.start).unwrap_or(quiet_since);
+        let end = self.arrival(last).unwrap_or(first);
+        // Its first byte was on the wire for a character before it arrived, and the whole for its own time.
+        let by_first = first.checked_sub(self.format.chars(1)).unwrap_or(first);
+        let by_last = end.checked_sub(self.format.chars(part.range.len())).unwrap_or(end);
+        (by_first.min(by_last).saturating_duration_since(quiet_since), end)
+    }
+
+    fn arrival(&self, place: usize) -> Option<Instant> {
+        self.arrivals
+            .iter()
+            .find(|(count, _)| place < *count)
+            .map(|(_, at)| *at)
+    }
+}
+
+/// The time of day of an instant in the near past.
+fn time_of_day(at: Instant) -> SystemTime {
+    SystemTime::now() - Instant::now().saturating_duration_since(at)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn silence_is_that_of_the_wire() {
+        let format = LineFormat::new(9600, "8N1").unwrap();
+        let ms = |ms: u64| Duration::from_millis(ms);
+        let start = Instant::now();
+        let part = |range| Part {
+            kind: Kind::Reply,
+            range,
+        };
+        // Byte by byte: ten characters of 1.04 ms from 5 ms on.
+        let mut bytewise = Hearing::new(format, start);
+        for count in 1..=10 {
+            bytewise.add(&[0], start + ms(5) + format.chars(count));
+        }
+        assert_eq!(
+            bytewise.times(&part(0..10), start),
+            (ms(5), start + ms(5) + format.chars(10))
+        );
+        // The same handed over as a whole.
+        let mut whole = Hearing::new(format, start);
+        whole.add(&[0; 10], start + ms(5) + format.chars(10));
+        assert_eq!(
+            whole.times(&part(0..10), start),
+            (ms(5), start + ms(5) + format.chars(10))
+        );
+        // Faster than the wire: a line without timing.
+        let mut fast = Hearing::new(format, start);
+        fast.add(&[0; 10], start);
+        assert_eq!(fast.times(&part(0..10), start), (Duration::ZERO, start));
+        // A second frame 3 ms behind the first.
+        let end = start + ms(5) + format.chars(10);
+        bytewise.add(&[0; 4], end + ms(3) + format.chars(4));
+        assert_eq!(bytewise.times(&part(10..14), end).0, ms(3));
+    }
+
+    #[test]
+    fn a_babble_is_cut() {
+        let start = Instant::now();
+        let mut hearing = Hearing::new(LineFormat::new(9600, "8N1").unwrap(), start);
+        (0..100).for_each(|_| hearing.add(&[0; 512], start));
+        assert_eq!((hearing.bytes.len(), hearing.arrivals.len()), (KEPT, 4));
+    }
+}

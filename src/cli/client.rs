@@ -1,0 +1,362 @@
+//! A client of a running gateway's HTTP server, for commands that show what it does.
+
+use std::collections::VecDeque;
+use std::fmt;
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::str::FromStr;
+use std::time::Duration;
+
+use hyper::body::{Body as _, Bytes, Incoming};
+use hyper::client::conn::http1::{self, Connection};
+use hyper::{Request, Response, StatusCode, Uri, header};
+use hyper_util::rt::TokioIo;
+use serde::Deserialize;
+use tokio::net::TcpStream;
+use tokio::time::timeout;
+
+/// Time for the connection and the head of the reply.
+const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
+/// A stream that says nothing for this long is dead: the gateway sends a comment every 10 s.
+const SILENCE: Duration = Duration::from_secs(35);
+/// Longest reply that is no stream, longest line of a stream.
+const MOST_BYTES: usize = 1 << 20;
+
+/// Where a gateway's HTTP server is: `http://host:port`, with a path where a proxy has put it below one.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Url {
+    /// An IPv6 address without its brackets.
+    host: String,
+    port: u16,
+    authority: String,
+    path: String,
+}
+
+impl FromStr for Url {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Url, String> {
+        let form = "write it as http://127.0.0.1:9488";
+        let uri: Uri = text.parse().map_err(|why| format!("{why}; {form}"))?;
+        match uri.scheme_str() {
+            Some("http") => {}
+            Some("https") => return Err("https:// is not spoken here; reach the gateway itself by http://".to_string()),
+            _ => return Err(format!("http:// is missing; {form}")),
+        }
+        let authority = uri.authority().map(ToString::to_string).unwrap_or_default();
+        if authority.contains('@') || uri.query().is_some() {
+            return Err(format!("user, password and query have no place here; {form}"));
+        }
+        let host = uri.host().unwrap_or_default();
+        Ok(Url {
+            host: host.trim_start_matches('[').trim_end_matches(']').to_string(),
+            port: uri.port_u16().unwrap_or(80),
+            authority,
+            path: uri.path().trim_end_matches('/').to_string(),
+        })
+    }
+}
+
+impl fmt::Display for Url {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "http://{}{}", self.authority, self.path)
+    }
+}
+
+/// Why nothing comes from a gateway; the texts say what, where and what to do.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum ClientError {
+    /// Nobody listens there, or the way is barred.
+    #[error(
+        "cannot reach the gateway: {1}; {0}; start it with an [http] section, or name its `listen` address by --url"
+    )]
+    Unreachable(Url, String),
+    /// The gateway says why not.
+    #[error("{error}; {url}; {remedy}")]
+    Refused {
+        /// The gateway.
+        url: Url,
+        /// Its words.
+        error: String,
+        /// What to do, as far as it tells.
+        remedy: String,
+    },
+    /// Somebody answers, but not so.
+    #[error("{1}; {0}; check that this is the address of drivegate's [http] section")]
+    Strange(Url, String),
+    /// The stream is over, though nobody here ended it.
+    #[error(
+        "the gateway has ended the stream{1}; {0}; it was stopped, or a reload took the bus away: start it and try again"
+    )]
+    Ended(Url, String),
+    /// Neither news nor signs of life.
+    #[error("the gateway has fallen silent; {0}; check the gateway and the network, then try again")]
+    Silent(Url),
+}
+
+/// What the gateway answers to what it cannot do.
+#[derive(Debug, Deserialize)]
+struct Problem {
+    error: String,
+    #[serde(default)]
+    known: Vec<String>,
+}
+
+/// An event of a stream.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct StreamEvent {
+    /// Its name; empty for an ordinary one.
+    pub(super) name: String,
+    /// Its text.
+    pub(super) data: String,
+}
+
+/// A stream of server-sent events.
+#[derive(Debug)]
+pub(super) struct EventStream {
+    url: Url,
+    wire: Wire,
+    body: Incoming,
+    parser: Parser,
+}
+
+impl EventStream {
+    /// Asks for a stream; `path` begins with a slash.
+    ///
+    /// # Errors
+    /// When the gateway cannot be reached, refuses, or is none.
+    pub(super) async fn open(url: &Url, path: &str) -> Result<EventStream, ClientError> {
+        let late = || ClientError::Unreachable(url.clone(), "it does not answer within 10 s".to_string());
+        let (wire, response) = timeout(OPEN_TIMEOUT, ask(url, path)).await.map_err(|_| late())??;
+        let kind = response.headers().get(header::CONTENT_TYPE);
+        let is_stream = kind.is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"));
+        let status = response.status();
+        let stream = EventStream {
+            url: url.clone(),
+            wire,
+            body: response.into_body(),
+            parser: Parser::default(),
+        };
+        if status == StatusCode::OK && is_stream {
+            return Ok(stream);
+        }
+        Err(timeout(OPEN_TIMEOUT, stream.refusal(status))
+            .await
+            .map_err(|_| late())?)
+    }
+
+    /// The next event. May be dropped before it is ready; nothing is lost by that.
+    ///
+    /// # Errors
+    /// When the stream is over.
+    pub(super) async fn next(&mut self) -> Result<StreamEvent, ClientError> {
+        loop {
+            if let Some(event) = self.parser.take() {
+                return Ok(event);
+            }
+            let Ok(chunk) = timeout(SILENCE, self.chunk()).await else {
+                return Err(ClientError::Silent(self.url.clone()));
+            };
+            let bytes = match chunk {
+                Some(Ok(bytes)) => bytes,
+                Some(Err(error)) => return Err(ClientError::Ended(self.url.clone(), format!(" ({error})"))),
+                None => return Err(ClientError::Ended(self.url.clone(), String::new())),
+            };
+            self.parser
+                .feed(&bytes)
+                .map_err(|why| ClientError::Strange(self.url.clone(), why))?;
+        }
+    }
+
+    async fn chunk(&mut self) -> Option<hyper::Result<Bytes>> {
+        loop {
+            let frame = self
+                .wire
+                .with(poll_fn(|cx| Pin::new(&mut self.body).poll_frame(cx)))
+                .await?;
+            match frame.map(hyper::body::Frame::into_data) {
+                Ok(Ok(bytes)) => return Some(Ok(bytes)),
+                // Trailers.
+                Ok(Err(_)) => {}
+                Err(error) => return Some(Err(error)),
+            }
+        }
+    }
+
+    /// What the reply that is no stream says.
+    async fn refusal(mut self, status: StatusCode) -> ClientError {
+        let mut text = Vec::new();
+        while let Some(Ok(bytes)) = self.chunk().await {
+            text.extend_from_slice(&bytes);
+            if text.len() > MOST_BYTES {
+                break;
+            }
+        }
+        let url = self.url;
+        match serde_json::from_slice::<Problem>(&text) {
+            Ok(Problem { error, known }) => ClientError::Refused {
+                remedy: match known.as_slice() {
+                    [] => "try again when that has changed".to_string(),
+                    known => format!("there is {}", known.join(", ")),
+                },
+                url,
+                error,
+            },
+            Err(_) => ClientError::Strange(url, format!("the server answers `{status}` and no stream")),
+        }
+    }
+}
+
+async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
+    let unreachable = |why: String| ClientError::Unreachable(url.clone(), why);
+    let socket = TcpStream::connect((url.host.as_str(), url.port))
+        .await
+        .map_err(|error| unreachable(error.to_string()))?;
+    let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("no HTTP reply ({error})"));
+    let (mut sender, connection) = http1::handshake(TokioIo::new(socket)).await.map_err(strange)?;
+    let mut wire = Wire(Some(Box::pin(connection)));
+    let request = Request::get(format!("{}{path}", url.path))
+        .header(header::HOST, &url.authority)
+        .header(header::ACCEPT, "text/event-stream, application/json")
+        .body(String::new())
+        .map_err(|error| unreachable(error.to_string()))?;
+    let response = wire.with(sender.send_request(request)).await.map_err(strange)?;
+    Ok((wire, response))
+}
+
+/// The connection, which moves only while somebody waits for something of it.
+struct Wire(Option<Pin<Box<Connected>>>);
+
+type Connected = Connection<TokioIo<TcpStream>, String>;
+
+impl fmt::Debug for Wire {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Wire")
+    }
+}
+
+impl Wire {
+    async fn with<T>(&mut self, wanted: impl Future<Output = T>) -> T {
+        let mut wanted = std::pin::pin!(wanted);
+        poll_fn(|cx| {
+            // How a connection ends is told by what was wanted of it.
+            if self.0.as_mut().is_some_and(|wire| wire.as_mut().poll(cx).is_ready()) {
+                self.0 = None;
+            }
+            wanted.as_mut().poll(cx)
+        })
+        .await
+    }
+}
+
+/// Events out of the bytes of a stream.
+#[derive(Debug, Default)]
+struct Parser {
+    line: Vec<u8>,
+    name: String,
+    data: String,
+    ready: VecDeque<StreamEvent>,
+}
+
+impl Parser {
+    fn feed(&mut self, bytes: &[u8]) -> Result<(), String> {
+        for &byte in bytes {
+            if byte == b'\n' {
+                let line = std::mem::take(&mut self.line);
+                self.take_line(String::from_utf8_lossy(&line).trim_end_matches('\r'));
+            } else {
+                self.line.push(byte);
+            }
+            if self.line.len() + self.data.len() > MOST_BYTES {
+                return Err("an event without end".to_string());
+            }
+        }
+        Ok(())
+    }
+
+    fn take_line(&mut self, line: &str) {
+        if line.is_empty() {
+            let (name, data) = (std::mem::take(&mut self.name), std::mem::take(&mut self.data));
+            if !data.is_empty() {
+                self.ready.push_back(StreamEvent { name, data });
+            }
+            return;
+        }
+        // A line that begins with a colon is a comment: a field without a name.
+        let (field, value) = line.split_once(':').unwrap_or((line, ""));
+        let value = value.strip_prefix(' ').unwrap_or(value);
+        match field {
+            "event" => self.name = value.to_string(),
+            "data" => {
+                if !self.data.is_empty() {
+                    self.data.push('\n');
+                }
+                self.data.push_str(value);
+            }
+            _ => {}
+        }
+    }
+
+    fn take(&mut self) -> Option<StreamEvent> {
+        self.ready.pop_front()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn urls() {
+        let url: Url = "http://127.0.0.1:9488".parse().unwrap();
+        assert_eq!(
+            (url.host.as_str(), url.port, url.path.as_str()),
+            ("127.0.0.1", 9488, "")
+        );
+        let url: Url = "http://[::1]/plant/".parse().unwrap();
+        assert_eq!((url.host.as_str(), url.port, url.path.as_str()), ("::1", 80, "/plant"));
+        assert_eq!(url.to_string(), "http://[::1]/plant");
+        for (bad, why) in [
+            ("127.0.0.1:9488", "http:// is missing"),
+            ("gateway", "http:// is missing"),
+            ("https://gateway", "https:// is not spoken"),
+            ("http://me:secret@gateway", "no place here"),
+            ("http://gateway/?a=b", "no place here"),
+            ("http://", "write it as"),
+            ("", "write it as"),
+        ] {
+            let error = bad.parse::<Url>().unwrap_err();
+            assert!(error.contains(why), "{bad}: {error}");
+        }
+    }
+
+    #[test]
+    fn events_in_any_pieces() {
+        let text = b"retry: 2000\r\n: open\n\ndata: {\"a\":1}\n\n: alive\n\nevent: lagged\ndata:{\"lost\":3}\ndata: x\n\ndata: cut";
+        let all = [
+            StreamEvent {
+                name: String::new(),
+                data: "{\"a\":1}".to_string(),
+            },
+            StreamEvent {
+                name: "lagged".to_string(),
+                data: "{\"lost\":3}\nx".to_string(),
+            },
+        ];
+        for size in 1..=text.len() {
+            let mut parser = Parser::default();
+            for piece in text.chunks(size) {
+                parser.feed(piece).unwrap();
+            }
+            let taken: Vec<StreamEvent> = std::iter::from_fn(|| parser.take()).collect();
+            assert_eq!(taken, all, "pieces of {size}");
+        }
+    }
+
+    #[test]
+    fn an_event_without_end_is_refused() {
+        let mut parser = Parser::default();
+        let piece = [b'x'; 4096];
+        assert!((0..300).any(|_| parser.feed(&piece).is_err()));
+    }
+}

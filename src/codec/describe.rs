@@ -1,0 +1,492 @@
+//! Frames in plain words, one line each, for people who look at a line.
+//!
+//! Registers are in hexadecimal as on the wire, addresses are PDU addresses, counted from 0.
+
+use std::fmt::Write as _;
+use std::ops::Range;
+
+use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table, rtu};
+
+/// Values that a line shows; the bytes of the frame have the others.
+const SHOWN: usize = 16;
+
+/// What some bytes of an exchange are.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Kind {
+    /// The request, sent back by an adapter that hears itself.
+    Echo,
+    /// The reply to the request, perhaps an exception.
+    Reply,
+    /// A sound frame of somebody else.
+    Foreign,
+    /// No sound frame.
+    Garbage,
+}
+
+/// A part of what was received in an exchange.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Part {
+    /// What it is.
+    pub kind: Kind,
+    /// Where it stands among the bytes.
+    pub range: Range<usize>,
+}
+
+/// Splits what came after `request`, whose frame was `frame`, into its parts, in the order of arrival. `answered`: the
+/// exchange ended with a reply, which tells the reply to a write from an echo of it.
+pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], answered: bool) -> Vec<Part> {
+    let mut parts = Vec::new();
+    let mut at = 0;
+    let mut echo_seen = false;
+    while let Some(rest) = bytes.get(at..).filter(|rest| !rest.is_empty()) {
+        let (kind, used) = match protocol.decode(request, rest) {
+            _ if !echo_seen && is_echo(protocol, request, frame, rest, answered) => (Kind::Echo, frame.len()),
+            Decoded::Reply { used, .. } => (Kind::Reply, used),
+            Decoded::Foreign { used } => (Kind::Foreign, used),
+            Decoded::Incomplete | Decoded::Corrupt(_) => {
+                (Kind::Garbage, garbage_len(protocol, request, rest, answered))
+            }
+        };
+        echo_seen |= kind == Kind::Echo;
+        // Never empty, so that the loop ends.
+        let end = (at + used.max(1)).min(bytes.len());
+        parts.push(Part { kind, range: at..end });
+        at = end;
+        if kind == Kind::Reply {
+            break;
+        }
+    }
+    if at < bytes.len() {
+        parts.push(Part {
+            kind: behind(protocol, bytes.get(at..).unwrap_or_default()),
+            range: at..bytes.len(),
+        });
+    }
+    parts
+}
+
+/// Most requests cannot be answered by their own frame; the write of one register is, so there only a second frame, or
+/// the lack of an answer, tells.
+fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], answered: bool) -> bool {
+    let Some(more) = rest.strip_prefix(frame).filter(|_| !frame.is_empty()) else {
+        return false;
+    };
+    let like_its_reply = matches!(protocol.decode(request, frame), Decoded::Reply { .. });
+    !like_its_reply || !answered || more.starts_with(frame)
+}
+
+/// Bytes until the reply that was believed although it stands behind garbage, or all. Exceptions and acknowledgements are
+/// not believed there.
+fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: bool) -> usize {
+    let is_reply = |at: &usize| {
+        let behind = rest.get(*at..).unwrap_or_default();
+        match protocol.decode(request, behind) {
+            Decoded::Reply { reply, .. } => !matches!(reply, Reply::Exception(_)),
+            _ => false,
+        }
+    };
+    let believed = answered && matches!(request.pdu, RequestPdu::Read { .. });
+    let at = (1..rest.len()).find(is_reply).filter(|_| believed);
+    at.unwrap_or(rest.len())
+}
+
+fn behind(protocol: Protocol, bytes: &[u8]) -> Kind {
+    match protocol {
+        Protocol::ModbusRtu if rtu::open_frame(bytes).is_some() => Kind::Foreign,
+        Protocol::ModbusRtu => Kind::Garbage,
+    }
+}
+
+/// A request: `read holding 2100..2110`, `write holding 2000 = 0x0001`.
+pub fn request(request: &RequestPdu) -> String {
+    match request {
+        RequestPdu::Read { table, start, count } => format!("read {}", span(*table, *start, usize::from(*count))),
+        RequestPdu::WriteCoil { address, on } => {
+            format!(
+                "write {} = {}",
+                span(Table::Coil, *address, 1),
+                if *on { "on" } else { "off" }
+            )
+        }
+        RequestPdu::WriteRegister { address, value } => {
+            format!("write {} = 0x{value:04X}", span(Table::Holding, *address, 1))
+        }
+        RequestPdu::WriteCoils { start, bits } => {
+            format!("write {} = {}", span(Table::Coil, *start, bits.len()), bit_list(bits))
+        }
+        RequestPdu::WriteRegisters { start, values } => {
+            format!(
+                "write {} = {}",
+                span(Table::Holding, *start, values.len()),
+                word_list(values)
+            )
+        }
+        RequestPdu::MaskWrite {
+            address,
+            and_mask,
+            or_mask,
+        } => format!(
+            "mask {}: and 0x{and_mask:04X}, or 0x{or_mask:04X}",
+            span(Table::Holding, *address, 1)
+        ),
+        RequestPdu::ReadWrite {
+            read_start,
+            read_count,
+            write_start,
+            values,
+        } => format!(
+            "write {} = {}, then read {}",
+            span(Table::Holding, *write_start, values.len()),
+            word_list(values),
+            span(Table::Holding, *read_start, usize::from(*read_count))
+        ),
+        RequestPdu::Diagnostics { subfunction, data } => format!("diagnostics {subfunction}: 0x{data:04X}"),
+        RequestPdu::DeviceIdentification { code, object } => {
+            format!("device identification: code {code} from object {object}")
+        }
+    }
+}
+
+/// What came back, against its request: `3 registers: 0023 2000 1388`, `exception 02 (illegal data address)`,
+/// `foreign: address 3, function 3, 2 registers`, `7 of 27 bytes`.
+pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
+    match protocol.decode(asked, bytes) {
+        Decoded::Reply { reply, .. } => answer(&reply),
+        Decoded::Foreign { .. } => stray(protocol, bytes),
+        Decoded::Incomplete => format!("{} of {} bytes", bytes.len(), protocol.reply_chars(&asked.pdu)),
+        Decoded::Corrupt(_) => no_frame(bytes),
+    }
+}
+
+/// Bytes that nobody asked for: a sound frame of somebody else, or noise.
+pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
+    let frame = match protocol {
+        Protocol::ModbusRtu => rtu::open_frame(bytes),
+    };
+    let Some((address, [function, data @ ..])) = frame else {
+        return no_frame(bytes);
+    };
+    let what = match (function, data) {
+        (code, [exception]) if code & 0x80 != 0 => {
+            format!("function {}, {}", code & 0x7F, Exception(*exception))
+        }
+        (3 | 4 | 23, [count, words @ ..]) if usize::from(*count) == words.len() && words.len() % 2 == 0 => {
+            format!("function {function}, {}", counted(words.len() / 2, "register"))
+        }
+        _ => format!("function {function}, {} of data", counted(data.len(), "byte")),
+    };
+    format!("foreign: address {address}, {what}")
+}
+
+fn answer(reply: &Reply) -> String {
+    match reply {
+        Reply::Bits(bits) => format!("{}: {}", counted(bits.len(), "bit"), bit_list(bits)),
+        Reply::Registers(words) => format!("{}: {}", counted(words.len(), "register"), word_list(words)),
+        Reply::Written => "written".to_string(),
+        Reply::Diagnostics(word) => format!("diagnostics: 0x{word:04X}"),
+        Reply::DeviceIdentification(bytes) => identification(bytes),
+        Reply::Exception(code) => code.to_string(),
+    }
+}
+
+/// The objects behind code, conformity, more-follows, next object and count.
+fn identification(bytes: &[u8]) -> String {
+    let mut text = "device identification".to_string();
+    let mut rest = bytes.get(5..).unwrap_or_default();
+    while let [id, len, more @ ..] = rest {
+        let len = usize::from(*len).min(more.len());
+        let (value, behind) = more.split_at(len);
+        let value: String = value.iter().map(|&byte| printable(byte)).collect();
+        // Writing to a string cannot fail.
+        let _ = write!(text, ", {id} `{value}`");
+        rest = behind;
+    }
+    text
+}
+
+fn printable(byte: u8) -> char {
+    if byte == b' ' || byte.is_ascii_graphic() {
+        char::from(byte)
+    } else {
+        '.'
+    }
+}
+
+fn no_frame(bytes: &[u8]) -> String {
+    format!("{}, no sound frame", counted(bytes.len(), "byte"))
+}
+
+fn counted(count: usize, what: &str) -> String {
+    format!("{count} {what}{}", if count == 1 { "" } else { "s" })
+}
+
+/// `holding 2100..2110`, both ends included.
+fn span(table: Table, start: u16, count: usize) -> String {
+    match count {
+        0 | 1 => format!("{table} {start}"),
+        _ => format!("{table} {start}..{}", usize::from(start) + count - 1),
+    }
+}
+
+fn word_list(words: &[u16]) -> String {
+    let shown: Vec<String> = words.iter().take(SHOWN).map(|word| format!("{word:04X}")).collect();
+    shown.join(" ") + more(words.len(), SHOWN)
+}
+
+/// In groups of eight, the first item first.
+fn bit_list(bits: &[bool]) -> String {
+    let shown = bits.get(..8 * SHOWN).unwrap_or(bits);
+    let groups: Vec<String> = shown
+        .chunks(8)
+        .map(|group| group.iter().map(|&bit| if bit { '1' } else { '0' }).collect())
+        .collect();
+    groups.join(" ") + more(bits.len(), 8 * SHOWN)
+}
+
+fn more(count: usize, shown: usize) -> &'static str {
+    if count > shown { " …" } else { "" }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    const RTU: Protocol = Protocol::ModbusRtu;
+
+    fn hex(text: &str) -> Vec<u8> {
+        text.split_whitespace()
+            .map(|b| u8::from_str_radix(b, 16).unwrap())
+            .collect()
+    }
+
+    fn asked(frame: &str) -> Request {
+        let (address, pdu) = rtu::decode_request(&hex(frame)).unwrap();
+        Request {
+            address,
+            pdu: pdu.unwrap(),
+        }
+    }
+
+    fn framed(address: u8, pdu: &str) -> Vec<u8> {
+        let mut out = Vec::new();
+        rtu::encode_frame(address, &hex(pdu), &mut out);
+        out
+    }
+
+    /// Worked requests of drives.md, section 7, misprints corrected.
+    #[test]
+    fn requests_of_the_reference() {
+        for (frame, text) in [
+            ("01 03 07 D0 00 03 05 46", "read holding 2000..2002"),
+            ("01 04 07 D0 00 01 31 47", "read input 2000"),
+            ("01 06 07 D0 00 01 48 87", "write holding 2000 = 0x0001"),
+            ("01 06 07 D2 EC 78 64 65", "write holding 2002 = 0xEC78"),
+            (
+                "01 10 07 D0 00 03 06 00 01 00 00 13 88 C8 CB",
+                "write holding 2000..2002 = 0001 0000 1388",
+            ),
+            ("01 03 08 34 00 0B 47 A3", "read holding 2100..2110"),
+            ("01 05 00 00 FF 00 8C 3A", "write coil 0 = on"),
+            ("01 05 00 00 00 00 CD CA", "write coil 0 = off"),
+            ("01 02 00 02 00 01 18 0A", "read discrete-input 2"),
+        ] {
+            assert_eq!(request(&asked(frame).pdu), text, "{frame}");
+        }
+    }
+
+    #[test]
+    fn the_other_requests() {
+        for (pdu, text) in [
+            (
+                RequestPdu::WriteCoils {
+                    start: 8,
+                    bits: vec![true, false, true, true, false, false, false, false, true],
+                },
+                "write coil 8..16 = 10110000 1",
+            ),
+            (
+                RequestPdu::MaskWrite {
+                    address: 2000,
+                    and_mask: 0xFFF2,
+                    or_mask: 4,
+                },
+                "mask holding 2000: and 0xFFF2, or 0x0004",
+            ),
+            (
+                RequestPdu::ReadWrite {
+                    read_start: 2100,
+                    read_count: 11,
+                    write_start: 2002,
+                    values: vec![5000],
+                },
+                "write holding 2002 = 1388, then read holding 2100..2110",
+            ),
+            (
+                RequestPdu::Diagnostics {
+                    subfunction: 0,
+                    data: 0xA537,
+                },
+                "diagnostics 0: 0xA537",
+            ),
+            (
+                RequestPdu::DeviceIdentification { code: 1, object: 0 },
+                "device identification: code 1 from object 0",
+            ),
+            (
+                RequestPdu::Read {
+                    table: Table::Holding,
+                    start: u16::MAX,
+                    count: 2,
+                },
+                "read holding 65535..65536",
+            ),
+        ] {
+            assert_eq!(request(&pdu), text);
+        }
+    }
+
+    #[test]
+    fn replies() {
+        let eleven = format!("03 16 {}", "00 23 ".repeat(11));
+        for (asked_for, pdu, text) in [
+            (
+                "03 07 D0 00 03",
+                "03 06 00 23 20 00 13 88",
+                "3 registers: 0023 2000 1388",
+            ),
+            ("04 07 D0 00 01", "04 02 00 23", "1 register: 0023"),
+            (
+                "03 08 34 00 0B",
+                eleven.as_str(),
+                "11 registers: 0023 0023 0023 0023 0023 0023 0023 0023 0023 0023 0023",
+            ),
+            ("01 00 00 00 0A", "01 02 05 02", "10 bits: 10100000 01"),
+            ("06 07 D0 00 01", "06 07 D0 00 01", "written"),
+            ("10 07 D0 00 01 02 00 01", "10 07 D0 00 01", "written"),
+            ("03 17 70 00 05", "83 02", "exception 02 (illegal data address)"),
+            ("08 00 00 A5 37", "08 00 00 A5 37", "diagnostics: 0xA537"),
+            (
+                "2B 0E 01 00",
+                "2B 0E 01 01 00 00 02 00 02 4E 58 01 01 07",
+                "device identification, 0 `NX`, 1 `.`",
+            ),
+        ] {
+            let (address, decoded) = rtu::decode_request(&framed(1, asked_for)).unwrap();
+            let asked = Request {
+                address,
+                pdu: decoded.unwrap(),
+            };
+            assert_eq!(reply(RTU, &asked, &framed(1, pdu)), text);
+        }
+    }
+
+    #[test]
+    fn what_is_no_reply() {
+        let asked = asked("01 03 07 D0 00 03 05 46");
+        for (bytes, text) in [
+            (
+                framed(3, "03 04 00 01 00 02"),
+                "foreign: address 3, function 3, 2 registers",
+            ),
+            (
+                framed(3, "83 02"),
+                "foreign: address 3, function 3, exception 02 (illegal data address)",
+            ),
+            (
+                framed(1, "04 06 00 01 00 02 00 03"),
+                "foreign: address 1, function 4, 3 registers",
+            ),
+            (framed(1, "03 02 00 01"), "foreign: address 1, function 3, 1 register"),
+            (
+                framed(1, "06 07 D0 00 01"),
+                "foreign: address 1, function 6, 4 bytes of data",
+            ),
+            (hex("01 03 06 00"), "4 of 11 bytes"),
+            (hex("01 03 06 00 23 20 00 13 88 00 00"), "11 bytes, no sound frame"),
+            (Vec::new(), "0 of 11 bytes"),
+        ] {
+            assert_eq!(reply(RTU, &asked, &bytes), text);
+        }
+        assert_eq!(stray(RTU, &hex("FF")), "1 byte, no sound frame");
+        assert_eq!(
+            stray(RTU, &framed(2, "03 02 00 01")),
+            "foreign: address 2, function 3, 1 register"
+        );
+    }
+
+    #[test]
+    fn long_lists_end() {
+        let words: Vec<u16> = (0..17).collect();
+        assert!(word_list(&words).ends_with("000E 000F …"));
+        assert!(word_list(&words[..16]).ends_with("000E 000F"));
+        assert!(bit_list(&[true; 129]).ends_with("1 …"));
+    }
+
+    fn kinds(asked: &Request, bytes: &[u8], answered: bool) -> Vec<(Kind, usize)> {
+        let mut frame = Vec::new();
+        RTU.encode(asked, &mut frame);
+        parts(RTU, asked, &frame, bytes, answered)
+            .into_iter()
+            .map(|part| (part.kind, part.range.len()))
+            .collect()
+    }
+
+    #[test]
+    fn an_exchange_in_its_parts() {
+        let read = asked("01 03 07 D0 00 01 84 87");
+        let echo = hex("01 03 07 D0 00 01 84 87");
+        let (own, other) = (framed(1, "03 02 00 23"), framed(3, "03 02 00 23"));
+        assert_eq!(kinds(&read, &own, true), [(Kind::Reply, 7)]);
+        let all = [echo.as_slice(), &other, &own, &[0xFF]].concat();
+        assert_eq!(
+            kinds(&read, &all, true),
+            [
+                (Kind::Echo, 8),
+                (Kind::Foreign, 7),
+                (Kind::Reply, 7),
+                (Kind::Garbage, 1)
+            ]
+        );
+        let noisy = [&[0xFF, 0x00], own.as_slice(), &other].concat();
+        assert_eq!(
+            kinds(&read, &noisy, true),
+            [(Kind::Garbage, 2), (Kind::Reply, 7), (Kind::Foreign, 7)]
+        );
+        assert_eq!(kinds(&read, &own[..5], false), [(Kind::Garbage, 5)]);
+        assert_eq!(kinds(&read, &[], false), []);
+
+        let write = asked("01 06 07 D0 00 01 48 87");
+        let frame = hex("01 06 07 D0 00 01 48 87");
+        assert_eq!(kinds(&write, &frame, true), [(Kind::Reply, 8)]);
+        assert_eq!(kinds(&write, &frame, false), [(Kind::Echo, 8)]);
+        let twice = [frame.as_slice(), &frame].concat();
+        assert_eq!(kinds(&write, &twice, true), [(Kind::Echo, 8), (Kind::Reply, 8)]);
+        let write = asked("01 10 07 D0 00 02 04 00 01 00 10 88 CF");
+        let all = [
+            hex("01 10 07 D0 00 02 04 00 01 00 10 88 CF"),
+            framed(1, "10 07 D0 00 02"),
+        ]
+        .concat();
+        assert_eq!(kinds(&write, &all, true), [(Kind::Echo, 13), (Kind::Reply, 8)]);
+        assert_eq!(kinds(&read, &noisy, false), [(Kind::Garbage, 16)]);
+    }
+
+    proptest! {
+        #[test]
+        fn any_bytes_have_words_and_parts(bytes in proptest::collection::vec(any::<u8>(), 0..300), answered: bool) {
+            let asked = asked("01 03 07 D0 00 03 05 46");
+            prop_assert!(!reply(RTU, &asked, &bytes).is_empty());
+            prop_assert!(!stray(RTU, &bytes).is_empty());
+            let mut frame = Vec::new();
+            RTU.encode(&asked, &mut frame);
+            let mut at = 0;
+            for part in parts(RTU, &asked, &frame, &bytes, answered) {
+                prop_assert_eq!(part.range.start, at);
+                prop_assert!(part.range.end > at);
+                at = part.range.end;
+            }
+            prop_assert_eq!(at, bytes.len());
+        }
+    }
+}
