@@ -119,7 +119,7 @@ impl Snapshot {
     /// The drive went away: what is read once may be otherwise when it returns, and is stale until it was read again.
     pub fn outlive(&mut self) {
         let once = self.spans.iter_mut().filter(|span| span.class == PollClass::Once);
-        for cell in once.flat_map(|span| &mut span.cells) {
+        for cell in once.flat_map(|span| &mut Arc::make_mut(span).cells) {
             cell.outlived = true;
         }
     }
