@@ -28,7 +28,7 @@ pub struct Problem {
 }
 
 impl fmt::Display for Problem {
-    /// `what; where (file:line, key); what to do`, the form of the public contract.
+    /// `what; file:line, key; what to do`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let (what, remedy) = match self.message.split_once("; ") {
             Some((what, remedy)) => (what, Some(remedy)),

@@ -125,7 +125,10 @@ impl Report {
         if matches!(drive.snapshot().link, Link::Offline(_)) {
             return;
         }
-        drive.update(|s| s.link = Link::Offline(SystemTime::now()));
+        drive.update(|s| {
+            s.link = Link::Offline(SystemTime::now());
+            s.outlive();
+        });
         let text = format!(
             "drive {} is offline: {why}; it is asked again with pauses up to 10 s",
             drive.spec.name

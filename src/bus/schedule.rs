@@ -1,6 +1,6 @@
 //! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
 //!
-//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls (public contract, section 8).
+//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls.
 //! Four rules soften it: after eight commands in a row a due poll goes first; commands other than stops have half of
 //! a line that is busy with polls at most; slow polls that had less than 5 % of the time go before fast ones; a drive
 //! that does not answer is asked so seldom that it costs at most 2 %.

@@ -317,7 +317,7 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
     })
 }
 
-/// All model points and profile points of a drive with their names, in the order of the contract.
+/// All model points and profile points of a drive with their names, in their public order.
 pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
     let model = ModelPoint::ALL
         .iter()

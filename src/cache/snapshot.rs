@@ -36,6 +36,8 @@ struct Cell {
     word: u16,
     at: Option<Instant>,
     refused: Option<Exception>,
+    /// Read before the drive went away, and not since.
+    outlived: bool,
 }
 
 /// Cells that lie together and are polled alike.
@@ -102,6 +104,7 @@ impl Snapshot {
                 word,
                 at: Some(now),
                 refused: None,
+                outlived: false,
             };
         });
     }
@@ -111,6 +114,14 @@ impl Snapshot {
         self.each(table, start, usize::from(count), |cell, _| {
             cell.refused = Some(exception)
         });
+    }
+
+    /// The drive went away: what is read once may be otherwise when it returns, and is stale until it was read again.
+    pub fn outlive(&mut self) {
+        let once = self.spans.iter_mut().filter(|span| span.class == PollClass::Once);
+        for cell in once.flat_map(|span| &mut Arc::make_mut(span).cells) {
+            cell.outlived = true;
+        }
     }
 
     fn each(&mut self, table: Table, start: u16, count: usize, mut change: impl FnMut(&mut Cell, usize)) {
@@ -171,7 +182,7 @@ impl Reading<'_> {
     fn quality(&self, class: PollClass, cell: &Cell) -> Quality {
         match (cell.refused, cell.at) {
             (Some(_), _) | (None, None) => Quality::Bad,
-            _ if !self.snapshot.link.is_online() => Quality::Stale,
+            _ if !self.snapshot.link.is_online() || cell.outlived => Quality::Stale,
             (None, Some(at)) => {
                 let age = self.now.saturating_duration_since(at);
                 let old = self.age_limit(class).is_some_and(|limit| age > limit);

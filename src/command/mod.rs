@@ -157,7 +157,7 @@ impl Outcome {
         matches!(self, Outcome::Acknowledged(_))
     }
 
-    /// The exception that tells a Modbus TCP client (public contract, section 5); `None` for success.
+    /// The exception that tells a Modbus TCP client (`docs/modbus-tcp.md`); `None` for success.
     pub fn exception(&self) -> Option<Exception> {
         match self {
             Outcome::Acknowledged(_) => None,

@@ -26,7 +26,7 @@ pub(super) const BAUDS: RangeInclusive<u32> = 300..=4_000_000;
 pub(super) const RETRIES: RangeInclusive<u32> = 0..=10;
 /// Times that a cadence or a timeout can be.
 pub(super) const TIMES: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_secs(3600);
-/// Protocols that the public contract names and this version does not speak.
+/// Protocols that are planned and that this version does not speak.
 const LATER: [&str; 2] = ["modbus-ascii", "n2"];
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);

@@ -1,4 +1,4 @@
-//! The common drive model: the same points, units and meanings for every family (public contract, section 4).
+//! The common drive model: the same points, units and meanings for every family.
 
 use std::fmt;
 use std::time::Instant;
@@ -164,7 +164,7 @@ macro_rules! model_points {
         }
 
         impl ModelPoint {
-            /// All points, in the order of the contract.
+            /// All points, in their public order.
             pub const ALL: &'static [ModelPoint] = &[$(ModelPoint::$variant,)*];
 
             /// The public name.

@@ -25,6 +25,8 @@ use crate::codec::{LineFormat, Parity};
 
 /// Time to reach a device server; the bus stops for no longer.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
+/// A connection whose other end has not taken a request for that time is lost.
+const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 
 /// Who switches the direction of an RS-485 line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -223,6 +225,9 @@ fn open_tcp(port: &str, address: &str) -> Result<Port, OpenError> {
         match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
             Ok(stream) => {
                 stream.set_nodelay(true).map_err(failed)?;
+                // A server that lost its power says nothing; the system would go on trying for a quarter of an hour.
+                let patience = rustix::net::sockopt::set_tcp_user_timeout(&stream, UNACKNOWLEDGED.as_millis() as u32);
+                patience.map_err(|error| failed(error.into()))?;
                 stream.set_nonblocking(true).map_err(failed)?;
                 return Ok(Port::Tcp(stream));
             }

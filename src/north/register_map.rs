@@ -1,5 +1,5 @@
 //! The public register map of Modbus TCP: common model, command block, float block and the gateway itself
-//! (public contract, section 5). Pure.
+//! (`docs/modbus-tcp.md`). Pure.
 //!
 //! Addresses below [`FIRST`] are the drive's own; everything from there on is answered from here, for holding
 //! and input registers alike. A figure that does not fit its register is served as "not available", never

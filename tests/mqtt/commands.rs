@@ -184,6 +184,8 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
             "only monitored",
         ),
     ] {
+        // Refusals are told at ten a second for each drive.
+        std::thread::sleep(Duration::from_millis(110));
         let result = bench.result(topic, payload, &[]);
         assert_eq!(result["ok"], false);
         assert_eq!(result["error"]["code"], code, "{payload}: {result}");

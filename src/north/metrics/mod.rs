@@ -1,4 +1,4 @@
-//! Prometheus metrics: one look at the plant, as families of series (public contract, section 7).
+//! Prometheus metrics: one look at the plant, as families of series (`docs/http.md`).
 //!
 //! The names are frozen. Every drive is read once a scrape, so its series belong together. A point that is
 //! not good has no series: a graph shows a gap, never an old figure.

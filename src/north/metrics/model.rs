@@ -105,7 +105,7 @@ pub(super) const MODEL: [(ModelPoint, &str, &str); 19] = [
 mod tests {
     use super::*;
 
-    /// Points of the model that the contract gives no metric of their own.
+    /// Points of the model that have no metric of their own.
     const WITHOUT: [ModelPoint; 6] = [
         ModelPoint::ZeroSpeed,
         ModelPoint::Remote,

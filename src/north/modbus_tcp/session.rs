@@ -227,7 +227,7 @@ impl Session {
         self.authority.may_write && drive.image.spec.access == Access::Control
     }
 
-    /// Unit 255: input registers by contract; holding registers alike, since many clients read nothing else.
+    /// Unit 255: input registers; holding registers alike, since many clients read nothing else.
     fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
         if WRITES.contains(&frame.function) {
             return Err(Exception::FUNCTION);

@@ -1,4 +1,4 @@
-//! MQTT client (public contract, section 6).
+//! MQTT client (`docs/mqtt.md`).
 //!
 //! ```text
 //! process image ──▶ publisher ──▶ ┌────────┐     connection        ┌────────┐
