@@ -372,9 +372,10 @@ impl Schedule {
         let cycle = self.round_started.map(|before| now.saturating_duration_since(before));
         self.round_started = Some(now);
         self.new_round = Some(RoundStart { at: now, cycle });
-        // The grid is kept while the line carries it; a round missed altogether is not caught up.
+        // The grid is kept whatever delayed this round; rounds that were missed altogether are not caught up.
         let next = self.round_due + self.cadence.fast;
-        self.round_due = if next + self.cadence.fast < now { now } else { next };
+        let missed = now.saturating_duration_since(next).as_nanos() / self.cadence.fast.as_nanos().max(1);
+        self.round_due = next + self.cadence.fast * u32::try_from(missed).unwrap_or(0);
     }
 
     /// Parts of a block that was refused long ago, by mistake perhaps, are read as one again.

@@ -164,6 +164,28 @@ fn the_grid_is_kept_without_drift() {
 }
 
 #[test]
+fn a_stall_does_not_move_the_grid() {
+    let cycle = Duration::from_millis(30);
+    let mut bench = Bench::new(1, cycle);
+    bench.run(Duration::from_secs(2));
+    let start = bench.schedule.round_due;
+    for stall in [7, 31, 95, 1000, 12_345] {
+        bench.now += Duration::from_millis(stall);
+        bench.log.clear();
+        bench.run(cycle * 20);
+        let fast: Vec<Instant> = bench
+            .log
+            .iter()
+            .filter(|(_, d)| matches!(d, Decision::Poll(p) if p.read.class == PollClass::Fast))
+            .map(|(at, _)| *at)
+            .collect();
+        assert!(fast.len() <= 22, "no catching up after {stall} ms: {}", fast.len());
+        let late = (fast[fast.len() - 1] - start).as_micros() % cycle.as_micros();
+        assert_eq!(late, 0, "back on the grid after {stall} ms");
+    }
+}
+
+#[test]
 fn eight_commands_then_a_poll() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     bench.run(Duration::from_secs(1));
