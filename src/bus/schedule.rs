@@ -143,6 +143,8 @@ pub struct Schedule {
     new_slow: Option<RoundStart>,
     /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
+    /// The slow poll that was chosen last goes before fast ones.
+    on_credit: bool,
     /// Until when the credit is reckoned.
     earned_until: Instant,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
@@ -193,6 +195,7 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
+            on_credit: false,
             earned_until: now,
             most_credit: longest.mul_f64(MOST_CREDIT),
             probed: false,
@@ -269,7 +272,12 @@ impl Schedule {
             }
             self.probed = false;
         } else {
-            self.slow_credit = self.slow_credit.saturating_sub(took);
+            self.slow_credit = if self.on_credit {
+                self.slow_credit.saturating_sub(took)
+            } else {
+                // There was room for it, so the others will find room too.
+                Duration::ZERO
+            };
             self.note_slow(now);
         }
         self.probed |= poll.probe && matches!(polled, Polled::Failed | Polled::Garbled);
@@ -401,11 +409,10 @@ impl Schedule {
             return Some(asked);
         }
         let slow = self.due_slow(now);
-        if let Some((due, poll, cost)) = slow
-            && self.slow_credit >= cost
-            && now.saturating_duration_since(due) > self.cadence.fast
-        {
-            // A whole round went by without room for it: the line is saturated.
+        // A whole round went by without room for it: the line is saturated.
+        let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
+        self.on_credit = slow.is_some_and(|(due, _, cost)| self.slow_credit >= cost && left_out(due));
+        if let Some((_, poll, _)) = slow.filter(|_| self.on_credit) {
             return Some(poll);
         }
         if let Some(&(drive, read)) = self.round.front() {
