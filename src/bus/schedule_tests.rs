@@ -275,7 +275,7 @@ fn dead_drives_cost_two_percent_each() {
     // It comes back within ten seconds, and its once class is read again.
     some.dead.clear();
     some.log.clear();
-    some.run(Duration::from_secs(11));
+    some.run(Duration::from_secs(14));
     for drive in [2, 5, 9] {
         assert!(
             some.polls(PollClass::Fast).contains_key(&drive),
