@@ -69,12 +69,14 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
             let Some((table, items)) = written(pdu) else {
                 return effects;
             };
-            for (address, word) in items {
-                for (index, point) in profile.points.iter().enumerate().filter(|(_, p)| p.write && !p.pulse) {
-                    let raw = point.raw().filter(|r| r.table == table && r.address == address);
-                    if let Some(value) = raw.and_then(|r| r.decode(&[word], point.kind())) {
-                        add(effect_of(profile, index, value));
-                    }
+            let word_at = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
+            for (index, point) in profile.points.iter().enumerate().filter(|(_, p)| p.write && !p.pulse) {
+                let Some(raw) = point.raw().filter(|r| r.table == table) else {
+                    continue;
+                };
+                let words: Option<Vec<u16>> = raw.addresses().map(word_at).collect();
+                if let Some(value) = words.and_then(|words| raw.decode(&words, point.kind())) {
+                    add(effect_of(profile, index, value));
                 }
             }
         }

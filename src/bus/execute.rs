@@ -51,6 +51,8 @@ enum Action {
     Send(RequestPdu),
     /// Bits of one word, merged into the shadow when they are sent.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
+    /// Takes the run command away from a motor that stands, where it is no bit of the word with the reset bit.
+    Disarm { raw: Raw, bit: u8, invert: bool },
     /// Takes the reset bit (and the run bit of a motor that stands) away, if set.
     PulseLow { raw: Raw, bit: u8, invert: bool },
     /// Sets the reset bit.
@@ -307,6 +309,11 @@ fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque
             Form::Bit { bit, invert } if point.pulse => {
                 if value.as_bool() {
                     let hold = Action::Hold(2 * profile.update_period);
+                    let elsewhere = |run: &Raw| (run.table, run.address) != (raw.table, raw.address);
+                    if let Some((run, bit, invert)) = profile.run_bit().filter(|(run, ..)| elsewhere(run)) {
+                        let raw = run.clone();
+                        pulses.push_back(Action::Disarm { raw, bit, invert });
+                    }
                     pulses.push_back(Action::PulseLow {
                         raw: raw.clone(),
                         bit,
@@ -332,22 +339,48 @@ fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque
                     .or_insert_with(|| (raw.clone(), Vec::new()));
                 entry.1.push((bit, value.as_bool() != invert));
             }
-            Form::U16 | Form::I16 => {
+            Form::Bits { first, count } => {
+                let Some(word) = raw.encode(*value, 0).ok().and_then(|words| words.first().copied()) else {
+                    continue;
+                };
+                let entry = words
+                    .entry((raw.table, raw.address))
+                    .or_insert_with(|| (raw.clone(), Vec::new()));
+                let bits = first..first.saturating_add(count);
+                entry.1.extend(bits.map(|bit| (bit, (word >> bit) & 1 == 1)));
+            }
+            _ => {
                 // Admitted values fit; one that does not is left out rather than sent wrong.
-                if let Ok(word) = raw.encode(*value, 0) {
-                    numbers.push_back(Action::Send(RequestPdu::WriteRegister {
-                        address: raw.address,
-                        value: word,
-                    }));
-                }
+                let pdu = raw
+                    .encode(*value, 0)
+                    .ok()
+                    .and_then(|words| write_of(raw.address, words));
+                numbers.extend(pdu.map(Action::Send));
             }
         }
     }
-    let bits = words.into_values().map(|(raw, changes)| Action::Bits { raw, changes });
+    // The run command of a drive whose bits are coils goes first in a stop, and last, behind the direction, otherwise.
+    let run = profile.run_bit().map(|(raw, ..)| (raw.table, raw.address));
+    let run = run.and_then(|place| words.remove(&place));
+    let others = words.into_values();
+    let action = |(raw, changes): WordChange| Action::Bits { raw, changes };
     if stop {
+        let bits = run.into_iter().chain(others).map(action);
         bits.chain(numbers).chain(pulses).collect()
     } else {
+        let bits = others.chain(run).map(action);
         numbers.into_iter().chain(pulses).chain(bits).collect()
+    }
+}
+
+fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
+    match words.as_slice() {
+        [] => None,
+        [value] => Some(RequestPdu::WriteRegister { address, value: *value }),
+        _ => Some(RequestPdu::WriteRegisters {
+            start: address,
+            values: words,
+        }),
     }
 }
 
@@ -365,6 +398,8 @@ fn request(
         Action::Send(pdu) => return Some(pdu.clone()),
         Action::Hold(_) => return None,
         Action::Bits { raw, changes } => (raw, changes.clone()),
+        Action::Disarm { .. } if running => return None,
+        Action::Disarm { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
         Action::PulseHigh { raw, bit, invert } => (raw, vec![(*bit, !invert)]),
         Action::PulseEnd { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
         Action::PulseLow { raw, bit, invert } => {
@@ -394,7 +429,7 @@ fn request(
         old,
         |word, (bit, on)| if *on { word | (1 << bit) } else { word & !(1 << bit) },
     );
-    let idle = matches!(action, Action::PulseLow { .. }) && value == old;
+    let idle = matches!(action, Action::PulseLow { .. } | Action::Disarm { .. }) && value == old;
     (!idle).then_some(RequestPdu::WriteRegister {
         address: raw.address,
         value,

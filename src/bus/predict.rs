@@ -158,7 +158,8 @@ impl<'a> Line<'a> {
     }
 
     fn wire(&self, format: &LineFormat, drive: &DriveSpec, read: &PlannedRead) -> Duration {
-        WireTime::of(self.spec.protocol, format, &read.pdu()).total(drive.turnaround, self.silence.on(format))
+        WireTime::of(self.spec.protocol, format, &read.pdu())
+            .total(drive.turnaround, self.spec.protocol.silence(self.silence, format))
     }
 
     fn requests(&self) -> Vec<PredictedRequest> {

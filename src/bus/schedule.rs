@@ -662,8 +662,7 @@ impl DriveSchedule {
 
     /// Splits a refused block until the bad point is found, which is retried slowly.
     fn refused(&mut self, read: PlannedRead, exception: Exception, now: Instant) -> Change {
-        let addressed =
-            exception == Exception::ADDRESS || exception == Exception::VALUE || exception == Exception::FUNCTION;
+        let addressed = exception.is_about_request();
         let Some(index) = self.items.iter().position(|i| i.read == read) else {
             return Change::None;
         };
@@ -707,7 +706,7 @@ impl DriveSchedule {
                         && !last.refused
                         && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
                 {
-                    last.read.count += item.read.count;
+                    last.read.append(&item.read);
                     last.wanted = true;
                     last.due = last.due.min(now);
                     last.whole_again = None;

@@ -11,6 +11,7 @@ fn read(class: PollClass, start: u16, count: u16) -> PlannedRead {
         table: Table::Holding,
         start,
         count,
+        wide: 0,
     }
 }
 

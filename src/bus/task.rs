@@ -11,8 +11,8 @@ use super::report::Report;
 use super::schedule::{Cadence, Change, Poll, Polled, Schedule};
 use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
 use crate::cache::{Outcome as Counted, Snapshot};
-use crate::codec::{Reply, Request, RequestPdu, Table};
-use crate::command::{Command, Outcome, Urgency};
+use crate::codec::{Reply, Request, RequestPdu};
+use crate::command::{Command, Outcome, Urgency, written};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::event::Events;
@@ -119,7 +119,7 @@ impl Worker {
     ) -> Worker {
         let now = Instant::now();
         let spec = handle.image.spec.clone();
-        let silence = options.silence.on(&spec.format);
+        let silence = spec.protocol.silence(options.silence, &spec.format);
         let cadence = Cadence {
             fast: spec.cycle,
             slow: spec.slow_cycle,
@@ -459,7 +459,7 @@ impl Worker {
             return;
         };
         for (address, word) in (read.start..).zip(&words) {
-            let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.address == address);
+            let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.covers(read.table, address));
             if drive.spec.profile.points.iter().any(commanded) {
                 self.desk.shadow.learn(poll.drive, read.table, address, *word);
             }
@@ -495,21 +495,11 @@ impl Worker {
         };
         let drives = &self.handle.image.drives;
         self.desk.ended(index, pdu, reply, self.options.retries, drives, now);
-        if pdu.is_write() {
+        if let Some((table, items)) = written(pdu) {
             self.schedule
-                .refresh(drive, |read| written(pdu).any(|a| read.covers(Table::Holding, a)), now);
+                .refresh(drive, |read| items.iter().any(|(a, _)| read.covers(table, *a)), now);
         }
     }
-}
-
-/// The registers that a write sets.
-fn written(pdu: &RequestPdu) -> impl Iterator<Item = u16> {
-    let (start, count) = match pdu {
-        RequestPdu::WriteRegister { address, .. } => (*address, 1),
-        RequestPdu::WriteRegisters { start, values } => (*start, values.len()),
-        _ => (0, 0),
-    };
-    (0..count).filter_map(move |offset| start.checked_add(u16::try_from(offset).ok()?))
 }
 
 /// What the counters call an exchange that ended so.

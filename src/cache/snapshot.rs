@@ -5,7 +5,8 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::DriveSpec;
 use crate::codec::{Exception, Table};
-use crate::drive::{ModelPoint, Plan, PollClass, Quality, Sample, Source, State, Value};
+use crate::drive::model::Kind;
+use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
 
 /// Whether a drive answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -220,41 +221,50 @@ impl Reading<'_> {
             return Sample::NONE;
         };
         match &point.source {
-            Source::Raw(raw) => {
-                let Some((class, cell)) = self.snapshot.cell(raw.table, raw.address) else {
-                    return Sample::NONE;
-                };
-                let quality = self.quality(class, cell);
-                let value = cell.at.and_then(|_| raw.decode(&[cell.word], point.kind()));
-                Sample {
-                    value,
-                    quality,
-                    at: cell.at,
-                }
-            }
-            Source::Band { of, minimum, maximum } => {
-                let percent = self.sample(*of);
-                let band = self.band(*minimum, *maximum);
-                match (percent.value, band) {
-                    (Some(p), Some((low, high))) => {
-                        let value = crate::drive::profile::tidy(low + p.as_f64() / 100.0 * (high - low));
-                        Sample {
-                            value: Some(Value::Number(value)),
-                            ..percent
-                        }
-                    }
-                    _ => Sample::NONE,
-                }
+            Source::Raw(raw) => self.raw_sample(raw, point.kind()),
+            Source::Derived(derived) => {
+                let sources: Vec<Sample> = derived.sources().into_iter().map(|i| self.sample(i)).collect();
+                let band = derived.band().and_then(|(_, low, high)| self.band(low, high));
+                derived.sample(&sources, band)
             }
         }
     }
 
-    /// Minimum and maximum frequency: the drive's own, else the configured ones.
-    pub fn band(&self, minimum: usize, maximum: usize) -> Option<(f64, f64)> {
-        let good = |point| self.sample(point).good().map(Value::as_f64);
-        match (good(minimum), good(maximum)) {
+    /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. What is no value
+    /// (a float that is no number) is bad.
+    fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
+        let cells: Option<Vec<_>> = raw.addresses().map(|a| self.snapshot.cell(raw.table, a)).collect();
+        let Some(cells) = cells.filter(|cells| cells.len() == usize::from(raw.form.items())) else {
+            return Sample::NONE;
+        };
+        let words: Vec<u16> = cells.iter().map(|(_, cell)| cell.word).collect();
+        let at: Option<Vec<Instant>> = cells.iter().map(|(_, cell)| cell.at).collect();
+        let at = at.and_then(|at| at.into_iter().min());
+        let value = at.and_then(|_| raw.decode(&words, kind));
+        let qualities = cells.iter().map(|(class, cell)| self.quality(*class, cell));
+        let worst = qualities.fold(Quality::Good, Quality::worse);
+        Sample {
+            value,
+            quality: if value.is_some() { worst } else { Quality::Bad },
+            at,
+        }
+    }
+
+    /// The ends of a band: the drive's own, else the configured frequencies.
+    pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        let own = |bound: Bound| match bound {
+            Bound::Point(point) => self.sample(point).good().map(Value::as_f64),
+            Bound::Fixed(figure) => Some(figure),
+        };
+        match (own(minimum), own(maximum)) {
             (Some(low), Some(high)) if high > low => Some((low, high)),
-            _ => self.spec.frequency_range.as_ref().map(|r| (*r.start(), *r.end())),
+            _ => {
+                let configured = self.spec.frequency_range.as_ref()?;
+                match (minimum, maximum) {
+                    (Bound::Fixed(low), _) => Some((low, *configured.end())),
+                    _ => Some((*configured.start(), *configured.end())),
+                }
+            }
         }
     }
 

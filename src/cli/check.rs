@@ -151,7 +151,7 @@ fn bus_text(bus: &BusSettings) -> String {
         if there { "" } else { " (not there now)" },
         spec.protocol.name(),
         spec.format,
-        milliseconds(bus.options.silence.on(&spec.format)),
+        milliseconds(spec.protocol.silence(bus.options.silence, &spec.format)),
     );
     let prediction = bus.predict();
     let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);

@@ -318,8 +318,8 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Acc
     let kind = match raw.form {
         RawForm::Bit { .. } if raw.table.is_bits() => "bit".to_string(),
         RawForm::Bit { bit, .. } => format!("bit {bit}"),
-        RawForm::U16 => "u16".to_string(),
-        RawForm::I16 => "i16".to_string(),
+        RawForm::Bits { first, count } => format!("bits {first}-{}", first.saturating_add(count).saturating_sub(1)),
+        other => other.name().to_string(),
     };
     let mut notes = Vec::new();
     if matches!(raw.form, RawForm::Bit { invert: true, .. }) {

@@ -8,7 +8,7 @@ use super::{EXIT_CONFIG, EXIT_USAGE, report};
 use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Problem, format_duration};
 use crate::drive::profile::{AddressRange, Form, Profiles};
-use crate::drive::{Point, Profile, Source};
+use crate::drive::{Bound, Derived, Point, Profile, Source};
 
 /// What a point, a fault text or a place without a manual behind it is marked with.
 const NOT_VERIFIED: &str = "not verified";
@@ -145,10 +145,7 @@ fn points(profile: &Profile) -> String {
         let (at, form, scale) = place(profile, point);
         let (class, note) = match &point.source {
             Source::Raw(_) => (point.class.name(), point.note.clone()),
-            Source::Band { minimum, maximum, .. } => {
-                let (low, high) = (name_of(profile, *minimum), name_of(profile, *maximum));
-                ("", format!("percent of the band between {low} and {high}"))
-            }
+            Source::Derived(derived) => ("", derivation(profile, derived)),
         };
         let range = point.range.as_ref();
         table.add_row([
@@ -190,21 +187,56 @@ fn place(profile: &Profile, point: &Point) -> (String, String, String) {
                 format!(" {:+}", raw.offset)
             };
             let scale = format!("{}{offset}", raw.scale);
+            let form = raw.form.word_order().map_or_else(
+                || raw.form.name().to_string(),
+                |order| format!("{} {}", raw.form.name(), order.name()),
+            );
             match raw.form {
-                Form::Bit { .. } if raw.table.is_bits() => (at, "bit".to_string(), String::new()),
+                Form::Bit { .. } if raw.table.is_bits() => (at, form, String::new()),
                 Form::Bit { bit, invert } => {
-                    let form = if invert { "bit, 0 is true" } else { "bit" };
-                    (format!("{at}.{bit}"), form.to_string(), String::new())
+                    let form = if invert { "bit, 0 is true".to_string() } else { form };
+                    (format!("{at}.{bit}"), form, String::new())
                 }
-                Form::U16 => (at, "u16".to_string(), scale),
-                Form::I16 => (at, "i16".to_string(), scale),
+                Form::Bits { first, count } => (
+                    format!("{at}.{first}-{}", first.saturating_add(count).saturating_sub(1)),
+                    form,
+                    scale,
+                ),
+                _ => (at, form, scale),
             }
         }
-        Source::Band { of, .. } => (
-            format!("from {}", name_of(profile, *of)),
-            "derived".to_string(),
-            String::new(),
-        ),
+        Source::Derived(derived) => {
+            let names: Vec<&str> = derived.sources().into_iter().map(|i| name_of(profile, i)).collect();
+            (
+                format!("from {}", names.join(", ")),
+                "derived".to_string(),
+                String::new(),
+            )
+        }
+    }
+}
+
+/// How a derived point is made, for people.
+fn derivation(profile: &Profile, derived: &Derived) -> String {
+    let bound = |bound: &Bound| match bound {
+        Bound::Point(point) => name_of(profile, *point).to_string(),
+        Bound::Fixed(figure) => figure.to_string(),
+    };
+    match derived {
+        Derived::Band { minimum, maximum, .. } => {
+            format!("percent of the band between {} and {}", bound(minimum), bound(maximum))
+        }
+        Derived::Percent { minimum, maximum, .. } => {
+            format!(
+                "as percent of the band between {} and {}",
+                bound(minimum),
+                bound(maximum)
+            )
+        }
+        Derived::Zero { within, .. } => format!("true up to {within}"),
+        Derived::Equal { within, .. } => format!("true while they differ by {within} at most"),
+        Derived::All { .. } => "true while all of them are".to_string(),
+        Derived::LowestBit { .. } => "number of the lowest bit that is set, counted from 1".to_string(),
     }
 }
 

@@ -28,6 +28,14 @@ const fn table() -> [u16; 256] {
     table
 }
 
+/// LRC of Modbus ASCII: two's complement of the sum of the bytes (drives.md 1.2).
+pub fn lrc(bytes: &[u8]) -> u8 {
+    bytes
+        .iter()
+        .fold(0u8, |sum, byte| sum.wrapping_add(*byte))
+        .wrapping_neg()
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 use std::ops::Range;
 
-use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table, rtu};
+use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table, ascii, rtu};
 
 /// Values that a line shows; the bytes of the frame have the others.
 const SHOWN: usize = 16;
@@ -93,7 +93,8 @@ fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: boo
 fn behind(protocol: Protocol, bytes: &[u8]) -> Kind {
     match protocol {
         Protocol::ModbusRtu if rtu::open_frame(bytes).is_some() => Kind::Foreign,
-        Protocol::ModbusRtu => Kind::Garbage,
+        Protocol::ModbusAscii if ascii::open_frame(bytes).is_some() => Kind::Foreign,
+        Protocol::ModbusRtu | Protocol::ModbusAscii | Protocol::N2 => Kind::Garbage,
     }
 }
 
@@ -161,9 +162,14 @@ pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
 /// Bytes that nobody asked for: a sound frame of somebody else, or noise.
 pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
     let frame = match protocol {
-        Protocol::ModbusRtu => rtu::open_frame(bytes),
+        Protocol::ModbusRtu => rtu::open_frame(bytes).map(|(address, pdu)| (address, pdu.to_vec())),
+        Protocol::ModbusAscii => ascii::open_frame(bytes),
+        Protocol::N2 => None,
     };
-    let Some((address, [function, data @ ..])) = frame else {
+    let Some((address, pdu)) = frame else {
+        return no_frame(bytes);
+    };
+    let [function, data @ ..] = pdu.as_slice() else {
         return no_frame(bytes);
     };
     let what = match (function, data) {

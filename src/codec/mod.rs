@@ -3,15 +3,19 @@
 //! On a half-duplex line a reply means something only against the outstanding request, so
 //! [`Protocol::decode`] takes that request. Nothing can go stale between two exchanges.
 
+pub mod ascii;
 mod checksum;
 pub mod describe;
 pub mod modbus;
+pub mod n2;
 pub mod rtu;
 pub mod wire;
 
-pub use checksum::crc16;
+pub use checksum::{crc16, lrc};
 pub use modbus::{Exception, Reply, RequestPdu, Table};
-pub use wire::{LineFormat, Parity};
+pub use wire::{LineFormat, Parity, Silence};
+
+use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
 
@@ -53,16 +57,22 @@ pub enum Decoded {
 pub enum Protocol {
     /// Modbus RTU: binary frames, CRC-16, silence between frames.
     ModbusRtu,
+    /// Modbus ASCII: a colon, hexadecimal digits, LRC, CR LF.
+    ModbusAscii,
+    /// Metasys N2: ASCII text, sums of characters, CR; objects are mapped onto the tables of Modbus, see [`n2`].
+    N2,
 }
 
 impl Protocol {
     /// All protocols, in the order of the documentation.
-    pub const ALL: [Protocol; 1] = [Protocol::ModbusRtu];
+    pub const ALL: [Protocol; 3] = [Protocol::ModbusRtu, Protocol::ModbusAscii, Protocol::N2];
 
     /// The name in configuration and output.
     pub fn name(self) -> &'static str {
         match self {
             Protocol::ModbusRtu => "modbus-rtu",
+            Protocol::ModbusAscii => "modbus-ascii",
+            Protocol::N2 => "n2",
         }
     }
 
@@ -75,6 +85,8 @@ impl Protocol {
     pub fn encode(self, request: &Request, out: &mut Vec<u8>) {
         match self {
             Protocol::ModbusRtu => rtu::encode_request(request, out),
+            Protocol::ModbusAscii => ascii::encode_request(request, out),
+            Protocol::N2 => n2::encode_request(request, out),
         }
     }
 
@@ -82,6 +94,8 @@ impl Protocol {
     pub fn decode(self, request: &Request, bytes: &[u8]) -> Decoded {
         match self {
             Protocol::ModbusRtu => rtu::decode_reply(request, bytes),
+            Protocol::ModbusAscii => ascii::decode_reply(request, bytes),
+            Protocol::N2 => n2::decode_reply(request, bytes),
         }
     }
 
@@ -89,13 +103,25 @@ impl Protocol {
     pub fn request_chars(self, request: &RequestPdu) -> usize {
         match self {
             Protocol::ModbusRtu => rtu::OVERHEAD + request.encoded_len(),
+            Protocol::ModbusAscii => ascii::chars(request.encoded_len()),
+            Protocol::N2 => n2::request_chars(request),
         }
     }
 
     /// Silence by which a drive knows that a request is over, before its turnaround begins.
-    pub fn recognition(self, format: &LineFormat) -> std::time::Duration {
+    pub fn recognition(self, format: &LineFormat) -> Duration {
         match self {
             Protocol::ModbusRtu => format.silence_chars(),
+            // The last character of the frame says so.
+            Protocol::ModbusAscii | Protocol::N2 => Duration::ZERO,
+        }
+    }
+
+    /// Silence before a request on a line where nothing else is configured than `silence`.
+    pub fn silence(self, silence: Silence, format: &LineFormat) -> Duration {
+        match (self, silence) {
+            (Protocol::N2, Silence::Spec) => n2::GAP.max(format.silence_chars()),
+            _ => silence.on(format),
         }
     }
 
@@ -103,6 +129,8 @@ impl Protocol {
     pub fn reply_chars(self, request: &RequestPdu) -> usize {
         match self {
             Protocol::ModbusRtu => rtu::OVERHEAD + request.reply_len(),
+            Protocol::ModbusAscii => ascii::chars(request.reply_len()),
+            Protocol::N2 => n2::reply_chars(request),
         }
     }
 }

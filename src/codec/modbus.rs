@@ -88,6 +88,19 @@ impl Exception {
     /// 0x0B: the device behind the gateway does not answer.
     pub const GATEWAY_TARGET: Exception = Exception(0x0B);
 
+    /// N2 error 00: the drive has restarted and waits for Identify.
+    pub const N2_RESTARTED: Exception = Exception(0x80);
+
+    /// An N2 error code (two printed digits, read as hexadecimal), kept apart from the codes of Modbus.
+    pub fn n2(code: u8) -> Exception {
+        Exception(0x80 | code)
+    }
+
+    /// Whether the same request would be refused again: function, address or value, not the state of the drive.
+    pub fn is_about_request(self) -> bool {
+        matches!(self.0, 0x01..=0x03 | 0x21 | 0x81 | 0x85 | 0x90..=0x92)
+    }
+
     /// What the code means, by the Modbus specification and the TECO list (drives.md 5.6).
     pub fn meaning(self) -> &'static str {
         match self.0 {
@@ -102,6 +115,14 @@ impl Exception {
             0x0B => "device behind the gateway does not answer",
             0x21 => "data value error (TECO)",
             0x22 => "register write error, drive in DRIVE mode (TECO)",
+            0x80 => "N2 00: the drive has restarted and waits for Identify",
+            0x81 => "N2 01: command not understood",
+            0x82 => "N2 02: checksum error",
+            0x83 => "N2 03: message too long",
+            0x85 => "N2 05: field size wrong for the command",
+            0x90 => "N2 10: invalid data, out of the expected range",
+            0x91 => "N2 11: invalid command for the data type, or the drive is in DRIVE mode (TECO)",
+            0x92 => "N2 12: the value is read-only",
             _ => "unknown exception",
         }
     }

@@ -142,24 +142,29 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                 .map_err(|why| Refusal::BadValue(format!("`{}`: {why}; nothing was written", point.name)))?;
             Ok((index, value))
         }
-        Source::Band { of, minimum, maximum } => {
-            let (low, high) = drive.band(*minimum, *maximum).ok_or_else(|| {
+        Source::Derived(derived) => {
+            let name = &point.name;
+            let Some((of, minimum, maximum)) = derived.band() else {
+                return Err(Refusal::NotWritable(format!(
+                    "`{name}` is made of other points and cannot be written"
+                )));
+            };
+            let band = drive.band(minimum, maximum).ok_or_else(|| {
                 Refusal::NotWritable(format!(
-                    "`{}` needs the drive's frequency range, which is not known; set frequency_range for the drive",
-                    point.name
+                    "`{name}` needs the drive's frequency range, which is not known; set frequency_range for the drive"
                 ))
             })?;
-            let base = drive.spec.profile.points.get(*of);
-            let percent = crate::cache::DriveSpec::percent_of(value.as_f64(), low, high);
-            let (Some(base), Some(percent)) = (base, percent) else {
+            let base = drive.spec.profile.points.get(of);
+            let (Some(base), Some(figure)) = (base, derived.inverse(value.as_f64(), band)) else {
+                let (low, high) = band;
                 return Err(Refusal::NotWritable(format!(
                     "the frequency range {low} to {high} Hz is empty"
                 )));
             };
-            // The limits of the frequency were checked; those of the percentage hold as well.
-            let rounded = Value::Number((percent * 100.0).round() / 100.0);
-            let value = checked(drive, *of, base, rounded)?;
-            resolve(drive, *of, base, value)
+            // The limits of the point itself were checked; those of the one behind it hold as well.
+            let rounded = Value::Number((figure * 100.0).round() / 100.0);
+            let value = checked(drive, of, base, rounded)?;
+            resolve(drive, of, base, value)
         }
     }
 }
@@ -216,17 +221,33 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
             "{count} items in one write, the drive takes {most}; nothing was written"
         )));
     }
-    for (address, word) in items {
-        for (index, point) in profile.points.iter().enumerate() {
-            let Some(raw) = point.raw().filter(|r| r.table == table && r.address == address) else {
-                continue;
-            };
-            if point.kind() != Kind::Bool
-                && let Some(value) = raw.decode(&[word], Kind::Number)
-            {
-                checked(drive, index, point, value)?;
-            }
+    for (index, point) in profile.points.iter().enumerate() {
+        let Some(raw) = point.raw().filter(|raw| raw.table == table) else {
+            continue;
+        };
+        let words: Vec<u16> = raw
+            .addresses()
+            .filter_map(|address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word))
+            .collect();
+        if words.is_empty() || point.kind() == Kind::Bool {
+            continue;
         }
+        if words.len() < usize::from(raw.form.items()) {
+            return Err(Refusal::BadValue(format!(
+                "`{}` takes {} registers; write them together; nothing was written",
+                point.name,
+                raw.form.items()
+            )));
+        }
+        match raw.decode(&words, Kind::Number) {
+            Some(value) => checked(drive, index, point, value)?,
+            None => {
+                return Err(Refusal::BadValue(format!(
+                    "`{}`: no number; nothing was written",
+                    point.name
+                )));
+            }
+        };
     }
     Ok(())
 }

@@ -26,8 +26,6 @@ pub(super) const BAUDS: RangeInclusive<u32> = 300..=4_000_000;
 pub(super) const RETRIES: RangeInclusive<u32> = 0..=10;
 /// Times that a cadence or a timeout can be.
 pub(super) const TIMES: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_secs(3600);
-/// Protocols that are planned and that this version does not speak.
-const LATER: [&str; 2] = ["modbus-ascii", "n2"];
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);
 
@@ -160,10 +158,6 @@ fn read_protocol(reader: &Reader<'_>) -> Option<Protocol> {
     }
     reader.parsed("protocol", |text| match Protocol::from_name(text) {
         Some(protocol) => Ok(protocol),
-        None if LATER.contains(&text) => Err(format!(
-            "protocol \"{text}\" is not served by this version; remove it, or write \"{}\"",
-            DEFAULT_PROTOCOL.name()
-        )),
         None => Err(values::unknown_word(text, Protocol::ALL.iter().map(|p| p.name()))),
     })
 }

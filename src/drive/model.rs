@@ -56,6 +56,16 @@ pub enum Quality {
 }
 
 impl Quality {
+    /// The worse of two.
+    pub fn worse(self, other: Quality) -> Quality {
+        let rank = |quality| match quality {
+            Quality::Good => 0,
+            Quality::Stale => 1,
+            Quality::Bad => 2,
+        };
+        if rank(other) > rank(self) { other } else { self }
+    }
+
     /// The name in payloads.
     pub fn name(self) -> &'static str {
         match self {

@@ -17,6 +17,8 @@ pub struct PlannedRead {
     pub start: u16,
     /// Items.
     pub count: u16,
+    /// Bit i is set where item i is the second register of a value: no request begins there.
+    pub wide: u128,
 }
 
 impl PlannedRead {
@@ -52,58 +54,77 @@ impl Plan {
         let mut taken: BTreeSet<(Table, u16)> = BTreeSet::new();
         let mut reads = Vec::new();
         for class in [PollClass::Fast, PollClass::Slow, PollClass::Once] {
-            let mut wanted: BTreeSet<(Table, u16)> = BTreeSet::new();
-            for raw in profile
-                .points
-                .iter()
-                .filter(|p| p.class == class)
-                .filter_map(|p| p.raw())
-            {
-                for item in 0..raw.form.items() {
-                    if let Some(address) = raw
-                        .address
-                        .checked_add(item)
-                        .filter(|a| !taken.contains(&(raw.table, *a)))
-                    {
-                        wanted.insert((raw.table, address));
-                    }
-                }
-            }
+            let points = profile.points.iter().filter(|p| p.class == class);
+            let raw = points.filter_map(|p| p.raw());
+            let wanted: BTreeSet<Piece> = raw
+                .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
+                .map(|raw| (raw.table, raw.address, raw.form.items()))
+                .collect();
             reads.extend(merge(profile, class, &wanted));
-            taken.extend(wanted);
+            for (table, start, items) in wanted {
+                taken.extend((start..).take(usize::from(items)).map(|a| (table, a)));
+            }
         }
         Plan { reads }
     }
 
-    /// Splits a refused request in two halves; a single item cannot be split.
+    /// Splits a refused request in two halves, never within a value; a single value cannot be split.
     pub fn halves(read: PlannedRead) -> Option<(PlannedRead, PlannedRead)> {
-        if read.count < 2 {
-            return None;
-        }
-        let first = read.count / 2;
-        let low = PlannedRead { count: first, ..read };
+        let middle = read.count / 2;
+        let joint = |at: &u16| *at >= 1 && *at < read.count && !is_wide(read.wide, *at);
+        let first = (middle..read.count).chain((0..middle).rev()).find(joint)?;
+        let low = PlannedRead {
+            count: first,
+            wide: read.wide & low_bits(first),
+            ..read
+        };
         let high = PlannedRead {
             start: read.start.checked_add(first)?,
             count: read.count - first,
+            wide: read.wide.checked_shr(u32::from(first)).unwrap_or(0),
             ..read
         };
         Some((low, high))
     }
 }
 
-fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -> Vec<PlannedRead> {
+impl PlannedRead {
+    /// Appends the read of the addresses that follow.
+    pub fn append(&mut self, next: &PlannedRead) {
+        self.wide |= next.wide.checked_shl(u32::from(self.count)).unwrap_or(0);
+        self.count = self.count.saturating_add(next.count);
+    }
+}
+
+fn is_wide(wide: u128, item: u16) -> bool {
+    wide.checked_shr(u32::from(item)).is_some_and(|rest| rest & 1 == 1)
+}
+
+fn low_bits(count: u16) -> u128 {
+    1u128.checked_shl(u32::from(count)).map_or(u128::MAX, |bit| bit - 1)
+}
+
+/// Registers that make one value and are read together: table, first address, how many.
+type Piece = (Table, u16, u16);
+
+fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<PlannedRead> {
     let mut reads: Vec<PlannedRead> = Vec::new();
-    for &(table, address) in wanted {
+    for &(table, address, items) in wanted {
         let Some(range) = profile.range(table, address) else {
             continue;
         };
+        let piece_end = u32::from(address) + u32::from(items);
+        // The registers of a value behind its first.
+        let inner = low_bits(items) & !1;
         // The last read of another table may lie above this address.
         if let Some(last) = reads.last_mut().filter(|last| last.table == table) {
             let end = u32::from(last.start) + u32::from(last.count);
-            let joined = u32::from(address) + 1 - u32::from(last.start);
-            let adjacent = u32::from(address) == end || range.holes;
+            let joined = piece_end.max(end) - u32::from(last.start);
+            let adjacent = u32::from(address) <= end || range.holes;
             let fits = joined <= u32::from(range.read);
             if range.addresses.contains(&last.start) && adjacent && fits {
+                let at = u32::from(address) - u32::from(last.start);
+                last.wide |= inner.checked_shl(at).unwrap_or(0);
                 last.count = joined as u16;
                 continue;
             }
@@ -112,7 +133,8 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<(Table, u16)>) -
             class,
             table,
             start: address,
-            count: 1,
+            count: items,
+            wide: inner,
         });
     }
     reads
@@ -197,6 +219,35 @@ mod tests {
             "never across a border"
         );
         assert_eq!(spans(&profile(&range(0, 99, 1, false), &[1, 2])), [(1, 1), (2, 1)]);
+    }
+
+    #[test]
+    fn a_wide_value_is_never_torn() {
+        let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n\
+            [[range]]\ntable = \"input\"\nfirst = 0\nlast = 99\nread = 3\n\
+            [[point]]\nname = \"a\"\nat = \"input 0\"\ntype = \"f32\"\nclass = \"fast\"\n\
+            [[point]]\nname = \"b\"\nat = \"input 2\"\ntype = \"f32\"\nclass = \"fast\"\n\
+            [[point]]\nname = \"c\"\nat = \"input 4\"\nclass = \"fast\"\n\
+            [[point]]\nname = \"d\"\nat = \"input 3\"\nclass = \"fast\"\n";
+        let plan = Plan::of(&Profile::parse("p.toml", text, false).unwrap());
+        assert_eq!(
+            plan.reads.iter().map(|r| (r.start, r.count)).collect::<Vec<_>>(),
+            [(0, 2), (2, 3)]
+        );
+        let read = PlannedRead {
+            count: 6,
+            wide: 0b10_1010,
+            ..plan.reads[0]
+        };
+        let (low, high) = Plan::halves(read).unwrap();
+        assert_eq!(
+            (low.count, low.wide, high.start, high.count, high.wide),
+            (4, 0b1010, 4, 2, 0b10)
+        );
+        let (low, mut first) = (high, low);
+        assert_eq!(Plan::halves(low), None, "one value");
+        first.append(&low);
+        assert_eq!(first, read);
     }
 
     #[test]

@@ -5,8 +5,9 @@ use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::derive::{Bound, Derived};
 use super::model::ModelPoint;
-use super::profile::{AddressRange, FaultText, Form, Point, PollClass, Profile, Profiles, Raw, Source};
+use super::profile::{AddressRange, FaultText, Form, Point, PollClass, Profile, Profiles, Raw, Source, WordOrder};
 use crate::codec::{Protocol, Table};
 use crate::document::{self, Document, Problem, Reader};
 
@@ -117,11 +118,13 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
         reader.problem("point", "the profile has no point; write at least one [[point]]");
     }
     let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
-    let points: Vec<Point> = tables
-        .into_iter()
-        .enumerate()
+    let points: Vec<Point> = (0..)
+        .zip(&tables)
         .filter_map(|(i, table)| read_point(table, i, &names, &ranges))
         .collect();
+    for (index, table) in tables.iter().enumerate() {
+        check_derived(table, index, &points);
+    }
     let mut faults = read_faults(reader, "faults", true);
     for (code, text) in read_faults(reader, "faults_unverified", false) {
         faults.entry(code).or_insert(text);
@@ -234,7 +237,7 @@ fn read_range(reader: Reader<'_>) -> Option<AddressRange> {
     })
 }
 
-fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[AddressRange]) -> Option<Point> {
+fn read_point(reader: &Reader<'_>, index: usize, names: &[String], ranges: &[AddressRange]) -> Option<Point> {
     let name: String = reader.required("name").unwrap_or_default();
     if !is_name(&name, '_') {
         reader.problem("name", "a point's name is snake_case: a-z, 0-9 and _; rename the point");
@@ -244,9 +247,9 @@ fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[Addr
     }
     let model = ModelPoint::from_name(&name);
     let source = if reader.has("derive") {
-        read_derived(&reader, names)
+        read_derived(reader, names)
     } else {
-        read_raw(&reader, ranges)
+        read_raw(reader, ranges)
     };
     let unit = match model {
         Some(model) => {
@@ -261,7 +264,7 @@ fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[Addr
         None => reader.or("unit", String::new()),
     };
     let derived = !matches!(source, Some(Source::Raw(_)));
-    let class = if derived { PollClass::Never } else { read_class(&reader) };
+    let class = if derived { PollClass::Never } else { read_class(reader) };
     let point = Point {
         name,
         model,
@@ -269,16 +272,14 @@ fn read_point(reader: Reader<'_>, index: usize, names: &[String], ranges: &[Addr
         class,
         write: reader.or("write", false),
         pulse: reader.or("pulse", false),
-        range: read_pair::<f64>(&reader, "range"),
+        on_change: reader.or("on_change", false),
+        range: read_pair::<f64>(reader, "range"),
+        texts: read_texts(reader),
         verified: reader.or("verified", true),
         note: reader.or("note", String::new()),
-        source: source.unwrap_or(Source::Band {
-            of: index,
-            minimum: index,
-            maximum: index,
-        }),
+        source: source.unwrap_or(Source::Derived(Derived::All { of: Vec::new() })),
     };
-    check_write(&reader, &point, ranges);
+    check_write(reader, &point, ranges);
     reader.finish();
     Some(point)
 }
@@ -295,29 +296,113 @@ fn read_class(reader: &Reader<'_>) -> PollClass {
 }
 
 fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
-    reader.parsed("derive", |text| match text {
-        "band" => Ok(()),
-        other => Err(format!("unknown derivation `{other}`; known: band")),
-    });
-    let other = |key: &str| -> Option<usize> {
-        let name: String = reader.required(key)?;
-        let index = names.iter().position(|n| *n == name);
-        if index.is_none() {
-            let near = document::nearest(&name, names.iter().map(String::as_str));
-            let remedy = near.map_or_else(
-                || "name a point of this profile".to_string(),
-                |n| format!("did you mean `{n}`?"),
+    const KNOWN: [&str; 6] = ["band", "percent", "zero", "equal", "all", "lowest_bit"];
+    let kind = reader.parsed("derive", |text| {
+        let known = KNOWN.into_iter().find(|known| *known == text);
+        known.ok_or_else(|| format!("unknown derivation `{text}`; known: {}", KNOWN.join(", ")))
+    })?;
+    let index = |key: &str, name: &str| point_of(reader, key, name, names);
+    let other = |key: &str| -> Option<usize> { index(key, &reader.required::<String>(key)?) };
+    let within = |default: f64| reader.or("within", default);
+    let derived = match kind {
+        "band" | "percent" => {
+            let (of, minimum, maximum) = (
+                other("of"),
+                read_bound(reader, "minimum", names, Some(Bound::Fixed(0.0))),
+                read_bound(reader, "maximum", names, None),
             );
-            reader.problem(key, format!("there is no point `{name}`; {remedy}"));
+            let (of, minimum, maximum) = (of?, minimum?, maximum?);
+            if kind == "band" {
+                Derived::Band { of, minimum, maximum }
+            } else {
+                Derived::Percent { of, minimum, maximum }
+            }
         }
-        index
+        "zero" => Derived::Zero {
+            of: other("of")?,
+            within: within(0.0),
+        },
+        "equal" => {
+            let (of, to) = (other("of"), other("to"));
+            Derived::Equal {
+                of: of?,
+                to: to?,
+                within: within(0.0),
+            }
+        }
+        "all" => {
+            let all: Vec<String> = reader.required("of")?;
+            let of: Option<Vec<usize>> = all.iter().map(|name| index("of", name)).collect();
+            Derived::All { of: of? }
+        }
+        _ => Derived::LowestBit { of: other("of")? },
     };
-    let (of, minimum, maximum) = (other("of"), other("minimum"), other("maximum"));
-    Some(Source::Band {
-        of: of?,
-        minimum: minimum?,
-        maximum: maximum?,
-    })
+    Some(Source::Derived(derived))
+}
+
+fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[String]) -> Option<usize> {
+    let index = names.iter().position(|n| n == name);
+    if index.is_none() {
+        let near = document::nearest(name, names.iter().map(String::as_str));
+        let remedy = near.map_or_else(
+            || "name a point of this profile".to_string(),
+            |n| format!("did you mean `{n}`?"),
+        );
+        reader.problem(key, format!("there is no point `{name}`; {remedy}"));
+    }
+    index
+}
+
+/// The end of a band: the name of a point, or a figure.
+fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<Bound>) -> Option<Bound> {
+    match reader.raw(key).map(|node| &node.value) {
+        None if default.is_some() => default,
+        Some(document::Raw::Float(_) | document::Raw::Integer(_)) => reader.optional(key).map(Bound::Fixed),
+        _ => {
+            let name: String = reader.required(key)?;
+            point_of(reader, key, &name, names).map(Bound::Point)
+        }
+    }
+}
+
+/// What is told of derived points: they rest on points that the drive tells itself.
+fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {
+        return;
+    };
+    let ends = derived.band().map(|(_, low, high)| [low, high]).into_iter().flatten();
+    let ends = ends.filter_map(|bound| match bound {
+        Bound::Point(point) => Some(point),
+        Bound::Fixed(_) => None,
+    });
+    for source in derived.sources().into_iter().chain(ends) {
+        if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
+            reader.problem(
+                "derive",
+                format!("`{}` is derived itself; name points that have `at`", point.name),
+            );
+        }
+    }
+}
+
+/// `[point.texts]`: what the values of an enumeration mean.
+fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
+    let Some(table) = reader.table("texts") else {
+        return BTreeMap::new();
+    };
+    let mut texts = BTreeMap::new();
+    for key in table.keys() {
+        let text: Option<String> = table.optional(key);
+        match (key.parse::<i64>(), text) {
+            (Ok(value), Some(text)) => {
+                texts.insert(value, text);
+            }
+            (Err(_), _) => table.problem(key, format!("`{key}` is no whole number; write value = \"meaning\"")),
+            (Ok(_), None) => {}
+        }
+    }
+    table.finish();
+    texts
 }
 
 /// `holding 2100.3`: table, PDU address, bit.
@@ -330,19 +415,16 @@ fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
         return None;
     };
     let table = read_table(reader, "at", table)?;
-    let (address, bit) = match place.split_once('.') {
-        Some((address, bit)) => (
-            address.parse::<u16>().ok(),
-            bit.parse::<u8>().ok().filter(|b| *b < 16).map(Some),
-        ),
-        None => (place.parse::<u16>().ok(), Some(None)),
+    let (address, bits) = match place.split_once('.') {
+        Some((address, bits)) => (parse_address(address), parse_bits(bits).map(Some)),
+        None => (parse_address(place), Some(None)),
     };
-    let (Some(address), Some(bit)) = (address, bit) else {
+    let (Some(address), Some(bits)) = (address, bits) else {
         reader.problem("at", bad());
         return None;
     };
     let invert = reader.or("invert", false);
-    let form = read_form(reader, table, bit, invert)?;
+    let form = read_form(reader, table, bits, invert)?;
     let raw = Raw {
         table,
         address,
@@ -356,29 +438,75 @@ fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
             "a scale of 0 loses every value; write the engineering value of one count",
         );
     }
-    if !ranges
+    check_place(reader, &raw, ranges);
+    Some(Source::Raw(raw))
+}
+
+/// A PDU address, decimal or as the hexadecimal number of a manual (0x0023).
+fn parse_address(text: &str) -> Option<u16> {
+    match text.strip_prefix("0x") {
+        Some(hex) => u16::from_str_radix(hex, 16).ok(),
+        None => text.parse().ok(),
+    }
+}
+
+/// `3` is one bit, `4-7` a field: the first bit and how many.
+fn parse_bits(text: &str) -> Option<(u8, u8)> {
+    let (first, last) = text.split_once('-').unwrap_or((text, text));
+    let (first, last): (u8, u8) = (first.parse().ok()?, last.parse().ok()?);
+    (first <= last && last < 16).then(|| (first, last - first + 1))
+}
+
+fn check_place(reader: &Reader<'_>, raw: &Raw, ranges: &[AddressRange]) {
+    let Raw {
+        table, address, form, ..
+    } = raw;
+    let range = ranges
         .iter()
-        .any(|r| r.table == table && r.addresses.contains(&address))
-    {
+        .find(|r| r.table == *table && r.addresses.contains(address));
+    let Some(range) = range else {
         reader.problem(
             "at",
             format!("{table} {address} lies in no [[range]] of the profile; add the range"),
         );
+        return;
+    };
+    let items = form.items();
+    if raw.addresses().count() != usize::from(items) || raw.addresses().any(|a| !range.addresses.contains(&a)) {
+        reader.problem(
+            "at",
+            format!("{table} {address} takes {items} registers, which its [[range]] does not hold; widen the range"),
+        );
+    } else if items > range.read {
+        reader.problem(
+            "type",
+            format!(
+                "the value takes {items} registers, its [[range]] reads {}; raise `read` there",
+                range.read
+            ),
+        );
     }
-    Some(Source::Raw(raw))
 }
 
-fn read_form(reader: &Reader<'_>, table: Table, bit: Option<u8>, invert: bool) -> Option<Form> {
+fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: bool) -> Option<Form> {
     let kind: Option<String> = reader.optional("type");
-    match (table.is_bits(), bit, kind.as_deref()) {
-        (true, None, None) => Some(Form::Bit { bit: 0, invert }),
-        (false, Some(bit), None) => Some(Form::Bit { bit, invert }),
-        (false, None, None | Some("u16")) => Some(Form::U16),
-        (false, None, Some("i16")) => Some(Form::I16),
-        (false, None, Some(other)) => {
-            reader.problem("type", format!("unknown type `{other}`; known: u16, i16"));
-            None
+    let words = match reader.optional::<String>("words").as_deref() {
+        None | Some("high-first") => WordOrder::HighFirst,
+        Some("low-first") => WordOrder::LowFirst,
+        Some(other) => {
+            reader.problem(
+                "words",
+                format!("unknown word order `{other}`; write high-first or low-first"),
+            );
+            WordOrder::HighFirst
         }
+    };
+    match (table.is_bits(), bits, kind.as_deref()) {
+        (true, None, None) => Some(Form::Bit { bit: 0, invert }),
+        (false, Some((bit, 1)), None) => Some(Form::Bit { bit, invert }),
+        (false, Some((first, count)), None) => Some(Form::Bits { first, count }),
+        (false, None, Some(text)) => form_of(reader, text, words),
+        (false, None, None) => Some(Form::U16),
         (true, _, _) => {
             reader.problem(
                 "at",
@@ -393,6 +521,30 @@ fn read_form(reader: &Reader<'_>, table: Table, bit: Option<u8>, invert: bool) -
     }
 }
 
+fn form_of(reader: &Reader<'_>, kind: &str, words: WordOrder) -> Option<Form> {
+    let form = match kind {
+        "u16" => Form::U16,
+        "i16" => Form::I16,
+        "u32" => Form::U32(words),
+        "i32" => Form::I32(words),
+        "f32" => Form::F32(words),
+        other => {
+            reader.problem(
+                "type",
+                format!("unknown type `{other}`; known: u16, i16, u32, i32, f32"),
+            );
+            return None;
+        }
+    };
+    if form.items() == 1 && reader.has("words") {
+        reader.problem(
+            "words",
+            format!("a {kind} is one register and has no word order; leave the key out"),
+        );
+    }
+    Some(form)
+}
+
 fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if point.pulse && !point.write {
         reader.problem(
@@ -403,16 +555,22 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     let Some(raw) = point.raw().filter(|_| point.write) else {
         return;
     };
-    let writable = ranges
+    let range = ranges
         .iter()
-        .any(|r| r.table == raw.table && r.addresses.contains(&raw.address) && r.write > 0);
-    if !writable {
+        .find(|r| r.table == raw.table && r.addresses.contains(&raw.address));
+    let (most, items) = (range.map_or(0, |r| r.write), raw.form.items());
+    if most == 0 {
         reader.problem(
             "write",
             format!(
                 "{} {} lies in a read-only range; set `write` there",
                 raw.table, raw.address
             ),
+        );
+    } else if most < items {
+        reader.problem(
+            "write",
+            format!("the value takes {items} registers, its range writes {most}; raise `write` there"),
         );
     }
 }
@@ -493,13 +651,13 @@ x = "y"
         let all = text.join("\n");
         for wanted in [
             "meter.toml:2, name",
-            "meter.toml:3, protocols; known: modbus-rtu",
+            "meter.toml:3, protocols; known: modbus-rtu, modbus-ascii, n2",
             "meter.toml:7, range[0].last",
             "meter.toml:10, point[0].at",
             "meter.toml:13, point[1].at; add the range",
             "meter.toml:14, point[1].scael; did you mean `scale`?",
             "meter.toml:16, point[2].name",
-            "meter.toml:18, point[2].type; known: u16, i16",
+            "meter.toml:18, point[2].type; known: u16, i16, u32, i32, f32",
             "meter.toml:21, faults.x",
         ] {
             assert!(all.contains(wanted), "{wanted} is missing in\n{all}");

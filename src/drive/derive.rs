@@ -1,0 +1,228 @@
+//! Points that the drive does not tell, made of points that it does. Pure.
+
+use super::model::{Quality, Sample, Value};
+use super::profile::tidy;
+
+/// One end of a band: another point, or a figure of the manual.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Bound {
+    /// Index of a point of the profile.
+    Point(usize),
+    /// In the unit of the band.
+    Fixed(f64),
+}
+
+/// How a value is made of other points, by their indices in the profile. All of them are raw points.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Derived {
+    /// A percentage as a place in a band: `minimum + of / 100 * (maximum - minimum)`.
+    Band {
+        /// Point in percent.
+        of: usize,
+        /// Value at 0 %.
+        minimum: Bound,
+        /// Value at 100 %.
+        maximum: Bound,
+    },
+    /// A place in a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`.
+    Percent {
+        /// Point in the unit of the band.
+        of: usize,
+        /// Value at 0 %.
+        minimum: Bound,
+        /// Value at 100 %.
+        maximum: Bound,
+    },
+    /// True while the amount of the point is not above `within`.
+    Zero {
+        /// Point.
+        of: usize,
+        /// In the unit of the point.
+        within: f64,
+    },
+    /// True while the two points differ by not more than `within`.
+    Equal {
+        /// Point.
+        of: usize,
+        /// The other one.
+        to: usize,
+        /// In the unit of the points.
+        within: f64,
+    },
+    /// True while all of the points are.
+    All {
+        /// Points.
+        of: Vec<usize>,
+    },
+    /// Number of the lowest bit that is set, counted from 1; 0 when none is.
+    LowestBit {
+        /// Point with a mask.
+        of: usize,
+    },
+}
+
+impl Derived {
+    /// The name in profiles and output.
+    pub fn name(&self) -> &'static str {
+        match self {
+            Derived::Band { .. } => "band",
+            Derived::Percent { .. } => "percent",
+            Derived::Zero { .. } => "zero",
+            Derived::Equal { .. } => "equal",
+            Derived::All { .. } => "all",
+            Derived::LowestBit { .. } => "lowest_bit",
+        }
+    }
+
+    /// The point that a command to this one is turned into, with the ends of its band.
+    pub fn band(&self) -> Option<(usize, Bound, Bound)> {
+        match *self {
+            Derived::Band { of, minimum, maximum } | Derived::Percent { of, minimum, maximum } => {
+                Some((of, minimum, maximum))
+            }
+            _ => None,
+        }
+    }
+
+    /// The points that the value itself is made of; the ends of a band are not among them.
+    pub fn sources(&self) -> Vec<usize> {
+        match self {
+            Derived::Band { of, .. }
+            | Derived::Percent { of, .. }
+            | Derived::Zero { of, .. }
+            | Derived::LowestBit { of } => vec![*of],
+            Derived::Equal { of, to, .. } => vec![*of, *to],
+            Derived::All { of } => of.clone(),
+        }
+    }
+
+    /// The value in the unit of this point that `value` of its source means; `None` where there is none.
+    pub fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
+        let first = sources.first()?;
+        match self {
+            Derived::Band { .. } => {
+                let (low, high) = band?;
+                Some(Value::Number(tidy(low + first.as_f64() / 100.0 * (high - low))))
+            }
+            Derived::Percent { .. } => {
+                let (low, high) = band.filter(|(low, high)| high > low)?;
+                Some(Value::Number(tidy((first.as_f64() - low) / (high - low) * 100.0)))
+            }
+            Derived::Zero { within, .. } => Some(Value::Bool(first.as_f64().abs() <= *within)),
+            Derived::Equal { within, .. } => {
+                let apart = tidy((first.as_f64().abs() - sources.get(1)?.as_f64().abs()).abs());
+                Some(Value::Bool(apart <= *within))
+            }
+            Derived::All { .. } => Some(Value::Bool(sources.iter().all(|v| v.as_bool()))),
+            Derived::LowestBit { .. } => {
+                let mask = first.as_f64() as u64;
+                let number = if mask == 0 {
+                    0
+                } else {
+                    i64::from(mask.trailing_zeros()) + 1
+                };
+                Some(Value::Integer(number))
+            }
+        }
+    }
+
+    /// What the source has to be so that this point is `value`; `None` where it cannot be commanded.
+    pub fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
+        let (low, high) = band;
+        match self {
+            _ if high <= low => None,
+            Derived::Band { .. } => Some((value - low) / (high - low) * 100.0),
+            Derived::Percent { .. } => Some(low + value / 100.0 * (high - low)),
+            _ => None,
+        }
+    }
+
+    /// The sample made of those of the sources: the worst quality, the oldest time.
+    pub fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
+        let values: Option<Vec<Value>> = sources.iter().map(|s| s.value).collect();
+        let value = values.and_then(|values| self.value(&values, band));
+        let Some(value) = value else { return Sample::NONE };
+        Sample {
+            value: Some(value),
+            quality: sources.iter().map(|s| s.quality).fold(Quality::Good, Quality::worse),
+            at: sources.iter().filter_map(|s| s.at).min(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const BAND: Option<(f64, f64)> = Some((10.0, 50.0));
+
+    fn ends() -> (Bound, Bound) {
+        (Bound::Fixed(10.0), Bound::Fixed(50.0))
+    }
+
+    #[test]
+    fn bands_both_ways() {
+        let (minimum, maximum) = ends();
+        let band = Derived::Band {
+            of: 0,
+            minimum,
+            maximum,
+        };
+        let percent = Derived::Percent {
+            of: 0,
+            minimum,
+            maximum,
+        };
+        assert_eq!(band.value(&[Value::Number(50.0)], BAND), Some(Value::Number(30.0)));
+        assert_eq!(percent.value(&[Value::Number(30.0)], BAND), Some(Value::Number(50.0)));
+        assert_eq!(band.inverse(30.0, (10.0, 50.0)), Some(50.0));
+        assert_eq!(percent.inverse(50.0, (10.0, 50.0)), Some(30.0));
+        assert_eq!(percent.value(&[Value::Number(30.0)], Some((5.0, 5.0))), None);
+        assert_eq!(percent.value(&[Value::Number(30.0)], None), None);
+        assert_eq!(band.inverse(30.0, (5.0, 5.0)), None);
+    }
+
+    #[test]
+    fn states_and_codes() {
+        let number = Value::Number;
+        let zero = Derived::Zero { of: 0, within: 0.0 };
+        assert_eq!(zero.value(&[number(0.0)], None), Some(Value::Bool(true)));
+        assert_eq!(zero.value(&[number(-0.01)], None), Some(Value::Bool(false)));
+        let equal = Derived::Equal {
+            of: 0,
+            to: 1,
+            within: 0.01,
+        };
+        assert_eq!(
+            equal.value(&[number(10.0), number(10.01)], None),
+            Some(Value::Bool(true))
+        );
+        assert_eq!(
+            equal.value(&[number(10.0), number(10.02)], None),
+            Some(Value::Bool(false))
+        );
+        assert_eq!(equal.value(&[number(10.0)], None), None);
+        let all = Derived::All { of: vec![0, 1] };
+        assert_eq!(
+            all.value(&[Value::Bool(true), Value::Bool(false)], None),
+            Some(Value::Bool(false))
+        );
+        let lowest = Derived::LowestBit { of: 0 };
+        for (mask, code) in [(0, 0), (1, 1), (0x0204, 3), (0x1000, 13), (0x8000, 16)] {
+            assert_eq!(lowest.value(&[Value::Integer(mask)], None), Some(Value::Integer(code)));
+        }
+    }
+
+    #[test]
+    fn the_worst_source_counts() {
+        let sample = |quality| Sample {
+            value: Some(Value::Bool(true)),
+            quality,
+            at: None,
+        };
+        let all = Derived::All { of: vec![0, 1] };
+        let made = all.sample(&[sample(Quality::Good), sample(Quality::Stale)], None);
+        assert_eq!((made.value, made.quality), (Some(Value::Bool(true)), Quality::Stale));
+        assert_eq!(all.sample(&[sample(Quality::Good), Sample::NONE], None), Sample::NONE);
+    }
+}
