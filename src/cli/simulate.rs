@@ -158,7 +158,11 @@ fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
         })
     };
     let drives = bus.drives.iter().map(drive).collect::<Result<_, String>>()?;
-    let mut line = SimulatedBusOptions::new(&bus.spec.name, LineRules::new(bus.spec.format), drives);
+    let mut line = SimulatedBusOptions::new(
+        &bus.spec.name,
+        LineRules::of(bus.spec.protocol, bus.spec.format),
+        drives,
+    );
     line.endpoint = endpoint_for(&bus.spec.port)?;
     Ok(line)
 }

@@ -116,6 +116,13 @@ impl SimulatedDrive {
         drive.answer(request, now)
     }
 
+    /// A request to all drives. Nobody answers it, so only writes have an effect.
+    pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+        if request.is_write() {
+            let _: Reply = self.answer(request, now);
+        }
+    }
+
     /// Whether an autopilot still runs it.
     pub fn runs_by_itself(&self) -> bool {
         self.autopilot.is_some()

@@ -1,13 +1,14 @@
 //! What goes wrong on a simulated line: by chance, or by script for the request of a given number. Pure.
 
+use super::framing;
 use super::random::Random;
-use crate::codec::rtu;
+use crate::codec::Protocol;
 use crate::document::parse_duration;
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
 
-/// In what a foreign reply differs from the true one. Its data differs, its CRC is right.
+/// In what a foreign reply differs from the true one. Its data differs, its check code is right.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Foreign {
     /// From another drive.
@@ -192,7 +193,14 @@ impl FaultPlan {
     }
 
     /// What comes over the line for `reply` to `request` under a fault, in order.
-    pub fn shape(&mut self, fault: Option<Fault>, request: &[u8], reply: Vec<u8>, silence: Duration) -> Vec<Burst> {
+    pub fn shape(
+        &mut self,
+        fault: Option<Fault>,
+        protocol: Protocol,
+        request: &[u8],
+        reply: Vec<u8>,
+        silence: Duration,
+    ) -> Vec<Burst> {
         let random = &mut self.random;
         let burst = |bytes| Burst {
             gap: Duration::ZERO,
@@ -207,16 +215,16 @@ impl FaultPlan {
             None | Some(Fault::Exception(_)) => vec![burst(reply)],
             Some(Fault::Deaf | Fault::Drop) => Vec::new(),
             Some(Fault::Truncate) => vec![burst(cut(reply, random))],
-            Some(Fault::Corrupt) => vec![burst(flip(reply, random))],
+            Some(Fault::Corrupt) => vec![burst(corrupt(protocol, reply, random))],
             Some(Fault::Double) => vec![burst(reply.clone()), provoked(reply)],
             Some(Fault::Late(by)) => vec![Burst {
                 gap: by,
                 ..provoked(reply)
             }],
-            Some(Fault::Foreign(what)) => vec![burst(foreign(what, &reply))],
+            Some(Fault::Foreign(what)) => vec![burst(foreign(what, protocol, &reply))],
             Some(Fault::Stray(what)) => {
                 vec![
-                    burst(foreign(what, &reply)),
+                    burst(foreign(what, protocol, &reply)),
                     Burst {
                         gap: silence,
                         ..burst(reply)
@@ -274,6 +282,29 @@ fn cut(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     reply
 }
 
+/// A reply that is no sound frame any more, and no other one either.
+fn corrupt(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
+    match protocol {
+        Protocol::ModbusRtu | Protocol::N2 => flip(reply, random),
+        Protocol::ModbusAscii => garble(reply, random),
+    }
+}
+
+/// Not any bit of any character: bit 5 of a letter is its case, which is no error.
+fn garble(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
+    let digits = reply.len().saturating_sub(3) as u64;
+    let at = random.within(1..=digits.max(1)) as usize;
+    let Some(digit) = reply.get_mut(at) else { return reply };
+    match random.within(0..=2) {
+        // Another digit, so that the LRC is wrong.
+        0 => *digit = if *digit == b'0' { b'1' } else { b'0' },
+        1 => *digit |= 0x80,
+        // An odd number of digits.
+        _ => drop(reply.remove(at)),
+    }
+    reply
+}
+
 fn flip(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     let at = random.within(0..=(reply.len() as u64).saturating_sub(1)) as usize;
     if let Some(byte) = reply.get_mut(at) {
@@ -287,11 +318,10 @@ fn noise(random: &mut Random) -> Vec<u8> {
 }
 
 /// A sound frame that does not answer the request; its data is changed so that it proves itself when believed.
-fn foreign(what: Foreign, reply: &[u8]) -> Vec<u8> {
-    let Some((address, pdu)) = rtu::open_frame(reply) else {
+fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
+    let Some((address, mut pdu)) = framing::open_any(protocol, reply) else {
         return Vec::new();
     };
-    let mut pdu = pdu.to_vec();
     let registers = matches!(pdu.first(), Some(3 | 4));
     pdu.iter_mut().skip(2).for_each(|byte| *byte ^= 0x55);
     let mut address = address;
@@ -314,15 +344,17 @@ fn foreign(what: Foreign, reply: &[u8]) -> Vec<u8> {
             }
         }
     }
-    let mut out = Vec::with_capacity(pdu.len() + rtu::OVERHEAD);
-    rtu::encode_frame(address, &pdu, &mut out);
+    let mut out = Vec::new();
+    framing::close(protocol, address, &pdu, &mut out);
     out
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::codec::{Decoded, Request, RequestPdu, Table};
+    use crate::codec::{Decoded, Request, RequestPdu, Table, rtu};
+
+    const RTU: Protocol = Protocol::ModbusRtu;
 
     const SILENCE: Duration = Duration::from_micros(911);
 
@@ -343,7 +375,7 @@ mod tests {
 
     fn shaped(text: &str) -> Vec<Burst> {
         let (_, asked, reply) = exchange();
-        FaultPlan::default().shape(Some(text.parse().unwrap()), &asked, reply, SILENCE)
+        FaultPlan::default().shape(Some(text.parse().unwrap()), RTU, &asked, reply, SILENCE)
     }
 
     #[test]
@@ -351,7 +383,7 @@ mod tests {
         for name in NAMES.split(", ") {
             let fault: Fault = name.trim().parse().unwrap();
             let (_, asked, reply) = exchange();
-            FaultPlan::default().shape(Some(fault), &asked, reply, SILENCE);
+            FaultPlan::default().shape(Some(fault), RTU, &asked, reply, SILENCE);
         }
         for bad in ["", "drip", "drop:3", "exception:0", "exception:x", "late:x"] {
             assert!(bad.parse::<Fault>().is_err(), "{bad}");
@@ -431,7 +463,7 @@ mod tests {
             for what in [Foreign::Address, Foreign::Function, Foreign::Length] {
                 let mut reply = Vec::new();
                 rtu::encode_frame(247, &pdu, &mut reply);
-                let frame = foreign(what, &reply);
+                let frame = foreign(what, RTU, &reply);
                 assert!(rtu::open_frame(&frame).is_some() && frame != reply, "{what:?} {pdu:?}");
             }
         }

@@ -2,16 +2,19 @@
 //!
 //! A master on a pseudo-terminal hands over a whole frame in no time. Here it takes the time that it would take on the
 //! wire: its first character begins when the bytes were read, or right after the characters before them. A frame is
-//! over after 3.5 characters of silence; then the drive takes its turnaround, then its reply begins. Bytes of the reply
-//! are due at the end of the character that completes a chunk, never before.
+//! over when its protocol says so (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the drive takes
+//! its turnaround, then its reply begins. Bytes of the reply are due at the end of the character that completes a
+//! chunk, never before.
 //!
-//! A strict drive, as drives of the field do, does not hear a request that begins before 3.5 characters of silence.
+//! A strict drive, as drives of the field do, does not hear a Modbus RTU request that begins before 3.5 characters of
+//! silence.
 
 use super::SimTime;
 use super::faults::{Burst, Fault, FaultPlan, Kind};
+use super::framing;
 use super::slave::{Asked, Heard, Slaves, refuse};
 use super::statistics::{Direction, Lateness, Recorded, Statistics, Transcript};
-use crate::codec::{Exception, LineFormat, rtu};
+use crate::codec::{Exception, LineFormat, Protocol, rtu};
 use std::time::Duration;
 
 /// How the bytes of a reply reach the master.
@@ -37,9 +40,12 @@ pub enum Wire {
 /// How the line behaves.
 #[derive(Debug, Clone)]
 pub struct LineRules {
+    /// What the drives speak.
+    pub protocol: Protocol,
     /// Baud and character format.
     pub format: LineFormat,
-    /// Time between the end of a request (its last character and 3.5 characters of silence) and the reply.
+    /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and the
+    /// reply.
     pub turnaround: Duration,
     /// Whether drives ignore a request that comes too early; counted it is anyway.
     pub strict: bool,
@@ -52,9 +58,15 @@ pub struct LineRules {
 }
 
 impl LineRules {
-    /// A strict line with whole delivery, turnaround 0.5 ms and a tolerance of 3 %.
+    /// A strict Modbus RTU line with whole delivery, turnaround 0.5 ms and a tolerance of 3 %.
     pub fn new(format: LineFormat) -> LineRules {
+        LineRules::of(Protocol::ModbusRtu, format)
+    }
+
+    /// The same for drives that speak `protocol`.
+    pub fn of(protocol: Protocol, format: LineFormat) -> LineRules {
         LineRules {
+            protocol,
             format,
             turnaround: Duration::from_micros(500),
             strict: true,
@@ -65,9 +77,7 @@ impl LineRules {
     }
 }
 
-/// Longest frame that is kept; what follows until the next silence is counted and thrown away.
-const LONGEST_FRAME: usize = 300;
-/// Where the time on the wire is not known, a frame that stays a fragment is over after that time.
+/// Where the time on the wire is not known, a Modbus RTU frame that stays a fragment is over after that time.
 const FRAGMENT: Duration = Duration::from_millis(20);
 /// Bursts that may wait for delivery; late replies beyond that are lost.
 const MOST_OUTGOING: usize = 64;
@@ -87,6 +97,8 @@ struct Incoming {
     end: SimTime,
     bytes: Vec<u8>,
     verdict: Verdict,
+    /// Its last character came, where a character ends a frame.
+    ended: bool,
 }
 
 /// Characters of a drive, on the wire or waiting for it.
@@ -194,11 +206,11 @@ impl HalfDuplex {
         self.provoked_end = None;
     }
 
-    /// Silence that ends a frame, and that a request has to wait for.
+    /// Silence that ends a frame, and that a request has to wait for; zero where characters tell frames apart.
     fn silence(&self) -> Duration {
         match self.rules.wire {
             Wire::Instant => Duration::ZERO,
-            _ => self.rules.format.silence_chars(),
+            _ => self.rules.protocol.recognition(&self.rules.format),
         }
     }
 
@@ -213,12 +225,27 @@ impl HalfDuplex {
     pub fn on_bytes(&mut self, bytes: &[u8], now: SimTime) {
         self.on_time(now);
         self.statistics.bytes_in += bytes.len() as u64;
-        let wire_time = self.chars(bytes.len());
-        let begun = if self.rules.wire == Wire::Real {
-            now.saturating_sub(wire_time)
-        } else {
-            now
+        let mut at = match self.rules.wire {
+            Wire::Real => now.saturating_sub(self.chars(bytes.len())),
+            Wire::Simulated | Wire::Instant => now,
         };
+        for piece in framing::pieces(self.rules.protocol, bytes) {
+            at = self.on_piece(piece, at);
+        }
+        if self.rules.wire == Wire::Instant {
+            self.on_time(now);
+        }
+    }
+
+    /// Characters that belong to one frame and begin at `at` or right after those before them; their end is returned.
+    fn on_piece(&mut self, piece: &[u8], at: SimTime) -> SimTime {
+        let protocol = self.rules.protocol;
+        let fresh = piece.first().is_some_and(|&first| framing::begins(protocol, first));
+        let mut begun = at;
+        if let Some(frame) = self.incoming.take_if(|frame| fresh || frame.ended) {
+            begun = begun.max(frame.end);
+            self.finish(&frame);
+        }
         if self.incoming.is_none() {
             let verdict = self.verdict(begun);
             if verdict == Verdict::Collided {
@@ -229,15 +256,18 @@ impl HalfDuplex {
                 end: begun,
                 bytes: Vec::new(),
                 verdict,
+                ended: false,
             });
         }
-        let Some(incoming) = &mut self.incoming else { return };
+        let wire_time = self.chars(piece.len());
+        let Some(incoming) = &mut self.incoming else {
+            return begun;
+        };
         incoming.end = incoming.end.max(begun) + wire_time;
-        let room = LONGEST_FRAME.saturating_sub(incoming.bytes.len());
-        incoming.bytes.extend(bytes.iter().take(room));
-        if self.rules.wire == Wire::Instant {
-            self.on_time(now);
-        }
+        incoming.ended = piece.last().is_some_and(|&last| framing::ends(protocol, last));
+        let room = framing::kept(protocol).saturating_sub(incoming.bytes.len());
+        incoming.bytes.extend(piece.iter().take(room));
+        incoming.end
     }
 
     /// What it means that a request begins at `start`.
@@ -254,11 +284,14 @@ impl HalfDuplex {
         }
     }
 
-    /// Ends the master's frame when its silence is over by `now`.
+    /// Ends the master's frame when it is over by `now`.
     pub fn on_time(&mut self, now: SimTime) {
-        let Some(frame) = self.incoming.take_if(|frame| Self::is_over(frame, &self.rules, now)) else {
-            return;
-        };
+        if let Some(frame) = self.incoming.take_if(|frame| Self::is_over(frame, &self.rules, now)) {
+            self.finish(&frame);
+        }
+    }
+
+    fn finish(&mut self, frame: &Incoming) {
         let heard_at = frame.end + self.silence();
         self.last_end = Some(frame.end);
         let met_fault = self.provoked_end.is_some_and(|end| frame.start < end + self.silence());
@@ -270,11 +303,11 @@ impl HalfDuplex {
             bytes: frame.bytes.clone(),
         });
         match frame.verdict {
-            Verdict::Clean => self.hear(&frame, heard_at),
+            Verdict::Clean => self.hear(frame, heard_at),
             Verdict::TooEarly => {
                 self.statistics.silence_violations += 1;
                 if !self.rules.strict {
-                    self.hear(&frame, heard_at);
+                    self.hear(frame, heard_at);
                 }
             }
             Verdict::Collided => self.statistics.collisions += 1,
@@ -285,9 +318,16 @@ impl HalfDuplex {
         now >= frame.end + Self::end_after(frame, rules)
     }
 
-    /// Silence after which a frame is over. Drivers and adapters of real ports hand bytes over with pauses, and an
+    /// Pause after which a frame is over, unless a character ended it. Drivers and adapters of real ports hand bytes over with pauses, and an
     /// instant line knows no time, so there a frame that is not yet whole is waited for.
     fn end_after(frame: &Incoming, rules: &LineRules) -> Duration {
+        if rules.protocol != Protocol::ModbusRtu {
+            return if frame.ended {
+                Duration::ZERO
+            } else {
+                framing::LONGEST_PAUSE
+            };
+        }
         let silence = rules.format.silence_chars();
         let whole = || rtu::request_len(&frame.bytes).is_some_and(|len| len <= frame.bytes.len());
         match rules.wire {
@@ -311,10 +351,10 @@ impl HalfDuplex {
         }
     }
 
-    /// The drives hear a frame whose silence ended at `now`.
+    /// The drives hear a frame that was over at `now`.
     fn hear(&mut self, frame: &Incoming, now: SimTime) {
-        match self.slaves.hear(&frame.bytes, now) {
-            Heard::BadCrc => self.statistics.bad_crc += 1,
+        match self.slaves.hear(self.rules.protocol, &frame.bytes, now) {
+            Heard::BadFrame => self.statistics.bad_crc += 1,
             Heard::Nobody(_) => self.statistics.unanswered += 1,
             Heard::Broadcast => self.statistics.broadcasts += 1,
             Heard::Request(asked) => self.reply(frame, &asked, now),
@@ -330,9 +370,18 @@ impl HalfDuplex {
             Some(Fault::Deaf) => return,
             Some(Fault::DeafEcho) => {}
             Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
-            _ => self.slaves.answer(asked, now, &mut reply),
+            _ => {
+                self.slaves.answer(asked, now, &mut reply);
+                if reply.is_empty() {
+                    return;
+                }
+            }
         }
-        let bursts = self.faults.shape(fault, &frame.bytes, reply, self.silence());
+        let gap = match self.rules.wire {
+            Wire::Instant => Duration::ZERO,
+            _ => self.rules.format.silence_chars(),
+        };
+        let bursts = self.faults.shape(fault, self.rules.protocol, &frame.bytes, reply, gap);
         self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
         let mut at = now + self.rules.turnaround;
         for burst in bursts {

@@ -6,6 +6,7 @@
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
 //! - [`faults`]: what goes wrong on a line, by chance or by script.
+//! - [`framing`]: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
 //! - [`bare_master`]: a measuring rod for benches, not a master to build on.
@@ -22,6 +23,7 @@ pub mod broker;
 pub mod drive;
 pub mod endpoint;
 pub mod faults;
+pub mod framing;
 pub mod half_duplex;
 pub mod nx;
 pub mod pty;

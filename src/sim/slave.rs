@@ -1,12 +1,13 @@
-//! The drives of one Modbus RTU line: whole frames in, replies out.
+//! The drives of one line: whole frames in, replies out.
 //!
-//! A frame with a wrong CRC and a frame for somebody else get silence; a broadcast acts on all and gets silence
+//! A frame with a wrong check code and a frame for somebody else get silence; a broadcast acts on all and gets silence
 //! (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
 
 use super::SimTime;
 use super::drive::{DriveOptions, SimulatedDrive};
+use super::framing;
 use crate::codec::modbus::encode_exception;
-use crate::codec::{Exception, Reply, RequestPdu, rtu};
+use crate::codec::{Exception, Protocol, RequestPdu};
 use std::collections::BTreeMap;
 
 /// Address of a broadcast.
@@ -15,8 +16,8 @@ const BROADCAST: u8 = 0;
 /// What a frame meant to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Heard {
-    /// The CRC is wrong or the frame is too short.
-    BadCrc,
+    /// The check code is wrong, or it is no frame at all.
+    BadFrame,
     /// Nobody with that address is on the line, or it is dead.
     Nobody(u8),
     /// A broadcast, acted upon.
@@ -28,6 +29,8 @@ pub enum Heard {
 /// A request that a drive of the line has to answer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Asked {
+    /// What the line speaks.
+    pub protocol: Protocol,
     /// The drive's address.
     pub address: u8,
     /// The function code as it was sent.
@@ -84,9 +87,9 @@ impl Slaves {
     }
 
     /// What a whole frame means; a broadcast is acted upon at once.
-    pub fn hear(&mut self, frame: &[u8], now: SimTime) -> Heard {
-        let Some((address, decoded)) = rtu::decode_request(frame) else {
-            return Heard::BadCrc;
+    pub fn hear(&mut self, protocol: Protocol, frame: &[u8], now: SimTime) -> Heard {
+        let Some((address, decoded)) = framing::open(protocol, frame) else {
+            return Heard::BadFrame;
         };
         if address == BROADCAST {
             self.broadcast(decoded.ok(), now);
@@ -95,15 +98,19 @@ impl Slaves {
         if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
             return Heard::Nobody(address);
         }
-        let function = frame.get(1).copied().unwrap_or(0);
+        let function = match &decoded {
+            Ok(request) => request.function(),
+            Err((function, _)) => *function,
+        };
         Heard::Request(Asked {
+            protocol,
             address,
             function,
             request: decoded.map_err(|(_, exception)| exception),
         })
     }
 
-    /// The reply's frame, appended to `out`: the drive does what it is asked.
+    /// The reply's frame, appended to `out`: the drive does what it is asked. Nothing is appended when it stays silent.
     pub fn answer(&mut self, asked: &Asked, now: SimTime, out: &mut Vec<u8>) {
         let Some(drive) = self.drives.get_mut(&asked.address) else {
             return;
@@ -112,7 +119,7 @@ impl Slaves {
             Ok(request) => {
                 let mut pdu = Vec::with_capacity(request.reply_len());
                 drive.answer(request, now).encode(request, &mut pdu);
-                rtu::encode_frame(asked.address, &pdu, out);
+                framing::close(asked.protocol, asked.address, &pdu, out);
             }
             Err(exception) => {
                 drive.heard(now);
@@ -121,12 +128,11 @@ impl Slaves {
         }
     }
 
-    /// Writes only: a broadcast that asks for something has nobody to answer it.
     fn broadcast(&mut self, request: Option<RequestPdu>, now: SimTime) {
         for drive in self.drives.values_mut().filter(|drive| drive.answers()) {
             drive.heard(now);
-            if let Some(request) = request.as_ref().filter(|request| request.is_write()) {
-                let _: Reply = drive.answer(request, now);
+            if let Some(request) = &request {
+                drive.heard_broadcast(request, now);
             }
         }
     }
@@ -136,7 +142,7 @@ impl Slaves {
 pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
     let mut pdu = Vec::with_capacity(2);
     encode_exception(asked.function, exception, &mut pdu);
-    rtu::encode_frame(asked.address, &pdu, out);
+    framing::close(asked.protocol, asked.address, &pdu, out);
 }
 
 #[cfg(test)]
@@ -144,7 +150,10 @@ mod tests {
     use super::super::drive::ModelOptions;
     use super::super::nx::{NxOptions, StatusBits};
     use super::*;
+    use crate::codec::rtu;
     use std::time::Duration;
+
+    const RTU: Protocol = Protocol::ModbusRtu;
 
     fn hex(text: &str) -> Vec<u8> {
         text.split_whitespace()
@@ -171,7 +180,7 @@ mod tests {
     fn exchange(line: &mut Slaves, request: &str, seconds: u64) -> String {
         let now = Duration::from_secs(seconds);
         let mut out = Vec::new();
-        if let Heard::Request(asked) = line.hear(&hex(request), now) {
+        if let Heard::Request(asked) = line.hear(RTU, &hex(request), now) {
             line.answer(&asked, now, &mut out);
         }
         out.iter().map(|b| format!("{b:02X}")).collect::<Vec<_>>().join(" ")
@@ -227,17 +236,17 @@ mod tests {
     fn silence_for_others_and_for_bad_frames() {
         let mut line = line();
         let good = hex("01 03 08 34 00 0B 47 A3");
-        assert!(matches!(line.hear(&good, SimTime::ZERO), Heard::Request(_)));
+        assert!(matches!(line.hear(RTU, &good, SimTime::ZERO), Heard::Request(_)));
         for bit in 0..good.len() * 8 {
             let mut bad = good.clone();
             bad[bit / 8] ^= 1 << (bit % 8);
-            assert_eq!(line.hear(&bad, SimTime::ZERO), Heard::BadCrc);
+            assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), Heard::BadFrame);
         }
-        assert_eq!(line.hear(&good[..5], SimTime::ZERO), Heard::BadCrc);
+        assert_eq!(line.hear(RTU, &good[..5], SimTime::ZERO), Heard::BadFrame);
         let mut other = Vec::new();
         rtu::encode_frame(2, &[3, 8, 0x34, 0, 11], &mut other);
-        assert_eq!(line.hear(&other, SimTime::ZERO), Heard::Nobody(2));
+        assert_eq!(line.hear(RTU, &other, SimTime::ZERO), Heard::Nobody(2));
         line.drive(1).unwrap().set_alive(false);
-        assert_eq!(line.hear(&good, SimTime::ZERO), Heard::Nobody(1));
+        assert_eq!(line.hear(RTU, &good, SimTime::ZERO), Heard::Nobody(1));
     }
 }

@@ -241,7 +241,7 @@ fn a_flood_is_bounded() {
     assert!(
         line.incoming
             .as_ref()
-            .is_some_and(|frame| frame.bytes.len() == LONGEST_FRAME)
+            .is_some_and(|frame| frame.bytes.len() == framing::kept(Protocol::ModbusRtu))
     );
     run(&mut line, Duration::from_secs(1000));
     assert_eq!(line.statistics().bytes_in, 500_000);
@@ -250,20 +250,93 @@ fn a_flood_is_bounded() {
     assert_eq!(run(&mut line, Duration::from_secs(2001)).len(), 1);
 }
 
+/// The same request and the length of its reply in Modbus ASCII.
+const ASCII_READ_STATUS: &[u8; 17] = b":01030834000BB5\r\n";
+const ASCII_REPLY_CHARS: usize = 1 + 2 * 26 + 2;
+
+fn ascii_rules() -> LineRules {
+    LineRules {
+        turnaround: us(15_000),
+        ..LineRules::of(Protocol::ModbusAscii, LineFormat::new(9600, "7E1").unwrap())
+    }
+}
+
+#[test]
+fn an_ascii_reply_begins_a_turnaround_after_the_line_feed() {
+    let rules = ascii_rules();
+    let mut line = line(rules.clone(), FaultPlan::default());
+    line.on_bytes(&ASCII_READ_STATUS[..5], us(0));
+    // A pause that would end a Modbus RTU frame.
+    line.on_bytes(&ASCII_READ_STATUS[5..], us(500_000));
+    let seen = run(&mut line, us(1_000_000));
+    let asked = us(500_000) + rules.format.chars(12);
+    let replied = asked + us(15_000) + rules.format.chars(ASCII_REPLY_CHARS);
+    assert_eq!(
+        (seen.len(), seen[0].0, seen[0].1.len()),
+        (1, replied, ASCII_REPLY_CHARS)
+    );
+    assert!(seen[0].1.starts_with(b":0103160541"), "{:?}", seen[0].1);
+    // No silence is asked for between frames.
+    line.on_bytes(ASCII_READ_STATUS, replied);
+    assert_eq!(run(&mut line, us(2_000_000)).len(), 1);
+    let s = line.statistics();
+    assert_eq!((s.requests, s.silence_violations, s.bad_crc), (2, 0, 0));
+}
+
+#[test]
+fn an_ascii_fragment_is_thrown_away_after_a_second_or_by_a_colon() {
+    let (head, tail) = ASCII_READ_STATUS.split_at(9);
+    for (pause, replies) in [(us(990_000), 1), (us(1_010_000), 0)] {
+        let mut line = line(ascii_rules(), FaultPlan::default());
+        line.on_bytes(head, us(0));
+        line.on_bytes(tail, ascii_rules().format.chars(9) + pause);
+        assert_eq!(run(&mut line, Duration::from_secs(9)).len(), replies, "{pause:?}");
+    }
+    for wire in [Wire::Simulated, Wire::Real, Wire::Instant] {
+        let mut line = line(LineRules { wire, ..ascii_rules() }, FaultPlan::default());
+        for noise in [&[0xFF; 2000][..], head, b":01\r:", b"\n", b":01030834000bb5\n"] {
+            line.on_bytes(noise, us(0));
+        }
+        line.on_bytes(ASCII_READ_STATUS, us(0));
+        assert_eq!(run(&mut line, Duration::from_secs(9)).len(), 1, "{wire:?}");
+        assert_eq!((line.statistics().requests, line.statistics().collisions), (1, 0));
+        assert!(line.wake().is_none());
+    }
+}
+
+#[test]
+fn an_ascii_request_that_follows_without_waiting_spoils_the_reply() {
+    let mut line = line(ascii_rules(), FaultPlan::default());
+    line.on_bytes(&ASCII_READ_STATUS.repeat(2), us(0));
+    let seen = run(&mut line, Duration::from_secs(1));
+    assert_eq!(seen.len(), 1);
+    assert_eq!((line.statistics().requests, line.statistics().collisions), (1, 1));
+    let sound = |bytes: &[u8]| framing::open_any(Protocol::ModbusAscii, bytes).is_some();
+    assert!(!sound(&seen[0].1));
+    line.on_bytes(ASCII_READ_STATUS, Duration::from_secs(2));
+    assert!(sound(&run(&mut line, Duration::from_secs(3))[0].1));
+}
+
 proptest! {
     #[test]
     fn no_bytes_at_any_time_panic_and_nothing_is_early(
         chunks in prop::collection::vec((prop::collection::vec(any::<u8>(), 0..40), 0u64..20_000, any::<bool>()), 0..40),
         wire in prop_oneof![Just(Wire::Simulated), Just(Wire::Real), Just(Wire::Instant)],
+        ascii in any::<bool>(),
         size in 1u8..30,
     ) {
-        let rules = LineRules { wire, delivery: Delivery::Chunks(size), strict: false, ..rules() };
+        let (rules, question): (_, &[u8]) = if ascii {
+            (ascii_rules(), ASCII_READ_STATUS)
+        } else {
+            (rules(), &READ_STATUS)
+        };
+        let rules = LineRules { wire, delivery: Delivery::Chunks(size), strict: false, ..rules };
         let mut line = line(rules, FaultPlan::new("echo=0.2,double=0.2,late=0.2,split=0.2".parse().unwrap(), 1));
         let (mut now, mut sound) = (SimTime::ZERO, 0);
         for (bytes, later, request) in chunks {
             now += us(later);
             run(&mut line, now);
-            line.on_bytes(if request { &READ_STATUS } else { &bytes }, now);
+            line.on_bytes(if request { question } else { &bytes }, now);
             sound += u64::from(request);
         }
         run(&mut line, now + Duration::from_secs(10));

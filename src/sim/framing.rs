@@ -1,0 +1,97 @@
+//! How a drive finds a master's frames among the characters on its line, and how it frames its replies, by protocol.
+//!
+//! | | a frame begins | it is over | silence before it |
+//! |---|---|---|---|
+//! | Modbus RTU | after silence | after 3.5 characters of silence | 3.5 characters |
+//! | Modbus ASCII | with a colon, in the middle of another too | with LF; a pause of 1 s throws it away | none |
+//! | N2 | with `>` | with CR; the same pause | none |
+
+use std::time::Duration;
+
+use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
+
+/// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1); N2 is given the
+/// same.
+pub const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+
+/// Whether the character begins a frame, whatever was before it.
+pub fn begins(protocol: Protocol, character: u8) -> bool {
+    match protocol {
+        Protocol::ModbusRtu => false,
+        Protocol::ModbusAscii => character == b':',
+        Protocol::N2 => character == b'>',
+    }
+}
+
+/// Whether a frame is over with that character.
+pub fn ends(protocol: Protocol, character: u8) -> bool {
+    match protocol {
+        Protocol::ModbusRtu => false,
+        Protocol::ModbusAscii => character == b'\n',
+        Protocol::N2 => character == b'\r',
+    }
+}
+
+/// The characters in pieces, none of which belongs to two frames.
+pub fn pieces(protocol: Protocol, characters: &[u8]) -> impl Iterator<Item = &[u8]> {
+    characters.chunk_by(move |&last, &next| !ends(protocol, last) && !begins(protocol, next))
+}
+
+/// Characters of a frame that a drive keeps; what follows until its end is thrown away.
+pub fn kept(protocol: Protocol) -> usize {
+    match protocol {
+        Protocol::ModbusRtu | Protocol::N2 => 300,
+        Protocol::ModbusAscii => ascii::LONGEST,
+    }
+}
+
+/// Address and request of a sound Modbus frame; the request's function with the exception that refuses it when its PDU
+/// is wrong.
+pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, Result<RequestPdu, (u8, Exception)>)> {
+    match protocol {
+        Protocol::ModbusRtu => rtu::decode_request(frame),
+        Protocol::ModbusAscii => ascii::decode_request(frame),
+        Protocol::N2 => None,
+    }
+}
+
+/// Address and PDU of any sound Modbus frame, such as a reply.
+pub fn open_any(protocol: Protocol, frame: &[u8]) -> Option<(u8, Vec<u8>)> {
+    match protocol {
+        Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec())),
+        Protocol::ModbusAscii => ascii::open_frame(frame),
+        Protocol::N2 => None,
+    }
+}
+
+/// Appends the frame of a Modbus PDU to `out`.
+pub fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
+    match protocol {
+        Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
+        Protocol::ModbusAscii => ascii::encode_frame(address, pdu, out),
+        Protocol::N2 => {}
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn split(protocol: Protocol, text: &str) -> Vec<&str> {
+        pieces(protocol, text.as_bytes())
+            .map(|piece| std::str::from_utf8(piece).unwrap())
+            .collect()
+    }
+
+    #[test]
+    fn characters_fall_into_frames() {
+        let text = "xx:0103\r:01\r\n\n:02>03\r";
+        assert_eq!(
+            split(Protocol::ModbusAscii, text),
+            ["xx", ":0103\r", ":01\r\n", "\n", ":02>03\r"]
+        );
+        assert_eq!(split(Protocol::N2, text), ["xx:0103\r", ":01\r", "\n\n:02", ">03\r"]);
+        assert_eq!(split(Protocol::ModbusRtu, text), [text]);
+        assert!(split(Protocol::ModbusAscii, "").is_empty());
+    }
+}
