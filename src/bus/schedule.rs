@@ -5,9 +5,13 @@
 //! a line that is busy with polls at most; slow polls that had less than 5 % of the time go before fast ones; a drive
 //! that does not answer is asked so seldom that it costs at most 2 %.
 
+mod drives;
+mod outcome;
+
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use self::drives::{DriveSchedule, Item, Presence};
 use crate::codec::Exception;
 use crate::command::Urgency;
 use crate::drive::{Plan, PlannedRead, PollClass};
@@ -18,17 +22,6 @@ pub const COMMANDS_IN_A_ROW: u32 = 8;
 pub const SLOW_SHARE: f64 = 0.05;
 /// Credit that slow polls gather while none is due, in requests of the longest kind.
 const MOST_CREDIT: f64 = 1.5;
-/// Share of the line that probes of a drive which does not answer take. The promise is 2 %; three such drives among ten
-/// were measured to cost 6.5 % with just that.
-const DEAD_SHARE: f64 = 0.016;
-/// First and longest pause between two probes of a drive that does not answer.
-const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Pause before a request that the drive refused is tried again.
-const REFUSED_PAUSE: Duration = Duration::from_secs(60);
-/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
-const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
-const MOST_GARBLED: u32 = 8;
 
 /// A planned read of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -87,39 +80,6 @@ pub struct Cadence {
     pub slow: Duration,
     /// Tries after the first.
     pub retries: u32,
-}
-
-#[derive(Debug, Clone)]
-struct Item {
-    read: PlannedRead,
-    /// The read of the plan that this one is a part of.
-    origin: PlannedRead,
-    due: Instant,
-    cost: Duration,
-    refused: bool,
-    failures: u32,
-    /// A read of the once class that is still to be done.
-    wanted: bool,
-    /// A command changed what it reads: it goes before the round, so that the command is confirmed soon.
-    asked: bool,
-    /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
-    whole_again: Option<Instant>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Presence {
-    Online,
-    /// Asked again at that time; the pause before it.
-    Away(Instant, Duration),
-}
-
-#[derive(Debug)]
-struct DriveSchedule {
-    presence: Presence,
-    tried: bool,
-    failures: u32,
-    garbled: u32,
-    items: Vec<Item>,
 }
 
 /// A round of the fast class that was started.
@@ -513,214 +473,7 @@ impl Schedule {
             self.slow_started = Some(now);
         }
     }
-
-    fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
-        let slow = self.cadence.slow;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        drive.failures = 0;
-        drive.garbled = 0;
-        drive.tried = true;
-        let came = drive.presence != Presence::Online;
-        if came {
-            drive.presence = Presence::Online;
-            if self.round_started.is_none() {
-                self.round_due = self.round_due.min(now);
-            }
-            for item in &mut drive.items {
-                item.wanted = true;
-                item.due = now;
-                item.failures = 0;
-            }
-        }
-        let mut change = Change::None;
-        if let Polled::Refused(exception) = polled {
-            change = drive.refused(poll.read, exception, now);
-        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-            item.failures = 0;
-            if std::mem::take(&mut item.refused) {
-                // The bad point is sound again: it is read with its neighbours.
-                item.whole_again = Some(now);
-            }
-            item.wanted = item.read.class != PollClass::Once;
-            if item.read.class == PollClass::Slow {
-                let next = item.due + slow;
-                item.due = if next < now { now + slow } else { next };
-            }
-        }
-        if came { Change::Online } else { change }
-    }
-
-    fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        if let Presence::Away(_, pause) = drive.presence {
-            drive.failures += 1;
-            if !drive.tried && drive.failures <= retries {
-                drive.presence = Presence::Away(now, pause);
-                return Change::None;
-            }
-            let first = !drive.tried;
-            drive.tried = true;
-            drive.presence = away(now, pause, took);
-            return if first { Change::Offline } else { Change::None };
-        }
-        let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
-        if !presence_counts {
-            // A request that is never answered must not take the drive away while its process data comes.
-            if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-                item.failures += 1;
-                item.due = match item.failures.checked_sub(retries + 1) {
-                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
-                    None => now,
-                };
-            }
-            return Change::None;
-        }
-        drive.failures += 1;
-        if drive.failures <= retries {
-            if poll.read.class == PollClass::Fast {
-                self.round.push_front((poll.drive, poll.read));
-            }
-            return Change::None;
-        }
-        drive.presence = away(now, Duration::ZERO, took);
-        drive.failures = 0;
-        drive.garbled = 0;
-        self.round.retain(|(index, _)| *index != poll.drive);
-        Change::Offline
-    }
-
-    fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
-        if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
-            return self.failed(poll, took, now);
-        }
-        drive.garbled += 1;
-        if poll.read.class == PollClass::Fast {
-            if drive.garbled <= retries {
-                self.round.push_front((poll.drive, poll.read));
-            }
-        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-            item.due = if drive.garbled <= retries {
-                now
-            } else {
-                now + MUTE_PAUSE.0
-            };
-        }
-        Change::None
-    }
-}
-
-/// The next probe: the pause doubles, and the probe's cost stays within its share of the line.
-fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
-    let (first, longest) = PROBE_PAUSE;
-    let doubled = if pause.is_zero() {
-        first
-    } else {
-        (pause * 2).min(longest)
-    };
-    let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
-    Presence::Away(now + doubled.max(affordable), doubled)
-}
-
-impl Item {
-    fn new(read: PlannedRead, origin: PlannedRead, cost: Duration, now: Instant) -> Item {
-        Item {
-            read,
-            origin,
-            due: now,
-            cost,
-            refused: false,
-            failures: 0,
-            wanted: true,
-            asked: false,
-            whole_again: None,
-        }
-    }
-
-    fn is_slow(&self) -> bool {
-        match self.read.class {
-            PollClass::Slow => true,
-            PollClass::Once => self.wanted,
-            PollClass::Fast | PollClass::Never => false,
-        }
-    }
-}
-
-impl DriveSchedule {
-    fn has_fast(&self) -> bool {
-        self.items.iter().any(|i| i.read.class == PollClass::Fast)
-    }
-
-    /// Splits a refused block until the bad point is found, which is retried slowly.
-    fn refused(&mut self, read: PlannedRead, exception: Exception, now: Instant) -> Change {
-        let addressed = exception.is_about_request();
-        let Some(index) = self.items.iter().position(|i| i.read == read) else {
-            return Change::None;
-        };
-        let Some(item) = self.items.get_mut(index) else {
-            return Change::None;
-        };
-        if !addressed {
-            // Busy or failing: the drive is alive, the values age, the poll comes round again.
-            item.due = item.due.max(now);
-            if item.read.class == PollClass::Once {
-                item.due = now + Duration::from_secs(1);
-            }
-            return Change::None;
-        }
-        let Some((low, high)) = Plan::halves(read) else {
-            item.refused = true;
-            item.wanted = true;
-            item.due = now + REFUSED_PAUSE;
-            let origin = item.origin;
-            self.join(origin, now);
-            return Change::Unavailable(read, exception);
-        };
-        let (origin, cost) = (item.origin, item.cost);
-        let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
-        for half in &mut halves {
-            half.whole_again = Some(now + REFUSED_PAUSE);
-        }
-        self.items.splice(index..=index, halves);
-        Change::None
-    }
-
-    /// Joins the sound neighbours that splitting tore apart, around the refused addresses.
-    fn join(&mut self, origin: PlannedRead, now: Instant) {
-        let mut joined: Vec<Item> = Vec::with_capacity(self.items.len());
-        for item in self.items.drain(..) {
-            match joined.last_mut() {
-                Some(last)
-                    if item.origin == origin
-                        && last.origin == origin
-                        && !item.refused
-                        && !last.refused
-                        && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
-                {
-                    last.read.append(&item.read);
-                    last.wanted = true;
-                    last.due = last.due.min(now);
-                    last.whole_again = None;
-                }
-                _ => joined.push(Item {
-                    whole_again: item.whole_again.filter(|_| item.origin != origin),
-                    ..item
-                }),
-            }
-        }
-        self.items = joined;
-    }
 }
 
 #[cfg(test)]
-#[path = "schedule_tests.rs"]
 mod tests;
