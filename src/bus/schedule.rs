@@ -1,17 +1,19 @@
 //! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls.
-//! Four rules soften it: after eight commands in a row a due poll goes first; commands other than stops have half of
-//! a line that is busy with polls at most; slow polls that had less than 5 % of the time go before fast ones; a drive
-//! that does not answer is asked so seldom that it costs at most 2 %.
+//! Four rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
+//! of a line that is busy with polls than process data; slow polls that had less than 5 % of the time go before fast
+//! ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 mod drives;
 mod outcome;
+mod share;
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
 use self::drives::{DriveSchedule, Item, Presence};
+use self::share::CommandShare;
 use crate::codec::Exception;
 use crate::command::Urgency;
 use crate::drive::{Plan, PlannedRead, PollClass};
@@ -91,6 +93,17 @@ pub struct RoundStart {
     pub cycle: Option<Duration>,
 }
 
+/// Why a poll has its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Turn {
+    /// It is due.
+    Due,
+    /// A slow poll that goes before fast ones.
+    OnCredit,
+    /// A command asked for it.
+    Asked,
+}
+
 /// The schedule of a bus.
 #[derive(Debug)]
 pub struct Schedule {
@@ -104,8 +117,8 @@ pub struct Schedule {
     new_slow: Option<RoundStart>,
     /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
-    /// The slow poll that was chosen last goes before fast ones.
-    on_credit: bool,
+    /// Why the poll that was chosen last has its turn.
+    turn: Turn,
     /// Until when the credit is reckoned.
     earned_until: Instant,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
@@ -113,14 +126,7 @@ pub struct Schedule {
     most_credit: Duration,
     /// A probe found nobody since the last fast poll.
     probed: bool,
-    commands_in_a_row: u32,
-    stops_in_a_row: u32,
-    /// Time of the line that commands had more than polls, since polls last had nothing to do.
-    command_lead: Duration,
-    /// Time of the last command: eight of it are the lead that a burst may have.
-    command_took: Duration,
-    /// The last poll was one that a command had asked for.
-    asked_last: bool,
+    share: CommandShare,
 }
 
 impl Schedule {
@@ -156,15 +162,11 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
-            on_credit: false,
+            turn: Turn::Due,
             earned_until: now,
             most_credit: longest.mul_f64(MOST_CREDIT),
             probed: false,
-            commands_in_a_row: 0,
-            stops_in_a_row: 0,
-            command_lead: Duration::ZERO,
-            command_took: Duration::ZERO,
-            asked_last: false,
+            share: CommandShare::default(),
         }
     }
 
@@ -174,20 +176,21 @@ impl Schedule {
         self.start_round(now);
         let poll = self.due_poll(now);
         if poll.is_none() {
-            self.command_lead = Duration::ZERO;
+            self.share.line_is_free();
         }
-        if let Some(urgency) = waiting {
-            let row = if urgency == Urgency::Stop {
-                self.stops_in_a_row
-            } else {
-                self.commands_in_a_row
-            };
-            let share = urgency == Urgency::Stop || self.command_lead < COMMANDS_IN_A_ROW * self.command_took;
-            if poll.is_none() || (row < COMMANDS_IN_A_ROW && (share || self.command_lead.is_zero())) {
-                return Decision::Command(urgency);
-            }
+        if waiting == Some(Urgency::Stop) && (poll.is_none() || self.share.admits(Urgency::Stop)) {
+            return Decision::Command(Urgency::Stop);
         }
-
+        let asked = self.due_asked(now).filter(|_| {
+            self.share.reads_before_commands(waiting.is_some()) && (poll.is_none() || self.share.reads_before_polls())
+        });
+        if let Some(asked) = asked {
+            self.turn = Turn::Asked;
+            return Decision::Poll(asked);
+        }
+        if let Some(urgency) = waiting.filter(|urgency| poll.is_none() || self.share.admits(*urgency)) {
+            return Decision::Command(urgency);
+        }
         match poll {
             Some(poll) => Decision::Poll(poll),
             None => Decision::Idle(self.next_due(now)),
@@ -206,38 +209,35 @@ impl Schedule {
 
     /// A command (or a step of one) was on the line for `took`.
     pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
-        self.commands_in_a_row += 1;
-        if urgency != Urgency::Stop {
-            self.command_lead += took;
-            self.command_took = took;
-        }
-        self.stops_in_a_row = if urgency == Urgency::Stop {
-            self.stops_in_a_row + 1
-        } else {
-            0
-        };
+        self.share.commanded(urgency, took);
     }
 
     /// A poll is over.
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
-        self.commands_in_a_row = 0;
-        self.stops_in_a_row = 0;
-        self.command_lead = self.command_lead.saturating_sub(took);
         let item = self.drives.get_mut(poll.drive);
-        let item = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read));
-        // Two of them never follow one another while a round waits.
-        self.asked_last = item.is_some_and(|item| std::mem::take(&mut item.asked));
+        if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
+            // One that tells nothing is made up for among the slow polls.
+            item.wanted |= item.asked.take().is_some();
+        }
+        let turn = std::mem::replace(&mut self.turn, Turn::Due);
+        match turn {
+            Turn::Asked => self.share.read(took),
+            // Neither the least that slow polls have nor a drive that is away is at the cost of process data alone.
+            Turn::OnCredit => self.share.polled(Duration::ZERO),
+            Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
+            Turn::Due => self.share.polled(took),
+        }
         if poll.read.class == PollClass::Fast {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
             }
             self.probed = false;
         } else {
-            self.slow_credit = if self.on_credit {
-                self.slow_credit.saturating_sub(took)
-            } else {
+            self.slow_credit = match turn {
+                Turn::OnCredit => self.slow_credit.saturating_sub(took),
+                Turn::Asked => self.slow_credit,
                 // There was room for it, so the others will find room too.
-                Duration::ZERO
+                Turn::Due => Duration::ZERO,
             };
             self.note_slow(now);
         }
@@ -267,6 +267,7 @@ impl Schedule {
         }
         if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.due = item.due.max(until);
+            item.asked = item.asked.map(|since| since.max(until));
         }
     }
 
@@ -278,11 +279,9 @@ impl Schedule {
         for item in drive
             .items
             .iter_mut()
-            .filter(|i| i.read.class != PollClass::Fast && covers(&i.read))
+            .filter(|i| i.read.class != PollClass::Fast && !i.refused && covers(&i.read))
         {
-            item.due = item.due.min(now);
-            item.wanted = true;
-            item.asked = !item.refused;
+            item.asked.get_or_insert(now);
         }
     }
 
@@ -358,22 +357,18 @@ impl Schedule {
     }
 
     fn due_poll(&mut self, now: Instant) -> Option<Poll> {
+        self.turn = Turn::Due;
         // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);
         }
-        if let Some(asked) = self
-            .due_asked(now)
-            .filter(|_| !self.asked_last || self.round.is_empty())
-        {
-            return Some(asked);
-        }
         let slow = self.due_slow(now);
         // A whole round went by without room for it: the line is saturated.
         let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
-        self.on_credit = slow.is_some_and(|(due, _, cost)| self.slow_credit >= cost && left_out(due));
-        if let Some((_, poll, _)) = slow.filter(|_| self.on_credit) {
+        let on_credit = |(due, _, cost): &(Instant, Poll, Duration)| self.slow_credit >= *cost && left_out(*due);
+        if let Some((_, poll, _)) = slow.filter(on_credit) {
+            self.turn = Turn::OnCredit;
             return Some(poll);
         }
         if let Some(&(drive, read)) = self.round.front() {
@@ -417,10 +412,11 @@ impl Schedule {
         let online = self.drives.iter().enumerate();
         let online = online.filter(|(_, d)| d.presence == Presence::Online);
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
-        let due = asked.filter(|(_, item)| item.asked && item.is_slow() && item.due <= now);
-        due.min_by_key(|(_, item)| item.due).map(|(drive, item)| Poll {
+        let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
+        let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;
+        Some(Poll {
             drive,
-            read: item.read,
+            read,
             probe: false,
         })
     }
@@ -453,12 +449,11 @@ impl Schedule {
         for drive in &self.drives {
             let due = match drive.presence {
                 Presence::Away(at, _) => Some(at),
-                Presence::Online => drive
-                    .items
-                    .iter()
-                    .filter(|i| i.is_slow() && i.due > now)
-                    .map(|i| i.due)
-                    .min(),
+                Presence::Online => {
+                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| i.due);
+                    let asked = drive.items.iter().filter_map(|i| i.asked);
+                    slow.chain(asked).filter(|due| *due > now).min()
+                }
             };
             next = due.map_or(next, |due| next.min(due));
         }

@@ -25,8 +25,8 @@ pub(super) struct Item {
     pub(super) failures: u32,
     /// A read of the once class that is still to be done.
     pub(super) wanted: bool,
-    /// A command changed what it reads: it goes before the round, so that the command is confirmed soon.
-    pub(super) asked: bool,
+    /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
+    pub(super) asked: Option<Instant>,
     /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
     pub(super) whole_again: Option<Instant>,
 }
@@ -69,7 +69,7 @@ impl Item {
             refused: false,
             failures: 0,
             wanted: true,
-            asked: false,
+            asked: None,
             whole_again: None,
         }
     }

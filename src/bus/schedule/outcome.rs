@@ -44,7 +44,9 @@ impl Schedule {
             item.wanted = item.read.class != PollClass::Once;
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
-                item.due = if next < now { now + slow } else { next };
+                // Read before its time because a command asked for it, it is due a whole cycle later.
+                let early = item.due > now;
+                item.due = if next < now || early { now + slow } else { next };
             }
         }
         if came { Change::Online } else { change }
