@@ -30,6 +30,8 @@ pub enum EventKind {
     Restarted,
     /// A lease ran out and its action was taken.
     Supervision,
+    /// A drive that takes commands has neither a lease nor a response of its own to a silent master.
+    Unsupervised,
     /// A command was refused.
     RefusedCommand,
     /// An acknowledged command showed no effect in time.
@@ -50,6 +52,7 @@ impl EventKind {
             EventKind::FaultEnd => "fault_end",
             EventKind::Restarted => "restarted",
             EventKind::Supervision => "supervision",
+            EventKind::Unsupervised => "unsupervised",
             EventKind::RefusedCommand => "refused_command",
             EventKind::NotConfirmed => "not_confirmed",
             EventKind::BusUp => "bus_up",

@@ -5,9 +5,12 @@ mod common;
 use std::time::Duration;
 
 use common::{Rig, drive};
+use drivegate::cache::{Access, LeaseAction, Supervision};
 use drivegate::command::Outcome;
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
+use drivegate::sim::drive::ModelOptions;
+use drivegate::sim::nx::NxOptions;
 use drivegate::sim::statistics::{Direction, Recorded};
 
 fn hex(frames: &[Recorded], direction: Direction) -> Vec<String> {
@@ -102,7 +105,14 @@ async fn nothing_is_written_at_start() {
 
 #[tokio::test]
 async fn a_fault_is_told_and_reset() {
-    let rig = Rig::start(&[1], 115_200).await;
+    // With a lease, so that nothing is told of a missing one.
+    let rig = Rig::start_with(&[1], 115_200, |spec| {
+        spec.supervision = Some(Supervision {
+            timeout: Duration::from_secs(60),
+            action: LeaseAction::Hold,
+        });
+    })
+    .await;
     rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
     let mut events = rig.events.subscribe();
     rig.line.with_drive(1, |drive, _| drive.as_nx().unwrap().trip(1));
@@ -220,4 +230,60 @@ async fn commands_are_checked_against_the_drive() {
     assert_eq!(rig.good(1, ModelPoint::FrequencyReference), Some(Value::Number(30.0)));
     let unknown = rig.read(drive(1), 6000, 5).await;
     assert_eq!(unknown, Outcome::Exception(drivegate::codec::Exception::ADDRESS));
+}
+
+/// Parameter P2.7.22 of the drive.
+const FIELDBUS_FAULT_RESPONSE: u16 = 733;
+
+#[tokio::test]
+async fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
+    for (access, lease, response, wanted) in [
+        (Access::Control, false, 0, 1),
+        (Access::Control, true, 0, 0),
+        (Access::Control, false, 2, 0),
+        (Access::Monitor, false, 0, 0),
+    ] {
+        let mut setup = common::Setup::new(&[1], 115_200);
+        setup.drives[0].model = ModelOptions::Nx(NxOptions {
+            parameters: vec![(FIELDBUS_FAULT_RESPONSE, response)],
+            ..NxOptions::default()
+        });
+        let rig = Rig::of(setup, |spec| {
+            spec.access = access;
+            spec.supervision = lease.then_some(Supervision {
+                timeout: Duration::from_secs(5),
+                action: LeaseAction::Stop,
+            });
+        });
+        let told = |rig: &Rig| {
+            let events = rig.events.recent();
+            let of_kind = events.iter().filter(|e| e.kind == EventKind::Unsupervised);
+            of_kind.map(|e| e.text.clone()).collect::<Vec<_>>()
+        };
+        let known = |r: &Rig| {
+            let handle = r.handle(1);
+            let point = handle.image.spec.profile.point_index("fieldbus_fault_response");
+            handle
+                .reading(std::time::Instant::now())
+                .sample(point.unwrap())
+                .good()
+                .is_some()
+        };
+        rig.until("the parameter is read", known).await;
+        rig.until("it was told", |r| told(r).len() == wanted).await;
+        // It goes and comes: told again, once.
+        rig.line.set_alive(1, false);
+        rig.until("it is away", |r| r.state(1) == State::Offline).await;
+        rig.line.set_alive(1, true);
+        rig.until("the parameter is read again", known).await;
+        tokio::time::sleep(Duration::from_millis(100)).await;
+        let texts = told(&rig);
+        assert_eq!(texts.len(), 2 * wanted, "{texts:?}");
+        for text in texts {
+            assert!(
+                text.contains("nothing stops drive drive-1") && text.contains("fieldbus_fault_response = 0"),
+                "{text}"
+            );
+        }
+    }
 }

@@ -10,7 +10,9 @@
 //! look-alike waits, the request that is in debt is held back too after a while: the drive gets the time to pay.
 //!
 //! A write acknowledged late is worth nothing once another write to that drive was acknowledged in between: the same
-//! write then waits as a look-alike does.
+//! write then waits as a look-alike does. A stop does not wait. So the first acknowledgement of such a stop proves nothing:
+//! it may be that of the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
+//! acknowledged in between, either acknowledgement tells the truth: the drive's last word is a stop.
 
 use std::time::{Duration, Instant};
 
@@ -102,6 +104,16 @@ impl Debts {
                 debt.overtaken = true;
             }
         }
+    }
+
+    /// Whether an acknowledgement of `pdu` may be that of an earlier one that another write has overtaken. To be asked
+    /// before [`Debts::answered`]; told once, for the drive owes that acknowledgement no more.
+    pub fn proves_nothing(&mut self, drive: usize, pdu: &RequestPdu, sent: Instant) -> bool {
+        let of = |debt: &&mut Debt| debt.drive == drive && debt.pdu == *pdu && debt.ends() > sent;
+        self.owed
+            .iter_mut()
+            .find(of)
+            .is_some_and(|debt| std::mem::take(&mut debt.overtaken))
     }
 
     /// Whether the last reply, if it came once more, could pass for the reply to `pdu`.
@@ -308,5 +320,26 @@ mod tests {
         debts.answered(0, &write(0), now);
         assert_eq!(debts.blocks(0, &write(1), now), Some(now + FORGOTTEN_AFTER));
         assert_eq!(debts.blocks(0, &write(0), now), None);
+    }
+
+    #[test]
+    fn the_first_acknowledgement_of_a_stop_that_was_overtaken_proves_nothing() {
+        let now = Instant::now();
+        let write = |value| RequestPdu::WriteRegister { address: 2000, value };
+        let (stop, run) = (write(0), write(1));
+        let mut debts = Debts::default();
+        debts.given_up(0, &stop, now - DEADLINE, now);
+        assert!(!debts.proves_nothing(0, &stop, now), "nothing came in between");
+        debts.answered(0, &run, now);
+        assert!(!debts.proves_nothing(1, &stop, now) && !debts.proves_nothing(0, &run, now));
+        assert!(debts.proves_nothing(0, &stop, now));
+        debts.answered(0, &stop, now);
+        assert!(!debts.proves_nothing(0, &stop, now), "the second one counts");
+        debts.answered(0, &stop, now);
+        assert_eq!(debts.blocks(0, &run, now), None);
+        // Forgotten: it will not come any more.
+        debts.given_up(0, &stop, now - DEADLINE, now);
+        debts.answered(0, &run, now);
+        assert!(!debts.proves_nothing(0, &stop, now + FORGOTTEN_AFTER));
     }
 }

@@ -159,6 +159,13 @@ impl Desk {
         self.begun.get(index).is_some_and(|e| e.is_late(now))
     }
 
+    /// The acknowledgement of a step may be that of an earlier request: the step is done once more.
+    pub fn doubted(&mut self, index: usize) {
+        if let Some(execution) = self.begun.get_mut(index) {
+            execution.doubted();
+        }
+    }
+
     /// A step of a begun command is over: with the drive's reply, or without one to be believed.
     pub fn ended(
         &mut self,

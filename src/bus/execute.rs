@@ -133,7 +133,7 @@ impl Execution {
     pub fn next(&mut self, shadow: &Shadow, profile: &Profile, running: bool, now: Instant) -> Next {
         self.running = running;
         if self.is_late(now) {
-            let outcome = if self.failures > 0 {
+            let outcome = if self.failures > 0 || self.in_doubt {
                 Outcome::TimedOut
             } else {
                 Outcome::Expired
@@ -216,6 +216,11 @@ impl Execution {
             return self.without_word(Outcome::TimedOut);
         }
         over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
+    }
+
+    /// What was sent was acknowledged, perhaps by a late reply to something else.
+    pub fn doubted(&mut self) {
+        self.in_doubt = true;
     }
 
     /// Whether the drive may have taken a write that it did not answer: its words are not known then.

@@ -11,6 +11,7 @@ pub mod schedule;
 mod tap;
 mod task;
 pub mod transaction;
+mod watchdog;
 
 pub use task::BusTask;
 

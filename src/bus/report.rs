@@ -7,9 +7,10 @@ use super::confirm::NotConfirmed;
 use super::tap::{self, Tap};
 use super::task::counted;
 use super::transaction::{Ended, Transaction};
+use super::watchdog::{OwnResponse, own_response};
 use crate::cache::{Access, BusImage, Link, PollCycle};
 use crate::codec::{Exception, Reply, Request};
-use crate::drive::{FIELDBUS_FAULT_RESPONSE, ModelPoint, PlannedRead, Value};
+use crate::drive::{ModelPoint, PlannedRead, Value};
 use crate::event::{Event, EventKind, Events};
 
 /// The load of the line is reckoned over this time.
@@ -155,7 +156,7 @@ impl Report {
         );
     }
 
-    /// Tells once of a controlled drive that nothing stops when its clients, or the gateway, fall silent.
+    /// Tells, once each time it comes online, of a controlled drive that does not respond to a silent master.
     pub(super) fn look_at_supervision(&mut self, index: usize) {
         let (Some(drive), Some(looked_at)) = (self.image.drives.get(index), self.looked_at.get_mut(index)) else {
             return;
@@ -163,23 +164,23 @@ impl Report {
         if *looked_at || drive.spec.access == Access::Monitor {
             return;
         }
-        let reading = drive.reading(Instant::now(), Duration::from_secs(60));
-        let point = drive.spec.profile.point_index(FIELDBUS_FAULT_RESPONSE);
-        let Some(response) = point.and_then(|p| reading.sample(p).good()) else {
-            return;
-        };
-        *looked_at = true;
-        if response.as_f64() == 0.0 {
-            let lease = match drive.spec.supervision {
-                Some(_) => "its lease stops it only while the gateway works",
-                None => "and it has no lease: nothing stops it when its client falls silent",
-            };
+        let response = own_response(&drive.reading(Instant::now(), Duration::from_secs(60)));
+        *looked_at = response != OwnResponse::Unknown;
+        let OwnResponse::Off(point) = response else { return };
+        let name = &drive.spec.name;
+        if drive.spec.supervision.is_some() {
             tracing::warn!(
-                bus = %self.image.spec.name, drive = %drive.spec.name,
-                "the drive does not respond to a silent master ({FIELDBUS_FAULT_RESPONSE} = 0), {lease}; \
-                 set the parameter to a stop if the process allows it"
+                bus = %self.image.spec.name, drive = %name,
+                "the drive does not respond to a silent master ({point} = 0), its lease stops it only while the gateway \
+                 works; set the parameter to a stop if the process allows it"
             );
+            return;
         }
+        let text = format!(
+            "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response to a \
+             silent master is off ({point} = 0); configure supervision, and set the parameter if the process allows it"
+        );
+        self.tell(EventKind::Unsupervised, Some(index), None, text);
     }
 
     /// Faults that came or went with the last poll.

@@ -1,13 +1,19 @@
 //! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls.
-//! Four rules soften it: after eight commands in a row a due poll goes first; commands other than stops have half of
-//! a line that is busy with polls at most; slow polls that had less than 5 % of the time go before fast ones; a drive
-//! that does not answer is asked so seldom that it costs at most 2 %.
+//! Four rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
+//! of a line that is busy with polls than process data; slow polls that had less than 5 % of the time go before fast
+//! ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+
+mod drives;
+mod outcome;
+mod share;
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+use self::drives::{DriveSchedule, Item, Presence};
+use self::share::CommandShare;
 use crate::codec::Exception;
 use crate::command::Urgency;
 use crate::drive::{Plan, PlannedRead, PollClass};
@@ -18,17 +24,6 @@ pub const COMMANDS_IN_A_ROW: u32 = 8;
 pub const SLOW_SHARE: f64 = 0.05;
 /// Credit that slow polls gather while none is due, in requests of the longest kind.
 const MOST_CREDIT: f64 = 1.5;
-/// Share of the line that probes of a drive which does not answer take. The promise is 2 %; three such drives among ten
-/// were measured to cost 6.5 % with just that.
-const DEAD_SHARE: f64 = 0.016;
-/// First and longest pause between two probes of a drive that does not answer.
-const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Pause before a request that the drive refused is tried again.
-const REFUSED_PAUSE: Duration = Duration::from_secs(60);
-/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
-const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
-/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
-const MOST_GARBLED: u32 = 8;
 
 /// A planned read of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -89,39 +84,6 @@ pub struct Cadence {
     pub retries: u32,
 }
 
-#[derive(Debug, Clone)]
-struct Item {
-    read: PlannedRead,
-    /// The read of the plan that this one is a part of.
-    origin: PlannedRead,
-    due: Instant,
-    cost: Duration,
-    refused: bool,
-    failures: u32,
-    /// A read of the once class that is still to be done.
-    wanted: bool,
-    /// A command changed what it reads: it goes before the round, so that the command is confirmed soon.
-    asked: bool,
-    /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
-    whole_again: Option<Instant>,
-}
-
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Presence {
-    Online,
-    /// Asked again at that time; the pause before it.
-    Away(Instant, Duration),
-}
-
-#[derive(Debug)]
-struct DriveSchedule {
-    presence: Presence,
-    tried: bool,
-    failures: u32,
-    garbled: u32,
-    items: Vec<Item>,
-}
-
 /// A round of the fast class that was started.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RoundStart {
@@ -129,6 +91,17 @@ pub struct RoundStart {
     pub at: Instant,
     /// Time since the start of the round before.
     pub cycle: Option<Duration>,
+}
+
+/// Why a poll has its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Turn {
+    /// It is due.
+    Due,
+    /// A slow poll that goes before fast ones.
+    OnCredit,
+    /// A command asked for it.
+    Asked,
 }
 
 /// The schedule of a bus.
@@ -144,8 +117,8 @@ pub struct Schedule {
     new_slow: Option<RoundStart>,
     /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
-    /// The slow poll that was chosen last goes before fast ones.
-    on_credit: bool,
+    /// Why the poll that was chosen last has its turn.
+    turn: Turn,
     /// Until when the credit is reckoned.
     earned_until: Instant,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
@@ -153,14 +126,7 @@ pub struct Schedule {
     most_credit: Duration,
     /// A probe found nobody since the last fast poll.
     probed: bool,
-    commands_in_a_row: u32,
-    stops_in_a_row: u32,
-    /// Time of the line that commands had more than polls, since polls last had nothing to do.
-    command_lead: Duration,
-    /// Time of the last command: eight of it are the lead that a burst may have.
-    command_took: Duration,
-    /// The last poll was one that a command had asked for.
-    asked_last: bool,
+    share: CommandShare,
 }
 
 impl Schedule {
@@ -196,15 +162,11 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
-            on_credit: false,
+            turn: Turn::Due,
             earned_until: now,
             most_credit: longest.mul_f64(MOST_CREDIT),
             probed: false,
-            commands_in_a_row: 0,
-            stops_in_a_row: 0,
-            command_lead: Duration::ZERO,
-            command_took: Duration::ZERO,
-            asked_last: false,
+            share: CommandShare::default(),
         }
     }
 
@@ -214,20 +176,21 @@ impl Schedule {
         self.start_round(now);
         let poll = self.due_poll(now);
         if poll.is_none() {
-            self.command_lead = Duration::ZERO;
+            self.share.line_is_free();
         }
-        if let Some(urgency) = waiting {
-            let row = if urgency == Urgency::Stop {
-                self.stops_in_a_row
-            } else {
-                self.commands_in_a_row
-            };
-            let share = urgency == Urgency::Stop || self.command_lead < COMMANDS_IN_A_ROW * self.command_took;
-            if poll.is_none() || (row < COMMANDS_IN_A_ROW && (share || self.command_lead.is_zero())) {
-                return Decision::Command(urgency);
-            }
+        if waiting == Some(Urgency::Stop) && (poll.is_none() || self.share.admits(Urgency::Stop)) {
+            return Decision::Command(Urgency::Stop);
         }
-
+        let asked = self.due_asked(now).filter(|_| {
+            self.share.reads_before_commands(waiting.is_some()) && (poll.is_none() || self.share.reads_before_polls())
+        });
+        if let Some(asked) = asked {
+            self.turn = Turn::Asked;
+            return Decision::Poll(asked);
+        }
+        if let Some(urgency) = waiting.filter(|urgency| poll.is_none() || self.share.admits(*urgency)) {
+            return Decision::Command(urgency);
+        }
         match poll {
             Some(poll) => Decision::Poll(poll),
             None => Decision::Idle(self.next_due(now)),
@@ -246,38 +209,35 @@ impl Schedule {
 
     /// A command (or a step of one) was on the line for `took`.
     pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
-        self.commands_in_a_row += 1;
-        if urgency != Urgency::Stop {
-            self.command_lead += took;
-            self.command_took = took;
-        }
-        self.stops_in_a_row = if urgency == Urgency::Stop {
-            self.stops_in_a_row + 1
-        } else {
-            0
-        };
+        self.share.commanded(urgency, took);
     }
 
     /// A poll is over.
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
-        self.commands_in_a_row = 0;
-        self.stops_in_a_row = 0;
-        self.command_lead = self.command_lead.saturating_sub(took);
         let item = self.drives.get_mut(poll.drive);
-        let item = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read));
-        // Two of them never follow one another while a round waits.
-        self.asked_last = item.is_some_and(|item| std::mem::take(&mut item.asked));
+        if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
+            // One that tells nothing is made up for among the slow polls.
+            item.wanted |= item.asked.take().is_some();
+        }
+        let turn = std::mem::replace(&mut self.turn, Turn::Due);
+        match turn {
+            Turn::Asked => self.share.read(took),
+            // Neither the least that slow polls have nor a drive that is away is at the cost of process data alone.
+            Turn::OnCredit => self.share.polled(Duration::ZERO),
+            Turn::Due if poll.probe => self.share.polled(Duration::ZERO),
+            Turn::Due => self.share.polled(took),
+        }
         if poll.read.class == PollClass::Fast {
             if self.round.front() == Some(&(poll.drive, poll.read)) {
                 self.round.pop_front();
             }
             self.probed = false;
         } else {
-            self.slow_credit = if self.on_credit {
-                self.slow_credit.saturating_sub(took)
-            } else {
+            self.slow_credit = match turn {
+                Turn::OnCredit => self.slow_credit.saturating_sub(took),
+                Turn::Asked => self.slow_credit,
                 // There was room for it, so the others will find room too.
-                Duration::ZERO
+                Turn::Due => Duration::ZERO,
             };
             self.note_slow(now);
         }
@@ -307,6 +267,7 @@ impl Schedule {
         }
         if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.due = item.due.max(until);
+            item.asked = item.asked.map(|since| since.max(until));
         }
     }
 
@@ -318,11 +279,9 @@ impl Schedule {
         for item in drive
             .items
             .iter_mut()
-            .filter(|i| i.read.class != PollClass::Fast && covers(&i.read))
+            .filter(|i| i.read.class != PollClass::Fast && !i.refused && covers(&i.read))
         {
-            item.due = item.due.min(now);
-            item.wanted = true;
-            item.asked = !item.refused;
+            item.asked.get_or_insert(now);
         }
     }
 
@@ -398,22 +357,18 @@ impl Schedule {
     }
 
     fn due_poll(&mut self, now: Instant) -> Option<Poll> {
+        self.turn = Turn::Due;
         // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
         let hold = self.probed && !self.round.is_empty();
         if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
             return Some(probe);
         }
-        if let Some(asked) = self
-            .due_asked(now)
-            .filter(|_| !self.asked_last || self.round.is_empty())
-        {
-            return Some(asked);
-        }
         let slow = self.due_slow(now);
         // A whole round went by without room for it: the line is saturated.
         let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
-        self.on_credit = slow.is_some_and(|(due, _, cost)| self.slow_credit >= cost && left_out(due));
-        if let Some((_, poll, _)) = slow.filter(|_| self.on_credit) {
+        let on_credit = |(due, _, cost): &(Instant, Poll, Duration)| self.slow_credit >= *cost && left_out(*due);
+        if let Some((_, poll, _)) = slow.filter(on_credit) {
+            self.turn = Turn::OnCredit;
             return Some(poll);
         }
         if let Some(&(drive, read)) = self.round.front() {
@@ -457,10 +412,11 @@ impl Schedule {
         let online = self.drives.iter().enumerate();
         let online = online.filter(|(_, d)| d.presence == Presence::Online);
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
-        let due = asked.filter(|(_, item)| item.asked && item.is_slow() && item.due <= now);
-        due.min_by_key(|(_, item)| item.due).map(|(drive, item)| Poll {
+        let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
+        let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;
+        Some(Poll {
             drive,
-            read: item.read,
+            read,
             probe: false,
         })
     }
@@ -493,12 +449,11 @@ impl Schedule {
         for drive in &self.drives {
             let due = match drive.presence {
                 Presence::Away(at, _) => Some(at),
-                Presence::Online => drive
-                    .items
-                    .iter()
-                    .filter(|i| i.is_slow() && i.due > now)
-                    .map(|i| i.due)
-                    .min(),
+                Presence::Online => {
+                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| i.due);
+                    let asked = drive.items.iter().filter_map(|i| i.asked);
+                    slow.chain(asked).filter(|due| *due > now).min()
+                }
             };
             next = due.map_or(next, |due| next.min(due));
         }
@@ -513,214 +468,7 @@ impl Schedule {
             self.slow_started = Some(now);
         }
     }
-
-    fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
-        let slow = self.cadence.slow;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        drive.failures = 0;
-        drive.garbled = 0;
-        drive.tried = true;
-        let came = drive.presence != Presence::Online;
-        if came {
-            drive.presence = Presence::Online;
-            if self.round_started.is_none() {
-                self.round_due = self.round_due.min(now);
-            }
-            for item in &mut drive.items {
-                item.wanted = true;
-                item.due = now;
-                item.failures = 0;
-            }
-        }
-        let mut change = Change::None;
-        if let Polled::Refused(exception) = polled {
-            change = drive.refused(poll.read, exception, now);
-        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-            item.failures = 0;
-            if std::mem::take(&mut item.refused) {
-                // The bad point is sound again: it is read with its neighbours.
-                item.whole_again = Some(now);
-            }
-            item.wanted = item.read.class != PollClass::Once;
-            if item.read.class == PollClass::Slow {
-                let next = item.due + slow;
-                item.due = if next < now { now + slow } else { next };
-            }
-        }
-        if came { Change::Online } else { change }
-    }
-
-    fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        if let Presence::Away(_, pause) = drive.presence {
-            drive.failures += 1;
-            if !drive.tried && drive.failures <= retries {
-                drive.presence = Presence::Away(now, pause);
-                return Change::None;
-            }
-            let first = !drive.tried;
-            drive.tried = true;
-            drive.presence = away(now, pause, took);
-            return if first { Change::Offline } else { Change::None };
-        }
-        let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
-        if !presence_counts {
-            // A request that is never answered must not take the drive away while its process data comes.
-            if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-                item.failures += 1;
-                item.due = match item.failures.checked_sub(retries + 1) {
-                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
-                    None => now,
-                };
-            }
-            return Change::None;
-        }
-        drive.failures += 1;
-        if drive.failures <= retries {
-            if poll.read.class == PollClass::Fast {
-                self.round.push_front((poll.drive, poll.read));
-            }
-            return Change::None;
-        }
-        drive.presence = away(now, Duration::ZERO, took);
-        drive.failures = 0;
-        drive.garbled = 0;
-        self.round.retain(|(index, _)| *index != poll.drive);
-        Change::Offline
-    }
-
-    fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
-        let retries = self.cadence.retries;
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
-            return Change::None;
-        };
-        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
-        if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
-            return self.failed(poll, took, now);
-        }
-        drive.garbled += 1;
-        if poll.read.class == PollClass::Fast {
-            if drive.garbled <= retries {
-                self.round.push_front((poll.drive, poll.read));
-            }
-        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
-            item.due = if drive.garbled <= retries {
-                now
-            } else {
-                now + MUTE_PAUSE.0
-            };
-        }
-        Change::None
-    }
-}
-
-/// The next probe: the pause doubles, and the probe's cost stays within its share of the line.
-fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
-    let (first, longest) = PROBE_PAUSE;
-    let doubled = if pause.is_zero() {
-        first
-    } else {
-        (pause * 2).min(longest)
-    };
-    let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
-    Presence::Away(now + doubled.max(affordable), doubled)
-}
-
-impl Item {
-    fn new(read: PlannedRead, origin: PlannedRead, cost: Duration, now: Instant) -> Item {
-        Item {
-            read,
-            origin,
-            due: now,
-            cost,
-            refused: false,
-            failures: 0,
-            wanted: true,
-            asked: false,
-            whole_again: None,
-        }
-    }
-
-    fn is_slow(&self) -> bool {
-        match self.read.class {
-            PollClass::Slow => true,
-            PollClass::Once => self.wanted,
-            PollClass::Fast | PollClass::Never => false,
-        }
-    }
-}
-
-impl DriveSchedule {
-    fn has_fast(&self) -> bool {
-        self.items.iter().any(|i| i.read.class == PollClass::Fast)
-    }
-
-    /// Splits a refused block until the bad point is found, which is retried slowly.
-    fn refused(&mut self, read: PlannedRead, exception: Exception, now: Instant) -> Change {
-        let addressed = exception.is_about_request();
-        let Some(index) = self.items.iter().position(|i| i.read == read) else {
-            return Change::None;
-        };
-        let Some(item) = self.items.get_mut(index) else {
-            return Change::None;
-        };
-        if !addressed {
-            // Busy or failing: the drive is alive, the values age, the poll comes round again.
-            item.due = item.due.max(now);
-            if item.read.class == PollClass::Once {
-                item.due = now + Duration::from_secs(1);
-            }
-            return Change::None;
-        }
-        let Some((low, high)) = Plan::halves(read) else {
-            item.refused = true;
-            item.wanted = true;
-            item.due = now + REFUSED_PAUSE;
-            let origin = item.origin;
-            self.join(origin, now);
-            return Change::Unavailable(read, exception);
-        };
-        let (origin, cost) = (item.origin, item.cost);
-        let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
-        for half in &mut halves {
-            half.whole_again = Some(now + REFUSED_PAUSE);
-        }
-        self.items.splice(index..=index, halves);
-        Change::None
-    }
-
-    /// Joins the sound neighbours that splitting tore apart, around the refused addresses.
-    fn join(&mut self, origin: PlannedRead, now: Instant) {
-        let mut joined: Vec<Item> = Vec::with_capacity(self.items.len());
-        for item in self.items.drain(..) {
-            match joined.last_mut() {
-                Some(last)
-                    if item.origin == origin
-                        && last.origin == origin
-                        && !item.refused
-                        && !last.refused
-                        && u32::from(last.read.start) + u32::from(last.read.count) == u32::from(item.read.start) =>
-                {
-                    last.read.append(&item.read);
-                    last.wanted = true;
-                    last.due = last.due.min(now);
-                    last.whole_again = None;
-                }
-                _ => joined.push(Item {
-                    whole_again: item.whole_again.filter(|_| item.origin != origin),
-                    ..item
-                }),
-            }
-        }
-        self.items = joined;
-    }
 }
 
 #[cfg(test)]
-#[path = "schedule_tests.rs"]
 mod tests;

@@ -481,7 +481,14 @@ impl Worker {
         let reply = match ended {
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
-                if !matches!(reply, Reply::Exception(_)) {
+                let acknowledged = !matches!(reply, Reply::Exception(_));
+                if acknowledged && pdu.is_write() && self.desk.debts.proves_nothing(drive, pdu, began) {
+                    // It goes out once more.
+                    self.desk.doubted(index);
+                    self.desk.debts.answered(drive, pdu, now);
+                    return;
+                }
+                if acknowledged {
                     self.desk.debts.answered(drive, pdu, now);
                 }
                 Some(reply)

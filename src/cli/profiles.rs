@@ -118,7 +118,24 @@ fn show(profile: &Profile) -> String {
             "turnaround",
             format!("{}, for the prediction only", format_duration(profile.turnaround)),
         ),
-        ("update period", format_duration(profile.update_period)),
+        (
+            "update period",
+            format!(
+                "{}; a reset pulse is held for two",
+                format_duration(profile.update_period)
+            ),
+        ),
+        (
+            "confirmation",
+            format!(
+                "within {} of the acknowledgement, or an event tells",
+                format_duration(profile.confirm_within)
+            ),
+        ),
+        (
+            "simulator",
+            profile.simulator.clone().unwrap_or_else(|| "none".to_string()),
+        ),
     ] {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "  {what:<14}{value}");

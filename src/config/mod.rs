@@ -344,9 +344,19 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
         if spec.supervision.is_some() {
             continue;
         }
-        let own = match spec.profile.point_index(crate::drive::FIELDBUS_FAULT_RESPONSE) {
-            Some(_) => "its own response to a silent master, P2.7.22, is 0 by default and sees the gateway poll",
-            None => "no parameter for its own response to a silent master is known",
+        let known = [
+            crate::drive::FIELDBUS_FAULT_RESPONSE,
+            crate::drive::COMMUNICATION_TIMEOUT,
+        ];
+        let known: Vec<&str> = known
+            .into_iter()
+            .filter(|p| spec.profile.point_index(p).is_some())
+            .collect();
+        let own = if known.is_empty() {
+            "no parameter for its own response to a silent master is known".to_string()
+        } else {
+            let points = known.join(" and ");
+            format!("its own response to a silent master ({points}) may be off, and sees the gateway poll")
         };
         reader.document().warning(
             place,

@@ -14,3 +14,7 @@ pub use profile::{Point, PollClass, Profile, Raw, Source};
 /// Name of the point that tells how a drive itself responds to a silent master; 0 is no response. For Vacon NX
 /// parameter P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
+
+/// Name of the point that tells after how many seconds without a request a drive responds to a silent master; 0 is
+/// never. For drives that have a register for it.
+pub const COMMUNICATION_TIMEOUT: &str = "communication_timeout";

@@ -11,17 +11,17 @@ use crate::tools::{run_well, tool};
 
 const SET: &str = "drivegate/test/drive/pump-1/set";
 
-struct Plant {
+pub(crate) struct Plant {
     _simulator: Running,
     gateway: Running,
-    modbus: u16,
+    pub(crate) modbus: u16,
     mqtt: u16,
-    http: u16,
+    pub(crate) http: u16,
     folder: tempfile::TempDir,
 }
 
 impl Plant {
-    fn start(baud: u32) -> Plant {
+    pub(crate) fn start(baud: u32) -> Plant {
         let folder = tempfile::tempdir().unwrap();
         let link = folder.path().join("line1").display().to_string();
         let baud = baud.to_string();
@@ -35,7 +35,7 @@ impl Plant {
              [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
              supervision = {{ timeout = \"3s\", action = \"stop\" }}\n\
              [[bus.drive]]\nname = \"pump-2\"\naddress = 2\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
-             [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n\
+             [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n\
              [mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n\
              [http]\nlisten = \"127.0.0.1:{http}\"\n"
         );
@@ -69,13 +69,13 @@ impl Plant {
         until(line, || get(self.http, "/metrics")?.1.contains(line).then_some(()));
     }
 
-    fn until_state(&self, drive: &str, state: &str) {
+    pub(crate) fn until_state(&self, drive: &str, state: &str) {
         until(&format!("{drive} is {state}"), || {
             (api(self.http, drive)["state"] == state).then_some(())
         });
     }
 
-    fn audit(&self) -> Vec<serde_json::Value> {
+    pub(crate) fn audit(&self) -> Vec<serde_json::Value> {
         serde_json::from_str(&get(self.http, "/api/v1/audit").unwrap().1).unwrap()
     }
 

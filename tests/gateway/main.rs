@@ -9,6 +9,7 @@
 
 mod commands;
 mod demo;
+mod flood;
 mod operators;
 mod process;
 mod restart;

@@ -306,7 +306,7 @@ async function tick() {
 
 // ---- Events
 
-const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", supervision: "amber", refused_command: "amber",
+const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", supervision: "amber", unsupervised: "amber", refused_command: "amber",
   restarted: "amber", not_confirmed: "amber", fault_end: "green", online: "green", bus_up: "green" };
 let lastEvent = "";
 

@@ -1,0 +1,120 @@
+//! What a poll that is over changes: presence, retries, back-off.
+
+use std::time::{Duration, Instant};
+
+use super::drives::{Presence, away};
+use super::{Change, Poll, Polled, Schedule};
+use crate::drive::PollClass;
+
+/// First and longest pause before a slow request that is not answered, while the drive answers others, is tried again.
+const MUTE_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
+/// Garbled answers in a row after which a drive counts as away: something is there, but nothing comes of it.
+const MOST_GARBLED: u32 = 8;
+
+impl Schedule {
+    pub(super) fn answered(&mut self, poll: &Poll, polled: Polled, now: Instant) -> Change {
+        let slow = self.cadence.slow;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        drive.failures = 0;
+        drive.garbled = 0;
+        drive.tried = true;
+        let came = drive.presence != Presence::Online;
+        if came {
+            drive.presence = Presence::Online;
+            if self.round_started.is_none() {
+                self.round_due = self.round_due.min(now);
+            }
+            for item in &mut drive.items {
+                item.wanted = true;
+                item.due = now;
+                item.failures = 0;
+            }
+        }
+        let mut change = Change::None;
+        if let Polled::Refused(exception) = polled {
+            change = drive.refused(poll.read, exception, now);
+        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.failures = 0;
+            if std::mem::take(&mut item.refused) {
+                // The bad point is sound again: it is read with its neighbours.
+                item.whole_again = Some(now);
+            }
+            item.wanted = item.read.class != PollClass::Once;
+            if item.read.class == PollClass::Slow {
+                let next = item.due + slow;
+                // Read before its time because a command asked for it, it is due a whole cycle later.
+                let early = item.due > now;
+                item.due = if next < now || early { now + slow } else { next };
+            }
+        }
+        if came { Change::Online } else { change }
+    }
+
+    pub(super) fn failed(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
+        let retries = self.cadence.retries;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        if let Presence::Away(_, pause) = drive.presence {
+            drive.failures += 1;
+            if !drive.tried && drive.failures <= retries {
+                drive.presence = Presence::Away(now, pause);
+                return Change::None;
+            }
+            let first = !drive.tried;
+            drive.tried = true;
+            drive.presence = away(now, pause, took);
+            return if first { Change::Offline } else { Change::None };
+        }
+        let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        if !presence_counts {
+            // A request that is never answered must not take the drive away while its process data comes.
+            if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+                item.failures += 1;
+                item.due = match item.failures.checked_sub(retries + 1) {
+                    Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
+                    None => now,
+                };
+            }
+            return Change::None;
+        }
+        drive.failures += 1;
+        if drive.failures <= retries {
+            if poll.read.class == PollClass::Fast {
+                self.round.push_front((poll.drive, poll.read));
+            }
+            return Change::None;
+        }
+        drive.presence = away(now, Duration::ZERO, took);
+        drive.failures = 0;
+        drive.garbled = 0;
+        self.round.retain(|(index, _)| *index != poll.drive);
+        Change::Offline
+    }
+
+    pub(super) fn garbled(&mut self, poll: &Poll, took: Duration, now: Instant) -> Change {
+        let retries = self.cadence.retries;
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
+            return Change::None;
+        };
+        let counts = poll.read.class == PollClass::Fast || !drive.has_fast();
+        if drive.presence != Presence::Online || !counts || drive.garbled >= MOST_GARBLED.max(retries) {
+            return self.failed(poll, took, now);
+        }
+        drive.garbled += 1;
+        if poll.read.class == PollClass::Fast {
+            if drive.garbled <= retries {
+                self.round.push_front((poll.drive, poll.read));
+            }
+        } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
+            item.due = if drive.garbled <= retries {
+                now
+            } else {
+                now + MUTE_PAUSE.0
+            };
+        }
+        Change::None
+    }
+}

@@ -1,0 +1,109 @@
+//! What commands may take of a line that is busy with polls: as much time as process data at most.
+//!
+//! The share holds everything that a command causes: its steps, reads of the drive's own control word, forwarded reads, and
+//! the reads that confirm it. Without that a client that writes often would slow the polls twice.
+
+use std::time::Duration;
+
+use super::COMMANDS_IN_A_ROW;
+use crate::command::Urgency;
+
+/// Time of the line that was taken ahead of those who pay for it.
+#[derive(Debug, Default)]
+struct Lead {
+    time: Duration,
+    /// Time of the last one: eight of it are the lead that a burst may have.
+    took: Duration,
+}
+
+impl Lead {
+    fn charge(&mut self, took: Duration) {
+        self.time += took;
+        self.took = took;
+    }
+
+    fn pay(&mut self, took: Duration) {
+        self.time = self.time.saturating_sub(took);
+    }
+
+    fn has_room(&self) -> bool {
+        self.time.is_zero() || self.time < COMMANDS_IN_A_ROW * self.took
+    }
+}
+
+/// The share of commands.
+#[derive(Debug, Default)]
+pub(super) struct CommandShare {
+    /// Of everything that commands caused, over process data; reckoned since polls last had nothing to do.
+    all: Lead,
+    /// Of stops alone: they wait for no other command.
+    stops: Lead,
+    /// Since the last poll, the reads that commands asked for being theirs.
+    in_a_row: u32,
+    stops_in_a_row: u32,
+    /// Commands since the last read that one of them asked for.
+    unread: u32,
+    /// No poll since such a read.
+    asked_last: bool,
+}
+
+impl CommandShare {
+    /// No poll is due: whoever wants the line may have it.
+    pub(super) fn line_is_free(&mut self) {
+        self.all.time = Duration::ZERO;
+        self.stops.time = Duration::ZERO;
+    }
+
+    /// Whether a command of that rank goes before a poll that is due. A stop waits for one poll at most, and only where
+    /// stops alone took half of the line.
+    pub(super) fn admits(&self, urgency: Urgency) -> bool {
+        match urgency {
+            Urgency::Stop => {
+                self.stops_in_a_row < COMMANDS_IN_A_ROW && (self.stops_in_a_row == 0 || self.stops.has_room())
+            }
+            Urgency::Command | Urgency::Read => self.in_a_row < COMMANDS_IN_A_ROW && self.all.has_room(),
+        }
+    }
+
+    /// Whether a read that a command asked for goes before the next command. One such read shows the effect of all
+    /// commands before it, so those that wait go first, eight of them.
+    pub(super) fn reads_before_commands(&self, command_waits: bool) -> bool {
+        !command_waits || self.unread >= COMMANDS_IN_A_ROW
+    }
+
+    /// Whether it goes before a poll that is due: two of them never do.
+    pub(super) fn reads_before_polls(&self) -> bool {
+        !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && self.all.has_room()
+    }
+
+    /// A command, or a step of one, took that time.
+    pub(super) fn commanded(&mut self, urgency: Urgency, took: Duration) {
+        self.in_a_row += 1;
+        self.unread += 1;
+        self.all.charge(took);
+        if urgency == Urgency::Stop {
+            self.stops_in_a_row += 1;
+            self.stops.charge(took);
+        } else {
+            self.stops_in_a_row = 0;
+        }
+    }
+
+    /// A read that a command asked for took that time.
+    pub(super) fn read(&mut self, took: Duration) {
+        self.in_a_row += 1;
+        self.stops_in_a_row = 0;
+        self.unread = 0;
+        self.asked_last = true;
+        self.all.time += took;
+    }
+
+    /// A poll is over. `paid` is the time that commands may take for it.
+    pub(super) fn polled(&mut self, paid: Duration) {
+        self.in_a_row = 0;
+        self.stops_in_a_row = 0;
+        self.asked_last = false;
+        self.all.pay(paid);
+        self.stops.pay(paid);
+    }
+}
