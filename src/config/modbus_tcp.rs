@@ -157,7 +157,11 @@ fn read_listener(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::
     }
     modbus_tcp::Listener {
         section: "[[modbus_tcp.listener]]".to_string(),
-        listen: read_listen(reader, DEFAULT_LISTEN),
+        listen: if reader.has("listen") {
+            read_listen(reader, DEFAULT_LISTEN)
+        } else {
+            Vec::new()
+        },
         allow: values::list(reader, "allow", inherited.allow.to_vec(), values::network),
         write: values::list(reader, "write", inherited.write.to_vec(), values::network),
         buses: read_buses(reader, inherited.buses),

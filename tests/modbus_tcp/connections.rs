@@ -13,7 +13,7 @@ use crate::rig::{Client, Rig, options, plant, registers, until, words};
 #[tokio::test]
 async fn only_allowed_clients() {
     let mut options = options();
-    options.allow = vec!["127.0.0.2/32".parse().unwrap()];
+    options.listeners[0].allow = vec!["127.0.0.2/32".parse().unwrap()];
     let rig = Rig::with(options).await;
     let mut refused = rig.client().await;
     assert!(refused.is_closed().await);
@@ -51,7 +51,7 @@ async fn no_more_than_max_connections() {
 #[tokio::test]
 async fn several_listeners_share_one_server() {
     let mut options = options();
-    options.listen = vec![
+    options.listeners[0].listen = vec![
         SocketAddr::from(([127, 0, 0, 1], 0)),
         SocketAddr::from(([127, 0, 0, 3], 0)),
     ];
@@ -66,7 +66,7 @@ async fn several_listeners_share_one_server() {
 #[tokio::test]
 async fn an_ipv4_client_of_an_ipv6_listener() {
     let mut options = options();
-    options.listen = vec!["[::]:0".parse().unwrap()];
+    options.listeners[0].listen = vec!["[::]:0".parse().unwrap()];
     let rig = Rig::with(options).await;
     let port = rig.address().port();
     let mut client = Client::connect(SocketAddr::from(([127, 0, 0, 1], port))).await;
@@ -84,7 +84,7 @@ async fn a_taken_address_is_told() {
     let taken = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = taken.local_addr().unwrap();
     let mut options = options();
-    options.listen = vec![address];
+    options.listeners[0].listen = vec![address];
     let plant = Arc::new(ArcSwap::from_pointee(plant()));
     let why = modbus_tcp::start(options, plant, Arc::default(), CancellationToken::new())
         .await
