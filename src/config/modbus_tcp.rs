@@ -285,7 +285,7 @@ fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
             roles.insert(name.to_string(), values::choice(&table, name, Role::Monitor, &ROLES));
         }
     }
-    if !roles.values().any(|role| *role == Role::Control) {
+    if !roles.values().any(|role| *role == Role::Control) && reader.document().is_sound() {
         reader.warning(
             "roles",
             "no role may write, so every TLS client only reads; write for example roles = { operator = \"control\" }",

@@ -56,10 +56,6 @@ struct Logs {
 
 impl Door {
     pub(super) async fn serve(self, listener: TcpListener) {
-        if let Ok(address) = listener.local_addr() {
-            let tls = matches!(self.admission, Admission::ByCertificate(_));
-            tracing::info!(%address, tls, "Modbus TCP: listening");
-        }
         let door = Arc::new(self);
         let mut logs = Logs::default();
         loop {

@@ -174,6 +174,13 @@ pub async fn start(
             doors.push((socket, door(&view, section, &tls.allow, &admission)));
         }
     }
+    for (address, tls) in addresses
+        .iter()
+        .map(|a| (a, false))
+        .chain(tls_addresses.iter().map(|a| (a, true)))
+    {
+        tracing::info!(%address, tls, "Modbus TCP: listening");
+    }
     for (socket, door) in doors {
         tasks.spawn(door.serve(socket));
     }
