@@ -197,6 +197,14 @@ impl Daemon {
     }
 
     async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
+        if let (Some(old), Some(new), Some((_, server))) =
+            (&self.settings.modbus_tcp, &settings.modbus_tcp, &self.modbus_tcp)
+            && new.differs_in_certificates_only(old)
+        {
+            server.renew_certificates(new).map_err(StartError)?;
+            tracing::info!("Modbus TCP: new certificates for clients that connect from now on");
+            self.settings.modbus_tcp = settings.modbus_tcp.clone();
+        }
         if settings.modbus_tcp != self.settings.modbus_tcp {
             self.settings.modbus_tcp = None;
             if let Some((cancel, server)) = self.modbus_tcp.take() {

@@ -6,6 +6,7 @@
 mod bus;
 mod drive;
 mod log;
+mod modbus_tcp;
 mod mqtt;
 mod north;
 pub mod schema;
@@ -24,7 +25,7 @@ use crate::bus::predict::{self, Prediction};
 use crate::cache::{Access, BusSpec, DriveSpec};
 use crate::document::{self, Document, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
-use crate::north::{http, modbus_tcp, mqtt as mqtt_client};
+use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 
 /// What variables of the environment begin with: `DRIVEGATE__MQTT__PASSWORD`.
 pub const ENVIRONMENT: &str = "DRIVEGATE";
@@ -43,7 +44,7 @@ pub struct Settings {
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
     /// Absent: not started.
-    pub modbus_tcp: Option<modbus_tcp::Options>,
+    pub modbus_tcp: Option<modbus_tcp_server::Options>,
     /// Absent: not started.
     pub mqtt: Option<mqtt_client::Options>,
     /// Absent: not started.
@@ -160,7 +161,14 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .iter()
         .map(|table| bus::read(table, base, &profiles, broken))
         .collect();
-    let modbus_tcp = reader.table("modbus_tcp").map(|table| north::read_modbus_tcp(&table));
+    let names: Vec<&str> = buses
+        .iter()
+        .filter_map(|bus| bus.name.as_ref())
+        .map(|(name, _)| name.as_str())
+        .collect();
+    let modbus_tcp = reader
+        .table("modbus_tcp")
+        .map(|table| modbus_tcp::read(&table, base, &names));
     let mqtt = reader
         .table("mqtt")
         .map(|table| mqtt::read(&table, base, name.as_deref()));
@@ -185,9 +193,9 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         profiles,
         stale_after: modbus_tcp
             .as_ref()
-            .map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after),
+            .map_or(modbus_tcp::DEFAULT_STALE_AFTER, |m| m.stale_after),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
-        modbus_tcp: modbus_tcp.map(|m| m.options),
+        modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http)?,
         log,
@@ -198,20 +206,20 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
 fn judge(
     reader: &Reader<'_>,
     buses: &[bus::Found],
-    modbus_tcp: Option<&north::ModbusTcp>,
+    modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
     mqtt: Option<&Option<mqtt_client::Options>>,
     http: Option<&north::Listener>,
 ) {
     unique::check(reader.document(), buses);
     // Without Modbus TCP nobody is reached by a unit, and a gateway may have more drives than there are units.
-    if reader.has("modbus_tcp") {
-        unique::check_units(reader.document(), buses);
+    if let Some(modbus_tcp) = modbus_tcp {
+        unique::check_units(reader.document(), buses, &modbus_tcp.selections);
     }
-    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.listeners).chain(http);
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http);
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);
-    let commanded = modbus_tcp.is_some_and(|m| !m.options.write.is_empty())
-        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
+    let commanded =
+        modbus_tcp.is_some_and(|m| m.commands) || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
     if commanded {
         warn_of_missing_leases(reader, buses);
     } else {
@@ -219,7 +227,7 @@ fn judge(
     }
     if reader.document().is_sound() {
         // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
-        let stale_after = modbus_tcp.map_or(north::DEFAULT_STALE_AFTER, |m| m.stale_after);
+        let stale_after = modbus_tcp.map_or(modbus_tcp::DEFAULT_STALE_AFTER, |m| m.stale_after);
         warn_of_cadence(reader, buses, stale_after, modbus_tcp.map(|m| &m.stale_place));
     }
 }

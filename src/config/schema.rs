@@ -8,7 +8,7 @@ use std::time::Duration;
 
 use serde_json::{Map, Value, json};
 
-use super::{bus, drive, log, mqtt, north, values};
+use super::{bus, drive, log, modbus_tcp as modbus, mqtt, north, values};
 use crate::codec::Protocol;
 use crate::document::format_duration;
 use crate::drive::ModelPoint;
@@ -244,35 +244,97 @@ fn supervision() -> Value {
 
 fn modbus_tcp() -> Value {
     let network = || text("A network such as 192.168.1.0/24, or one address.");
+    let listen = |description: &str| nonempty(list(description, text("Address and port.")));
+    let buses = || {
+        let names = list("Buses whose drives are shown; without it all.", text("Name of a bus."));
+        ("buses", nonempty(names))
+    };
+    let allow = || {
+        (
+            "allow",
+            list("Who may connect; without it as in [modbus_tcp].", network()),
+        )
+    };
+    let listener = table(
+        "A listener of its own.",
+        &["listen"],
+        [
+            ("listen", listen("Addresses to listen on.")),
+            allow(),
+            (
+                "write",
+                list("Who may write; without it as in [modbus_tcp].", network()),
+            ),
+            buses(),
+        ],
+    );
+    let roles = json!({
+        "type": "object",
+        "description": "What the roles in client certificates may do; no role and any other one may read.",
+        "additionalProperties": { "enum": modbus::ROLES.map(|(word, _)| word) },
+    });
+    let tls = table(
+        "Modbus/TCP Security: TLS in which the clients show certificates.",
+        &["certificate", "key", "client_ca"],
+        [
+            (
+                "listen",
+                with_default(listen("Addresses to listen on."), [modbus::DEFAULT_TLS_LISTEN]),
+            ),
+            allow(),
+            buses(),
+            (
+                "certificate",
+                text("PEM file of the server's certificate, with those between it and its CA."),
+            ),
+            ("key", text("PEM file of the certificate's private key.")),
+            ("client_ca", text("PEM file of the CA whose clients are let in.")),
+            ("roles", roles),
+        ],
+    );
     table(
         "Modbus TCP server; not started without this section.",
         &[],
         [
             (
                 "listen",
-                with_default(
-                    nonempty(list("Addresses to listen on.", text("Address and port."))),
-                    [north::DEFAULT_MODBUS_TCP],
+                listen(
+                    "Addresses to listen on; without it, and without [[modbus_tcp.listener]] and [modbus_tcp.tls], 127.0.0.1:1502.",
                 ),
             ),
             (
                 "allow",
-                with_default(list("Who may connect.", network()), north::DEFAULT_ALLOW),
+                with_default(list("Who may connect.", network()), modbus::DEFAULT_ALLOW),
             ),
             ("write", with_default(list("Who may write.", network()), json!([]))),
             (
                 "max_connections",
                 with_default(
-                    number("Connections at one time.", &north::CONNECTIONS),
-                    north::DEFAULT_CONNECTIONS,
+                    number("Connections at one time.", &modbus::CONNECTIONS),
+                    modbus::DEFAULT_CONNECTIONS,
                 ),
+            ),
+            (
+                "max_connections_per_address",
+                number(
+                    "Connections at one time from one address; without it no limit but max_connections.",
+                    &modbus::CONNECTIONS,
+                ),
+            ),
+            (
+                "idle_timeout",
+                json!({
+                    "description": "Time without a request after which a connection is closed; off: never.",
+                    "anyOf": [{ "enum": [modbus::OFF] }, { "type": "string", "pattern": DURATION }],
+                    "default": format_duration(modbus::DEFAULT_IDLE),
+                }),
             ),
             (
                 "uncached",
                 with_default(
                     words(
                         "Raw reads outside the plan: asked of the drive, or refused.",
-                        north::UNCACHED.iter().map(|(w, _)| *w),
+                        modbus::UNCACHED.iter().map(|(w, _)| *w),
                     ),
                     "forward",
                 ),
@@ -281,13 +343,17 @@ fn modbus_tcp() -> Value {
                 "stale_after",
                 duration(
                     "Older samples are stale, on every side of the gateway.",
-                    Some(north::DEFAULT_STALE_AFTER),
+                    Some(modbus::DEFAULT_STALE_AFTER),
                 ),
             ),
             (
-                "tls",
-                json!({ "not": {}, "description": "Modbus/TCP Security is not served by this version." }),
+                "listener",
+                tables(
+                    "Listeners with their own rights and their own choice of buses.",
+                    listener,
+                ),
             ),
+            ("tls", tls),
         ],
     )
 }

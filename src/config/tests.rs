@@ -1,5 +1,6 @@
 use std::collections::BTreeSet;
 use std::path::Path;
+use std::sync::LazyLock;
 
 use proptest::prelude::*;
 use serde_json::Value;
@@ -8,7 +9,9 @@ use super::*;
 use crate::config::schema::schema;
 
 /// Every table of the configuration, so that the loader asks for every key it knows.
-const FULL: &str = r#"
+static FULL: LazyLock<String> = LazyLock::new(|| FORM.replace("DIR", &certificates().display().to_string()));
+
+const FORM: &str = r#"
 [gateway]
 name = "g"
 [[bus]]
@@ -21,12 +24,44 @@ profile = "vacon-nx"
 limits = { speed_reference = [0.0, 100.0] }
 supervision = { timeout = "5s", action = { speed_reference = 20.0 } }
 [modbus_tcp]
+listen = ["127.0.0.1:1502"]
+[[modbus_tcp.listener]]
+listen = ["127.0.0.1:1503"]
+[modbus_tcp.tls]
+certificate = "DIR/gateway.crt"
+key = "DIR/gateway.key"
+client_ca = "DIR/ca.crt"
+roles = { operator = "control" }
 [mqtt]
 publish = {}
 buffer = {}
 [http]
 [log]
 "#;
+
+/// Directory of a CA and a server certificate, made by the script of the documentation.
+fn certificates() -> &'static Path {
+    static DIR: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+        let dir = tempfile::tempdir().unwrap();
+        for arguments in [&["ca"][..], &["server", "gateway"], &["server", "other"]] {
+            certificate(dir.path(), arguments, "30");
+        }
+        certificate(dir.path(), &["server", "expired"], "-1");
+        dir
+    });
+    DIR.path()
+}
+
+fn certificate(dir: &Path, arguments: &[&str], days: &str) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus-tls-ca.sh");
+    let output = std::process::Command::new(script)
+        .arg(dir)
+        .args(arguments)
+        .env("DAYS", days)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
 
 fn load(source: &str) -> (Loaded, Vec<String>) {
     parse(Path::new("/etc/drivegate/t.toml"), source, std::iter::empty())
@@ -74,11 +109,14 @@ fn properties_of_table(node: &Value, path: &str, found: &mut BTreeSet<String>) {
 fn the_schema_has_the_keys_of_the_loader() {
     let mut described = BTreeSet::new();
     properties(&schema(), "", &mut described);
-    let (loaded, known) = load(FULL);
+    let (loaded, known) = load(&FULL);
     assert_eq!(loaded.errors, []);
     let known: BTreeSet<String> = known
         .into_iter()
-        .map(|key| key.replace("limits.speed_reference", "limits.*"))
+        .map(|key| {
+            key.replace("limits.speed_reference", "limits.*")
+                .replace("roles.operator", "roles.*")
+        })
         .collect();
     assert_eq!(described, known);
 }
@@ -114,7 +152,7 @@ fn the_defaults_of_the_schema_are_those_of_the_loader() {
         filled.contains("stale_after") && filled.contains("baud") && filled.contains("max_bytes"),
         "{filled}"
     );
-    assert_eq!(settings(&filled), settings(FULL));
+    assert_eq!(settings(&filled), settings(&FULL));
 }
 
 #[test]
@@ -191,10 +229,14 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
     assert_eq!(all.buses[1].spec.port, "tcp://10.0.0.9:4001");
     let modbus = all.modbus_tcp.as_ref().unwrap();
     assert_eq!(
-        modbus.allow.iter().map(ToString::to_string).collect::<Vec<_>>(),
-        north::DEFAULT_ALLOW
+        modbus.listeners[0]
+            .allow
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<_>>(),
+        modbus_tcp::DEFAULT_ALLOW
     );
-    assert_eq!(modbus.write[0].to_string(), "127.0.0.1/32");
+    assert_eq!(modbus.listeners[0].write[0].to_string(), "127.0.0.1/32");
     let mqtt = all.mqtt.as_ref().unwrap();
     assert_eq!((mqtt.host.as_str(), mqtt.port, mqtt.tls), ("broker", 8883, true));
     assert_eq!(mqtt.client_id, "drivegate-pump-house");
@@ -226,10 +268,168 @@ fn units_are_unique_where_modbus_tcp_serves_them() {
     );
 }
 
+/// Two lines with the same addresses, and what stands in `[modbus_tcp]`.
+fn two_lines(modbus_tcp: &str) -> String {
+    let mut source = "[gateway]\nname = \"g\"\n".to_string();
+    for bus in ["line1", "line2"] {
+        source += &format!("[[bus]]\nname = \"{bus}\"\nport = \"/dev/{bus}\"\n");
+        for address in [1, 2] {
+            source +=
+                &format!("[[bus.drive]]\nname = \"{bus}-{address}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
+        }
+    }
+    source + modbus_tcp
+}
+
+#[test]
+fn a_listener_for_each_line() {
+    let split = two_lines(
+        "[modbus_tcp]\nallow = [\"10.0.0.0/8\"]\nwrite = [\"10.0.0.1\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1503\"]\nbuses = [\"line1\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1504\"]\nbuses = [\"line2\"]\nwrite = []\nallow = [\"10.2.0.0/16\"]\n",
+    );
+    let options = settings(&split).modbus_tcp.unwrap();
+    assert_eq!(
+        options.listeners.len(),
+        2,
+        "the short form is not there unless it is written"
+    );
+    let [one, two] = [&options.listeners[0], &options.listeners[1]];
+    assert_eq!(one.buses.as_deref(), Some(&["line1".to_string()][..]));
+    assert_eq!(
+        (one.allow[0].to_string(), one.write[0].to_string()),
+        ("10.0.0.0/8".into(), "10.0.0.1/32".into())
+    );
+    assert_eq!((two.allow[0].to_string(), two.write.len()), ("10.2.0.0/16".into(), 0));
+    assert_eq!(options.idle_timeout, Some(modbus_tcp::DEFAULT_IDLE));
+    let off = settings(&split.replace("[modbus_tcp]", "[modbus_tcp]\nidle_timeout = \"off\""))
+        .modbus_tcp
+        .unwrap();
+    assert_eq!(off.idle_timeout, None);
+    // Together they would share their units.
+    let (both, _) = load(&split.replace("buses = [\"line2\"]", "buses = [\"line1\", \"line2\"]"));
+    assert_eq!(both.errors.len(), 2, "{:?}", both.errors);
+    assert!(
+        both.errors[0].message.contains("unit 1 belongs to drive `line1-1`"),
+        "{:?}",
+        both.errors[0]
+    );
+    // Shown twice, told once.
+    let (all, _) = load(&(split + "[modbus_tcp.tls]\ncertificate = \"a\"\n"));
+    assert_eq!(
+        all.errors
+            .iter()
+            .filter(|e| e.message.contains("belongs to drive"))
+            .count(),
+        2
+    );
+}
+
+#[test]
+fn faults_of_listeners() {
+    let (loaded, _) = load(&two_lines(
+        "[modbus_tcp]\nlisten = [\"127.0.0.1:1502\"]\nmax_connections_per_address = 0\nidle_timeout = \"0s\"\n\
+         [[modbus_tcp.listener]]\nbuses = [\"lime1\", \"hall\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1502\"]\nbuses = []\n",
+    ));
+    let told: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
+    for wanted in [
+        "there is no bus `lime1`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; did you mean `line1`?",
+        "there is no bus `hall`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; write one of line1, line2",
+        "`listen` is missing; /etc/drivegate/t.toml:29, modbus_tcp.listener[0].listen; write for example [\"127.0.0.1:1502\"]",
+        "the list is empty; /etc/drivegate/t.toml:33, modbus_tcp.listener[1].buses; name a bus, or leave the key out for all",
+        "127.0.0.1:1502 collides with 127.0.0.1:1502 of modbus_tcp.listen (line 26); /etc/drivegate/t.toml:32, \
+         modbus_tcp.listener[1].listen; give each server a port of its own",
+        "0 is out of range; /etc/drivegate/t.toml:27, modbus_tcp.max_connections_per_address; write 1 to 10000",
+        "0s is out of range; /etc/drivegate/t.toml:28, modbus_tcp.idle_timeout; write \"1s\" to \"168h\"",
+    ] {
+        assert!(
+            told.iter().any(|t| t == wanted),
+            "{wanted}\nis missing in\n{}",
+            told.join("\n")
+        );
+    }
+}
+
+#[test]
+fn faults_of_certificates_are_told_with_file_and_key() {
+    let dir = certificates();
+    let shown = dir.display();
+    let of = |from: &str, to: &str| {
+        let (loaded, _) = load(&FULL.replace(&format!("{shown}/{from}\""), &format!("{to}\"")));
+        assert!(loaded.settings.is_none());
+        loaded
+            .errors
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<_>>()
+            .join("\n")
+    };
+    let file = |name: &str| dir.join(name).display().to_string();
+    for (from, to, wanted) in [
+        (
+            "gateway.crt",
+            file("nowhere.crt"),
+            "nowhere.crt: No such file or directory (os error 2); /etc/drivegate/t.toml:18, \
+          modbus_tcp.tls.certificate; check the path and its permissions",
+        ),
+        (
+            "gateway.crt",
+            file("gateway.key"),
+            "gateway.key holds no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; give a PEM file",
+        ),
+        (
+            "gateway.crt",
+            file("other.crt"),
+            "the key does not belong to the certificate; /etc/drivegate/t.toml:19, \
+          modbus_tcp.tls.key; give the key that the certificate was made for",
+        ),
+        ("gateway.key", file("gateway.crt"), "gateway.crt holds no private key: "),
+        ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
+        ("gateway.crt", file("expired.crt"), "has expired on "),
+    ] {
+        let told = of(from, &to);
+        assert!(told.contains(wanted), "{wanted}\nis not in\n{told}");
+        assert_eq!(told.lines().count(), 1, "{told}");
+    }
+}
+
+#[test]
+fn new_certificates_in_the_same_files_are_seen() {
+    let dir = tempfile::tempdir().unwrap();
+    certificate(dir.path(), &["ca"], "30");
+    let source = FORM.replace("DIR", &dir.path().display().to_string());
+    let renewed = || {
+        let _ = std::fs::remove_file(dir.path().join("gateway.key"));
+        let _ = std::fs::remove_file(dir.path().join("gateway.crt"));
+        certificate(dir.path(), &["server", "gateway"], "400");
+        settings(&source).modbus_tcp.unwrap()
+    };
+    let (one, two) = (renewed(), renewed());
+    assert!(two.differs_in_certificates_only(&one));
+    assert!(!one.differs_in_certificates_only(&one.clone()));
+    let mut other = two.clone();
+    other.max_connections += 1;
+    assert!(!other.differs_in_certificates_only(&one));
+    let debug = format!("{one:?}");
+    let key = std::fs::read_to_string(dir.path().join("gateway.key")).unwrap();
+    assert!(
+        debug.contains("elided") && !debug.contains(key.lines().nth(1).unwrap()),
+        "{debug}"
+    );
+    // Thirty days before its end a certificate is worth a word.
+    let (loaded, _) = load(&FULL);
+    assert!(
+        loaded.warnings.iter().any(|w| w.message.contains("expires on")),
+        "{:?}",
+        loaded.warnings
+    );
+}
+
 #[test]
 fn a_reload_sees_what_changed() {
-    let one = settings(FULL);
-    assert_eq!(one, settings(FULL));
+    let one = settings(&FULL);
+    assert_eq!(one, settings(&FULL));
     let two = settings(&FULL.replace("address = 1", "address = 2"));
     assert_ne!(one.buses, two.buses);
     assert_eq!(
@@ -245,7 +445,7 @@ fn a_reload_sees_what_changed() {
 fn the_environment_overrides_and_is_told_by_name() {
     let load = |vars: &[(&str, &str)]| {
         let vars: Vec<_> = vars.iter().map(|(k, v)| (k.to_string(), v.to_string())).collect();
-        Settings::parse(Path::new("t.toml"), FULL, vars.into_iter())
+        Settings::parse(Path::new("t.toml"), &FULL, vars.into_iter())
     };
     let set = [
         ("DRIVEGATE__GATEWAY__NAME", "other"),
@@ -260,7 +460,7 @@ fn the_environment_overrides_and_is_told_by_name() {
     let all = loaded.settings.unwrap();
     assert_eq!(all.gateway, "other");
     assert_eq!(all.buses[0].drives[0].address, 9);
-    assert_eq!(all.modbus_tcp.unwrap().listen.len(), 2);
+    assert_eq!(all.modbus_tcp.unwrap().listeners[0].listen.len(), 2);
     assert_eq!(all.log.level, "debug");
     let mqtt = all.mqtt.unwrap();
     assert_eq!(mqtt.password.as_ref().unwrap().0, "12345");

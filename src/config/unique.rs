@@ -108,28 +108,47 @@ fn owner(drive: &super::drive::Found) -> String {
     }
 }
 
-/// A unit id reaches one drive.
-pub(super) fn check_units(document: &Document, buses: &[Found]) {
-    let drives = || buses.iter().flat_map(|bus| &bus.drives);
-    let mut used: Vec<u8> = drives()
-        .filter_map(|d| d.unit.as_ref())
-        .map(|(unit, _)| *unit)
-        .collect();
-    let mut seen: BTreeMap<u8, String> = BTreeMap::new();
-    for drive in drives() {
-        let Some((unit, place)) = &drive.unit else { continue };
-        let Some(first) = seen.get(unit) else {
-            seen.insert(*unit, owner(drive));
-            continue;
+/// A unit id reaches one drive on each listener. `selections` are the buses that each shows, `None` all.
+pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Option<Vec<String>>]) {
+    let mut told: Vec<(Option<usize>, u8)> = Vec::new();
+    for selection in selections {
+        let is_shown = |bus: &&Found| match (selection, &bus.name) {
+            (Some(names), Some((name, _))) => names.contains(name),
+            (Some(_), None) => false,
+            (None, _) => true,
         };
-        let remedy = match UNITS.into_iter().find(|unit| !used.contains(unit)) {
-            Some(free) => {
-                used.push(free);
-                format!("write unit = {free}, or another free one")
+        let drives = || buses.iter().filter(is_shown).flat_map(|bus| &bus.drives);
+        let mut used: Vec<u8> = drives()
+            .filter_map(|d| d.unit.as_ref())
+            .map(|(unit, _)| *unit)
+            .collect();
+        let mut seen: BTreeMap<u8, String> = BTreeMap::new();
+        for drive in drives() {
+            let Some((unit, place)) = &drive.unit else { continue };
+            let Some(first) = seen.get(unit) else {
+                seen.insert(*unit, owner(drive));
+                continue;
+            };
+            // What two listeners show alike is told once.
+            if place.line.is_some() && told.contains(&(place.line, *unit)) {
+                continue;
             }
-            None => "all 254 units are taken, so take a second gateway, or one without [modbus_tcp]".to_string(),
-        };
-        document.problem(place, format!("unit {unit} belongs to {first} already; {remedy}"));
+            told.push((place.line, *unit));
+            let remedy = match UNITS.into_iter().find(|unit| !used.contains(unit)) {
+                Some(free) => {
+                    used.push(free);
+                    format!(
+                        "write unit = {free}, or another free one, or give each bus a [[modbus_tcp.listener]] of its own"
+                    )
+                }
+                None => {
+                    "all 254 units are taken; give each bus a [[modbus_tcp.listener]] of its own, or take a second \
+                         gateway"
+                        .to_string()
+                }
+            };
+            document.problem(place, format!("unit {unit} belongs to {first} already; {remedy}"));
+        }
     }
 }
 

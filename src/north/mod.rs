@@ -8,4 +8,4 @@ pub mod mqtt;
 pub mod register_map;
 mod stats;
 
-pub use stats::{ModbusTcpStats, MqttStats, NorthStats};
+pub use stats::{ModbusTcpStats, MqttStats, NorthStats, Turned};

@@ -24,10 +24,39 @@ const OUTCOMES: [(u8, &str); 8] = [
 ];
 const OTHER: &str = "other";
 
+/// Why a Modbus TCP client was not let in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Turned {
+    /// Its address is not in `allow`.
+    NotAllowed,
+    /// All places are taken.
+    Full,
+    /// All places for its address are taken.
+    AddressFull,
+    /// The handshake failed: no certificate, one that is not trusted or has expired, no TLS at all.
+    Tls,
+}
+
+impl Turned {
+    /// All reasons.
+    pub const ALL: [Turned; 4] = [Turned::NotAllowed, Turned::Full, Turned::AddressFull, Turned::Tls];
+
+    /// The name in metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            Turned::NotAllowed => "not_allowed",
+            Turned::Full => "full",
+            Turned::AddressFull => "address_full",
+            Turned::Tls => "tls",
+        }
+    }
+}
+
 /// Counters of the Modbus TCP server.
 #[derive(Debug, Default)]
 pub struct ModbusTcpStats {
     connections: AtomicU64,
+    turned_away: [AtomicU64; Turned::ALL.len()],
     requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
 }
 
@@ -45,6 +74,19 @@ impl ModbusTcpStats {
     /// Clients connected now.
     pub fn connections(&self) -> u64 {
         self.connections.load(Ordering::Relaxed)
+    }
+
+    /// Counts a client that was not let in.
+    pub fn turned_away(&self, why: Turned) {
+        if let Some(counter) = self.turned_away.get(why as usize) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Clients that were not let in so far, by reason.
+    pub fn refused(&self) -> impl Iterator<Item = (Turned, u64)> {
+        let counts = self.turned_away.iter().map(|c| c.load(Ordering::Relaxed));
+        Turned::ALL.into_iter().zip(counts)
     }
 
     /// Counts an answer: exception code, 0 for a regular one.

@@ -8,12 +8,12 @@ use drivegate::north::modbus_tcp;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-use crate::rig::{Client, Rig, options, plant, registers, until, words};
+use crate::rig::{Client, Rig, listener, options, plant, registers, until, words};
 
 #[tokio::test]
 async fn only_allowed_clients() {
     let mut options = options();
-    options.allow = vec!["127.0.0.2/32".parse().unwrap()];
+    options.listeners[0].allow = vec!["127.0.0.2/32".parse().unwrap()];
     let rig = Rig::with(options).await;
     let mut refused = rig.client().await;
     assert!(refused.is_closed().await);
@@ -51,7 +51,7 @@ async fn no_more_than_max_connections() {
 #[tokio::test]
 async fn several_listeners_share_one_server() {
     let mut options = options();
-    options.listen = vec![
+    options.listeners[0].listen = vec![
         SocketAddr::from(([127, 0, 0, 1], 0)),
         SocketAddr::from(([127, 0, 0, 3], 0)),
     ];
@@ -66,7 +66,7 @@ async fn several_listeners_share_one_server() {
 #[tokio::test]
 async fn an_ipv4_client_of_an_ipv6_listener() {
     let mut options = options();
-    options.listen = vec!["[::]:0".parse().unwrap()];
+    options.listeners[0].listen = vec!["[::]:0".parse().unwrap()];
     let rig = Rig::with(options).await;
     let port = rig.address().port();
     let mut client = Client::connect(SocketAddr::from(([127, 0, 0, 1], port))).await;
@@ -84,7 +84,7 @@ async fn a_taken_address_is_told() {
     let taken = TcpListener::bind("127.0.0.1:0").await.unwrap();
     let address = taken.local_addr().unwrap();
     let mut options = options();
-    options.listen = vec![address];
+    options.listeners[0].listen = vec![address];
     let plant = Arc::new(ArcSwap::from_pointee(plant()));
     let why = modbus_tcp::start(options, plant, Arc::default(), CancellationToken::new())
         .await
@@ -114,4 +114,55 @@ async fn the_end_closes_every_connection() {
         assert!(client.is_closed().await);
     }
     assert!(tokio::net::TcpStream::connect(address).await.is_err());
+}
+
+#[tokio::test]
+async fn each_listener_has_its_own_rights_and_buses() {
+    let mut options = options();
+    options.listeners = [("line1", false), ("line2", true)]
+        .map(|(bus, may_write)| {
+            let mut listener = listener();
+            listener.buses = Some(vec![bus.to_string()]);
+            if !may_write {
+                listener.write = Vec::new();
+            }
+            listener
+        })
+        .to_vec();
+    options.listeners.push(listener());
+    options.listeners[2].allow = vec!["127.0.0.2/32".parse().unwrap()];
+    let rig = Rig::with(options).await;
+    let addresses = rig.server.addresses().to_vec();
+    let (mut one, mut two) = (Client::connect(addresses[0]).await, Client::connect(addresses[1]).await);
+    assert!(Client::connect(addresses[2]).await.is_closed().await);
+    let mut all = Client::connect_from([127, 0, 0, 2], addresses[2]).await;
+    let (speed, current, relay) = (words(3, &[2102, 1]), words(4, &[5, 1]), words(5, &[7, 0xFF00]));
+    assert_eq!(one.ask(1, &speed).await, registers(3, &[5000]));
+    assert_eq!(one.ask(4, &current).await, [0x84, 0x0A]);
+    assert_eq!(one.ask(4, &[43, 14, 1, 0]).await, [0xAB, 0x0A]);
+    assert_eq!(one.ask(1, &words(6, &[0x8100, 1])).await, [0x86, 1]);
+    assert_eq!(two.ask(4, &current).await, registers(4, &[77]));
+    assert_eq!(two.ask(1, &speed).await, [0x83, 0x0A]);
+    assert_eq!(two.ask(1, &words(6, &[0x8100, 1])).await, [0x86, 0x0A]);
+    assert_eq!(two.ask(4, &relay).await, relay);
+    assert_eq!(all.ask(1, &speed).await, registers(3, &[5000]));
+    assert_eq!(all.ask(4, &current).await, registers(4, &[77]));
+    // Unit 255: the blocks keep their addresses, those of other buses are not there.
+    assert_eq!(one.ask(255, &words(4, &[1, 1])).await, registers(4, &[3]));
+    assert_eq!(one.ask(255, &words(4, &[17, 1])).await, [0x84, 2]);
+    assert_eq!(two.ask(255, &words(4, &[1, 1])).await, [0x84, 2]);
+    assert_eq!(two.ask(255, &words(4, &[17, 1])).await, registers(4, &[1]));
+    assert_eq!(all.ask(255, &words(4, &[0, 32])).await.len(), 66);
+    // A reload reaches the listeners as it reaches one.
+    let mut next = plant();
+    next.buses.remove(0);
+    rig.plant.store(Arc::new(next));
+    assert_eq!(one.ask(1, &speed).await, [0x83, 0x0A]);
+    assert_eq!(two.ask(4, &current).await, registers(4, &[77]));
+    assert_eq!(
+        two.ask(255, &words(4, &[1, 1])).await,
+        registers(4, &[1]),
+        "line2 is the first bus now"
+    );
+    rig.end().await;
 }

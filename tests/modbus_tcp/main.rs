@@ -5,6 +5,13 @@
 mod bad_input;
 mod commands;
 mod connections;
+mod load;
 mod peers;
+#[path = "../gateway/process.rs"]
+#[allow(dead_code, reason = "the tests of the whole gateway take the rest")]
+mod process;
 mod requests;
 mod rig;
+mod tls;
+#[path = "../tools/mod.rs"]
+mod tools;

@@ -327,7 +327,7 @@ async fn device_identification() {
 #[tokio::test]
 async fn a_client_that_may_not_write() {
     let mut options = options();
-    options.write = vec!["127.0.0.1/32".parse().unwrap()];
+    options.listeners[0].write = vec!["127.0.0.1/32".parse().unwrap()];
     let rig = Rig::with(options).await;
     let mut client = Client::connect_from([127, 0, 0, 2], rig.address()).await;
     for request in [

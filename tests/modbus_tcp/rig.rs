@@ -14,7 +14,7 @@ use drivegate::command::{Command, CommandQueue, Order, Outcome, Urgency};
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::event::Events;
 use drivegate::north::NorthStats;
-use drivegate::north::modbus_tcp::{self, Options, Server, Uncached};
+use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use rustix::event::{PollFd, PollFlags, poll};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -167,11 +167,23 @@ pub(crate) struct Rig {
 
 pub(crate) fn options() -> Options {
     Options {
+        listeners: vec![listener()],
+        tls: None,
+        max_connections: 64,
+        max_connections_per_address: None,
+        idle_timeout: None,
+        uncached: Uncached::Forward,
+    }
+}
+
+/// One that all of this machine may use and 127.0.0.1 may write by.
+pub(crate) fn listener() -> Listener {
+    Listener {
+        section: "[modbus_tcp]".to_string(),
         listen: vec![SocketAddr::from(([127, 0, 0, 1], 0))],
         allow: vec!["127.0.0.0/8".parse().unwrap()],
         write: vec!["127.0.0.1/32".parse().unwrap()],
-        max_connections: 64,
-        uncached: Uncached::Forward,
+        buses: None,
     }
 }
 

@@ -1,8 +1,12 @@
-"""Reads and commands a gateway of the Modbus TCP tests with pymodbus: pymodbus_client.py PORT."""
+"""Reads and commands a gateway of the Modbus TCP tests with pymodbus: pymodbus_client.py PORT [CA CERTIFICATE KEY].
 
+With three files it speaks TLS.
+"""
+
+import ssl
 import sys
 
-from pymodbus.client import ModbusTcpClient
+from pymodbus.client import ModbusTcpClient, ModbusTlsClient
 
 
 def check(what, got, wanted):
@@ -10,8 +14,19 @@ def check(what, got, wanted):
         sys.exit(f"{what}: got {got}, wanted {wanted}")
 
 
+def connect(port, files):
+    if not files:
+        return ModbusTcpClient("127.0.0.1", port=port)
+    ca, certificate, key = files
+    context = ssl.create_default_context(cafile=ca)
+    # pymodbus does not tell the context which host it connects to.
+    context.check_hostname = False
+    context.load_cert_chain(certificate, key)
+    return ModbusTlsClient("127.0.0.1", port=port, sslctx=context)
+
+
 def main():
-    client = ModbusTcpClient("127.0.0.1", port=int(sys.argv[1]))
+    client = connect(int(sys.argv[1]), sys.argv[2:])
     if not client.connect():
         sys.exit("no connection")
     reply = client.read_holding_registers(0x8000, count=2, device_id=1)

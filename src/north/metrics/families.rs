@@ -260,6 +260,15 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         requests.add(labels, Figure::Count(count));
     }
     all.push(requests);
+    let mut refused = Family::new(
+        Kind::Counter,
+        "drivegate_modbus_tcp_refused_total",
+        "Modbus TCP clients that were not let in, by reason.",
+    );
+    for (reason, count) in stats.modbus_tcp.refused() {
+        refused.add(vec![("reason", reason.name().to_string())], Figure::Count(count));
+    }
+    all.push(refused);
     let mqtt = &stats.mqtt;
     all.push(Family::of(
         Kind::Gauge,

@@ -2,29 +2,26 @@
 
 use std::convert::Infallible;
 use std::io;
+use std::pin::Pin;
 use std::time::Duration;
 
-use futures_util::FutureExt;
-use futures_util::stream::{FuturesUnordered, StreamExt};
+use futures_util::stream::StreamExt;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
-use tokio::time::Instant;
+use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
 
-use super::frame::{self, MAX_FRAME, NotModbus};
-use super::session::{Session, Waiting};
+use super::dialogue::Dialogue;
+use super::frame::NotModbus;
+use super::session::{Finished, Session};
 
-/// Input that is worked off at a time.
-const INPUT: usize = 32 * MAX_FRAME;
-/// Output that is collected before it is written.
-const OUTPUT: usize = 32 * 1024;
-/// Requests of one connection that may wait for the bus; with so many under way no more are read.
-const MOST_WAITING: usize = 16;
 /// Time for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for the client to take some of its answers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time for requests under way when the gateway stops.
+/// Time for requests under way when the gateway stops, and for a farewell on the wire.
 const FAREWELL: Duration = Duration::from_millis(500);
+/// Requests after which other clients get their turn, should this one send on and on.
+const TURN: usize = 128;
 
 /// Why a connection ended.
 #[derive(Debug, thiserror::Error)]
@@ -37,22 +34,27 @@ enum End {
     NotModbus(#[from] NotModbus),
     #[error("closed: the client did not finish a frame within {FRAME_TIMEOUT:?}")]
     HalfFrame,
+    #[error("closed: no request for {0:?} (`idle_timeout`)")]
+    Idle(Duration),
     #[error("closed: the client took none of its answers within {WRITE_TIMEOUT:?}")]
     NotReading,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it leaves, misbehaves or the gateway stops.
-pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(stream: S, session: Session, cancel: CancellationToken) {
+/// Serves a client until it leaves, misbehaves, is silent for `idle_timeout` or the gateway stops.
+pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
+    stream: S,
+    session: Session,
+    idle_timeout: Option<Duration>,
+    cancel: CancellationToken,
+) {
     tracing::debug!(client = session.who(), "Modbus TCP: connected");
     let mut connection = Connection {
         stream,
-        session,
-        waiting: FuturesUnordered::new(),
-        input: vec![0; INPUT],
-        filled: 0,
-        output: Vec::with_capacity(1024),
+        dialogue: Dialogue::new(session),
+        since_yield: 0,
+        idle: idle_timeout.map(Idle::new),
     };
     let end = match connection.run(&cancel).await {
         Ok(never) => match never {},
@@ -61,17 +63,19 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(stream: S, session:
     if matches!(end, End::Cancelled) {
         connection.farewell().await;
     }
-    tracing::debug!(client = connection.session.who(), "Modbus TCP: {end}");
+    // A TLS client wants to hear that this is the end and no cut.
+    if !matches!(end, End::Lost(_) | End::NotReading) {
+        let _ = tokio::time::timeout(FAREWELL, connection.stream.shutdown()).await;
+    }
+    tracing::debug!(client = connection.dialogue.who(), "Modbus TCP: {end}");
 }
 
 struct Connection<S> {
     stream: S,
-    session: Session,
-    waiting: FuturesUnordered<Waiting>,
-    input: Vec<u8>,
-    /// Bytes in `input` that are not worked off yet.
-    filled: usize,
-    output: Vec<u8>,
+    dialogue: Dialogue,
+    /// Requests since others had their turn.
+    since_yield: usize,
+    idle: Option<Idle>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
@@ -79,83 +83,72 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         let mut client_done = false;
         let mut half_frame_since: Option<Instant> = None;
         loop {
-            let worked = self.work();
-            self.collect();
+            let worked = self.dialogue.work(std::time::Instant::now());
+            self.dialogue.collect();
             tokio::select! {
                 biased;
                 () = cancel.cancelled() => return Err(End::Cancelled),
-                flushed = flush(&mut self.stream, &mut self.output) => flushed?,
+                flushed = flush(&mut self.stream, &mut self.dialogue) => flushed?,
             }
-            if worked? > 0 {
+            let taken = worked?;
+            if taken.frames > 0 {
                 half_frame_since = None;
+                self.touch();
+                self.give_way(taken.frames).await;
             }
-            let full = self.waiting.len() >= MOST_WAITING;
-            if !full && self.has_more() {
+            let full = self.dialogue.is_full();
+            if !full && self.dialogue.has_more() {
                 continue;
             }
-            if client_done && self.waiting.is_empty() {
+            if client_done && !self.dialogue.is_waiting() {
                 return Err(End::Client);
             }
             // While it is the gateway that does not read on, a half frame is nobody's fault.
-            let half = self.filled > 0 && !full && !client_done;
+            let half = self.dialogue.has_input() && !full && !client_done;
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
-            tokio::select! {
+            let waits = self.dialogue.is_waiting();
+            let (space, waiting) = self.dialogue.parts();
+            let event = tokio::select! {
                 () = cancel.cancelled() => return Err(End::Cancelled),
-                Some(finished) = self.waiting.next() => self.session.finish(&finished, &mut self.output),
-                read = read(&mut self.stream, &mut self.input, self.filled), if !full && !client_done => match read? {
-                    0 => client_done = true,
-                    count => self.filled += count,
-                },
+                Some(finished) = waiting.next() => Event::Answer(finished),
+                count = self.stream.read(space), if !full && !client_done => Event::Input(count?),
                 () = expired(half_frame_since) => return Err(End::HalfFrame),
+                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+            };
+            match event {
+                Event::Answer(finished) => {
+                    self.dialogue.finish(&finished);
+                    self.touch();
+                }
+                Event::Input(0) => client_done = true,
+                Event::Input(count) => self.dialogue.received(count),
             }
         }
     }
 
-    /// Works off the frames in the input while there is room for what they cause; gives the bytes they took.
-    fn work(&mut self) -> Result<usize, NotModbus> {
-        let mut used = 0;
-        self.session.refresh();
-        let now = std::time::Instant::now();
-        let result = loop {
-            if self.waiting.len() >= MOST_WAITING || self.output.len() >= OUTPUT {
-                break Ok(used);
-            }
-            match frame::decode(self.input.get(used..self.filled).unwrap_or_default()) {
-                Ok(Some(frame)) => {
-                    used += frame.used;
-                    self.waiting.extend(self.session.take(&frame, now, &mut self.output));
-                }
-                Ok(None) => break Ok(used),
-                Err(misfit) => break Err(misfit),
-            }
-        };
-        self.input.copy_within(used..self.filled, 0);
-        self.filled -= used;
-        result
+    /// The client uses its connection.
+    fn touch(&mut self) {
+        if let Some(idle) = &mut self.idle {
+            idle.since = Instant::now();
+        }
     }
 
-    /// Whether the input has something to work off: a frame, or what will never become one.
-    fn has_more(&self) -> bool {
-        !matches!(
-            frame::decode(self.input.get(..self.filled).unwrap_or_default()),
-            Ok(None)
-        )
-    }
-
-    /// Takes the answers that have come in the meantime, to write them together.
-    fn collect(&mut self) {
-        while let Some(Some(finished)) = self.waiting.next().now_or_never() {
-            self.session.finish(&finished, &mut self.output);
+    /// Lets the other clients have the processor after so many requests of this one.
+    async fn give_way(&mut self, frames: usize) {
+        self.since_yield += frames;
+        if self.since_yield >= TURN {
+            self.since_yield = 0;
+            tokio::task::yield_now().await;
         }
     }
 
     /// Gives the requests under way a last chance to be answered.
     async fn farewell(&mut self) {
         let answered = async {
-            flush(&mut self.stream, &mut self.output).await?;
-            while let Some(finished) = self.waiting.next().await {
-                self.session.finish(&finished, &mut self.output);
-                flush(&mut self.stream, &mut self.output).await?;
+            flush(&mut self.stream, &mut self.dialogue).await?;
+            while let Some(finished) = self.dialogue.parts().1.next().await {
+                self.dialogue.finish(&finished);
+                flush(&mut self.stream, &mut self.dialogue).await?;
             }
             Ok::<(), End>(())
         };
@@ -164,21 +157,58 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 }
 
-/// Reads behind the bytes that are there; the session works the buffer off so far that there is always room.
-async fn read<S: AsyncRead + Unpin>(stream: &mut S, input: &mut [u8], filled: usize) -> io::Result<usize> {
-    stream.read(input.get_mut(filled..).unwrap_or_default()).await
+/// What a connection waits for.
+enum Event {
+    /// An answer from the bus.
+    Answer(Finished),
+    /// So many bytes from the client; 0 at its end.
+    Input(usize),
+}
+
+/// How long the client has been silent. The timer is set anew only when it runs out, not with each request.
+struct Idle {
+    timeout: Duration,
+    since: Instant,
+    timer: Pin<Box<Sleep>>,
+}
+
+impl Idle {
+    fn new(timeout: Duration) -> Idle {
+        Idle {
+            timeout,
+            since: Instant::now(),
+            timer: Box::pin(tokio::time::sleep(timeout)),
+        }
+    }
+
+    /// Waits until the client was silent for the whole time; for good without a limit.
+    async fn over(idle: Option<&mut Idle>) -> Duration {
+        let Some(idle) = idle else {
+            return std::future::pending().await;
+        };
+        loop {
+            idle.timer.as_mut().await;
+            let end = idle.since + idle.timeout;
+            if end <= Instant::now() {
+                return idle.timeout;
+            }
+            idle.timer.as_mut().reset(end);
+        }
+    }
 }
 
 /// Writes the output; when it is dropped half way, the output keeps what was not written.
-async fn flush<S: AsyncWrite + Unpin>(stream: &mut S, output: &mut Vec<u8>) -> Result<(), End> {
-    if output.is_empty() {
+async fn flush<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<(), End> {
+    if dialogue.output.is_empty() {
         return Ok(());
     }
+    let output = &mut dialogue.output;
     while !output.is_empty() {
         // The time runs anew with every byte taken: a slow line is no reason to give a client up.
         let written = tokio::time::timeout(WRITE_TIMEOUT, stream.write(output)).await;
         match written.map_err(|_| End::NotReading)?? {
             0 => return Err(io::Error::from(io::ErrorKind::WriteZero).into()),
+            count if count == output.len() => output.clear(),
             count => drop(output.drain(..count)),
         }
     }

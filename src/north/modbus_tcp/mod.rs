@@ -5,50 +5,84 @@
 //! for beside it and answered when it is done, so replies can overtake one another and carry their
 //! transaction ids.
 
+mod certificate;
 mod connection;
+mod dialogue;
+mod door;
 mod frame;
 mod identify;
+mod offline;
+mod places;
 mod session;
 mod shared;
+mod tls;
 
 use std::io;
-use std::net::{IpAddr, SocketAddr};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use ipnet::IpNet;
-use tokio::net::{TcpListener, TcpStream};
-use tokio::sync::Semaphore;
+use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use self::session::Session;
-use self::shared::{Authority, Shared};
+use self::door::{Admission, Door};
+use self::places::Places;
+use self::shared::{Shared, View};
+use self::tls::Gatekeeper;
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
 
-/// Pause after a failed accept: the usual reason, too many open files, does not go away at once.
-const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+pub use self::offline::Offline;
+pub use self::tls::{Finding, Identity, Role, Tls, TlsFile};
+
 /// Least time between two log lines of one kind.
 const LOG_INTERVAL: Duration = Duration::from_secs(10);
-/// A peer that vanished without a word is found out after 60 s + 3 * 10 s.
-const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);
-const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(10);
-const KEEPALIVE_PROBES: u32 = 3;
+/// Files that the gateway needs open beside the connections: ports, queues, other servers, their clients.
+const OTHER_FILES: u64 = 512;
 
 /// What the Modbus TCP server is told.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
+    /// Where clients connect without TLS, and what they may do there.
+    pub listeners: Vec<Listener>,
+    /// Where clients connect with TLS.
+    pub tls: Option<Tls>,
+    /// Connections at one time, of all listeners together.
+    pub max_connections: usize,
+    /// Connections at one time from one address.
+    pub max_connections_per_address: Option<usize>,
+    /// Time without a request after which a connection is closed.
+    pub idle_timeout: Option<Duration>,
+    /// What happens to raw reads outside the plan.
+    pub uncached: Uncached,
+}
+
+impl Options {
+    /// Whether `other` differs in the content of certificate files only, which a running server can take over.
+    pub fn differs_in_certificates_only(&self, other: &Options) -> bool {
+        let mut same = other.clone();
+        if let (Some(tls), Some(own)) = (&mut same.tls, &self.tls) {
+            tls.identity = own.identity.clone();
+        }
+        self != other && *self == same
+    }
+}
+
+/// A listener without TLS: who may connect, who may write, what is shown.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Listener {
+    /// Its section of the configuration, for messages: `[modbus_tcp]`.
+    pub section: String,
     /// Addresses to listen on.
     pub listen: Vec<SocketAddr>,
     /// Networks that may connect.
     pub allow: Vec<IpNet>,
     /// Networks that may write.
     pub write: Vec<IpNet>,
-    /// Connections at one time.
-    pub max_connections: usize,
-    /// What happens to raw reads outside the plan.
-    pub uncached: Uncached,
+    /// Names of the buses whose drives are shown; `None` shows all.
+    pub buses: Option<Vec<String>>,
 }
 
 /// What happens to raw reads outside the plan.
@@ -64,13 +98,31 @@ pub enum Uncached {
 #[derive(Debug)]
 pub struct Server {
     addresses: Vec<SocketAddr>,
+    tls_addresses: Vec<SocketAddr>,
+    gatekeeper: Option<Arc<Gatekeeper>>,
     tasks: TaskTracker,
 }
 
 impl Server {
-    /// Where it listens; a port 0 of the options is the real one here.
+    /// Where it listens without TLS; a port 0 of the options is the real one here.
     pub fn addresses(&self) -> &[SocketAddr] {
         &self.addresses
+    }
+
+    /// Where it listens with TLS.
+    pub fn tls_addresses(&self) -> &[SocketAddr] {
+        &self.tls_addresses
+    }
+
+    /// Takes the certificates of `options` for clients that connect from now on; nobody is disconnected.
+    ///
+    /// # Errors
+    /// When they cannot be used; the old ones stay.
+    pub fn renew_certificates(&self, options: &Options) -> Result<(), String> {
+        match (&self.gatekeeper, &options.tls) {
+            (Some(gatekeeper), Some(tls)) => gatekeeper.renew(&tls.identity),
+            _ => Ok(()),
+        }
     }
 
     /// Waits until every listener and connection has ended, after the token was cancelled.
@@ -89,34 +141,71 @@ pub async fn start(
     stats: Arc<NorthStats>,
     cancel: CancellationToken,
 ) -> io::Result<Server> {
-    let mut listeners = Vec::with_capacity(options.listen.len());
-    let mut addresses = Vec::with_capacity(options.listen.len());
-    for address in &options.listen {
-        let listener = TcpListener::bind(address).await.map_err(|why| told(*address, &why))?;
-        addresses.push(listener.local_addr()?);
-        listeners.push(listener);
-    }
+    let gatekeeper = options.tls.as_ref().map(Gatekeeper::new).transpose();
+    let gatekeeper = gatekeeper.map_err(io::Error::other)?.map(Arc::new);
+    raise_file_limit(options.max_connections);
+    let places = Places::new(options.max_connections, options.max_connections_per_address);
     let tasks = TaskTracker::new();
-    let slots = Arc::new(Semaphore::new(options.max_connections.min(Semaphore::MAX_PERMITS)));
-    let shared = Arc::new(Shared::new(options, plant, stats));
-    for (listener, address) in listeners.into_iter().zip(&addresses) {
-        tracing::info!(%address, "Modbus TCP: listening");
-        let door = Door {
-            shared: shared.clone(),
-            slots: slots.clone(),
-            tasks: tasks.clone(),
-            cancel: cancel.clone(),
-            refused: Seldom::default(),
-            full: Seldom::default(),
-            failed: Seldom::default(),
-        };
-        tasks.spawn(door.serve(listener));
+    let shared = Arc::new(Shared::new(options, stats));
+    let door = |view: &Arc<View>, section: &str, allow: &[IpNet], admission: &Admission| Door {
+        section: section.to_string(),
+        allow: allow.to_vec(),
+        admission: admission.clone(),
+        view: view.clone(),
+        shared: shared.clone(),
+        places: places.clone(),
+        tasks: tasks.clone(),
+        cancel: cancel.clone(),
+    };
+    let (mut doors, mut addresses, mut tls_addresses) = (Vec::new(), Vec::new(), Vec::new());
+    for listener in &shared.options.listeners {
+        let view = Arc::new(View::new(plant.clone(), listener.buses.clone()));
+        let admission = Admission::ByAddress(listener.write.clone());
+        for socket in listen(&listener.listen, &listener.section).await? {
+            addresses.push(socket.local_addr()?);
+            doors.push((socket, door(&view, &listener.section, &listener.allow, &admission)));
+        }
+    }
+    if let (Some(tls), Some(gatekeeper)) = (&shared.options.tls, &gatekeeper) {
+        let view = Arc::new(View::new(plant.clone(), tls.buses.clone()));
+        let (section, admission) = ("[modbus_tcp.tls]", Admission::ByCertificate(gatekeeper.clone()));
+        for socket in listen(&tls.listen, section).await? {
+            tls_addresses.push(socket.local_addr()?);
+            doors.push((socket, door(&view, section, &tls.allow, &admission)));
+        }
+    }
+    for (address, tls) in addresses
+        .iter()
+        .map(|a| (a, false))
+        .chain(tls_addresses.iter().map(|a| (a, true)))
+    {
+        tracing::info!(%address, tls, "Modbus TCP: listening");
+    }
+    for (socket, door) in doors {
+        tasks.spawn(door.serve(socket));
     }
     tasks.close();
-    Ok(Server { addresses, tasks })
+    Ok(Server {
+        addresses,
+        tls_addresses,
+        gatekeeper,
+        tasks,
+    })
 }
 
-fn told(address: SocketAddr, why: &io::Error) -> io::Error {
+/// Opens sockets on all addresses of a section, or none.
+async fn listen(addresses: &[SocketAddr], section: &str) -> io::Result<Vec<TcpListener>> {
+    let mut sockets = Vec::with_capacity(addresses.len());
+    for address in addresses {
+        let socket = TcpListener::bind(address)
+            .await
+            .map_err(|why| told(*address, section, &why))?;
+        sockets.push(socket);
+    }
+    Ok(sockets)
+}
+
+fn told(address: SocketAddr, section: &str, why: &io::Error) -> io::Error {
     let remedy = match why.kind() {
         io::ErrorKind::AddrInUse => "another program has it; stop that one or choose another port",
         io::ErrorKind::PermissionDenied => {
@@ -127,95 +216,32 @@ fn told(address: SocketAddr, why: &io::Error) -> io::Error {
     };
     io::Error::new(
         why.kind(),
-        format!("cannot listen for Modbus TCP on {address}: {why}; {remedy} in `listen` of [modbus_tcp]"),
+        format!("cannot listen for Modbus TCP on {address}: {why}; {remedy} in `listen` of {section}"),
     )
 }
 
-/// A listener: who comes in.
-struct Door {
-    shared: Arc<Shared>,
-    slots: Arc<Semaphore>,
-    tasks: TaskTracker,
-    cancel: CancellationToken,
-    refused: Seldom,
-    full: Seldom,
-    failed: Seldom,
-}
-
-impl Door {
-    async fn serve(mut self, listener: TcpListener) {
-        loop {
-            let accepted = tokio::select! {
-                () = self.cancel.cancelled() => return,
-                accepted = listener.accept() => accepted,
-            };
-            match accepted {
-                Ok((stream, peer)) => self.admit(stream, peer),
-                // The client went away between its knock and the answer.
-                Err(why) if why.kind() == io::ErrorKind::ConnectionAborted => {}
-                Err(why) => {
-                    if let Some(more) = self.failed.tell(Instant::now()) {
-                        tracing::warn!(more, "Modbus TCP: cannot accept a connection: {why}; trying on");
-                    }
-                    tokio::select! {
-                        () = self.cancel.cancelled() => return,
-                        () = tokio::time::sleep(ACCEPT_PAUSE) => {}
-                    }
-                }
-            }
-        }
+/// Many connections need many files; what the system lets a process have by default is often 1024.
+fn raise_file_limit(connections: usize) {
+    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
+    let wanted = connections as u64 + OTHER_FILES;
+    let limit = getrlimit(Resource::Nofile);
+    if limit.current.is_none_or(|current| current >= wanted) {
+        return;
     }
-
-    /// Starts a task for a client that may connect; else its connection is closed at once.
-    fn admit(&mut self, stream: TcpStream, peer: SocketAddr) {
-        // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
-        let ip = peer.ip().to_canonical();
-        let options = &self.shared.options;
-        if !contains(&options.allow, ip) {
-            if let Some(more) = self.refused.tell(Instant::now()) {
-                tracing::warn!(client = %ip, more, "Modbus TCP: client refused: it is not in `allow` of [modbus_tcp]");
-            }
-            return;
-        }
-        let Ok(slot) = self.slots.clone().try_acquire_owned() else {
-            if let Some(more) = self.full.tell(Instant::now()) {
-                let most = options.max_connections;
-                tracing::warn!(client = %ip, more,
-                    "Modbus TCP: client refused: {most} are connected already; raise `max_connections` of [modbus_tcp]");
-            }
-            return;
-        };
-        let authority = Authority {
-            may_write: contains(&options.write, ip),
-            who: SocketAddr::new(ip, peer.port()).to_string(),
-        };
-        let (shared, cancel) = (self.shared.clone(), self.cancel.child_token());
-        self.tasks.spawn(async move {
-            let _slot = slot;
-            prepare(&stream);
-            connection::serve(stream, Session::new(shared, authority), cancel).await;
-        });
-    }
-}
-
-fn contains(networks: &[IpNet], ip: IpAddr) -> bool {
-    networks.iter().any(|n| n.contains(&ip))
-}
-
-/// Answers leave at once; a peer that vanished is noticed. Neither is worth refusing a client for.
-fn prepare(stream: &TcpStream) {
-    use rustix::net::sockopt;
-    let told = |what: &str, why: &dyn std::fmt::Display| tracing::debug!("Modbus TCP: cannot set {what}: {why}");
-    if let Err(why) = stream.set_nodelay(true) {
-        told("TCP_NODELAY", &why);
-    }
-    let keepalive = sockopt::set_socket_keepalive(stream, true)
-        .and_then(|()| sockopt::set_tcp_keepidle(stream, KEEPALIVE_IDLE))
-        .and_then(|()| sockopt::set_tcp_keepintvl(stream, KEEPALIVE_INTERVAL))
-        .and_then(|()| sockopt::set_tcp_keepcnt(stream, KEEPALIVE_PROBES));
-    if let Err(why) = keepalive {
-        told("TCP keepalive", &why);
-    }
+    let reached = limit.maximum.map_or(wanted, |most| most.min(wanted));
+    let raised = Rlimit {
+        current: Some(reached),
+        maximum: limit.maximum,
+    };
+    let why = match setrlimit(Resource::Nofile, raised) {
+        Ok(()) if reached == wanted => return,
+        Ok(()) => "the hard limit is in the way".to_string(),
+        Err(why) => why.to_string(),
+    };
+    tracing::warn!(
+        "Modbus TCP: {connections} connections want {wanted} open files and only {reached} are granted: {why}; raise \
+         LimitNOFILE of the service or lower `max_connections` of [modbus_tcp]"
+    );
 }
 
 /// Keeps a log readable while something happens again and again.
@@ -251,20 +277,5 @@ mod tests {
         assert_eq!(seldom.tell(now), None);
         assert_eq!(seldom.tell(now + Duration::from_secs(9)), None);
         assert_eq!(seldom.tell(now + Duration::from_secs(10)), Some(2));
-    }
-
-    #[test]
-    fn networks() {
-        let networks = ["127.0.0.0/8".parse().unwrap(), "fd00::/8".parse().unwrap()];
-        for (ip, inside) in [
-            ("127.9.9.9", true),
-            ("10.0.0.1", false),
-            ("fd12::1", true),
-            ("::1", false),
-        ] {
-            assert_eq!(contains(&networks, ip.parse().unwrap()), inside, "{ip}");
-        }
-        let mapped: IpAddr = "::ffff:127.0.0.1".parse().unwrap();
-        assert!(contains(&networks, mapped.to_canonical()));
     }
 }

@@ -9,7 +9,7 @@ use futures_util::FutureExt;
 
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::shared::{Authority, Routes, Shared};
+use super::shared::{Authority, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
@@ -67,8 +67,9 @@ struct Errand {
 #[derive(Debug)]
 pub(super) struct Session {
     shared: Arc<Shared>,
+    view: Arc<View>,
     authority: Authority,
-    routes: Routes,
+    routes: Arc<Routes>,
     foreign_codes: Seldom,
 }
 
@@ -80,11 +81,12 @@ impl Drop for Session {
 
 impl Session {
     /// A client has connected; it has left when the session is dropped.
-    pub(super) fn new(shared: Arc<Shared>, authority: Authority) -> Session {
+    pub(super) fn new(shared: Arc<Shared>, view: Arc<View>, authority: Authority) -> Session {
         shared.stats.modbus_tcp.connected();
-        let routes = Routes::new(shared.plant.load_full());
+        let routes = view.routes();
         Session {
             shared,
+            view,
             authority,
             routes,
             foreign_codes: Seldom::default(),
@@ -102,9 +104,8 @@ impl Session {
 
     /// Takes over a plant that a reload has put in place.
     pub(super) fn refresh(&mut self) {
-        let plant = self.shared.plant.load();
-        if !Arc::ptr_eq(&plant, &self.routes.plant) {
-            self.routes = Routes::new(Arc::clone(&plant));
+        if !self.view.is_current(&self.routes) {
+            self.routes = self.view.routes();
         }
     }
 
@@ -236,7 +237,7 @@ impl Session {
         let plant = &self.routes.plant;
         let reply = match request {
             RequestPdu::Read { table, start, count } if !table.is_bits() => {
-                let bus = |place: usize| plant.buses.get(place).map(figures);
+                let bus = |place: usize| self.routes.bus(place).map(figures);
                 Reply::Registers(register_map::gateway(start, count, bus)?)
             }
             RequestPdu::DeviceIdentification { code, object } => {

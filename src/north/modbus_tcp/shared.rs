@@ -2,29 +2,37 @@
 
 use std::collections::HashMap;
 use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
 
-use super::Options;
+use arc_swap::ArcSwap;
+
+use super::{Options, Seldom};
 use crate::north::NorthStats;
-use crate::plant::{DriveHandle, Plant, SharedPlant};
+use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 
 /// What all connections share.
 #[derive(Debug)]
 pub(super) struct Shared {
     pub(super) options: Options,
-    pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthStats>,
     /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
     command_words: Mutex<HashMap<String, u16>>,
+    tls_log: Mutex<Seldom>,
 }
 
 impl Shared {
-    pub(super) fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>) -> Shared {
+    pub(super) fn new(options: Options, stats: Arc<NorthStats>) -> Shared {
         Shared {
             options,
-            plant,
             stats,
             command_words: Mutex::default(),
+            tls_log: Mutex::default(),
         }
+    }
+
+    /// Whether to log a refused handshake now; as [`Seldom::tell`].
+    pub(super) fn tell_tls(&self, now: Instant) -> Option<u64> {
+        self.tls_log.lock().unwrap_or_else(PoisonError::into_inner).tell(now)
     }
 
     /// Does something with the word of a drive that nobody else may change in between.
@@ -42,33 +50,79 @@ impl Shared {
 pub(super) struct Authority {
     /// Whether it may write at all.
     pub(super) may_write: bool,
-    /// Its address, or later the name in its certificate.
+    /// Its address, with the name in its certificate if it has shown one.
     pub(super) who: String,
 }
 
-/// The drives by unit id, as the plant has them now.
+/// What the clients of one listener see of the plant.
+#[derive(Debug)]
+pub(super) struct View {
+    plant: SharedPlant,
+    /// Names of the buses that are shown; `None` shows all.
+    buses: Option<Vec<String>>,
+    routes: ArcSwap<Routes>,
+}
+
+impl View {
+    pub(super) fn new(plant: SharedPlant, buses: Option<Vec<String>>) -> View {
+        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), buses.as_deref()));
+        View { plant, buses, routes }
+    }
+
+    /// The drives as the plant has them now; all clients share what one has worked out after a reload.
+    pub(super) fn routes(&self) -> Arc<Routes> {
+        let routes = self.routes.load_full();
+        if self.is_current(&routes) {
+            return routes;
+        }
+        let routes = Arc::new(Routes::new(self.plant.load_full(), self.buses.as_deref()));
+        self.routes.store(routes.clone());
+        routes
+    }
+
+    pub(super) fn is_current(&self, routes: &Routes) -> bool {
+        Arc::ptr_eq(&self.plant.load(), &routes.plant)
+    }
+}
+
+/// The drives by unit id, as the plant had them at one time.
 #[derive(Debug)]
 pub(super) struct Routes {
     pub(super) plant: Arc<Plant>,
     drives: Vec<DriveHandle>,
     /// Place in `drives`.
     units: Vec<Option<u16>>,
+    /// Whether the bus is shown, in the order of the plant.
+    shown: Vec<bool>,
 }
 
 impl Routes {
-    pub(super) fn new(plant: Arc<Plant>) -> Routes {
-        let drives: Vec<DriveHandle> = plant.drives().collect();
+    fn new(plant: Arc<Plant>, buses: Option<&[String]>) -> Routes {
+        let is_shown = |name: &String| buses.is_none_or(|buses| buses.contains(name));
+        let drives: Vec<DriveHandle> = plant.drives().filter(|d| is_shown(&d.image.spec.bus)).collect();
         let mut units = vec![None; usize::from(u8::MAX) + 1];
         for (place, drive) in (0u16..).zip(&drives) {
             if let Some(unit) = units.get_mut(usize::from(drive.image.spec.unit)) {
                 unit.get_or_insert(place);
             }
         }
-        Routes { plant, drives, units }
+        let shown = plant.buses.iter().map(|b| is_shown(&b.image.spec.name)).collect();
+        Routes {
+            plant,
+            drives,
+            units,
+            shown,
+        }
     }
 
     pub(super) fn drive(&self, unit: u8) -> Option<&DriveHandle> {
         let place = self.units.get(usize::from(unit)).copied().flatten()?;
         self.drives.get(usize::from(place))
+    }
+
+    /// The bus at that place of the file, if it is shown.
+    pub(super) fn bus(&self, place: usize) -> Option<&BusHandle> {
+        let shown = self.shown.get(place).copied().unwrap_or_default();
+        self.plant.buses.get(place).filter(|_| shown)
     }
 }

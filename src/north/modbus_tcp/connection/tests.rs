@@ -4,7 +4,7 @@ use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
 
-use super::super::shared::{Authority, Shared};
+use super::super::shared::{Authority, Shared, View};
 use super::super::{Options, Uncached};
 use super::*;
 use crate::north::NorthStats;
@@ -23,11 +23,16 @@ struct Bench {
 
 /// A connection over a pipe that holds `pipe` bytes each way.
 fn bench(pipe: usize) -> Bench {
+    bench_with(pipe, None)
+}
+
+fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
     let options = Options {
-        listen: Vec::new(),
-        allow: Vec::new(),
-        write: Vec::new(),
+        listeners: Vec::new(),
+        tls: None,
         max_connections: 1,
+        max_connections_per_address: None,
+        idle_timeout: None,
         uncached: Uncached::Refuse,
     };
     let plant = Plant {
@@ -38,15 +43,16 @@ fn bench(pipe: usize) -> Bench {
         writes: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
-    let shared = Shared::new(options, Arc::new(ArcSwap::from_pointee(plant)), stats.clone());
+    let shared = Shared::new(options, stats.clone());
+    let view = View::new(Arc::new(ArcSwap::from_pointee(plant)), None);
     let authority = Authority {
         may_write: false,
         who: "test".to_string(),
     };
-    let session = Session::new(Arc::new(shared), authority);
+    let session = Session::new(Arc::new(shared), Arc::new(view), authority);
     let (client, end) = tokio::io::duplex(pipe);
     let cancel = CancellationToken::new();
-    let server = tokio::spawn(serve(end, session, cancel.clone()));
+    let server = tokio::spawn(serve(end, session, idle_timeout, cancel.clone()));
     Bench {
         client,
         server,
@@ -175,4 +181,20 @@ async fn a_client_that_only_stops_sending_gets_its_answer() {
     bench.client.shutdown().await.unwrap();
     assert_eq!(bench.rest().await, ANSWER);
     bench.server.await.unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_client_that_asks_nothing_is_let_go() {
+    let timeout = Duration::from_secs(60);
+    let mut bench = bench_with(1024, Some(timeout));
+    for _ in 0..5 {
+        tokio::time::sleep(timeout - Duration::from_secs(1)).await;
+        bench.send(&REQUEST).await;
+        assert_eq!(bench.receive(9).await, ANSWER);
+    }
+    let begin = Instant::now();
+    assert_eq!(bench.rest().await, b"");
+    assert_eq!(begin.elapsed(), timeout);
+    bench.server.await.unwrap();
+    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
 }

@@ -1,0 +1,203 @@
+//! A listener: who comes in, as whom.
+
+use std::io;
+use std::net::{IpAddr, SocketAddr};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use ipnet::IpNet;
+use tokio::net::{TcpListener, TcpStream};
+use tokio_util::sync::CancellationToken;
+use tokio_util::task::TaskTracker;
+
+use super::places::{Full, Place, Places};
+use super::session::Session;
+use super::shared::{Authority, Shared, View};
+use super::tls::{Gatekeeper, Role};
+use super::{Seldom, connection};
+use crate::north::Turned;
+
+/// Pause after a failed accept: the usual reason, too many open files, does not go away at once.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+/// A peer that vanished without a word is found out after 60 s + 3 * 10 s.
+const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);
+const KEEPALIVE_INTERVAL: Duration = Duration::from_secs(10);
+const KEEPALIVE_PROBES: u32 = 3;
+
+/// What decides about the rights of a client.
+#[derive(Debug, Clone)]
+pub(super) enum Admission {
+    /// Its address: these networks may write.
+    ByAddress(Vec<IpNet>),
+    /// The role in its certificate.
+    ByCertificate(Arc<Gatekeeper>),
+}
+
+/// A listener.
+pub(super) struct Door {
+    /// Its section of the configuration, for messages.
+    pub(super) section: String,
+    pub(super) allow: Vec<IpNet>,
+    pub(super) admission: Admission,
+    pub(super) view: Arc<View>,
+    pub(super) shared: Arc<Shared>,
+    pub(super) places: Arc<Places>,
+    pub(super) tasks: TaskTracker,
+    pub(super) cancel: CancellationToken,
+}
+
+/// What is told again and again is told seldom.
+#[derive(Default)]
+struct Logs {
+    refused: Seldom,
+    full: Seldom,
+    failed: Seldom,
+}
+
+impl Door {
+    pub(super) async fn serve(self, listener: TcpListener) {
+        let door = Arc::new(self);
+        let mut logs = Logs::default();
+        loop {
+            let accepted = tokio::select! {
+                () = door.cancel.cancelled() => return,
+                accepted = listener.accept() => accepted,
+            };
+            match accepted {
+                Ok((stream, peer)) => door.admit(stream, peer, &mut logs),
+                // The client went away between its knock and the answer.
+                Err(why) if why.kind() == io::ErrorKind::ConnectionAborted => {}
+                Err(why) => {
+                    if let Some(more) = logs.failed.tell(Instant::now()) {
+                        tracing::warn!(more, "Modbus TCP: cannot accept a connection: {why}; trying on");
+                    }
+                    tokio::select! {
+                        () = door.cancel.cancelled() => return,
+                        () = tokio::time::sleep(ACCEPT_PAUSE) => {}
+                    }
+                }
+            }
+        }
+    }
+
+    /// Starts a task for a client that may connect; else its connection is closed at once.
+    fn admit(self: &Arc<Self>, stream: TcpStream, peer: SocketAddr, logs: &mut Logs) {
+        // A listener on [::] sees IPv4 clients as ::ffff:a.b.c.d.
+        let peer = SocketAddr::new(peer.ip().to_canonical(), peer.port());
+        let (ip, section, stats) = (peer.ip(), &self.section, &self.shared.stats.modbus_tcp);
+        if !contains(&self.allow, ip) {
+            stats.turned_away(Turned::NotAllowed);
+            if let Some(more) = logs.refused.tell(Instant::now()) {
+                tracing::warn!(client = %ip, more, "Modbus TCP: client refused: it is not in `allow` of {section}");
+            }
+            return;
+        }
+        match self.places.take(ip) {
+            Ok(place) => {
+                self.tasks.spawn(self.clone().receive(stream, peer, place));
+            }
+            Err(full) => {
+                let (turned, why, key) = match full {
+                    Full::All(most) => (Turned::Full, format!("{most} are connected already"), "max_connections"),
+                    Full::Address(most) => (
+                        Turned::AddressFull,
+                        format!("{most} of its address are connected already"),
+                        "max_connections_per_address",
+                    ),
+                };
+                stats.turned_away(turned);
+                if let Some(more) = logs.full.tell(Instant::now()) {
+                    tracing::warn!(client = %ip, more,
+                        "Modbus TCP: client refused: {why}; raise `{key}` of [modbus_tcp] or let the client close what it \
+                         does not use");
+                }
+            }
+        }
+    }
+
+    /// Serves one client to its end.
+    async fn receive(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, place: Place) {
+        prepare(&stream);
+        let cancel = self.cancel.child_token();
+        match &self.admission {
+            Admission::ByAddress(write) => {
+                let authority = Authority {
+                    may_write: contains(write, peer.ip()),
+                    who: peer.to_string(),
+                };
+                self.converse(stream, authority, cancel).await;
+            }
+            Admission::ByCertificate(gatekeeper) => {
+                let admitted = tokio::select! {
+                    () = cancel.cancelled() => return,
+                    admitted = gatekeeper.admit(stream) => admitted,
+                };
+                match admitted {
+                    Ok((stream, known)) => {
+                        let may_write = known.role == Role::Control;
+                        let authority = Authority {
+                            may_write,
+                            who: format!("{} at {peer}", known.name),
+                        };
+                        self.converse(stream, authority, cancel).await;
+                    }
+                    Err(why) => {
+                        self.shared.stats.modbus_tcp.turned_away(Turned::Tls);
+                        if let Some(more) = self.shared.tell_tls(Instant::now()) {
+                            tracing::warn!(client = %peer, more, "Modbus TCP: client refused: TLS: {why}");
+                        }
+                    }
+                }
+            }
+        }
+        drop(place);
+    }
+
+    async fn converse<S>(&self, stream: S, authority: Authority, cancel: CancellationToken)
+    where
+        S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
+    {
+        let session = Session::new(self.shared.clone(), self.view.clone(), authority);
+        connection::serve(stream, session, self.shared.options.idle_timeout, cancel).await;
+    }
+}
+
+fn contains(networks: &[IpNet], ip: IpAddr) -> bool {
+    networks.iter().any(|n| n.contains(&ip))
+}
+
+/// Answers leave at once; a peer that vanished is noticed. Neither is worth refusing a client for.
+fn prepare(stream: &TcpStream) {
+    use rustix::net::sockopt;
+    let told = |what: &str, why: &dyn std::fmt::Display| tracing::debug!("Modbus TCP: cannot set {what}: {why}");
+    if let Err(why) = stream.set_nodelay(true) {
+        told("TCP_NODELAY", &why);
+    }
+    let keepalive = sockopt::set_socket_keepalive(stream, true)
+        .and_then(|()| sockopt::set_tcp_keepidle(stream, KEEPALIVE_IDLE))
+        .and_then(|()| sockopt::set_tcp_keepintvl(stream, KEEPALIVE_INTERVAL))
+        .and_then(|()| sockopt::set_tcp_keepcnt(stream, KEEPALIVE_PROBES));
+    if let Err(why) = keepalive {
+        told("TCP keepalive", &why);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn networks() {
+        let networks = ["127.0.0.0/8".parse().unwrap(), "fd00::/8".parse().unwrap()];
+        for (ip, inside) in [
+            ("127.9.9.9", true),
+            ("10.0.0.1", false),
+            ("fd12::1", true),
+            ("::1", false),
+        ] {
+            assert_eq!(contains(&networks, ip.parse().unwrap()), inside, "{ip}");
+        }
+        let mapped: IpAddr = "::ffff:127.0.0.1".parse().unwrap();
+        assert!(contains(&networks, mapped.to_canonical()));
+    }
+}

@@ -1,0 +1,70 @@
+//! The server without sockets, for whoever has bytes instead of a connection: tests and fuzz targets.
+
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::Options;
+use super::dialogue::Dialogue;
+use super::session::Session;
+use super::shared::{Authority, Shared, View};
+use crate::north::NorthStats;
+use crate::plant::SharedPlant;
+
+/// One client of a server that has no sockets.
+#[derive(Debug)]
+pub struct Offline {
+    dialogue: Dialogue,
+    /// What the dialogue had no room for yet.
+    backlog: Vec<u8>,
+    closed: bool,
+}
+
+impl Offline {
+    /// A client named `who` that sees the whole plant and may write or not. Of the options only `uncached` matters.
+    pub fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, who: &str, may_write: bool) -> Offline {
+        let view = Arc::new(View::new(plant, None));
+        let authority = Authority {
+            may_write,
+            who: who.to_string(),
+        };
+        let session = Session::new(Arc::new(Shared::new(options, stats)), view, authority);
+        Offline {
+            dialogue: Dialogue::new(session),
+            backlog: Vec::new(),
+            closed: false,
+        }
+    }
+
+    /// The bytes that are answered to `bytes` so far; requests that wait for the bus are answered by a later call.
+    pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
+        self.backlog.extend_from_slice(bytes);
+        let mut answers = Vec::new();
+        while !self.closed {
+            if !self.dialogue.is_full() {
+                let space = self.dialogue.parts().0;
+                let count = self.backlog.len().min(space.len());
+                for (place, byte) in space.iter_mut().zip(self.backlog.drain(..count)) {
+                    *place = byte;
+                }
+                self.dialogue.received(count);
+            }
+            self.closed = self.dialogue.work(now).is_err();
+            self.dialogue.collect();
+            answers.append(&mut self.dialogue.output);
+            if self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
+                break;
+            }
+        }
+        answers
+    }
+
+    /// Whether a server would have closed the connection: what came is no Modbus.
+    pub fn is_closed(&self) -> bool {
+        self.closed
+    }
+
+    /// Whether any request waits for the bus.
+    pub fn is_waiting(&self) -> bool {
+        self.dialogue.is_waiting()
+    }
+}
