@@ -6,6 +6,7 @@ pub mod desk;
 pub mod execute;
 pub mod leases;
 pub mod predict;
+pub mod probe;
 mod report;
 pub mod schedule;
 mod tap;

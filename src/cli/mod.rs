@@ -8,12 +8,16 @@ mod client;
 mod demo;
 mod log;
 mod map;
+mod oneshot;
 mod profiles;
+mod read;
 mod report;
 mod run;
+mod scan;
 mod schema;
 mod simulate;
 mod trace;
+mod write;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -63,6 +67,9 @@ commands! {
     Run => run,
     Demo => demo,
     Check => check,
+    Scan => scan,
+    Read => read,
+    Write => write,
     Trace => trace,
     Simulate => simulate,
     Profiles => profiles,

@@ -88,9 +88,9 @@ pub(super) enum Speed {
 
 /// Addresses of drives, ascending, none twice.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Addresses(Vec<u8>);
+pub(super) struct Addresses(pub(super) Vec<u8>);
 
-fn parse_addresses(text: &str) -> Result<Addresses, String> {
+pub(super) fn parse_addresses(text: &str) -> Result<Addresses, String> {
     let bad = || format!("`{text}` is no list of addresses; write numbers from 1 to 247, such as 1-10 or 1,2,7");
     let number = |word: &str| {
         word.trim()

@@ -28,6 +28,13 @@ pub struct Request {
     pub pdu: RequestPdu,
 }
 
+impl Request {
+    /// Asks the drive at `address`.
+    pub fn new(address: u8, pdu: RequestPdu) -> Request {
+        Request { address, pdu }
+    }
+}
+
 /// What the bytes received so far are, seen against the outstanding request.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Decoded {
@@ -79,6 +86,23 @@ impl Protocol {
     /// The protocol of that name.
     pub fn from_name(name: &str) -> Option<Protocol> {
         Protocol::ALL.into_iter().find(|p| p.name() == name)
+    }
+
+    /// Whether the protocol can be spoken with these characters: bytes of 8 bits for RTU, 9600 8N1 for N2.
+    pub fn allows(self, format: &LineFormat) -> bool {
+        match self {
+            Protocol::ModbusRtu => format.data_bits == 8,
+            Protocol::ModbusAscii => true,
+            Protocol::N2 => format.to_string() == "9600 8N1",
+        }
+    }
+
+    /// Time for the first byte of a reply where nothing else is configured.
+    pub fn usual_timeout(self) -> Duration {
+        match self {
+            Protocol::ModbusRtu | Protocol::ModbusAscii => Duration::from_millis(100),
+            Protocol::N2 => Duration::from_millis(250),
+        }
     }
 
     /// The frame of `request`, appended to `out`.

@@ -75,10 +75,10 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
     }
     let mut resolved: Vec<(usize, Value)> = Vec::with_capacity(values.len());
     for (index, value) in values {
-        let point =
-            profile.points.get(index).filter(|p| p.write).ok_or_else(|| {
-                Refusal::NotWritable(format!("point {index} of `{}` cannot be written", drive.spec.name))
-            })?;
+        let point = profile.points.get(index).filter(|p| p.write).ok_or_else(|| {
+            let name = profile.points.get(index).map_or("?", |p| p.name.as_str());
+            Refusal::NotWritable(format!("`{name}` of `{}` cannot be written", drive.spec.name))
+        })?;
         let value = checked(drive, index, point, value)?;
         let (index, value) = resolve(drive, index, point, value)?;
         if resolved.iter().any(|(other, _)| *other == index) {

@@ -37,15 +37,18 @@ pub enum SourceKind {
     Supervision,
     /// The gateway stops.
     Shutdown,
+    /// `drivegate write`, without a gateway.
+    CommandLine,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 4] = [
+    pub const ALL: [SourceKind; 5] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Supervision,
         SourceKind::Shutdown,
+        SourceKind::CommandLine,
     ];
 
     /// The label of metrics and audit lines.
@@ -55,6 +58,7 @@ impl SourceKind {
             SourceKind::Mqtt => "mqtt",
             SourceKind::Supervision => "supervision",
             SourceKind::Shutdown => "shutdown",
+            SourceKind::CommandLine => "command_line",
         }
     }
 }

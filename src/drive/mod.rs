@@ -1,6 +1,7 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
 pub mod derive;
+pub mod identify;
 pub mod model;
 pub mod plan;
 pub mod profile;

@@ -6,6 +6,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use super::derive::Derived;
+use super::identify::Expected;
 use super::model::{Kind, ModelPoint, Value};
 use crate::codec::{Protocol, Table};
 
@@ -34,6 +35,8 @@ pub struct Profile {
     pub confirm_within: Duration,
     /// Function 04 reads the same registers as function 03.
     pub input_is_holding: bool,
+    /// Reads that show the family, for whoever looks for drives.
+    pub identify: Vec<Expected>,
     /// Name of the behaviour that a simulated drive of this profile has.
     pub simulator: Option<String>,
     /// Address ranges with their limits per request, ascending.
@@ -353,6 +356,14 @@ fn short(single: f32) -> Option<f64> {
     single
         .is_finite()
         .then(|| single.to_string().parse().unwrap_or(f64::from(single)))
+}
+
+/// A PDU address, decimal or as the hexadecimal number of a manual (0x0023).
+pub(super) fn parse_address(text: &str) -> Option<u16> {
+    match text.strip_prefix("0x") {
+        Some(hex) => u16::from_str_radix(hex, 16).ok(),
+        None => text.parse().ok(),
+    }
 }
 
 /// Takes the dust of binary fractions off a scaled count: 2500 * 0.01 is 25, not 25.000000000000004.

@@ -7,7 +7,9 @@ use std::time::Duration;
 
 use super::derive::{Bound, Derived};
 use super::model::ModelPoint;
-use super::profile::{AddressRange, FaultText, Form, Point, PollClass, Profile, Profiles, Raw, Source, WordOrder};
+use super::profile::{
+    AddressRange, FaultText, Form, Point, PollClass, Profile, Profiles, Raw, Source, WordOrder, parse_address,
+};
 use crate::codec::{Protocol, Table};
 use crate::document::{self, Document, Problem, Reader};
 
@@ -145,6 +147,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
         update_period: reader.or("update_period", Duration::from_millis(10)),
         confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
         input_is_holding,
+        identify: super::identify::read(reader),
         simulator: reader.optional("simulator"),
         ranges,
         points,
@@ -440,14 +443,6 @@ fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
     }
     check_place(reader, &raw, ranges);
     Some(Source::Raw(raw))
-}
-
-/// A PDU address, decimal or as the hexadecimal number of a manual (0x0023).
-fn parse_address(text: &str) -> Option<u16> {
-    match text.strip_prefix("0x") {
-        Some(hex) => u16::from_str_radix(hex, 16).ok(),
-        None => text.parse().ok(),
-    }
 }
 
 /// `3` is one bit, `4-7` a field: the first bit and how many.

@@ -1,0 +1,383 @@
+//! Through a running gateway: its Modbus TCP server, as any other client.
+
+use std::io::{Read, Write};
+use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream};
+use std::time::Duration;
+
+use super::Row;
+use crate::cache::DriveSpec;
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::drive::profile::Form;
+use crate::drive::{Bound, ModelPoint, Point, Quality, Raw, Sample, Source, Value};
+
+/// Time to connect.
+const CONNECT: Duration = Duration::from_millis(500);
+/// Time for an answer: a command may wait for its turn, a forwarded read for a slow line.
+const ANSWER: Duration = Duration::from_secs(10);
+/// Bytes before the PDU.
+const HEADER: usize = 7;
+/// The command block (`docs/modbus-tcp.md`).
+const COMMAND: u16 = 0x8100;
+const SPEED_REFERENCE: u16 = 0x8101;
+const FREQUENCY_REFERENCE: u16 = 0x8102;
+const RUN: u16 = 1 << 0;
+const REVERSE: u16 = 1 << 1;
+const FAULT_RESET: u16 = 1 << 2;
+
+/// A connection to a gateway, with the drive under one unit.
+#[derive(Debug)]
+pub(in crate::cli) struct Remote {
+    stream: TcpStream,
+    address: SocketAddr,
+    unit: u8,
+    transaction: u16,
+}
+
+impl Remote {
+    /// The gateway at one of these addresses, if one runs there.
+    ///
+    /// # Errors
+    /// When a gateway is there and the unit is another drive: nothing is asked of it.
+    pub(in crate::cli) fn find(addresses: &[SocketAddr], spec: &DriveSpec) -> Result<Option<Remote>, String> {
+        for address in addresses.iter().map(|a| reachable(*a)) {
+            let Ok(stream) = TcpStream::connect_timeout(&address, CONNECT) else {
+                continue;
+            };
+            let timeouts = stream
+                .set_read_timeout(Some(ANSWER))
+                .and_then(|()| stream.set_write_timeout(Some(ANSWER)))
+                .and_then(|()| stream.set_nodelay(true));
+            if timeouts.is_err() {
+                continue;
+            }
+            let mut remote = Remote {
+                stream,
+                address,
+                unit: spec.unit,
+                transaction: 0,
+            };
+            match (remote.identity(0), remote.identity(5)) {
+                (Some(vendor), Some(name)) if vendor == "drivegate" && name == spec.name => return Ok(Some(remote)),
+                (Some(vendor), name) if vendor == "drivegate" => {
+                    return Err(format!(
+                        "the gateway has `{}` under unit {}; {address}; it runs with another configuration: name its \
+                         file by --config, or reload it",
+                        name.unwrap_or_default(),
+                        spec.unit
+                    ));
+                }
+                _ => {}
+            }
+        }
+        Ok(None)
+    }
+
+    /// An object of the device identification.
+    fn identity(&mut self, object: u8) -> Option<String> {
+        let reply = self.ask(&RequestPdu::DeviceIdentification { code: 4, object }).ok()?;
+        let Reply::DeviceIdentification(body) = reply else {
+            return None;
+        };
+        let text = body.get(7..)?;
+        Some(String::from_utf8_lossy(text).into_owned())
+    }
+
+    /// One request and its reply.
+    fn ask(&mut self, pdu: &RequestPdu) -> Result<Reply, String> {
+        let failed =
+            |error: std::io::Error| format!("the gateway does not answer: {error}; {}; try again", self.address);
+        self.transaction = self.transaction.wrapping_add(1);
+        let mut body = vec![self.unit];
+        pdu.encode(&mut body);
+        let mut frame = self.transaction.to_be_bytes().to_vec();
+        frame.extend([0, 0]);
+        frame.extend((body.len() as u16).to_be_bytes());
+        frame.extend(body);
+        self.stream.write_all(&frame).map_err(failed)?;
+        let mut header = [0u8; HEADER];
+        self.stream.read_exact(&mut header).map_err(failed)?;
+        let [high, low, _, _, length_high, length_low, _] = header;
+        let length = usize::from(u16::from_be_bytes([length_high, length_low]));
+        if u16::from_be_bytes([high, low]) != self.transaction || !(2..=254).contains(&length) {
+            return Err(format!("no Modbus TCP reply; {}; check the address", self.address));
+        }
+        let mut reply = vec![0u8; length - 1];
+        self.stream.read_exact(&mut reply).map_err(failed)?;
+        Reply::decode(pdu, &reply)
+            .map_err(|_| format!("the reply does not fit the request; {}; try again", self.address))
+    }
+
+    /// The points with their values, each read as the drive itself numbers it.
+    pub(in crate::cli) fn read(&mut self, spec: &DriveSpec, points: &[usize]) -> Result<Vec<Row>, String> {
+        let mut rows = Vec::with_capacity(points.len());
+        for &index in points {
+            let Some(point) = spec.profile.points.get(index) else {
+                continue;
+            };
+            let (sample, why) = self.sample(spec, point)?;
+            rows.push(Row::new(point, &sample, why));
+        }
+        Ok(rows)
+    }
+
+    fn sample(&mut self, spec: &DriveSpec, point: &Point) -> Result<(Sample, Option<String>), String> {
+        match &point.source {
+            Source::Raw(raw) => self.raw(point, raw),
+            Source::Derived(derived) => {
+                let mut sources = Vec::new();
+                let mut why = None;
+                for index in derived.sources() {
+                    let Some(source) = spec.profile.points.get(index) else {
+                        continue;
+                    };
+                    let (sample, reason) = self.sample(spec, source)?;
+                    why = why.or(reason);
+                    sources.push(sample);
+                }
+                let band = match derived.band() {
+                    Some((_, low, high)) => self.bound(spec, low)?.zip(self.bound(spec, high)?),
+                    None => None,
+                };
+                Ok((
+                    derived.sample(&sources, band),
+                    why.or(Some("its range is not known".to_string())),
+                ))
+            }
+        }
+    }
+
+    fn bound(&mut self, spec: &DriveSpec, bound: Bound) -> Result<Option<f64>, String> {
+        match bound {
+            Bound::Fixed(figure) => Ok(Some(figure)),
+            Bound::Point(index) => match spec.profile.points.get(index) {
+                Some(point) => Ok(self.sample(spec, point)?.0.good().map(Value::as_f64)),
+                None => Ok(None),
+            },
+        }
+    }
+
+    fn raw(&mut self, point: &Point, raw: &Raw) -> Result<(Sample, Option<String>), String> {
+        let reply = self.ask(&RequestPdu::Read {
+            table: raw.table,
+            start: raw.address,
+            count: raw.form.items(),
+        })?;
+        let words = match reply {
+            Reply::Registers(words) => words,
+            Reply::Bits(bits) => bits.iter().map(|b| u16::from(*b)).collect(),
+            Reply::Exception(code) => return Ok((Sample::NONE, Some(refusal(code)))),
+            _ => return Ok((Sample::NONE, Some("the reply does not fit the request".to_string()))),
+        };
+        let value = raw.decode(&words, point.kind());
+        let sample = Sample {
+            value,
+            quality: if value.is_some() { Quality::Good } else { Quality::Bad },
+            at: None,
+        };
+        Ok((sample, Some("it is no number".to_string())))
+    }
+
+    /// Writes the points: commands of the common model as one command where the command block can hold them, other
+    /// points behind them one by one. Ends at the first that is refused.
+    pub(in crate::cli) fn write(&mut self, spec: &DriveSpec, values: &[(usize, Value)]) -> Result<(), String> {
+        let mut others = Vec::new();
+        let mut block = Block::default();
+        for &(index, value) in values {
+            let Some(point) = spec.profile.points.get(index) else {
+                continue;
+            };
+            match point.model {
+                Some(ModelPoint::Run) => block.set(RUN, value.as_bool()),
+                Some(ModelPoint::Reverse) => block.set(REVERSE, value.as_bool()),
+                Some(ModelPoint::FaultReset) => block.set(FAULT_RESET, value.as_bool()),
+                Some(ModelPoint::SpeedReference) => block.speed = Some(count(value, point)?),
+                Some(ModelPoint::FrequencyReference) => block.frequency = Some(count(value, point)?),
+                _ => others.push((point, value)),
+            }
+        }
+        for pdu in self.block_writes(&block)? {
+            self.set(&pdu)?;
+        }
+        for (point, value) in others {
+            let raw = point.raw().filter(|_| point.write).ok_or_else(|| {
+                format!(
+                    "`{}` cannot be written; command line; `drivegate profiles show` tells what can",
+                    point.name
+                )
+            })?;
+            let pdu = write_of(raw, value)
+                .map_err(|why| format!("`{}`: {why}; command line; nothing was written", point.name))?;
+            self.set(&pdu)?;
+        }
+        Ok(())
+    }
+
+    fn set(&mut self, pdu: &RequestPdu) -> Result<(), String> {
+        match self.ask(pdu)? {
+            Reply::Exception(code) => Err(format!(
+                "the gateway refused it with {}; {}",
+                refusal(code),
+                self.address
+            )),
+            _ => Ok(()),
+        }
+    }
+
+    fn block_writes(&mut self, block: &Block) -> Result<Vec<RequestPdu>, String> {
+        let register = |address, value| RequestPdu::WriteRegister { address, value };
+        if block.speed.is_some() && block.frequency.is_some() {
+            return Err(
+                "speed_reference and frequency_reference contradict each other; command line; send one of them"
+                    .to_string(),
+            );
+        }
+        let frequency = block.frequency.map(|value| register(FREQUENCY_REFERENCE, value));
+        let Some((set, mask)) = block.bits else {
+            return Ok(block
+                .speed
+                .map(|value| register(SPEED_REFERENCE, value))
+                .into_iter()
+                .chain(frequency)
+                .collect());
+        };
+        let old = if mask & (RUN | REVERSE) == RUN | REVERSE {
+            0
+        } else {
+            self.command_word()?
+        };
+        let word = (old & !mask & (RUN | REVERSE)) | set;
+        let command = match block.speed {
+            Some(speed) => RequestPdu::WriteRegisters {
+                start: COMMAND,
+                values: vec![word, speed],
+            },
+            None => register(COMMAND, word),
+        };
+        // A stop first, a reference before a start.
+        Ok(if word & RUN == 0 {
+            std::iter::once(command).chain(frequency).collect()
+        } else {
+            frequency.into_iter().chain([command]).collect()
+        })
+    }
+
+    /// The bits that are not commanded stay as they are.
+    fn command_word(&mut self) -> Result<u16, String> {
+        let read = RequestPdu::Read {
+            table: Table::Holding,
+            start: COMMAND,
+            count: 1,
+        };
+        match self.ask(&read)? {
+            Reply::Registers(words) => match words.first() {
+                Some(word) if *word != u16::MAX => Ok(*word),
+                _ => Err(format!(
+                    "the drive's commands are not known now; {}; wait until it is online, or give run and reverse both",
+                    self.address
+                )),
+            },
+            Reply::Exception(code) => Err(format!(
+                "the gateway refused it with {}; {}",
+                refusal(code),
+                self.address
+            )),
+            _ => Err(format!(
+                "the reply does not fit the request; {}; try again",
+                self.address
+            )),
+        }
+    }
+
+    /// Where the gateway listens.
+    pub(in crate::cli) fn address(&self) -> SocketAddr {
+        self.address
+    }
+}
+
+/// What goes into the command block.
+#[derive(Debug, Default)]
+struct Block {
+    /// Bits set, and which were named.
+    bits: Option<(u16, u16)>,
+    speed: Option<u16>,
+    frequency: Option<u16>,
+}
+
+impl Block {
+    fn set(&mut self, bit: u16, on: bool) {
+        let (set, mask) = self.bits.unwrap_or_default();
+        self.bits = Some((if on { set | bit } else { set & !bit }, mask | bit));
+    }
+}
+
+/// A reference in hundredths.
+fn count(value: Value, point: &Point) -> Result<u16, String> {
+    let count = (value.as_f64() * 100.0).round();
+    let (least, most) = match point.model {
+        Some(ModelPoint::FrequencyReference) => (0.0, f64::from(u16::MAX) - 1.0),
+        _ => (-32_767.0, 32_767.0),
+    };
+    if (least..=most).contains(&count) {
+        Ok(count as i32 as u16)
+    } else {
+        Err(format!(
+            "`{}` = {value} is out of range; command line; write {} to {}",
+            point.name,
+            least / 100.0,
+            most / 100.0
+        ))
+    }
+}
+
+fn write_of(raw: &Raw, value: Value) -> Result<RequestPdu, String> {
+    let words = raw.encode(value, 0).map_err(|why| why.to_string())?;
+    let first = words.first().copied().unwrap_or_default();
+    let merged = |mask: u16| RequestPdu::MaskWrite {
+        address: raw.address,
+        and_mask: !mask,
+        or_mask: first,
+    };
+    Ok(match (raw.table, raw.form) {
+        (Table::Coil, _) => RequestPdu::WriteCoil {
+            address: raw.address,
+            on: first != 0,
+        },
+        (_, Form::Bit { bit, .. }) => merged(1 << bit),
+        (_, Form::Bits { first, count }) => merged((0..count).fold(0, |mask, bit| {
+            mask | 1u16.checked_shl(u32::from(first + bit)).unwrap_or(0)
+        })),
+        _ if words.len() == 1 => RequestPdu::WriteRegister {
+            address: raw.address,
+            value: first,
+        },
+        _ => RequestPdu::WriteRegisters {
+            start: raw.address,
+            values: words,
+        },
+    })
+}
+
+/// A server that listens everywhere is reached on loopback.
+fn reachable(address: SocketAddr) -> SocketAddr {
+    let ip = match address.ip() {
+        IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
+        IpAddr::V6(ip) if ip.is_unspecified() => IpAddr::V6(Ipv6Addr::LOCALHOST),
+        ip => ip,
+    };
+    SocketAddr::new(ip, address.port())
+}
+
+/// An exception with what it mostly means behind a gateway (`docs/modbus-tcp.md`).
+fn refusal(code: Exception) -> String {
+    let meaning = match code {
+        Exception::FUNCTION => "not allowed: the drive is only monitored, or this host is not in `write`",
+        Exception::ADDRESS => "the address is read-only or the drive does not have it",
+        Exception::VALUE => "the value is outside the type, the profile or the limits",
+        Exception::DEVICE_FAILURE => "the drive refused it with a code of its own, which the log of the gateway tells",
+        Exception::BUSY => "the queue is full, or another command took its place; try again",
+        Exception::GATEWAY_PATH => "the bus is down",
+        Exception::GATEWAY_TARGET => "the drive does not answer, or its value is stale",
+        other => other.meaning(),
+    };
+    format!("exception {:02X} ({meaning})", code.0)
+}

@@ -1,0 +1,131 @@
+//! The configuration that a search prints. Pure.
+
+use std::path::Path;
+
+use crate::codec::{LineFormat, Protocol};
+
+/// A drive that answered.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Found {
+    pub(super) protocol: Protocol,
+    pub(super) format: LineFormat,
+    pub(super) address: u8,
+    /// Profiles that fit what it answers; none, one, or some that cannot be told apart by reading.
+    pub(super) profiles: Vec<String>,
+}
+
+impl Found {
+    /// For people.
+    pub(super) fn title(&self) -> String {
+        match self.profiles.as_slice() {
+            [] => "of no profile that is known".to_string(),
+            [one] => one.clone(),
+            some => format!("{}, which reading does not tell apart", some.join(" or ")),
+        }
+    }
+}
+
+/// Buses and drives as a configuration file has them.
+pub(super) fn snippet(port: &str, found: &[Found]) -> String {
+    // A configuration is read from its own directory.
+    let port = if port.contains("://") {
+        port.to_string()
+    } else {
+        std::path::absolute(Path::new(port)).map_or_else(|_| port.to_string(), |p| p.display().to_string())
+    };
+    let mut text = "[gateway]\nname = \"gateway\"\n".to_string();
+    let mut settings: Vec<(Protocol, LineFormat)> = found.iter().map(|f| (f.protocol, f.format)).collect();
+    settings.dedup();
+    let mut number = 0;
+    for (index, (protocol, format)) in settings.iter().enumerate() {
+        if index > 0 {
+            text += "\n# Drives answered to other settings too; a line has one setting, so choose.\n";
+        }
+        let written = format.to_string();
+        let characters = written.split_once(' ').map_or("8N1", |(_, characters)| characters);
+        text += &commented(
+            index > 0,
+            &format!(
+                "\n[[bus]]\nname = \"line{}\"\nport = {port:?}\nprotocol = \"{}\"\nbaud = {}\nformat = \"{characters}\"\n",
+                index + 1,
+                protocol.name(),
+                format.baud
+            ),
+        );
+        for drive in found.iter().filter(|f| (f.protocol, f.format) == (*protocol, *format)) {
+            number += 1;
+            text += &commented(index > 0, &entry(drive, number));
+        }
+    }
+    text
+}
+
+fn entry(drive: &Found, number: usize) -> String {
+    let head = format!(
+        "\n[[bus.drive]]\nname = \"drive-{number}\"\naddress = {}\n",
+        drive.address
+    );
+    match drive.profiles.as_slice() {
+        [] => {
+            commented(true, &format!("{head}profile = \"\""))
+                + "    # no profile fits; docs/profiles.md tells how to write one\n"
+        }
+        [one] => format!("{head}profile = \"{one}\"\n"),
+        [first, others @ ..] => format!("{head}profile = \"{first}\"    # or {}\n", others.join(", or ")),
+    }
+}
+
+fn commented(comment: bool, text: &str) -> String {
+    if !comment {
+        return text.to_string();
+    }
+    let line = |line: &str| {
+        if line.is_empty() {
+            String::new()
+        } else {
+            format!("# {line}")
+        }
+    };
+    let lines: Vec<String> = text.split('\n').map(line).collect();
+    lines.join("\n")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::config::Settings;
+
+    fn found(protocol: Protocol, address: u8, profiles: &[&str]) -> Found {
+        Found {
+            protocol,
+            format: LineFormat::new(9600, "8N1").unwrap(),
+            address,
+            profiles: profiles.iter().map(ToString::to_string).collect(),
+        }
+    }
+
+    #[test]
+    fn check_accepts_it() {
+        let rtu = Protocol::ModbusRtu;
+        let cases = [
+            vec![
+                found(rtu, 1, &["vacon-nx"]),
+                found(rtu, 7, &[]),
+                found(rtu, 9, &["vacon-nx", "eaton-svx"]),
+            ],
+            vec![found(rtu, 1, &["vacon-nx"]), found(Protocol::N2, 1, &["vacon-nx-n2"])],
+        ];
+        for case in cases {
+            let text = snippet("/dev/serial/by-id/usb-\"x\"", &case);
+            let loaded = Settings::parse("found.toml", &text, std::iter::empty());
+            let errors: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
+            let settings = loaded.settings.unwrap_or_else(|| panic!("{errors:?}\n{text}"));
+            let drives = settings.buses.iter().flat_map(|b| &b.drives);
+            let known = case.iter().filter(|f| !f.profiles.is_empty() && f.protocol == rtu);
+            assert_eq!(
+                drives.map(|d| d.address).collect::<Vec<_>>(),
+                known.map(|f| f.address).collect::<Vec<_>>()
+            );
+        }
+    }
+}

@@ -1,0 +1,127 @@
+//! `drivegate write`: one command to one drive.
+
+use std::process::ExitCode;
+
+use super::oneshot::alone::Alone;
+use super::oneshot::remote::Remote;
+use super::oneshot::{Target, shown, target};
+use super::read::{listens, quiet, runtime};
+use super::{EXIT_FAILED, EXIT_USAGE, report};
+use crate::drive::model::Kind;
+use crate::drive::{Point, Value};
+
+/// Commands a drive once, through the running gateway or alone.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  drivegate write --config drivegate.toml pump-1 speed_reference=50 run=true
+  drivegate write --config drivegate.toml pump-1 run=false
+  drivegate write --config drivegate.toml pump-1 fault_reset=true
+
+Several points are one command, in the order that is safe. The drive must have access = \"control\"; limits hold.
+Nobody supervises what a command without a gateway has started.")]
+pub(super) struct Args {
+    #[command(flatten)]
+    config: super::ConfigFile,
+    /// The drive.
+    drive: String,
+    /// What is set.
+    #[arg(required = true, value_name = "POINT=VALUE")]
+    values: Vec<String>,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    let target = match target(&args.config.path, &args.drive) {
+        Ok(target) => target,
+        Err(code) => return code,
+    };
+    let values: Result<Vec<(usize, Value)>, String> = args.values.iter().map(|text| parse(&target, text)).collect();
+    let values = match values {
+        Ok(values) => values,
+        Err(message) => {
+            report::error(&message);
+            return ExitCode::from(EXIT_USAGE);
+        }
+    };
+    match command(&target, values) {
+        Ok(text) => report::print(&text),
+        Err(message) => {
+            report::error(&message);
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}
+
+/// `speed_reference=50`, `run=true`, `mode=auto`.
+fn parse(target: &Target, text: &str) -> Result<(usize, Value), String> {
+    let (name, value) = text
+        .split_once('=')
+        .ok_or_else(|| format!("`{text}` sets nothing; command line; write POINT=VALUE, such as speed_reference=50"))?;
+    let index = target.point(name.trim())?;
+    let point = target.spec.profile.points.get(index);
+    let point = point.ok_or_else(|| format!("there is no point `{name}`; command line; name another"))?;
+    Ok((index, value_of(point, value.trim())?))
+}
+
+fn value_of(point: &Point, text: &str) -> Result<Value, String> {
+    let bad = |wanted: &str| {
+        format!(
+            "`{text}` is no value for `{}`; command line; write {wanted}",
+            point.name
+        )
+    };
+    let meaning = point.texts.iter().find(|(_, meaning)| meaning.as_str() == text);
+    match (point.kind(), text) {
+        (Kind::Bool, "true" | "on" | "1") => Ok(Value::Bool(true)),
+        (Kind::Bool, "false" | "off" | "0") => Ok(Value::Bool(false)),
+        (Kind::Bool, _) => Err(bad("true or false")),
+        _ if meaning.is_some() => Ok(Value::Integer(meaning.map_or(0, |(code, _)| *code))),
+        (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
+        (Kind::Number, _) => {
+            let number = text.parse::<f64>().ok().filter(|n| n.is_finite());
+            number.map(Value::Number).ok_or_else(|| bad("a number"))
+        }
+    }
+}
+
+fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, String> {
+    let what = described(target, &values);
+    if let Some(mut remote) = Remote::find(&listens(target), &target.spec)? {
+        remote.write(&target.spec, &values)?;
+        return Ok(format!(
+            "{what}: acknowledged, through the gateway at {}\n",
+            remote.address()
+        ));
+    }
+    quiet();
+    runtime()?.block_on(async {
+        let alone = Alone::start(target).await?;
+        let (answer, confirmed) = alone.write(values).await;
+        alone.stop().await;
+        if !answer.outcome.is_ok() {
+            let code = answer.outcome.code();
+            return Err(format!(
+                "{what}: {}; drive `{}` ({code})",
+                answer.outcome, target.spec.name
+            ));
+        }
+        let seen = match confirmed {
+            Some(after) => format!("seen {:.0} ms after it was given", after.as_secs_f64() * 1000.0),
+            None => "no read has shown it yet".to_string(),
+        };
+        let latency = answer.latency.as_secs_f64() * 1000.0;
+        Ok(format!("{what}: acknowledged within {latency:.0} ms, {seen}\n"))
+    })
+}
+
+fn described(target: &Target, values: &[(usize, Value)]) -> String {
+    let one = |(index, value): &(usize, Value)| {
+        let point = target.spec.profile.points.get(*index)?;
+        Some(
+            format!("{}={} {}", point.name, shown(point, *value), point.unit)
+                .trim_end()
+                .to_string(),
+        )
+    };
+    let all: Vec<String> = values.iter().filter_map(one).collect();
+    format!("{} {}", target.spec.name, all.join(" "))
+}
