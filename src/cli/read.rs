@@ -89,14 +89,18 @@ fn rows(target: Target, points: Vec<usize>) -> Result<Vec<Row>, String> {
     })
 }
 
-/// Where the configured gateway listens.
+/// Where the configured gateway listens for the drive's bus, without TLS.
 pub(super) fn listens(target: &Target) -> Vec<SocketAddr> {
-    target
-        .settings
-        .modbus_tcp
-        .as_ref()
-        .map(|o| o.listen.clone())
-        .unwrap_or_default()
+    let bus = &target.bus.spec.name;
+    let listeners = target.settings.modbus_tcp.iter().flat_map(|options| &options.listeners);
+    let shows = |buses: &Option<Vec<String>>| buses.as_ref().is_none_or(|buses| buses.contains(bus));
+    let mut showing: Vec<_> = listeners.filter(|listener| shows(&listener.buses)).collect();
+    // One that takes writes first.
+    showing.sort_by_key(|listener| listener.write.is_empty());
+    showing
+        .into_iter()
+        .flat_map(|listener| listener.listen.clone())
+        .collect()
 }
 
 /// A command says what happens itself; of the log only the audit is left.
