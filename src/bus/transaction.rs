@@ -2,9 +2,11 @@
 //!
 //! Garbage does not end an exchange at once: noise may have run into the beginning of a sound reply, and the rest of a
 //! broken one may still be on the line. The exchange goes on until as many characters came as a reply has, or nothing
-//! more came for their time, never beyond the deadline. A whole reply that stands behind the garbage is believed:
-//! address, function, length and check code fit, which random bytes do once in 2^40. An exception is shorter and may
-//! split a block: behind garbage it is not believed, the request is repeated.
+//! more came for their time, never beyond the deadline. A whole Modbus reply that stands behind the garbage is believed:
+//! address, function, length and check code fit, which random bytes do once in 2^40; in Modbus ASCII they would have to
+//! be digits between a colon and CR LF too. An exception is shorter and may split a block: behind garbage it is not
+//! believed, the request is repeated. N2 replies are not believed there at all. What stands before the colon of a
+//! Modbus ASCII frame is no garbage but noise, which its decoder skips.
 
 use std::time::{Duration, Instant};
 
@@ -128,7 +130,13 @@ impl<'r> Transaction<'r> {
                 }
                 // The echo of the request can look like a broken reply until it is whole.
                 _ if self.frame.starts_with(&self.received) => return self.on_time(now),
-                Decoded::Incomplete => return self.behind_garbage(now).unwrap_or_else(|| self.on_time(now)),
+                Decoded::Incomplete => {
+                    return self.behind_garbage(now).unwrap_or_else(|| {
+                        // A new colon began a frame anew: it has the time until the deadline.
+                        self.garbage = None;
+                        self.on_time(now)
+                    });
+                }
                 Decoded::Corrupt(why) => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
                         self.garbage = Some((why, now + self.rest_time()));
@@ -157,10 +165,10 @@ impl<'r> Transaction<'r> {
             return None;
         }
         let (at, used, reply) = (1..self.received.len()).find_map(|at| {
-            let rest = self
-                .received
-                .get(at..)
-                .filter(|rest| rest.first() == Some(&self.request.address))?;
+            let rest = self.received.get(at..).filter(|rest| {
+                rest.first()
+                    .is_some_and(|&first| self.protocol.may_begin_behind_garbage(self.request.address, first))
+            })?;
             match self.protocol.decode(self.request, rest) {
                 Decoded::Reply {
                     reply: Reply::Exception(_),
@@ -206,10 +214,12 @@ impl<'r> Transaction<'r> {
     /// frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known already.
     fn strip_echo(&mut self) -> bool {
         let tells = !self.echo_seen && (self.echo || self.is_unlike_its_reply());
-        if !tells || !self.received.starts_with(self.frame) {
+        let noise = self.protocol.noise(&self.received);
+        let from_frame = self.received.get(noise..).unwrap_or_default();
+        if !tells || !from_frame.starts_with(self.frame) {
             return false;
         }
-        self.received.drain(..self.frame.len());
+        self.received.drain(..noise + self.frame.len());
         self.first_byte = None;
         self.echo_seen = true;
         true
@@ -494,6 +504,118 @@ mod tests {
         assert_eq!(start(&request, &frame, now).on_bytes(now, &bytes), exception);
     }
 
+    /// A read of two registers in Modbus ASCII, its frame and its reply.
+    fn in_ascii() -> (Request, Vec<u8>, &'static [u8]) {
+        let pdu = RequestPdu::Read {
+            table: Table::Holding,
+            start: 0x20,
+            count: 2,
+        };
+        let request = Request { address: 1, pdu };
+        let mut frame = Vec::new();
+        Protocol::ModbusAscii.encode(&request, &mut frame);
+        (request, frame, b":01030400050000F3\r\n")
+    }
+
+    fn start_ascii<'r>(request: &'r Request, frame: &'r [u8], now: Instant, echo: bool) -> Transaction<'r> {
+        let ms = Duration::from_millis;
+        Transaction::new(Protocol::ModbusAscii, request, frame, now, ms(100), ms(19), echo)
+    }
+
+    #[test]
+    fn an_ascii_reply_is_found_behind_noise_foreign_frames_and_broken_ones() {
+        let (request, frame, reply) = in_ascii();
+        let now = Instant::now();
+        let truth = Step::Done(Ended::Reply(Reply::Registers(vec![5, 0])));
+        for before in [
+            b"".as_slice(),
+            b"\xFF\x00\x7F",
+            b":0103",
+            b":\xFF:!",
+            b"\n\r\n",
+            b":0203040005000BE7\r\n",
+            b":01030400050000F4\r\n",
+            b":01030400050000F\r\n",
+            b":0103040005\xB0\r\n",
+        ] {
+            for chunk in [1, 3, 100] {
+                let mut transaction = start_ascii(&request, &frame, now, false);
+                let bytes = [before, reply, b":"].concat();
+                let mut step = Step::Wait(now);
+                let mut pieces = bytes.chunks(chunk);
+                while let (Step::Wait(_), Some(piece)) = (&step, pieces.next()) {
+                    step = transaction.on_bytes(now, piece);
+                }
+                assert_eq!(step, truth, "{:?} by {chunk}", String::from_utf8_lossy(before));
+            }
+        }
+        // Not behind a broken frame: an exception, which is short.
+        let mut transaction = start_ascii(&request, &frame, now, false);
+        let bytes = b":01030400050000F4\r\n:0183027A\r\n";
+        assert!(matches!(transaction.on_bytes(now, bytes), Step::Wait(_)));
+    }
+
+    #[test]
+    fn a_broken_ascii_reply_says_why_and_does_not_wait_for_the_deadline() {
+        let (request, frame, reply) = in_ascii();
+        let now = Instant::now();
+        let deadline = now + Duration::from_millis(119);
+        for (bytes, why) in [
+            (b":01030400050000F4\r\n".as_slice(), "check code (LRC) is wrong"),
+            (b":0103040005000F4\r\n", "an odd number of hexadecimal digits"),
+            (
+                b":01030400050000F3\n",
+                "a line feed without a carriage return before it",
+            ),
+            (
+                b":0103\xB40005",
+                "a character has bit 7 set: noise, or the data bits and parity are not the drive's",
+            ),
+        ] {
+            let mut transaction = start_ascii(&request, &frame, now, false);
+            let Step::Wait(until) = transaction.on_bytes(now, bytes) else {
+                panic!("it ends at once")
+            };
+            assert!(until < deadline, "{why}");
+            assert_eq!(transaction.on_time(until), Step::Done(Ended::Corrupt(why)));
+            assert_eq!(transaction.is_paid(), bytes.len() >= reply.len());
+        }
+        // A frame that begins anew has its time, whatever was before it.
+        let mut transaction = start_ascii(&request, &frame, now, false);
+        assert!(matches!(transaction.on_bytes(now, b":!"), Step::Wait(until) if until < deadline));
+        assert_eq!(transaction.on_bytes(now, b":01"), Step::Wait(deadline));
+        for unfinished in [&reply[..reply.len() - 1], b"\xFF\xFE", b"0103"] {
+            let mut transaction = start_ascii(&request, &frame, now, false);
+            assert_eq!(transaction.on_bytes(now, unfinished), Step::Wait(deadline));
+            let ended = Step::Done(Ended::Corrupt("the reply is incomplete"));
+            assert_eq!(transaction.on_time(deadline), ended);
+        }
+    }
+
+    #[test]
+    fn an_ascii_echo_is_dropped_behind_noise_too() {
+        let (request, frame, reply) = in_ascii();
+        let now = Instant::now();
+        for noise in [b"".as_slice(), b"\x80", b":01"] {
+            let mut transaction = start_ascii(&request, &frame, now, false);
+            let bytes = [noise, &frame, reply].concat();
+            let answered = Ended::Reply(Reply::Registers(vec![5, 0]));
+            assert_eq!(transaction.on_bytes(now, &bytes), Step::Done(answered.clone()));
+            assert_eq!((transaction.echoes(&answered), transaction.foreign()), (Some(true), 0));
+        }
+        let write = Request {
+            address: 1,
+            pdu: RequestPdu::WriteRegister { address: 1, value: 1 },
+        };
+        let mut frame = Vec::new();
+        Protocol::ModbusAscii.encode(&write, &mut frame);
+        let mut transaction = start_ascii(&write, &frame, now, true);
+        let written = Step::Done(Ended::Reply(Reply::Written));
+        let bytes = [b"\x80".as_slice(), &frame].concat();
+        assert!(matches!(transaction.on_bytes(now, &bytes), Step::Wait(_)));
+        assert_eq!(transaction.on_bytes(now, &frame), written);
+    }
+
     mod chance {
         use super::*;
         use proptest::prelude::*;
@@ -565,6 +687,52 @@ mod tests {
                 match ended {
                     Ended::Reply(reply) => prop_assert_eq!(reply, Reply::Registers(vec![0x4711])),
                     Ended::Silent | Ended::Corrupt(_) => {}
+                }
+            }
+
+            #[test]
+            fn only_the_truth_is_believed_in_ascii_too(
+                pieces in proptest::collection::vec(prop_oneof![
+                    Just(b":01030400050000F3\r\n".to_vec()),
+                    (0usize..19).prop_map(|keep| b":01030400050000F3\r\n"[..keep].to_vec()),
+                    (0usize..19, any::<u8>()).prop_map(|(at, character)| {
+                        let mut frame = b":01030400050000F3\r\n".to_vec();
+                        frame[at] = character;
+                        frame
+                    }),
+                    (2u8..=247, any::<[u8; 4]>()).prop_map(|(address, [a, b, c, d])| {
+                        let mut frame = Vec::new();
+                        crate::codec::ascii::encode_frame(address, &[3, 4, a, b, c, d], &mut frame);
+                        frame
+                    }),
+                    proptest::collection::vec(any::<u8>(), 0..6),
+                    proptest::collection::vec(
+                        prop_oneof![Just(b':'), Just(b'\n'), Just(b'\r'), b'0'..=b'9', any::<u8>()], 0..30),
+                ], 0..6),
+                chunk in 1usize..20,
+                gap_us in 0u64..8000,
+            ) {
+                let (request, frame, _) = in_ascii();
+                let begun = Instant::now();
+                let deadline = begun + Duration::from_millis(119);
+                let mut transaction = start_ascii(&request, &frame, begun, false);
+                let bytes = pieces.concat();
+                let mut now = begun;
+                let mut step = transaction.on_time(now);
+                for piece in bytes.chunks(chunk) {
+                    now += Duration::from_micros(gap_us);
+                    let Step::Wait(until) = step else { break };
+                    prop_assert!(until <= deadline);
+                    step = if now >= until { transaction.on_time(until) } else { transaction.on_bytes(now, piece) };
+                }
+                if let Step::Wait(until) = step {
+                    prop_assert!(until <= deadline);
+                    step = transaction.on_time(until);
+                }
+                match step {
+                    Step::Done(Ended::Reply(reply)) => prop_assert_eq!(reply, Reply::Registers(vec![5, 0])),
+                    Step::Done(Ended::Silent | Ended::Corrupt(_)) => {}
+                    Step::Wait(_) => return Err(TestCaseError::fail("it waits beyond what it said")),
                 }
             }
 

@@ -117,6 +117,9 @@ struct Frame {
     #[serde(default)]
     drive: Option<String>,
     hex: String,
+    /// The bytes as text, where the protocol is text.
+    #[serde(default)]
+    text: Option<String>,
     #[serde(default)]
     decode: String,
     #[serde(default)]
@@ -308,7 +311,7 @@ fn line(frame: &Frame, with_bus: bool, colours: bool) -> String {
     let text = [
         format!("{} {gap:>8}", plain(time.trim_end_matches('Z'))),
         format!("{bus}{}", paint(&format!("{arrow} {drive:<12}"), colour, colours)),
-        format!("{:<23} ", plain(&frame.hex)),
+        format!("{:<23} ", plain(frame.text.as_ref().unwrap_or(&frame.hex))),
         meaning.join("  "),
     ];
     text.join(" ").trim_end().to_string()
@@ -364,6 +367,16 @@ mod tests {
         );
         assert_eq!(refused.matches(exception).count(), 1);
         assert!(refused.contains("\x1b[33mexception"), "{refused:?}");
+    }
+
+    #[test]
+    fn text_is_shown_as_text() {
+        let mut request = frame("request", "1792", "3A 30 0D 0A", "read holding 32..33", "");
+        request.text = Some(":010300200002DA\u{240D}\u{240A}".to_string());
+        assert_eq!(
+            line(&request, false, false),
+            "07:40:12.118304     1792 > pump-1       :010300200002DA\u{240D}\u{240A}        read holding 32..33"
+        );
     }
 
     #[test]

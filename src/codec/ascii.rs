@@ -1,4 +1,8 @@
 //! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (drives.md 5.1, worked frames section 7.3).
+//!
+//! A frame has a definite begin and end, so what is none of it is told at once: characters before a colon are noise,
+//! and a colon in the middle begins the frame anew. Digits are sent in upper case and taken in either. Of the pause of
+//! 1 s between two characters that ends a frame only a slave needs to know: a master has its deadline.
 
 use super::checksum::lrc;
 use super::modbus::{MAX_PDU, Reply, RequestPdu};
@@ -6,6 +10,9 @@ use super::{Decoded, Request};
 
 /// Longest frame: colon, address, PDU and LRC as two digits a byte, CR LF.
 pub const LONGEST: usize = chars(MAX_PDU);
+
+const BEGIN: u8 = b':';
+const END: u8 = b'\n';
 
 /// Characters of the frame around a PDU of that length.
 pub const fn chars(pdu: usize) -> usize {
@@ -18,7 +25,7 @@ pub fn encode_frame(address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     body.push(address);
     body.extend_from_slice(pdu);
     body.push(lrc(&body));
-    out.push(b':');
+    out.push(BEGIN);
     for byte in body {
         out.extend([digit(byte >> 4), digit(byte & 0x0F)]);
     }
@@ -32,19 +39,24 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
     encode_frame(request.address, &pdu, out);
 }
 
-/// What `bytes` are as the answer to `request`.
+/// What `bytes` are as the answer to `request`. A reply's `used` counts the noise before it too.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
-    let Some(end) = bytes.iter().position(|b| *b == b'\n') else {
-        return if bytes.len() >= LONGEST {
-            Decoded::Corrupt("no end of a frame in the longest one's characters")
-        } else {
-            Decoded::Incomplete
+    let start = noise(bytes);
+    let rest = bytes.get(start..).unwrap_or_default();
+    let end = rest.iter().position(|&b| b == END).map(|at| at + 1);
+    let Some(frame) = end.and_then(|end| rest.get(..end)) else {
+        return match unfinished(rest) {
+            Ok(()) if bytes.len() < LONGEST => Decoded::Incomplete,
+            // Noise may be longer than a frame that has only begun behind it.
+            Ok(()) if rest.first() == Some(&BEGIN) && rest.len() < LONGEST => Decoded::Incomplete,
+            Ok(()) => Decoded::Corrupt("no end of a frame in the characters of the longest one"),
+            Err(why) => Decoded::Corrupt(why),
         };
     };
-    let used = end + 1;
-    let line = bytes.get(..used).unwrap_or_default();
-    let Some((address, pdu)) = open_frame(line) else {
-        return Decoded::Corrupt("the frame is no colon, hexadecimal digits, LRC, CR LF");
+    let used = start + frame.len();
+    let (address, pdu) = match parse(frame) {
+        Ok(parsed) => parsed,
+        Err(why) => return Decoded::Corrupt(why),
     };
     if address != request.address {
         return Decoded::Foreign { used };
@@ -55,42 +67,94 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// Length of the frame of a master that starts `bytes`, up to its LF; `None` while it is not whole.
+/// Characters before the first frame that cannot belong to it: all until its colon, the last one where several came
+/// before a line feed. Without any colon, all of them.
+pub fn noise(bytes: &[u8]) -> usize {
+    let Some(first) = bytes.iter().position(|&b| b == BEGIN) else {
+        return bytes.len();
+    };
+    let line = bytes
+        .get(first..)
+        .unwrap_or_default()
+        .split(|&b| b == END)
+        .next()
+        .unwrap_or_default();
+    first + line.iter().rposition(|&b| b == BEGIN).unwrap_or(0)
+}
+
+/// Length of what a master sent up to its first line feed; `None` while that is not there.
 pub fn request_len(bytes: &[u8]) -> Option<usize> {
-    bytes.iter().position(|b| *b == b'\n').map(|end| end + 1)
+    bytes.iter().position(|&b| b == END).map(|end| end + 1)
 }
 
-/// The address and PDU of a whole frame whose LRC is right; a new colon begins the frame anew.
+/// The address and PDU of a whole frame whose LRC is right. What stands before its (last) colon does not matter.
 pub fn open_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
-    let colon = frame.iter().rposition(|b| *b == b':')?;
-    let digits = frame.get(colon + 1..)?.strip_suffix(b"\r\n")?;
-    if digits.len() % 2 != 0 {
-        return None;
-    }
-    let bytes: Option<Vec<u8>> = digits
-        .chunks_exact(2)
-        .map(|pair| Some(value(*pair.first()?)? << 4 | value(*pair.get(1)?)?))
-        .collect();
-    let bytes = bytes?;
-    let (check, body) = bytes.split_last()?;
-    if body.len() < 2 || lrc(body) != *check {
-        return None;
-    }
-    let (address, pdu) = body.split_first()?;
-    Some((*address, pdu.to_vec()))
+    parse(frame.get(noise(frame)..)?).ok()
 }
 
-/// The request in a whole frame, as a slave reads it; `None` when the frame or its LRC is wrong.
+/// The request in a whole frame, as a slave reads it; `None` when the frame or its LRC is wrong (a slave stays silent).
 pub fn decode_request(frame: &[u8]) -> Option<(u8, super::rtu::ReceivedPdu)> {
     let (address, pdu) = open_frame(frame)?;
     let function = *pdu.first()?;
     Some((address, RequestPdu::decode(&pdu).map_err(|code| (function, code))))
 }
 
+/// Whether characters without a line feed, from a colon on, can still become a frame.
+fn unfinished(frame: &[u8]) -> Result<(), &'static str> {
+    let Some((_, rest)) = frame.split_first() else {
+        return Ok(());
+    };
+    let digits = rest.strip_suffix(b"\r").unwrap_or(rest);
+    digits.iter().try_for_each(|&b| value(b).map(|_| ()))
+}
+
+/// Address and PDU of a frame from its colon to its line feed, or why it is none.
+fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
+    let line = frame.strip_prefix(b":").ok_or("it does not begin with a colon")?;
+    let line = line.strip_suffix(b"\n").ok_or("it does not end with a line feed")?;
+    let digits = line
+        .strip_suffix(b"\r")
+        .ok_or("a line feed without a carriage return before it")?;
+    if digits.len() > LONGEST - 3 {
+        return Err("it is longer than any frame");
+    }
+    let mut values = Vec::with_capacity(digits.len());
+    for &digit in digits {
+        values.push(value(digit)?);
+    }
+    let (pairs, odd) = values.as_chunks::<2>();
+    if !odd.is_empty() {
+        return Err("an odd number of hexadecimal digits");
+    }
+    let body: Vec<u8> = pairs.iter().map(|[high, low]| high << 4 | low).collect();
+    match body.as_slice() {
+        [address, pdu @ .., check] if !pdu.is_empty() => {
+            let sum = lrc(body.split_last().map_or(&[], |(_, rest)| rest));
+            if sum == *check {
+                Ok((*address, pdu.to_vec()))
+            } else {
+                Err("check code (LRC) is wrong")
+            }
+        }
+        _ => Err("it is shorter than any frame"),
+    }
+}
+
 fn digit(nibble: u8) -> u8 {
     if nibble < 10 { b'0' + nibble } else { b'A' + nibble - 10 }
 }
 
-fn value(digit: u8) -> Option<u8> {
-    char::from(digit).to_digit(16).map(|v| v as u8)
+/// The value of a digit, or what is wrong with a character that stands for one.
+fn value(character: u8) -> Result<u8, &'static str> {
+    match character {
+        b'0'..=b'9' => Ok(character - b'0'),
+        b'A'..=b'F' => Ok(character - b'A' + 10),
+        b'a'..=b'f' => Ok(character - b'a' + 10),
+        b'\r' => Err("a carriage return without a line feed behind it"),
+        0x80.. => Err("a character has bit 7 set: noise, or the data bits and parity are not the drive's"),
+        _ => Err("a character is no hexadecimal digit"),
+    }
 }
+
+#[cfg(test)]
+mod tests;

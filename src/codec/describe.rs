@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 use std::ops::Range;
 
-use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table, ascii, rtu};
+use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table};
 
 /// Values that a line shows; the bytes of the frame have the others.
 const SHOWN: usize = 16;
@@ -39,7 +39,9 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
     let mut at = 0;
     let mut echo_seen = false;
     while let Some(rest) = bytes.get(at..).filter(|rest| !rest.is_empty()) {
+        let noise = protocol.noise(rest);
         let (kind, used) = match protocol.decode(request, rest) {
+            _ if noise > 0 => (Kind::Garbage, noise),
             _ if !echo_seen && is_echo(protocol, request, frame, rest, answered) => (Kind::Echo, frame.len()),
             Decoded::Reply { used, .. } => (Kind::Reply, used),
             Decoded::Foreign { used } => (Kind::Foreign, used),
@@ -80,6 +82,10 @@ fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], ans
 fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: bool) -> usize {
     let is_reply = |at: &usize| {
         let behind = rest.get(*at..).unwrap_or_default();
+        let begins = |&first: &u8| protocol.may_begin_behind_garbage(request.address, first);
+        if !behind.first().is_some_and(begins) {
+            return false;
+        }
         match protocol.decode(request, behind) {
             Decoded::Reply { reply, .. } => !matches!(reply, Reply::Exception(_)),
             _ => false,
@@ -91,11 +97,26 @@ fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: boo
 }
 
 fn behind(protocol: Protocol, bytes: &[u8]) -> Kind {
-    match protocol {
-        Protocol::ModbusRtu if rtu::open_frame(bytes).is_some() => Kind::Foreign,
-        Protocol::ModbusAscii if ascii::open_frame(bytes).is_some() => Kind::Foreign,
-        Protocol::ModbusRtu | Protocol::ModbusAscii | Protocol::N2 => Kind::Garbage,
+    match protocol.open_frame(bytes) {
+        Some(_) => Kind::Foreign,
+        None => Kind::Garbage,
     }
+}
+
+/// The characters of a protocol that is text: control characters by their pictures, such as `␍␊`, and what is none of
+/// ASCII as `\xFF`.
+pub fn text(bytes: &[u8]) -> String {
+    let mut text = String::with_capacity(bytes.len() + 4);
+    for &byte in bytes {
+        match byte {
+            0x20..0x7F => text.push(char::from(byte)),
+            0x00..0x20 => text.extend(char::from_u32(0x2400 + u32::from(byte))),
+            0x7F => text.push('\u{2421}'),
+            // Writing to a string cannot fail.
+            0x80.. => drop(write!(text, "\\x{byte:02X}")),
+        }
+    }
+    text
 }
 
 /// A request: `read holding 2100..2110`, `write holding 2000 = 0x0001`.
@@ -161,12 +182,7 @@ pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
 
 /// Bytes that nobody asked for: a sound frame of somebody else, or noise.
 pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
-    let frame = match protocol {
-        Protocol::ModbusRtu => rtu::open_frame(bytes).map(|(address, pdu)| (address, pdu.to_vec())),
-        Protocol::ModbusAscii => ascii::open_frame(bytes),
-        Protocol::N2 => None,
-    };
-    let Some((address, pdu)) = frame else {
+    let Some((address, pdu)) = protocol.open_frame(bytes) else {
         return no_frame(bytes);
     };
     let [function, data @ ..] = pdu.as_slice() else {
@@ -255,6 +271,7 @@ fn more(count: usize, shown: usize) -> &'static str {
 
 #[cfg(test)]
 mod tests {
+    use super::super::{ascii, rtu};
     use super::*;
     use proptest::prelude::*;
 
@@ -478,16 +495,81 @@ mod tests {
         assert_eq!(kinds(&read, &noisy, false), [(Kind::Garbage, 16)]);
     }
 
+    /// What the parts of an exchange in Modbus ASCII are.
+    fn in_ascii(asked: &Request, bytes: &[u8], answered: bool) -> Vec<(Kind, usize)> {
+        let mut frame = Vec::new();
+        ascii::encode_request(asked, &mut frame);
+        parts(Protocol::ModbusAscii, asked, &frame, bytes, answered)
+            .into_iter()
+            .map(|part| (part.kind, part.range.len()))
+            .collect()
+    }
+
+    #[test]
+    fn ascii_exchanges_in_their_parts_and_words() {
+        let ask = |text: &[u8]| {
+            let (address, pdu) = ascii::decode_request(text).unwrap();
+            Request {
+                address,
+                pdu: pdu.unwrap(),
+            }
+        };
+        let echo = b":010300200002DA\r\n";
+        let read = ask(echo);
+        let own = b":01030400050000F3\r\n".as_slice();
+        let other = b":0203020023D6\r\n".as_slice();
+        assert_eq!(in_ascii(&read, own, true), [(Kind::Reply, 19)]);
+        let all = [b"\xFF0:", echo.as_slice(), other, own, b":0"].concat();
+        assert_eq!(
+            in_ascii(&read, &all, true),
+            [
+                (Kind::Garbage, 3),
+                (Kind::Echo, 17),
+                (Kind::Foreign, 15),
+                (Kind::Reply, 19),
+                (Kind::Garbage, 2)
+            ]
+        );
+        let broken = [b":01030400050000F4\r\n", own, other].concat();
+        assert_eq!(
+            in_ascii(&read, &broken, true),
+            [(Kind::Garbage, 19), (Kind::Reply, 19), (Kind::Foreign, 15)]
+        );
+        assert_eq!(in_ascii(&read, b"\x80\x81", false), [(Kind::Garbage, 2)]);
+        assert_eq!(in_ascii(&read, &own[..7], false), [(Kind::Garbage, 7)]);
+
+        let words = |bytes| reply(Protocol::ModbusAscii, &read, bytes);
+        assert_eq!(words(own), "2 registers: 0005 0000");
+        assert_eq!(words(b":0183027A\r\n"), "exception 02 (illegal data address)");
+        assert_eq!(words(other), "foreign: address 2, function 3, 1 register");
+        assert_eq!(words(&own[..7]), "7 of 19 bytes");
+        assert_eq!(words(b":01030400050000F4\r\n"), "19 bytes, no sound frame");
+    }
+
+    #[test]
+    fn text_is_shown_as_text() {
+        assert_eq!(text(b":010300200002DA\r\n"), ":010300200002DA\u{240D}\u{240A}");
+        assert_eq!(
+            text(&[0, 0x1B, b' ', 0x7F, 0x80, 0xFF]),
+            "\u{2400}\u{241B} \u{2421}\\x80\\xFF"
+        );
+        assert_eq!(text(b""), "");
+    }
+
     proptest! {
         #[test]
-        fn any_bytes_have_words_and_parts(bytes in proptest::collection::vec(any::<u8>(), 0..300), answered: bool) {
+        fn any_bytes_have_words_and_parts(
+            bytes in proptest::collection::vec(prop_oneof![any::<u8>(), Just(b':'), Just(b'\n')], 0..300),
+            answered: bool,
+            protocol in prop_oneof![Just(RTU), Just(Protocol::ModbusAscii)],
+        ) {
             let asked = asked("01 03 07 D0 00 03 05 46");
-            prop_assert!(!reply(RTU, &asked, &bytes).is_empty());
-            prop_assert!(!stray(RTU, &bytes).is_empty());
+            prop_assert!(!reply(protocol, &asked, &bytes).is_empty());
+            prop_assert!(!stray(protocol, &bytes).is_empty());
             let mut frame = Vec::new();
-            RTU.encode(&asked, &mut frame);
+            protocol.encode(&asked, &mut frame);
             let mut at = 0;
-            for part in parts(RTU, &asked, &frame, &bytes, answered) {
+            for part in parts(protocol, &asked, &frame, &bytes, answered) {
                 prop_assert_eq!(part.range.start, at);
                 prop_assert!(part.range.end > at);
                 at = part.range.end;

@@ -123,6 +123,41 @@ impl Protocol {
         }
     }
 
+    /// Characters at the beginning of `bytes` that cannot be part of a frame. Modbus RTU and N2 cannot tell.
+    pub fn noise(self, bytes: &[u8]) -> usize {
+        match self {
+            Protocol::ModbusAscii => ascii::noise(bytes),
+            Protocol::ModbusRtu | Protocol::N2 => 0,
+        }
+    }
+
+    /// Whether a reply from `address` that begins with this character may be believed although garbage came before it.
+    /// Never in N2: its reply has no address, and its check code 8 bits.
+    pub fn may_begin_behind_garbage(self, address: u8, character: u8) -> bool {
+        match self {
+            Protocol::ModbusRtu => character == address,
+            Protocol::ModbusAscii => character == b':',
+            Protocol::N2 => false,
+        }
+    }
+
+    /// The address and PDU of any sound Modbus frame; `None` in N2, whose frames hold none.
+    pub fn open_frame(self, frame: &[u8]) -> Option<(u8, Vec<u8>)> {
+        match self {
+            Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec())),
+            Protocol::ModbusAscii => ascii::open_frame(frame),
+            Protocol::N2 => None,
+        }
+    }
+
+    /// Whether its frames are text that people can read.
+    pub fn is_text(self) -> bool {
+        match self {
+            Protocol::ModbusRtu => false,
+            Protocol::ModbusAscii | Protocol::N2 => true,
+        }
+    }
+
     /// Characters on the wire of the request's frame.
     pub fn request_chars(self, request: &RequestPdu) -> usize {
         match self {

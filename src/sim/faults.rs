@@ -319,7 +319,7 @@ fn noise(random: &mut Random) -> Vec<u8> {
 
 /// A sound frame that does not answer the request; its data is changed so that it proves itself when believed.
 fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
-    let Some((address, mut pdu)) = framing::open_any(protocol, reply) else {
+    let Some((address, mut pdu)) = protocol.open_frame(reply) else {
         return Vec::new();
     };
     let registers = matches!(pdu.first(), Some(3 | 4));

@@ -55,15 +55,6 @@ pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, Result<RequestPdu, 
     }
 }
 
-/// Address and PDU of any sound Modbus frame, such as a reply.
-pub fn open_any(protocol: Protocol, frame: &[u8]) -> Option<(u8, Vec<u8>)> {
-    match protocol {
-        Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec())),
-        Protocol::ModbusAscii => ascii::open_frame(frame),
-        Protocol::N2 => None,
-    }
-}
-
 /// Appends the frame of a Modbus PDU to `out`.
 pub fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     match protocol {

@@ -23,6 +23,7 @@ use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 use super::routes::{Served, not_found};
 use super::{MAX_LISTENERS, api};
 use crate::cache::{Direction, FrameRecord};
+use crate::codec::{Protocol, describe};
 use crate::event::Event;
 
 /// Time after which a browser connects again.
@@ -78,7 +79,11 @@ pub(super) async fn trace(State(served): State<Arc<Served>>, RawQuery(query): Ra
         .filter(|image| wanted.as_ref().is_none_or(|name| *name == image.spec.name))
         .map(|image| {
             let bus = image.spec.name.clone();
-            hear(image.trace.subscribe(), move |frame| Some(frame_message(&bus, &frame))).boxed()
+            let protocol = image.spec.protocol;
+            hear(image.trace.subscribe(), move |frame| {
+                Some(frame_message(&bus, protocol, &frame))
+            })
+            .boxed()
         })
         .collect();
     if let (Some(name), true) = (wanted, heard.is_empty()) {
@@ -186,11 +191,13 @@ struct Frame<'f> {
     direction: Direction,
     drive: Option<&'f str>,
     hex: String,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    text: Option<String>,
     decode: &'f str,
     verdict: &'f str,
 }
 
-fn frame_message(bus: &str, record: &FrameRecord) -> Message {
+fn frame_message(bus: &str, protocol: Protocol, record: &FrameRecord) -> Message {
     let frame = Frame {
         bus,
         time: humantime::format_rfc3339_micros(record.time).to_string(),
@@ -198,6 +205,7 @@ fn frame_message(bus: &str, record: &FrameRecord) -> Message {
         direction: record.direction,
         drive: record.drive.as_deref(),
         hex: hex(&record.bytes),
+        text: protocol.is_text().then(|| describe::text(&record.bytes)),
         decode: &record.decode,
         verdict: &record.verdict,
     };

@@ -311,7 +311,7 @@ fn an_ascii_request_that_follows_without_waiting_spoils_the_reply() {
     let seen = run(&mut line, Duration::from_secs(1));
     assert_eq!(seen.len(), 1);
     assert_eq!((line.statistics().requests, line.statistics().collisions), (1, 1));
-    let sound = |bytes: &[u8]| framing::open_any(Protocol::ModbusAscii, bytes).is_some();
+    let sound = |bytes: &[u8]| Protocol::ModbusAscii.open_frame(bytes).is_some();
     assert!(!sound(&seen[0].1));
     line.on_bytes(ASCII_READ_STATUS, Duration::from_secs(2));
     assert!(sound(&run(&mut line, Duration::from_secs(3))[0].1));
