@@ -31,7 +31,10 @@ const MOST_SILENCE: Duration = Duration::from_secs(1);
 
 pub(super) const DEFAULT_PROTOCOL: Protocol = Protocol::ModbusRtu;
 pub(super) const DEFAULT_BAUD: u32 = 9600;
+/// Of Modbus RTU and N2.
 pub(super) const DEFAULT_FORMAT: &str = "8N1";
+/// Of Modbus ASCII: what TECO's card has with all switches off (drives.md 2).
+pub(super) const DEFAULT_ASCII_FORMAT: &str = "7N2";
 pub(super) const DEFAULT_CYCLE: Duration = Duration::from_millis(10);
 pub(super) const DEFAULT_SLOW_CYCLE: Duration = Duration::from_secs(1);
 pub(super) const DEFAULT_RESPONSE_TIMEOUT: Duration = Duration::from_millis(100);
@@ -53,7 +56,12 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
     let protocol = read_protocol(reader);
     let format = read_format(reader, protocol.unwrap_or(DEFAULT_PROTOCOL));
     let (cycle, slow_cycle) = read_cadence(reader);
-    let options = read_options(reader, format.as_ref(), port.as_deref());
+    let options = read_options(
+        reader,
+        protocol.unwrap_or(DEFAULT_PROTOCOL),
+        format.as_ref(),
+        port.as_deref(),
+    );
     let around = Surroundings {
         bus: name.as_ref().map_or("", |(name, _)| name),
         protocol: protocol.unwrap_or(DEFAULT_PROTOCOL),
@@ -118,11 +126,16 @@ fn read_cadence(reader: &Reader<'_>) -> (Duration, Duration) {
     (cycle, slow_cycle)
 }
 
-fn read_options(reader: &Reader<'_>, format: Option<&LineFormat>, port: Option<&str>) -> BusOptions {
+fn read_options(
+    reader: &Reader<'_>,
+    protocol: Protocol,
+    format: Option<&LineFormat>,
+    port: Option<&str>,
+) -> BusOptions {
     let options = BusOptions {
         response_timeout: values::duration(reader, "response_timeout", DEFAULT_RESPONSE_TIMEOUT, &TIMES),
         retries: values::number(reader, "retries", DEFAULT_RETRIES, &RETRIES),
-        silence: read_silence(reader, format),
+        silence: read_silence(reader, protocol, format),
         rs485: values::choice(reader, "rs485", Rs485::Off, &RS485),
     };
     let device_server = port.is_some_and(|p| p.starts_with("tcp://"));
@@ -169,7 +182,7 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
     };
     let text = match reader.has("format") {
         true => reader.optional::<String>("format"),
-        false => Some(DEFAULT_FORMAT.to_string()),
+        false => Some(default_format(protocol).to_string()),
     };
     let format = match LineFormat::new(baud.unwrap_or(DEFAULT_BAUD), &text?) {
         Ok(format) => format,
@@ -184,10 +197,23 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
             "Modbus RTU sends bytes of 8 bits; write for example \"8N1\" or \"8E1\"",
         );
     }
+    if protocol == Protocol::ModbusAscii && format.bits_per_char() < 10 {
+        reader.warning(
+            "format",
+            "characters of 9 bits: Modbus ASCII drives have 10, two stop bits where there is no parity; write \"7N2\"",
+        );
+    }
     baud.map(|_| format)
 }
 
-fn read_silence(reader: &Reader<'_>, format: Option<&LineFormat>) -> Silence {
+fn default_format(protocol: Protocol) -> &'static str {
+    match protocol {
+        Protocol::ModbusAscii => DEFAULT_ASCII_FORMAT,
+        Protocol::ModbusRtu | Protocol::N2 => DEFAULT_FORMAT,
+    }
+}
+
+fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFormat>) -> Silence {
     let silence = reader.parsed("silence", |text| {
         match text
             .parse::<Silence>()
@@ -201,7 +227,7 @@ fn read_silence(reader: &Reader<'_>, format: Option<&LineFormat>) -> Silence {
             silence => Ok(silence),
         }
     });
-    if let (Some(Silence::Fixed(time)), Some(format)) = (silence, format)
+    if let (Protocol::ModbusRtu, Some(Silence::Fixed(time)), Some(format)) = (protocol, silence, format)
         && time < format.silence_chars()
     {
         reader.warning(

@@ -86,9 +86,13 @@ fn bus() -> Value {
             ),
             (
                 "format",
-                with_default(
-                    pattern("Data bits, parity, stop bits.", "^[78][NEOneo][12]$"),
-                    bus::DEFAULT_FORMAT,
+                pattern(
+                    &format!(
+                        "Data bits, parity, stop bits; without it {}, with modbus-ascii {}.",
+                        bus::DEFAULT_FORMAT,
+                        bus::DEFAULT_ASCII_FORMAT
+                    ),
+                    "^[78][NEOneo][12]$",
                 ),
             ),
             (

@@ -427,6 +427,34 @@ fn new_certificates_in_the_same_files_are_seen() {
 }
 
 #[test]
+fn the_format_without_a_word_is_that_of_the_protocol() {
+    for (protocol, format) in [
+        ("modbus-rtu", "9600 8N1"),
+        ("modbus-ascii", "9600 7N2"),
+        ("n2", "9600 8N1"),
+    ] {
+        let bus = format!(
+            "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/tty1\"\nprotocol = \"{protocol}\"\n"
+        );
+        assert_eq!(settings(&bus).buses[0].spec.format.to_string(), format);
+    }
+    let ascii = |format: &str| {
+        let (loaded, _) = load(&format!(
+            "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/tty1\"\nprotocol = \"modbus-ascii\"\n\
+             format = \"{format}\"\nsilence = \"1ms\"\n"
+        ));
+        let told: Vec<_> = loaded.warnings.iter().map(|w| w.message.clone()).collect();
+        let odd = told.iter().any(|text| text.contains("9 bits"));
+        assert!(!told.iter().any(|text| text.contains("3.5 characters")), "{told:?}");
+        (loaded.settings.is_some(), odd)
+    };
+    for sound in ["7N2", "7E1", "7O1", "8N1", "8E1", "8N2"] {
+        assert_eq!(ascii(sound), (true, false), "{sound}");
+    }
+    assert_eq!(ascii("7N1"), (true, true));
+}
+
+#[test]
 fn a_reload_sees_what_changed() {
     let one = settings(&FULL);
     assert_eq!(one, settings(&FULL));

@@ -173,6 +173,25 @@ mod tests {
     use super::super::profile::Profiles;
     use super::*;
 
+    /// 17 and 75 characters of 10 bits (drives.md 5.2), 15 ms of a TECO drive, 3.5 characters of silence.
+    #[test]
+    fn an_ascii_exchange_by_hand() {
+        let format = LineFormat::new(9600, "7E1").unwrap();
+        let pdu = RequestPdu::Read {
+            table: Table::Holding,
+            start: 0x20,
+            count: 16,
+        };
+        let time = WireTime::of(Protocol::ModbusAscii, &format, &pdu);
+        let us = |time: Duration| time.as_micros();
+        assert_eq!(
+            (us(time.request), us(time.recognition), us(time.reply)),
+            (17_708, 0, 78_125)
+        );
+        let total = time.total(Duration::from_millis(15), format.silence_spec());
+        assert_eq!(us(total), 114_479);
+    }
+
     #[test]
     fn process_data_is_one_request() {
         let profiles = Profiles::built_in();
