@@ -13,8 +13,14 @@ use crate::process::{Running, api, free_port, get, mbpoll_read, until, until_rea
 use crate::tools::{run_well, tool};
 
 fn line(path: &Path) -> SimulatedBus {
+    line_of(path, &[1])
+}
+
+/// Simulated drives whose line is written down.
+pub(crate) fn line_of(path: &Path, addresses: &[u8]) -> SimulatedBus {
     let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
-    let options = SimulatedBusOptions::new("line1", rules, vec![DriveOptions::nx(1)]);
+    let drives = addresses.iter().map(|a| DriveOptions::nx(*a)).collect();
+    let options = SimulatedBusOptions::new("line1", rules, drives);
     let endpoint = EndpointOptions::Pty {
         link: Some(path.to_path_buf()),
     };
@@ -41,7 +47,7 @@ fn configure(folder: &Path, extra: &str) -> (String, u16, u16) {
 }
 
 /// Function codes of the requests on the line.
-fn functions(line: &SimulatedBus) -> Vec<u8> {
+pub(crate) fn functions(line: &SimulatedBus) -> Vec<u8> {
     let frames = line.transcript();
     frames
         .iter()
