@@ -149,3 +149,119 @@ impl Owed {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, OnShutdown, Supervision};
+    use crate::codec::{Exception, LineFormat, Protocol, Reply, Table};
+    use crate::command::{CommandQueue, Outcome};
+    use crate::drive::profile::Profiles;
+
+    struct Bench {
+        bus: BusHandle,
+        leases: Leases,
+        now: Instant,
+    }
+
+    impl Bench {
+        fn new(action: LeaseAction) -> Bench {
+            let spec = DriveSpec {
+                name: "d".to_string(),
+                bus: "b".to_string(),
+                address: 1,
+                unit: 1,
+                profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
+                access: Access::Control,
+                limits: BTreeMap::new(),
+                supervision: Some(Supervision {
+                    timeout: Duration::from_secs(5),
+                    action,
+                }),
+                on_shutdown: OnShutdown::Hold,
+                turnaround: Duration::ZERO,
+                frequency_range: None,
+            };
+            let bus = BusSpec {
+                name: "b".to_string(),
+                port: "none".to_string(),
+                protocol: Protocol::ModbusRtu,
+                format: LineFormat::new(38_400, "8N1").unwrap(),
+                cycle: Duration::from_millis(10),
+                slow_cycle: Duration::from_secs(1),
+            };
+            let drive = DriveImage::new(spec, bus.slow_cycle);
+            drive.update(|s| s.link = Link::Online(SystemTime::now()));
+            Bench {
+                bus: BusHandle {
+                    image: Arc::new(BusImage::new(bus, vec![Arc::new(drive)])),
+                    queue: Arc::new(CommandQueue::new().unwrap()),
+                },
+                leases: Leases::new(Events::default(), Arc::default()),
+                now: Instant::now(),
+            }
+        }
+
+        /// `ms` later the drive says whether it runs, and the leases are looked at: the rank of the action that is
+        /// written then, and where its answer goes.
+        fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
+            self.now += Duration::from_millis(ms);
+            let now = self.now;
+            let word = u16::from(runs) << 1;
+            self.bus.image.drives[0].update(|s| s.store(Table::Holding, 2100, &[word], now));
+            self.leases.look(&self.bus, now);
+            assert!(self.bus.queue.lock().len() <= 1, "one at a time");
+            self.bus.queue.lock().pop(Urgency::Read, now)
+        }
+
+        fn told(&self) -> usize {
+            self.leases.events.recent().len()
+        }
+    }
+
+    #[test]
+    fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
+        for (action, urgency) in [
+            (LeaseAction::Stop, Urgency::Stop),
+            (LeaseAction::SpeedReference(20.0), Urgency::Command),
+        ] {
+            let mut bench = Bench::new(action);
+            assert!(bench.after(60_000, true).is_none(), "nobody commanded it");
+            bench.bus.image.drives[0].renew_lease(bench.now);
+            assert!(bench.after(4_900, true).is_none());
+            for failed in [
+                Outcome::TimedOut,
+                Outcome::Exception(Exception::BUSY),
+                Outcome::QueueFull,
+            ] {
+                let command = bench.after(1_000, true).expect("the action");
+                assert_eq!(command.urgency, urgency);
+                assert!(bench.after(10, true).is_none(), "not while its answer is waited for");
+                command.ticket.answer(failed, bench.now);
+                assert!(bench.after(10, true).is_none(), "a pause first");
+            }
+            // Also when the drive was seen to stand meanwhile: nobody knows why.
+            let command = bench.after(1_000, false).expect("the action");
+            command.ticket.answer(Outcome::Acknowledged(Reply::Written), bench.now);
+            for _ in 0..20 {
+                assert!(bench.after(1_000, true).is_none(), "once");
+            }
+            assert_eq!(bench.told(), 1);
+            assert_eq!(bench.bus.image.drives[0].supervisions(), 1);
+        }
+    }
+
+    #[test]
+    fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
+        let mut bench = Bench::new(LeaseAction::Stop);
+        bench.bus.image.drives[0].renew_lease(bench.now);
+        assert!(bench.after(10_000, false).is_none());
+        assert_eq!(bench.told(), 0);
+        let mut bench = Bench::new(LeaseAction::Hold);
+        bench.bus.image.drives[0].renew_lease(bench.now);
+        assert!(bench.after(10_000, true).is_none());
+        assert_eq!(bench.told(), 1);
+    }
+}

@@ -7,6 +7,7 @@
     reason = "tests may panic"
 )]
 
+mod bad_commands;
 mod commands;
 mod demo;
 mod flood;

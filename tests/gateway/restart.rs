@@ -5,6 +5,7 @@ use std::path::Path;
 use drivegate::codec::LineFormat;
 use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
@@ -13,8 +14,14 @@ use crate::process::{Running, api, free_port, get, mbpoll_read, until, until_rea
 use crate::tools::{run_well, tool};
 
 fn line(path: &Path) -> SimulatedBus {
+    line_of(path, &[1])
+}
+
+/// Simulated drives whose line is written down.
+pub(crate) fn line_of(path: &Path, addresses: &[u8]) -> SimulatedBus {
     let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
-    let options = SimulatedBusOptions::new("line1", rules, vec![DriveOptions::nx(1)]);
+    let drives = addresses.iter().map(|a| DriveOptions::nx(*a)).collect();
+    let options = SimulatedBusOptions::new("line1", rules, drives);
     let endpoint = EndpointOptions::Pty {
         link: Some(path.to_path_buf()),
     };
@@ -41,7 +48,7 @@ fn configure(folder: &Path, extra: &str) -> (String, u16, u16) {
 }
 
 /// Function codes of the requests on the line.
-fn functions(line: &SimulatedBus) -> Vec<u8> {
+pub(crate) fn functions(line: &SimulatedBus) -> Vec<u8> {
     let frames = line.transcript();
     frames
         .iter()
@@ -122,9 +129,62 @@ fn on_shutdown_stop_stops_and_hold_holds() {
         gateway.signal("TERM");
         let (status, _) = gateway.ended();
         assert!(status.success(), "{status}");
-        let writes = functions(&line).into_iter().find(|f| *f != 3);
-        assert_eq!(writes, last, "on_shutdown = {action}");
+        let frames = line.transcript();
+        let mut writes = frames.iter().filter(|f| f.bytes.get(1) != Some(&3));
+        assert_eq!(
+            writes.next().map(|f| (f.direction, f.bytes[1])),
+            last.map(|function| (Direction::ToDrives, function)),
+            "on_shutdown = {action}"
+        );
+        // The port closes behind the acknowledgement, which repeats the request.
+        assert_eq!(writes.next().map(|f| f.direction), last.map(|_| Direction::FromDrives));
+        assert_eq!(writes.count(), 0);
     }
+}
+
+#[test]
+fn a_stop_that_nobody_acknowledges_holds_up_the_shutdown_for_a_bounded_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
+    let mut gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+    until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
+    line.record(100_000);
+    line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
+    gateway.signal("TERM");
+    let (status, time) = gateway.ended();
+    assert!(status.success(), "{status}");
+    assert!(time < std::time::Duration::from_secs(5), "{time:?}");
+    assert!(gateway.output().contains("not every drive acknowledged its stop"));
+    let stops = functions(&line).into_iter().filter(|f| *f == 6).count();
+    assert!(stops >= 2, "tried again: {stops}");
+}
+
+#[test]
+fn a_reload_that_opens_the_line_anew_writes_no_control_word() {
+    let folder = tempfile::tempdir().unwrap();
+    let line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+    until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
+    line.record(100_000);
+    let text = std::fs::read_to_string(&file).unwrap();
+    std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
+    gateway.signal("HUP");
+    gateway.until_printed("the new configuration is taken");
+    until("the control word was read again", || {
+        (crate::process::point(http, "pump-1", "run") == true).then_some(())
+    });
+    let functions = functions(&line);
+    assert!(
+        functions.len() > 5 && functions.iter().all(|f| *f == 3),
+        "only reads: {functions:?}"
+    );
+    assert_eq!(api(http, "pump-1")["state"], "running");
 }
 
 #[test]

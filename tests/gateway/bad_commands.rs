@@ -1,0 +1,300 @@
+//! Commands that must not reach a drive, by both protocols; the line is written down and shows that nothing did.
+
+use std::io::{Read, Write};
+use std::net::TcpStream;
+use std::path::Path;
+use std::process::Command;
+use std::time::{Duration, Instant};
+
+use drivegate::sim::statistics::Direction;
+use drivegate::sim::wire::SimulatedBus;
+
+use crate::process::{Running, api, free_port, get, point, until};
+use crate::restart::{functions, line_of};
+use crate::tools::tool;
+
+/// A drive that runs or stands, and has neither references nor a second direction.
+const PLAIN: &str = r#"
+name = "plain"
+protocols = ["modbus-rtu"]
+[[range]]
+table = "holding"
+first = 2000
+last = 2010
+read = 11
+write = 1
+[[range]]
+table = "holding"
+first = 2100
+last = 2110
+read = 11
+[[point]]
+name = "running"
+at = "holding 2100.1"
+class = "fast"
+[[point]]
+name = "run"
+at = "holding 2000.0"
+class = "slow"
+write = true
+"#;
+
+struct Bench {
+    line: SimulatedBus,
+    _broker: Running,
+    _gateway: Running,
+    modbus: u16,
+    mqtt: u16,
+    http: u16,
+    _folder: tempfile::TempDir,
+}
+
+/// Drives `pump` and `plain`, which may be commanded, `watched`, which may not, and `gone`, which is not there.
+fn bench() -> Bench {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name);
+    let line = line_of(&path("line1"), &[1, 2, 3]);
+    let (modbus, mqtt, http) = (free_port(), free_port(), free_port());
+    std::fs::create_dir(path("profiles")).unwrap();
+    let write = |name: &str, text: &str| std::fs::write(path(name), text).unwrap();
+    write("profiles/plain.toml", PLAIN);
+    write(
+        "mosquitto.conf",
+        &format!("listener {mqtt} 127.0.0.1\nallow_anonymous true\n"),
+    );
+    let drives: String = [
+        ("pump", 1, "vacon-nx", "control"),
+        ("plain", 2, "plain", "control"),
+        ("watched", 3, "vacon-nx", "monitor"),
+        ("gone", 9, "vacon-nx", "control"),
+    ]
+    .map(|(name, address, profile, access)| {
+        format!(
+            "[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"{profile}\"\naccess = \"{access}\"\n"
+        )
+    })
+    .concat();
+    write(
+        "drivegate.toml",
+        &format!(
+            "[gateway]\nname = \"test\"\nprofile_dirs = [\"profiles\"]\n\
+             [[bus]]\nname = \"line1\"\nport = \"{}\"\nbaud = 38400\nsilence = \"chars\"\n{drives}\
+             [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n\
+             [mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n[http]\nlisten = \"127.0.0.1:{http}\"\n",
+            path("line1").display()
+        ),
+    );
+    let text = |path: &Path| path.display().to_string();
+    let broker = Running::start(&tool("mosquitto"), &["-c", &text(&path("mosquitto.conf"))]);
+    let gateway = Running::drivegate(&["run", "--config", &text(&path("drivegate.toml"))]);
+    until("the broker", || {
+        get(http, "/metrics")?
+            .1
+            .contains("drivegate_mqtt_connected 1")
+            .then_some(())
+    });
+    until("the frequency range", || {
+        point(http, "pump", "frequency_reference").is_number().then_some(())
+    });
+    until("the plain drive", || {
+        point(http, "plain", "run").is_boolean().then_some(())
+    });
+    until("the drive that is gone", || {
+        (api(http, "gone")["state"] == "offline").then_some(())
+    });
+    line.record(100_000);
+    Bench {
+        line,
+        _broker: broker,
+        _gateway: gateway,
+        modbus,
+        mqtt,
+        http,
+        _folder: folder,
+    }
+}
+
+impl Bench {
+    /// The result of a message to a set topic, by a client of its own.
+    fn set(&self, topic: &str, payload: &str) -> serde_json::Value {
+        let port = self.mqtt.to_string();
+        let topic = format!("drivegate/test/drive/{topic}");
+        let arguments = ["-V", "5", "-h", "127.0.0.1", "-p", &port, "-q", "1", "-W", "10"];
+        let output = Command::new(tool("mosquitto_rr"))
+            .args(arguments)
+            .args(["-t", &topic, "-e", "answers/1", "-m", payload])
+            .output()
+            .unwrap();
+        let text = String::from_utf8_lossy(&output.stdout).into_owned();
+        serde_json::from_str(&text).unwrap_or_else(|_| panic!("{topic} {payload}: {text} {output:?}"))
+    }
+
+    /// The PDU that answers one.
+    fn ask(&self, unit: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut stream = TcpStream::connect(("127.0.0.1", self.modbus)).unwrap();
+        stream.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+        let mut frame = vec![0, 1, 0, 0, 0, pdu.len() as u8 + 1, unit];
+        frame.extend_from_slice(pdu);
+        stream.write_all(&frame).unwrap();
+        let mut head = [0u8; 7];
+        stream.read_exact(&mut head).unwrap();
+        let mut answer = vec![0u8; usize::from(head[5]) - 1];
+        stream.read_exact(&mut answer).unwrap();
+        answer
+    }
+
+    fn writes(&self) -> usize {
+        functions(&self.line).iter().filter(|f| **f != 3).count()
+    }
+}
+
+/// Functions 6 and 16.
+fn write(start: u16, values: &[u16]) -> Vec<u8> {
+    let words: Vec<u8> = values.iter().flat_map(|v| v.to_be_bytes()).collect();
+    let start = start.to_be_bytes();
+    match values {
+        [_] => [&[6], &start[..], &words].concat(),
+        _ => [&[16], &start[..], &[0, values.len() as u8, words.len() as u8], &words].concat(),
+    }
+}
+
+#[test]
+fn nothing_of_a_bad_command_reaches_a_drive() {
+    let bench = bench();
+    let mut wrong: Vec<String> = Vec::new();
+    for (topic, payload, code, text) in [
+        ("pump/set", r#"{"speed_reference": NaN}"#, "bad_value", "no JSON"),
+        ("pump/set", r#"{"speed_reference": -Infinity}"#, "bad_value", "no JSON"),
+        ("pump/set", r#"{"speed_reference": 1e999}"#, "bad_value", "no JSON"),
+        ("pump/set", r#"{"speed_reference": "50"}"#, "bad_value", "quotes"),
+        (
+            "pump/set",
+            r#"{"speed_reference": null}"#,
+            "bad_value",
+            "speed_reference",
+        ),
+        (
+            "pump/set",
+            r#"{"speed_reference": [50]}"#,
+            "bad_value",
+            "speed_reference",
+        ),
+        ("pump/set", r#"{"run": "true"}"#, "bad_value", "not true or false"),
+        ("pump/set", r#"{"run": 2}"#, "bad_value", "not true or false"),
+        ("pump/set", r#"{"run": true, "run": false}"#, "bad_value", "twice"),
+        (
+            "pump/set",
+            r#"{"run": true, "speed_reference": 50, "frequency_reference": 30}"#,
+            "bad_value",
+            "twice",
+        ),
+        (
+            "pump/set",
+            r#"{"run": true, "speed_reference": 1000}"#,
+            "bad_value",
+            "outside the limits",
+        ),
+        (
+            "pump/set",
+            r#"{"run": true, "ready": true}"#,
+            "not_writable",
+            "read-only",
+        ),
+        ("pump/set/speed_reference", "nan", "bad_value", "number"),
+        ("pump/set/speed_reference", "inf", "bad_value", "number"),
+        (
+            "plain/set",
+            r#"{"run": true, "reverse": true}"#,
+            "not_writable",
+            "reverse",
+        ),
+        (
+            "plain/set",
+            r#"{"run": true, "speed_reference": 10}"#,
+            "not_writable",
+            "speed_reference",
+        ),
+        (
+            "plain/set/frequency_reference",
+            "10",
+            "not_writable",
+            "frequency_reference",
+        ),
+        ("watched/set", r#"{"run": true}"#, "not_allowed", "only monitored"),
+        ("gone/set", r#"{"run": true}"#, "offline", "not sent"),
+        ("nobody/set", r#"{"run": true}"#, "unknown_drive", "nobody"),
+    ] {
+        let began = Instant::now();
+        let result = bench.set(topic, payload);
+        let message = result["error"]["message"].as_str().unwrap_or_default();
+        let waited = began.elapsed() > Duration::from_secs(5);
+        if result["ok"] != false || result["error"]["code"] != code || !message.contains(text) || waited {
+            wrong.push(format!("{topic} {payload}: {result} after {:?}", began.elapsed()));
+        }
+    }
+    for (unit, pdu, exception) in [
+        (1, write(0x8100, &[0x0100]), 3),         // a bit that means nothing
+        (1, write(0x8100, &[1, 20_000]), 3),      // run at 200 %
+        (1, write(0x8100, &[1, 5000, 3000]), 3),  // run at two references
+        (1, write(0x8101, &[5000, 3000]), 3),     // two references
+        (1, write(0x8101, &[0x8000]), 3),         // -327.68 %
+        (1, write(2002, &[10_001]), 3),           // 100.01 % in the drive's own register
+        (1, write(0x8200, &[0x7FC0, 0]), 2),      // NaN where floats are read
+        (1, write(0x8208, &[0x41A0, 0]), 2),      // 20.0 there
+        (1, write(0x8004, &[100]), 2),            // a value that is read
+        (1, write(2100, &[1]), 2),                // the status word
+        (2, write(0x8100, &[3]), 3),              // run reverse, no such direction
+        (2, write(0x8101, &[1000]), 2),           // no reference
+        (2, write(0x8102, &[1000]), 2),           // no reference
+        (2, write(0x8100, &[1, 1000]), 2),        // run at a reference
+        (3, write(0x8100, &[1]), 1),              // only monitored
+        (9, write(0x8100, &[1]), 0x0B),           // offline
+        (99, write(0x8100, &[1]), 0x0A),          // nobody
+        (1, vec![22, 0x07, 0xD0, 0, 1, 0, 1], 1), // mask write, which the drive does not have
+    ] {
+        let began = Instant::now();
+        let answer = bench.ask(unit, &pdu);
+        if answer != [pdu[0] | 0x80, exception] || began.elapsed() > Duration::from_secs(1) {
+            wrong.push(format!(
+                "unit {unit} {pdu:02X?}: {answer:02X?} after {:?}",
+                began.elapsed()
+            ));
+        }
+    }
+    assert!(wrong.is_empty(), "{wrong:#?}");
+    assert_eq!(bench.writes(), 0, "only reads are on the line");
+    let audit: Vec<serde_json::Value> = serde_json::from_str(&get(bench.http, "/api/v1/audit").unwrap().1).unwrap();
+    let of = |source: &str| audit.iter().filter(|r| r["source"] == source).count();
+    assert_eq!(
+        (of("mqtt"), of("modbus_tcp")),
+        (19, 16),
+        "each that names a drive and a function it has"
+    );
+
+    // A good one that comes again, as QoS 1 allows: one write, the same result.
+    let again = r#"{"id": "order-66", "speed_reference": 12.5}"#;
+    let first = bench.set("pump/set", again);
+    assert_eq!((&first["ok"], &first["result"]), (&true.into(), &"confirmed".into()));
+    assert_eq!(bench.set("pump/set", again), first, "from memory");
+    assert_eq!(bench.writes(), 1);
+
+    // Two clients that set different bits do not undo each other.
+    let control_words = || {
+        let frames = bench.line.transcript();
+        let to_drives = frames.iter().filter(|f| f.direction == Direction::ToDrives);
+        let words = to_drives.filter(|f| f.bytes.starts_with(&[1, 6, 0x07, 0xD0]));
+        words.map(|f| f.bytes[5]).collect::<Vec<u8>>()
+    };
+    assert_eq!(bench.set("pump/set/run", "true")["ok"], true);
+    assert_eq!(bench.set("pump/set/reverse", "true")["ok"], true);
+    assert_eq!(control_words(), [1, 3]);
+    assert_eq!(
+        bench.ask(1, &write(2000, &[1])),
+        write(2000, &[1]),
+        "the word as a whole"
+    );
+    assert_eq!(bench.set("pump/set", r#"{"reverse": true}"#)["ok"], true);
+    assert_eq!(control_words(), [1, 3, 1, 3], "a raw write is known to the next bit");
+    assert_eq!(bench.set("pump/set/run", "false")["ok"], true);
+    assert_eq!(control_words().last(), Some(&2));
+}
