@@ -384,7 +384,14 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
     if let Content::Point(point) = entry.content {
         note = point_note(profile, point, note);
     }
-    let writable = entry.is_command() && access == Access::Control;
+    let takes = |point| profile.model_point(point).is_some_and(|p| p.write);
+    let writable = access == Access::Control
+        && entry.is_command()
+        && match entry.content {
+            Content::Point(point) => takes(point),
+            Content::Command => takes(ModelPoint::Run),
+            _ => true,
+        };
     Row {
         view,
         table: "holding, input",
