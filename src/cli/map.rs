@@ -2,25 +2,31 @@
 
 use std::fmt::Write as _;
 use std::io;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::process::ExitCode;
 use std::sync::Arc;
 
 use comfy_table::{Table as TextTable, presets};
 
-use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, report};
+use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::cache::{Access, BusImage, DriveImage, DriveSpec};
 use crate::codec::Table;
 use crate::command::CommandQueue;
 use crate::config::{BusSettings, Settings, environment};
 use crate::drive::profile::{Form as RawForm, Raw};
-use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile};
+use crate::drive::{ModelPoint, Plan, Point, Profile};
+use crate::north::modbus_tcp::Role;
 use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry, GATEWAY_UNIT};
-use crate::plant::{BusHandle, Plant};
+use crate::plant::{BusHandle, DriveHandle, Plant};
+
+mod export;
 
 /// Prints the Modbus TCP register map of a configuration, for the SCADA engineer.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv")]
+#[command(after_help = "Examples:
+  drivegate map --config /etc/drivegate/drivegate.toml --csv > registers.csv
+  drivegate map --config /etc/drivegate/drivegate.toml --json --listener 127.0.0.1:1503")]
 pub(super) struct Args {
     /// Configuration file
     #[arg(long, value_name = "FILE", default_value = DEFAULT_CONFIG)]
@@ -28,6 +34,20 @@ pub(super) struct Args {
     /// Comma-separated values, one line for each register of each unit
     #[arg(long)]
     csv: bool,
+    /// JSON: listeners, units and registers
+    #[arg(long, conflicts_with = "csv")]
+    json: bool,
+    /// Only what the listener at this address shows
+    #[arg(long, value_name = "ADDRESS")]
+    listener: Option<SocketAddr>,
+}
+
+/// How the map is printed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Format {
+    Text,
+    Csv,
+    Json,
 }
 
 /// One line of the map.
@@ -46,10 +66,12 @@ struct Row {
     unit: String,
     not_available: &'static str,
     access: &'static str,
+    /// Where the value comes from, or a write goes to.
+    source: String,
     note: String,
 }
 
-const COLUMNS: [&str; 13] = [
+const COLUMNS: [&str; 14] = [
     "view",
     "table",
     "address",
@@ -59,9 +81,10 @@ const COLUMNS: [&str; 13] = [
     "name",
     "type",
     "scale",
-    "unit",
+    "engineering_unit",
     "not_available",
     "access",
+    "source",
     "note",
 ];
 
@@ -80,6 +103,7 @@ impl Row {
             self.unit.clone(),
             self.not_available.to_string(),
             self.access.to_string(),
+            self.source.clone(),
             self.note.clone(),
         ]
     }
@@ -92,13 +116,80 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let Some(settings) = loaded.settings else {
         return ExitCode::from(EXIT_CONFIG);
     };
+    let listeners = listeners(&settings);
+    let shown = match args.listener {
+        None => None,
+        Some(address) => match listeners.iter().find(|l| l.addresses.contains(&address)) {
+            Some(listener) => listener.buses.clone(),
+            None => return unknown_listener(address, &listeners),
+        },
+    };
+    let format = match (args.csv, args.json) {
+        (true, _) => Format::Csv,
+        (_, true) => Format::Json,
+        _ => Format::Text,
+    };
     match plant(&settings) {
-        Ok(plant) => report::print(&render(&plant, args.csv)),
+        Ok(plant) => report::print(&render(&plant, &listeners, shown.as_deref(), format)),
         Err(why) => {
             report::error(&format!("cannot lay out the map: {why}; map; free file descriptors"));
             ExitCode::from(EXIT_FAILED)
         }
     }
+}
+
+fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> ExitCode {
+    let known: Vec<String> = listeners
+        .iter()
+        .flat_map(|l| &l.addresses)
+        .map(ToString::to_string)
+        .collect();
+    let remedy = match known.as_slice() {
+        [] => "write [modbus_tcp] into the configuration".to_string(),
+        known => format!("write one of {}", known.join(", ")),
+    };
+    report::error(&format!("nothing listens on {address}; --listener; {remedy}"));
+    ExitCode::from(EXIT_USAGE)
+}
+
+/// A listener of the Modbus TCP server.
+#[derive(Debug, Clone, PartialEq)]
+struct Listener {
+    addresses: Vec<SocketAddr>,
+    tls: bool,
+    /// Buses that are shown; `None` shows all.
+    buses: Option<Vec<String>>,
+    /// Who may write.
+    writers: String,
+}
+
+fn listeners(settings: &Settings) -> Vec<Listener> {
+    let Some(options) = &settings.modbus_tcp else {
+        return Vec::new();
+    };
+    let joined = |words: Vec<String>| {
+        if words.is_empty() {
+            "nobody".to_string()
+        } else {
+            words.join(", ")
+        }
+    };
+    let plain = options.listeners.iter().map(|listener| Listener {
+        addresses: listener.listen.clone(),
+        tls: false,
+        buses: listener.buses.clone(),
+        writers: joined(listener.write.iter().map(ToString::to_string).collect()),
+    });
+    let tls = options.tls.iter().map(|tls| {
+        let control = tls.roles.iter().filter(|(_, role)| **role == Role::Control);
+        Listener {
+            addresses: tls.listen.clone(),
+            tls: true,
+            buses: tls.buses.clone(),
+            writers: joined(control.map(|(name, _)| format!("role {name}")).collect()),
+        }
+    });
+    plain.chain(tls).collect()
 }
 
 /// The plant of a configuration, at rest.
@@ -120,42 +211,36 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
     })
 }
 
-/// The map of all units: with `csv` one line for each register of each unit, else tables for people, one for
-/// each profile.
-fn render(plant: &Plant, csv: bool) -> String {
-    if csv { render_csv(plant) } else { render_text(plant) }
-}
-
-fn render_csv(plant: &Plant) -> String {
-    let mut out = format!("unit,drive,{}\n", COLUMNS.join(","));
-    let mut line = |unit: u8, drive: &str, row: &Row| {
-        let cells = [unit.to_string(), drive.to_string()].into_iter().chain(row.cells());
-        let cells: Vec<String> = cells.map(|c| quoted(&c)).collect();
-        let _ = writeln!(out, "{}", cells.join(","));
+/// The map of the units on the buses that are `shown`, all without a choice.
+fn render(plant: &Plant, listeners: &[Listener], shown: Option<&[String]>, format: Format) -> String {
+    let drives = plant
+        .drives()
+        .filter(|d| shown.is_none_or(|names| names.contains(&d.image.spec.bus)))
+        .collect();
+    let map = Map {
+        plant,
+        drives,
+        gateway: gateway_rows(plant, shown),
+        listeners,
     };
-    for drive in plant.drives() {
-        let spec = &drive.image.spec;
-        for row in drive_rows(&spec.profile, &drive.image.plan, spec.access) {
-            line(spec.unit, &spec.name, &row);
-        }
-    }
-    for row in gateway_rows(plant) {
-        line(GATEWAY_UNIT, "", &row);
-    }
-    out
-}
-
-/// A field of RFC 4180.
-fn quoted(text: &str) -> String {
-    if text.contains([',', '"', '\n', '\r']) {
-        format!("\"{}\"", text.replace('"', "\"\""))
-    } else {
-        text.to_string()
+    match format {
+        Format::Text => render_text(&map),
+        Format::Csv => export::csv(&map),
+        Format::Json => export::json(&map),
     }
 }
 
-fn render_text(plant: &Plant) -> String {
-    let drives: Vec<_> = plant.drives().collect();
+/// What is printed.
+struct Map<'a> {
+    plant: &'a Plant,
+    drives: Vec<DriveHandle>,
+    /// Registers of the gateway itself.
+    gateway: Vec<Row>,
+    listeners: &'a [Listener],
+}
+
+fn render_text(map: &Map<'_>) -> String {
+    let (plant, drives) = (map.plant, &map.drives);
     let specs: Vec<&DriveSpec> = drives.iter().map(|d| &d.image.spec).collect();
     let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", plant.gateway);
     let units = specs.iter().map(|s| {
@@ -178,10 +263,23 @@ fn render_text(plant: &Plant) -> String {
         &["unit", "drive", "bus", "address", "profile", "access"],
         units.chain([gateway]),
     );
+    if map.listeners.len() > 1 {
+        out += "\nListeners\n";
+        let cells = map.listeners.iter().map(|listener| {
+            let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
+            let buses = listener
+                .buses
+                .as_ref()
+                .map_or_else(|| "all".to_string(), |names| names.join(", "));
+            let tls = if listener.tls { "yes" } else { "no" };
+            vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
+        });
+        out += &table(&["address", "TLS", "buses", "who may write"], cells);
+    }
     out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
             32-bit values lie high word first; age and state tell why a value is not available.\n";
     let mut seen: Vec<&str> = Vec::new();
-    for drive in &drives {
+    for drive in drives {
         let profile = &drive.image.spec.profile;
         if seen.contains(&profile.name.as_str()) {
             continue;
@@ -205,7 +303,7 @@ fn render_text(plant: &Plant) -> String {
         out += &ranges(profile);
     }
     out += "\nThe gateway itself, unit 255\n";
-    out += &rows(&gateway_rows(plant));
+    out += &rows(&map.gateway);
     out
 }
 
@@ -228,7 +326,7 @@ fn drive_rows(profile: &Profile, plan: &Plan, access: Access) -> Vec<Row> {
     let entries = BLOCKS
         .into_iter()
         .flatten()
-        .map(|entry| entry_row(profile, entry, access));
+        .map(|entry| entry_row(profile, plan, entry, access));
     let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter_map(|p| Some((p, p.raw()?))).collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
     let raw = raw
@@ -264,7 +362,7 @@ fn ranges(profile: &Profile) -> String {
     table(&header, rows)
 }
 
-fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
+fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> Row {
     let (name, unit, mut note) = match entry.content {
         Content::Status => (
             "status",
@@ -286,7 +384,14 @@ fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
     if let Content::Point(point) = entry.content {
         note = point_note(profile, point, note);
     }
-    let writable = entry.is_command() && access == Access::Control;
+    let takes = |point| profile.model_point(point).is_some_and(|p| p.write);
+    let writable = access == Access::Control
+        && entry.is_command()
+        && match entry.content {
+            Content::Point(point) => takes(point),
+            Content::Command => takes(ModelPoint::Run),
+            _ => true,
+        };
     Row {
         view,
         table: "holding, input",
@@ -302,6 +407,11 @@ fn entry_row(profile: &Profile, entry: &Entry, access: Access) -> Row {
             Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
         },
         access: if writable { "read, write" } else { "read" },
+        source: match entry.content {
+            Content::Point(point) => point_source(profile, plan, point),
+            Content::Command => command_source(profile),
+            Content::Status | Content::State | Content::Age | Content::Heartbeat => "gateway".to_string(),
+        },
         note: note.to_string(),
     }
 }
@@ -311,6 +421,41 @@ fn point_note<'n>(profile: &Profile, point: ModelPoint, note: &'n str) -> &'n st
         None => "never available: this family lacks it",
         Some(point) if !point.verified => "address not verified by a manual",
         Some(_) => note,
+    }
+}
+
+/// The place that a point of the model is read from, or the points that it is made of.
+fn point_source(profile: &Profile, plan: &Plan, point: ModelPoint) -> String {
+    let Some(point) = profile.model_point(point) else {
+        return "none".to_string();
+    };
+    match point.raw() {
+        Some(raw) => format!("{} {}, {}", raw.table.name(), raw.address, polled(plan, point, raw)),
+        None => "made of other points".to_string(),
+    }
+}
+
+/// The command points that the family has.
+fn command_source(profile: &Profile) -> String {
+    let points = [ModelPoint::Run, ModelPoint::Reverse, ModelPoint::FaultReset];
+    let names: Vec<&str> = points
+        .into_iter()
+        .filter(|p| profile.model_point(*p).is_some())
+        .map(ModelPoint::name)
+        .collect();
+    if names.is_empty() {
+        "none".to_string()
+    } else {
+        names.join(", ")
+    }
+}
+
+/// How a register comes to be known.
+fn polled(plan: &Plan, point: &Point, raw: &Raw) -> String {
+    if plan.reads.iter().any(|r| r.covers(raw.table, raw.address)) {
+        format!("polled {}", point.class.name())
+    } else {
+        "asked of the drive on request".to_string()
     }
 }
 
@@ -327,11 +472,6 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Acc
     }
     if raw.offset != 0.0 {
         notes.push(format!("plus {}", raw.offset));
-    }
-    if !plan.reads.iter().any(|r| r.covers(raw.table, raw.address)) {
-        notes.push("not polled: read from the drive on request".to_string());
-    } else if point.class != PollClass::Fast {
-        notes.push(format!("poll class {}", point.class.name()));
     }
     if !point.verified {
         notes.push("address not verified by a manual".to_string());
@@ -357,12 +497,14 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Acc
         } else {
             "read"
         },
+        source: polled(plan, point, raw),
         note: notes.join("; "),
     }
 }
 
-fn gateway_rows(plant: &Plant) -> Vec<Row> {
-    let buses = (0u16..).zip(&plant.buses);
+fn gateway_rows(plant: &Plant, shown: Option<&[String]>) -> Vec<Row> {
+    let is_shown = |bus: &BusHandle| shown.is_none_or(|names| names.contains(&bus.image.spec.name));
+    let buses = (0u16..).zip(&plant.buses).filter(|(_, bus)| is_shown(bus));
     let rows = buses.flat_map(|(place, bus)| {
         BUS_REGISTERS.iter().map(move |register| {
             let address = place.saturating_mul(BUS_BLOCK).saturating_add(register.offset);
@@ -382,6 +524,7 @@ fn gateway_rows(plant: &Plant) -> Vec<Row> {
                     ""
                 },
                 access: "read",
+                source: "gateway".to_string(),
                 note: String::new(),
             }
         })
@@ -401,91 +544,4 @@ fn reference(table: Table, address: u16) -> String {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::collections::BTreeMap;
-    use std::time::Duration;
-
-    use super::*;
-    use crate::cache::{BusSpec, OnShutdown};
-    use crate::codec::{LineFormat, Protocol};
-    use crate::drive::profile::Profiles;
-
-    fn plant() -> Plant {
-        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
-        let drive = |name: &str, unit, access| {
-            let spec = DriveSpec {
-                name: name.to_string(),
-                bus: "line1".to_string(),
-                address: unit,
-                unit,
-                profile: profile.clone(),
-                access,
-                limits: BTreeMap::new(),
-                supervision: None,
-                on_shutdown: OnShutdown::Hold,
-                turnaround: Duration::ZERO,
-                frequency_range: None,
-            };
-            Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
-        };
-        let spec = BusSpec {
-            name: "line1".to_string(),
-            port: "/dev/null".to_string(),
-            protocol: Protocol::ModbusRtu,
-            format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
-            slow_cycle: Duration::from_secs(1),
-        };
-        let drives = vec![drive("pump-1", 1, Access::Control), drive("pump-2", 2, Access::Monitor)];
-        let image = Arc::new(BusImage::new(spec, drives));
-        let queue = Arc::new(CommandQueue::new().unwrap());
-        Plant {
-            gateway: "pump-house".to_string(),
-            stale_after: Duration::from_secs(1),
-            buses: vec![BusHandle { image, queue }],
-            events: Default::default(),
-            writes: Default::default(),
-        }
-    }
-
-    #[test]
-    fn csv_has_one_line_a_register() {
-        let csv = render(&plant(), true);
-        let mut lines = csv.lines();
-        let columns = lines.next().unwrap().split(',').count();
-        assert_eq!(columns, 15);
-        for wanted in [
-            "1,pump-1,common,\"holding, input\",32772,0x8004,432773,1,actual_speed,i16,0.01,%,0x8000,read,",
-            "1,pump-1,common,\"holding, input\",32781,0x800D,432782,2,energy,u32,1,kWh,0xFFFFFFFF,read,\
-             never available: this family lacks it",
-            "1,pump-1,command,\"holding, input\",33025,0x8101,433026,1,speed_reference,i16,0.01,%,0x8000,\"read, write\",",
-            "2,pump-2,command,\"holding, input\",33025,0x8101,433026,1,speed_reference,i16,0.01,%,0x8000,read,",
-            "1,pump-1,float,\"holding, input\",33282,0x8202,433283,2,output_frequency,f32,1,Hz,NaN,read,",
-            "1,pump-1,raw,\"holding, input\",2103,0x0837,402104,1,output_frequency,i16,0.01,Hz,,read,",
-            "255,,gateway,\"input, holding\",3,0x0003,300004,1,line1: line load,u16,0.1,%,,read,",
-        ] {
-            assert!(csv.lines().any(|line| line == wanted), "{wanted} is missing in\n{csv}");
-        }
-    }
-
-    #[test]
-    fn text_tells_units_and_each_profile_once() {
-        let text = render(&plant(), false);
-        assert!(
-            text.contains("\nProfile vacon-nx (Vacon NX, OPTC2/OPTC8 board, Modbus RTU), units 1, 2\n"),
-            "{text}"
-        );
-        assert_eq!(text.matches("Profile vacon-nx").count(), 1);
-        assert!(text.contains("monitor: every write is refused"));
-        assert!(
-            text.lines().all(|line| line == line.trim_end()),
-            "no blanks at line ends"
-        );
-    }
-
-    #[test]
-    fn fields_are_quoted_where_they_must() {
-        assert_eq!(quoted("a"), "a");
-        assert_eq!(quoted("a \"b\", c"), "\"a \"\"b\"\", c\"");
-    }
-}
+mod tests;

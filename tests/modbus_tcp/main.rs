@@ -2,10 +2,12 @@
 //! contract, bad input of all kinds, and independent clients.
 #![allow(clippy::unwrap_used, clippy::expect_used, clippy::panic, clippy::indexing_slicing)]
 
+mod answers;
 mod bad_input;
 mod commands;
 mod connections;
 mod load;
+mod map;
 mod peers;
 #[path = "../gateway/process.rs"]
 #[allow(dead_code, reason = "the tests of the whole gateway take the rest")]

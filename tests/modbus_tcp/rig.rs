@@ -249,6 +249,15 @@ pub(crate) fn fill(image: &DriveImage) {
 /// line1: unit 1 pump-1 (control), unit 2 pump-2 (monitor), unit 3 spare (control, never answered);
 /// line2: unit 4 meter (control). Values are good for an hour.
 pub(crate) fn plant() -> Plant {
+    plant_where(|_| {})
+}
+
+/// The same with other drives.
+pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
+    let bus = |name: &str, mut drives: Vec<DriveSpec>| {
+        drives.iter_mut().for_each(&change);
+        bus(name, drives)
+    };
     let profiles = Profiles::built_in();
     let nx = profiles.get("vacon-nx").unwrap();
     let meter = Arc::new(Profile::parse("meter.toml", METER, false).unwrap());
@@ -286,7 +295,10 @@ impl Rig {
     }
 
     pub(crate) async fn with(options: Options) -> Rig {
-        let plant = plant();
+        Rig::of(plant(), options).await
+    }
+
+    pub(crate) async fn of(plant: Plant, options: Options) -> Rig {
         let buses = plant.buses.iter().map(|b| FakeBus::start(b.queue.clone())).collect();
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let stats = Arc::new(NorthStats::default());
