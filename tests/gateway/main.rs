@@ -10,6 +10,7 @@
 mod commands;
 mod demo;
 mod flood;
+mod oneshot;
 mod operators;
 mod process;
 mod restart;
