@@ -373,12 +373,7 @@ fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {
         return;
     };
-    let ends = derived.band().map(|(_, low, high)| [low, high]).into_iter().flatten();
-    let ends = ends.filter_map(|bound| match bound {
-        Bound::Point(point) => Some(point),
-        Bound::Fixed(_) => None,
-    });
-    for source in derived.sources().into_iter().chain(ends) {
+    for source in derived.rests_on() {
         if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
             reader.problem(
                 "derive",

@@ -8,7 +8,7 @@
 
 use std::time::Duration;
 
-use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
+use crate::codec::{Protocol, ascii, rtu};
 
 /// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1); N2 is given the
 /// same.
@@ -47,7 +47,7 @@ pub fn kept(protocol: Protocol) -> usize {
 
 /// Address and request of a sound Modbus frame; the request's function with the exception that refuses it when its PDU
 /// is wrong.
-pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, Result<RequestPdu, (u8, Exception)>)> {
+pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> {
     match protocol {
         Protocol::ModbusRtu => rtu::decode_request(frame),
         Protocol::ModbusAscii => ascii::decode_request(frame),

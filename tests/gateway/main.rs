@@ -11,6 +11,7 @@ mod bad_commands;
 mod commands;
 mod demo;
 mod flood;
+mod oneshot;
 mod operators;
 mod process;
 mod restart;

@@ -181,7 +181,7 @@ fn origin() -> Origin {
 fn is_polled(profile: &Profile, index: usize) -> bool {
     let read = |i: usize| profile.points.get(i).is_some_and(|p| p.class != PollClass::Never);
     match profile.points.get(index).map(|p| &p.source) {
-        Some(crate::drive::Source::Derived(derived)) => derived.sources().into_iter().all(read),
+        Some(crate::drive::Source::Derived(derived)) => derived.rests_on().into_iter().all(read),
         Some(crate::drive::Source::Raw(_)) => read(index),
         None => false,
     }
@@ -190,7 +190,7 @@ fn is_polled(profile: &Profile, index: usize) -> bool {
 /// Whether the drive has told it, or has refused to.
 fn is_settled(reading: &Reading<'_>, index: usize) -> bool {
     let sources = match reading.spec.profile.points.get(index).map(|p| &p.source) {
-        Some(crate::drive::Source::Derived(derived)) => derived.sources(),
+        Some(crate::drive::Source::Derived(derived)) => derived.rests_on(),
         _ => vec![index],
     };
     sources.into_iter().all(|source| {

@@ -195,7 +195,7 @@ impl Remote {
                 _ => others.push((point, value)),
             }
         }
-        for pdu in self.block_writes(&block)? {
+        for pdu in self.block_writes(spec, &block)? {
             self.set(&pdu)?;
         }
         for (point, value) in others {
@@ -223,7 +223,7 @@ impl Remote {
         }
     }
 
-    fn block_writes(&mut self, block: &Block) -> Result<Vec<RequestPdu>, String> {
+    fn block_writes(&mut self, spec: &DriveSpec, block: &Block) -> Result<Vec<RequestPdu>, String> {
         let register = |address, value| RequestPdu::WriteRegister { address, value };
         if block.speed.is_some() && block.frequency.is_some() {
             return Err(
@@ -240,10 +240,11 @@ impl Remote {
                 .chain(frequency)
                 .collect());
         };
-        let old = if mask & (RUN | REVERSE) == RUN | REVERSE {
-            0
-        } else {
-            self.command_word()?
+        let old = match mask & (RUN | REVERSE) {
+            both if both == RUN | REVERSE => 0,
+            // No read stands in the way of a stop.
+            RUN if set & RUN == 0 => self.command_word(spec).unwrap_or(0),
+            _ => self.command_word(spec)?,
         };
         let word = (old & !mask & (RUN | REVERSE)) | set;
         let command = match block.speed {
@@ -261,31 +262,28 @@ impl Remote {
         })
     }
 
-    /// The bits that are not commanded stay as they are.
-    fn command_word(&mut self) -> Result<u16, String> {
-        let read = RequestPdu::Read {
-            table: Table::Holding,
-            start: COMMAND,
-            count: 1,
-        };
-        match self.ask(&read)? {
-            Reply::Registers(words) => match words.first() {
-                Some(word) if *word != u16::MAX => Ok(*word),
-                _ => Err(format!(
-                    "the drive's commands are not known now; {}; wait until it is online, or give run and reverse both",
-                    self.address
-                )),
-            },
-            Reply::Exception(code) => Err(format!(
-                "the gateway refused it with {}; {}",
-                refusal(code),
-                self.address
-            )),
-            _ => Err(format!(
-                "the reply does not fit the request; {}; try again",
-                self.address
-            )),
+    /// The bits that are not commanded stay as the drive has them.
+    fn command_word(&mut self, spec: &DriveSpec) -> Result<u16, String> {
+        let mut word = 0;
+        for (point, bit) in [(ModelPoint::Run, RUN), (ModelPoint::Reverse, REVERSE)] {
+            let Some(point) = spec.profile.model_point(point) else {
+                continue;
+            };
+            let (sample, why) = self.sample(spec, point)?;
+            match sample.good() {
+                Some(value) if value.as_bool() => word |= bit,
+                Some(_) => {}
+                None => {
+                    return Err(format!(
+                        "`{}` of the drive is not known: {}; {}; wait until it is, or give run and reverse both",
+                        point.name,
+                        why.unwrap_or_default(),
+                        self.address
+                    ));
+                }
+            }
         }
+        Ok(word)
     }
 
     /// Where the gateway listens.

@@ -1,0 +1,193 @@
+//! `scan`, `read` and `write`: on a port of their own, and through a gateway that has it.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use tempfile::TempDir;
+
+use crate::process::{Running, free_port, until};
+
+/// How a command ended, what it printed and what it complained of.
+struct Ran {
+    code: i32,
+    out: String,
+    err: String,
+}
+
+fn drivegate(arguments: &[&str]) -> Ran {
+    let output = Command::new(env!("CARGO_BIN_EXE_drivegate"))
+        .args(arguments)
+        .output()
+        .unwrap();
+    Ran {
+        code: output.status.code().unwrap_or(-1),
+        out: String::from_utf8_lossy(&output.stdout).into_owned(),
+        err: String::from_utf8_lossy(&output.stderr).into_owned(),
+    }
+}
+
+/// Two simulated drives behind a link, and a gateway's configuration for them.
+struct Line {
+    directory: TempDir,
+    _drives: Running,
+    modbus: u16,
+}
+
+impl Line {
+    fn start() -> Line {
+        let directory = TempDir::new().unwrap();
+        let link = directory.path().join("line1");
+        let arguments = ["simulate", "--addresses", "1,5", "--baud", "38400", "--link"];
+        let drives = Running::drivegate(&[&arguments[..], &[link.to_str().unwrap()]].concat());
+        until("the line", || link.exists().then_some(()));
+        let line = Line {
+            directory,
+            _drives: drives,
+            modbus: free_port(),
+        };
+        let text = format!(
+            "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\n\
+             [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
+             limits = {{ speed_reference = [0.0, 80.0] }}\n\
+             [[bus.drive]]\nname = \"pump-5\"\naddress = 5\nprofile = \"vacon-nx\"\n\
+             [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\n",
+            line.modbus
+        );
+        std::fs::write(line.config(), text).unwrap();
+        line
+    }
+
+    fn config(&self) -> PathBuf {
+        self.directory.path().join("drivegate.toml")
+    }
+
+    fn port(&self) -> String {
+        self.directory.path().join("line1").display().to_string()
+    }
+
+    fn command(&self, what: &str, rest: &[&str]) -> Ran {
+        let config = self.config();
+        drivegate(&[&[what, "--config", config.to_str().unwrap()], rest].concat())
+    }
+
+    fn value(&self, point: &str) -> serde_json::Value {
+        let ran = self.command("read", &["--json", "pump-1", point]);
+        assert_eq!(ran.code, 0, "{}", ran.err);
+        let rows: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
+        assert_eq!(rows[0]["quality"], "good");
+        rows[0]["value"].clone()
+    }
+
+    /// Start, look, refuse, stop: the same whoever has the port.
+    fn operate(&self) {
+        let all = self.command("read", &["pump-1"]);
+        assert_eq!(all.code, 0, "{}{}", all.out, all.err);
+        for row in ["ready", "output_frequency", "maximum_frequency", "frequency_reference"] {
+            assert!(all.out.contains(row), "{row} is missing in\n{}", all.out);
+        }
+        let started = self.command("write", &["pump-1", "run=true", "speed_reference=50"]);
+        assert_eq!(started.code, 0, "{}", started.err);
+        assert!(started.out.contains("acknowledged"), "{}", started.out);
+        until("a motor that runs", || (self.value("running") == true).then_some(()));
+        assert_eq!(self.value("speed_reference"), 50.0);
+        assert_eq!(self.value("frequency_reference"), 25.0);
+        for (arguments, code, wanted) in [
+            (&["pump-1", "speed_reference=81"][..], 1, "limits"),
+            (&["pump-5", "run=true"], 1, "monitored"),
+            (&["pump-1", "ready=true"], 1, "`ready`"),
+            (&["pump-1", "speed_reference=fast"], 2, "a number"),
+            (&["pump-1", "speed_referenc=1"], 2, "did you mean `speed_reference`?"),
+            (&["pump-1", "run"], 2, "POINT=VALUE"),
+            (&["pump-2", "run=true"], 2, "did you mean `pump-1`?"),
+        ] {
+            let ran = self.command("write", arguments);
+            assert_eq!(ran.code, code, "{arguments:?}: {}", ran.err);
+            assert!(ran.err.contains(wanted), "{arguments:?}: {}", ran.err);
+        }
+        assert_eq!(self.value("speed_reference"), 50.0, "refused is not written");
+        let stopped = self.command("write", &["pump-1", "run=false"]);
+        assert_eq!(stopped.code, 0, "{}", stopped.err);
+        until("a motor that stands", || (self.value("running") == false).then_some(()));
+    }
+}
+
+#[test]
+fn alone_and_through_the_gateway() {
+    let line = Line::start();
+    line.operate();
+    let gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+    // Asked before it listens, `read` would take the port itself.
+    until("the gateway", || {
+        std::net::TcpStream::connect(("127.0.0.1", line.modbus)).ok()
+    });
+    until("all points", || {
+        let read = |drive| line.command("read", &[drive, "run", "slot_fault_response"]).code == 0;
+        (read("pump-1") && read("pump-5")).then_some(())
+    });
+    line.operate();
+    // A gateway without a door for them: the port is taken, and they say so.
+    let closed = line.directory.path().join("closed.toml");
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    let text = text.split("[modbus_tcp]").next().unwrap();
+    std::fs::write(&closed, format!("{text}[http]\nlisten = \"127.0.0.1:0\"\n")).unwrap();
+    let ran = drivegate(&["read", "--config", closed.to_str().unwrap(), "pump-1"]);
+    assert_eq!(ran.code, 1);
+    assert!(
+        ran.err.contains("another program has it") && ran.err.contains("[modbus_tcp]"),
+        "{}",
+        ran.err
+    );
+    // So does a search.
+    let ran = drivegate(&["scan", "--port", &line.port(), "--addresses", "1"]);
+    assert_eq!(ran.code, 1);
+    assert!(ran.err.contains("another program has it"), "{}", ran.err);
+    drop(gateway);
+}
+
+#[test]
+fn what_a_search_prints_passes_check() {
+    let line = Line::start();
+    let scan = [
+        "scan",
+        "--protocol",
+        "modbus-rtu",
+        "--baud",
+        "38400",
+        "--addresses",
+        "1-6",
+        "--port",
+    ];
+    let ran = drivegate(&[&scan[..], &[&line.port()]].concat());
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(
+        ran.err.contains("found modbus-rtu 38400 8N1, address 5: vacon-nx"),
+        "{}",
+        ran.err
+    );
+    assert!(ran.err.contains(" left, "), "no estimate in {}", ran.err);
+    let found = line.directory.path().join("found.toml");
+    std::fs::write(&found, &ran.out).unwrap();
+    let checked = drivegate(&["check", "--json", "--config", found.to_str().unwrap()]);
+    assert_eq!(checked.code, 0, "{}\n{}", ran.out, checked.out);
+    let report: serde_json::Value = serde_json::from_str(&checked.out).unwrap();
+    let requests = report["buses"][0]["requests"].as_array().unwrap();
+    assert!(requests.iter().any(|r| r["drive"] == "drive-2"), "{}", checked.out);
+    let nobody = drivegate(&[
+        "scan",
+        "--port",
+        &line.port(),
+        "--addresses",
+        "2-3",
+        "--protocol",
+        "modbus-rtu",
+        "--baud",
+        "38400",
+    ]);
+    assert_eq!(nobody.code, 1);
+    assert!(
+        nobody.out.is_empty() && nobody.err.contains("no drive has answered"),
+        "{}",
+        nobody.err
+    );
+    assert!(Path::new(&line.port()).exists());
+}
