@@ -136,6 +136,13 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
 
 /// A derived point becomes the point it rests on; the value must fit the register.
 fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<(usize, Value), Refusal> {
+    if let Some(target) = point.write_to {
+        let base = drive.spec.profile.points.get(target).ok_or_else(|| {
+            Refusal::NotWritable(format!("point {target} of `{}` cannot be written", drive.spec.name))
+        })?;
+        let value = checked(drive, target, base, value)?;
+        return resolve(drive, target, base, value);
+    }
     match &point.source {
         Source::Raw(raw) => {
             raw.encode(value, 0)

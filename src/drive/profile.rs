@@ -68,6 +68,8 @@ pub struct AddressRange {
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
     pub holes: bool,
+    /// When the drive takes a write, for people; empty where the manual says nothing.
+    pub write_when: String,
     /// For people.
     pub note: String,
 }
@@ -112,6 +114,8 @@ pub struct Point {
     pub class: PollClass,
     /// Whether it can be commanded.
     pub write: bool,
+    /// The point of the profile that takes the commands, in the same unit, where the drive is read elsewhere.
+    pub write_to: Option<usize>,
     /// Written as a pulse 0, 1, 0.
     pub pulse: bool,
     /// Written only when the drive is not known to have the value already: it keeps it in a memory that wears.

@@ -11,7 +11,19 @@ use super::profile::{AddressRange, FaultText, Form, Point, PollClass, Profile, P
 use crate::codec::{Protocol, Table};
 use crate::document::{self, Document, Problem, Reader};
 
-const BUILT_IN: [(&str, &str); 1] = [("vacon-nx.toml", include_str!("../../profiles/vacon-nx.toml"))];
+const BUILT_IN: [(&str, &str); 8] = [
+    ("eaton-hvx-n2.toml", include_str!("../../profiles/eaton-hvx-n2.toml")),
+    ("eaton-hvx.toml", include_str!("../../profiles/eaton-hvx.toml")),
+    ("eaton-svx.toml", include_str!("../../profiles/eaton-svx.toml")),
+    (
+        "teco-7300pa-n2.toml",
+        include_str!("../../profiles/teco-7300pa-n2.toml"),
+    ),
+    ("teco-7300pa.toml", include_str!("../../profiles/teco-7300pa.toml")),
+    ("vacon-cx.toml", include_str!("../../profiles/vacon-cx.toml")),
+    ("vacon-nx-n2.toml", include_str!("../../profiles/vacon-nx-n2.toml")),
+    ("vacon-nx.toml", include_str!("../../profiles/vacon-nx.toml")),
+];
 
 impl Profiles {
     /// The profiles that are part of the program.
@@ -112,7 +124,12 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
         );
     }
     let input_is_holding = reader.or("input_is_holding", false);
-    let ranges: Vec<AddressRange> = reader.tables("range").into_iter().filter_map(read_range).collect();
+    let offsets = Offsets::read(reader);
+    let ranges: Vec<AddressRange> = reader
+        .tables("range")
+        .into_iter()
+        .filter_map(|table| read_range(table, &offsets))
+        .collect();
     let tables = reader.tables("point");
     if tables.is_empty() {
         reader.problem("point", "the profile has no point; write at least one [[point]]");
@@ -120,10 +137,11 @@ fn read_profile(reader: &Reader<'_>, built_in: bool) -> Option<Profile> {
     let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
     let points: Vec<Point> = (0..)
         .zip(&tables)
-        .filter_map(|(i, table)| read_point(table, i, &names, &ranges))
+        .filter_map(|(i, table)| read_point(table, i, &names, &ranges, &offsets))
         .collect();
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
+        check_target(table, index, &points);
     }
     let mut faults = read_faults(reader, "faults", true);
     for (code, text) in read_faults(reader, "faults_unverified", false) {
@@ -195,7 +213,7 @@ fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<Table> {
     table
 }
 
-fn read_range(reader: Reader<'_>) -> Option<AddressRange> {
+fn read_range(reader: Reader<'_>, offsets: &Offsets) -> Option<AddressRange> {
     let text: Option<String> = reader.required("table");
     let table = text.and_then(|text| read_table(&reader, "table", &text));
     let first: Option<u16> = reader.required("first");
@@ -204,6 +222,9 @@ fn read_range(reader: Reader<'_>) -> Option<AddressRange> {
     let write: u16 = reader.or("write", 0);
     let holes = reader.or("holes", false);
     let note = reader.or("note", String::new());
+    let write_when = reader.or("write_when", String::new());
+    let first = first.and_then(|at| offsets.applied(&reader, "first", table?, at));
+    let last = last.and_then(|at| offsets.applied(&reader, "last", table?, at));
     let (table, first, last) = match (table, first, last) {
         (Some(table), Some(first), Some(last)) => (table, first, last),
         _ => {
@@ -233,11 +254,18 @@ fn read_range(reader: Reader<'_>) -> Option<AddressRange> {
         read,
         write,
         holes,
+        write_when,
         note,
     })
 }
 
-fn read_point(reader: &Reader<'_>, index: usize, names: &[String], ranges: &[AddressRange]) -> Option<Point> {
+fn read_point(
+    reader: &Reader<'_>,
+    index: usize,
+    names: &[String],
+    ranges: &[AddressRange],
+    offsets: &Offsets,
+) -> Option<Point> {
     let name: String = reader.required("name").unwrap_or_default();
     if !is_name(&name, '_') {
         reader.problem("name", "a point's name is snake_case: a-z, 0-9 and _; rename the point");
@@ -249,7 +277,7 @@ fn read_point(reader: &Reader<'_>, index: usize, names: &[String], ranges: &[Add
     let source = if reader.has("derive") {
         read_derived(reader, names)
     } else {
-        read_raw(reader, ranges)
+        read_raw(reader, ranges, offsets)
     };
     let unit = match model {
         Some(model) => {
@@ -271,6 +299,9 @@ fn read_point(reader: &Reader<'_>, index: usize, names: &[String], ranges: &[Add
         unit,
         class,
         write: reader.or("write", false),
+        write_to: reader
+            .optional::<String>("write_to")
+            .and_then(|name| point_of(reader, "write_to", &name, names)),
         pulse: reader.or("pulse", false),
         on_change: reader.or("on_change", false),
         range: read_pair::<f64>(reader, "range"),
@@ -385,6 +416,68 @@ fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
     }
 }
 
+/// Commands for another point: that one must take them, and may not pass them on again.
+fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(point) = points.get(index) else { return };
+    let Some(target) = point.write_to.and_then(|to| points.get(to)) else {
+        return;
+    };
+    if !point.write {
+        reader.problem("write_to", "the point is not written at all; add `write = true`");
+    }
+    if !target.write || target.write_to.is_some() {
+        reader.problem(
+            "write_to",
+            format!(
+                "`{}` takes no commands itself; name a point with `write = true` and without `write_to`",
+                target.name
+            ),
+        );
+    } else if target.kind() != point.kind() {
+        reader.problem(
+            "write_to",
+            format!("`{}` is of another kind; name a point with like values", target.name),
+        );
+    }
+}
+
+/// `address_offset`: what the addresses of each table are shifted by on the wire.
+#[derive(Debug, Default)]
+struct Offsets(BTreeMap<Table, i64>);
+
+impl Offsets {
+    const TABLES: [Table; 4] = [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding];
+
+    fn read(reader: &Reader<'_>) -> Offsets {
+        let mut offsets = Offsets::default();
+        let Some(given) = reader.table("address_offset") else {
+            return offsets;
+        };
+        for table in Self::TABLES {
+            let shift: i64 = given.or(table.name(), 0);
+            if (-1..=1).contains(&shift) {
+                offsets.0.insert(table, shift);
+            } else {
+                given.problem(table.name(), format!("{shift} is out of range; write -1, 0 or 1"));
+            }
+        }
+        given.finish();
+        offsets
+    }
+
+    fn applied(&self, reader: &Reader<'_>, key: &str, table: Table, address: u16) -> Option<u16> {
+        let offset = self.0.get(&table).copied().unwrap_or(0);
+        let shifted = u16::try_from(i64::from(address) + offset).ok();
+        if shifted.is_none() {
+            reader.problem(
+                key,
+                format!("{table} {address} shifted by {offset} is no address; correct `address_offset` or the address"),
+            );
+        }
+        shifted
+    }
+}
+
 /// `[point.texts]`: what the values of an enumeration mean.
 fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
     let Some(table) = reader.table("texts") else {
@@ -406,7 +499,7 @@ fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
 }
 
 /// `holding 2100.3`: table, PDU address, bit.
-fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
+fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &Offsets) -> Option<Source> {
     let at: String = reader.required("at")?;
     let bad =
         || format!("`{at}` is no place; write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"");
@@ -423,6 +516,7 @@ fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange]) -> Option<Source> {
         reader.problem("at", bad());
         return None;
     };
+    let address = offsets.applied(reader, "at", table, address)?;
     let invert = reader.or("invert", false);
     let form = read_form(reader, table, bits, invert)?;
     let raw = Raw {
@@ -552,7 +646,7 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
             "only a point that can be written can be a pulse; add `write = true`",
         );
     }
-    let Some(raw) = point.raw().filter(|_| point.write) else {
+    let Some(raw) = point.raw().filter(|_| point.write && !reader.has("write_to")) else {
         return;
     };
     let range = ranges
