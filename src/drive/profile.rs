@@ -8,6 +8,7 @@ use std::time::Duration;
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
 use crate::codec::{Protocol, Table};
+use crate::document::Node;
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -20,6 +21,8 @@ pub struct Profile {
     pub source: String,
     /// Whether the profile is part of the program; else it came from a file.
     pub built_in: bool,
+    /// The profile that its file rests on.
+    pub base: Option<String>,
     /// Protocols the family speaks.
     pub protocols: Vec<Protocol>,
     /// Baud rates of the family; empty when any will do.
@@ -44,6 +47,10 @@ pub struct Profile {
     pub faults: BTreeMap<u16, FaultText>,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<usize>>,
+    /// The file as it is, without its base.
+    pub text: String,
+    /// The file with its base, for profiles that rest on this one.
+    pub(super) tree: Node,
 }
 
 /// Text of a fault code.
@@ -380,12 +387,14 @@ impl Point {
         }
     }
 
-    /// What a value of an enumeration means.
+    /// What a value of an enumeration, or a bit with texts, means.
     pub fn text_of(&self, value: Value) -> Option<&str> {
-        match value {
-            Value::Integer(code) => self.texts.get(&code).map(String::as_str),
-            Value::Bool(_) | Value::Number(_) => None,
-        }
+        let code = match value {
+            Value::Integer(code) => code,
+            Value::Bool(state) => i64::from(state),
+            Value::Number(_) => return None,
+        };
+        self.texts.get(&code).map(String::as_str)
     }
 
     /// Its raw source, if it has one.
