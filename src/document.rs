@@ -59,8 +59,11 @@ pub struct Place {
     pub key: String,
 }
 
+/// One key of a table: the key, its line, the value.
+pub type Entry = (String, Option<usize>, Node);
+
 /// A value and its place.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Node {
     /// The value.
     pub value: Raw,
@@ -69,7 +72,43 @@ pub struct Node {
 }
 
 impl Node {
-    fn empty_table(env: Option<String>) -> Node {
+    /// The value of `key`, if this is a table that has it.
+    pub fn entry(&self, key: &str) -> Option<&Node> {
+        entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
+    }
+
+    /// Line of the file, from 1.
+    pub fn line(&self) -> Option<usize> {
+        self.line
+    }
+
+    /// Takes the place of another value, so that what is told of this one is told there.
+    pub fn stand_where(&mut self, other: &Node) {
+        self.line = other.line;
+        self.env = other.env.clone();
+    }
+
+    /// The same for a document of another file: what is told of it names `what` instead of a line.
+    pub fn told_as(&self, what: &str) -> Node {
+        let value = match &self.value {
+            Raw::Table(entries) => {
+                let told = entries
+                    .iter()
+                    .map(|(key, _, node)| (key.clone(), None, node.told_as(what)));
+                Raw::Table(told.collect())
+            }
+            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.told_as(what)).collect()),
+            other => other.clone(),
+        };
+        Node {
+            value,
+            line: None,
+            env: Some(what.to_string()),
+        }
+    }
+
+    /// A table without keys.
+    pub fn empty_table(env: Option<String>) -> Node {
         Node {
             value: Raw::Table(Vec::new()),
             line: None,
@@ -79,7 +118,7 @@ impl Node {
 }
 
 /// A TOML value.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum Raw {
     /// A string.
     Text(String),
@@ -92,7 +131,7 @@ pub enum Raw {
     /// An array.
     Array(Vec<Node>),
     /// A table: key, line of the key, value.
-    Table(Vec<(String, Option<usize>, Node)>),
+    Table(Vec<Entry>),
     /// Text of an environment variable, read as whatever type is wanted.
     Env(String),
     /// A date or an integer beyond 64 bits: no key takes one.
@@ -196,6 +235,16 @@ impl Document {
         }
     }
 
+    /// The whole tree.
+    pub fn root(&self) -> &Node {
+        &self.root
+    }
+
+    /// Puts another tree in the place of the one that was parsed.
+    pub fn set_root(&mut self, root: Node) {
+        self.root = root;
+    }
+
     /// The reader of the whole document.
     pub fn reader(&self) -> Reader<'_> {
         Reader {
@@ -261,7 +310,7 @@ impl Document {
     }
 }
 
-fn entries(node: &Node) -> &[(String, Option<usize>, Node)] {
+fn entries(node: &Node) -> &[Entry] {
     match &node.value {
         Raw::Table(entries) => entries,
         _ => &[],
@@ -377,7 +426,7 @@ fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(),
 #[derive(Debug)]
 pub struct Reader<'d> {
     document: &'d Document,
-    entries: &'d [(String, Option<usize>, Node)],
+    entries: &'d [Entry],
     place: Place,
     known: RefCell<Vec<String>>,
     lenient: Cell<bool>,

@@ -115,7 +115,8 @@ fn errors_and_warnings_go_to_stderr_in_the_form_of_the_contract() {
     let unknown = run(&["profiles", "show", "vacon-xn"]);
     assert_eq!(
         unknown.err,
-        "error: unknown profile `vacon-xn`; command line, NAME; did you mean `vacon-nx`? known are vacon-nx\n"
+        "error: unknown profile `vacon-xn`; command line, NAME; did you mean `vacon-nx`? known are eaton-hvx, eaton-hvx-n2, eaton-svx, \
+         teco-7300pa, teco-7300pa-n2, vacon-cx, vacon-nx, vacon-nx-n2\n"
     );
     let (_dir, path) = sound();
     assert_eq!(run(&["check", "--config", &path]).err, "");

@@ -192,10 +192,16 @@ impl Report {
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
             return;
         };
-        let code = match reading.model(ModelPoint::FaultCode).good() {
+        let told = reading.model(ModelPoint::FaultCode);
+        let code = match told.good() {
             Some(Value::Integer(code)) => code,
             _ => 0,
         };
+        // A code that was read before the fault came, in a request of its own, is not that of the fault.
+        let before_the_fault = told.at < reading.model(ModelPoint::Fault).at;
+        if fault.as_bool() && code == 0 && told.good().is_some() && before_the_fault {
+            return;
+        }
         let now = fault.as_bool().then_some(code);
         let Some(before) = self.faults.get_mut(index) else {
             return;

@@ -20,7 +20,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 
 use crate::codec::{LineFormat, Protocol};
-use crate::drive::{ModelPoint, Plan, Profile, Value};
+use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, Value};
 
 /// Whether a drive may be commanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -317,8 +317,10 @@ pub fn value_or_null(value: Option<Value>) -> serde_json::Value {
     })
 }
 
-/// All model points and profile points of a drive with their names, in their public order.
+/// The model points and profile points of a drive with their names, in their public order; not those that are never
+/// read, of which there is nothing to show.
 pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
+    let is_read = |point: &Point| point.raw().is_none() || point.class != PollClass::Never;
     let model = ModelPoint::ALL
         .iter()
         .filter_map(|m| profile.model_index(*m).map(|i| (i, m.name())));
@@ -328,5 +330,7 @@ pub fn public_points(profile: &Profile) -> Vec<(usize, &str)> {
         .enumerate()
         .filter(|(_, p)| p.model.is_none())
         .map(|(i, p)| (i, p.name.as_str()));
-    model.chain(own).collect()
+    let all = model.chain(own);
+    all.filter(|(i, _)| profile.points.get(*i).is_some_and(is_read))
+        .collect()
 }

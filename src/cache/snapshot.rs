@@ -250,16 +250,22 @@ impl Reading<'_> {
         }
     }
 
-    /// The ends of a band: the drive's own, else the configured frequencies.
+    /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the
+    /// profile gives way to the configured one.
     pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
         let own = |bound: Bound| match bound {
             Bound::Point(point) => self.sample(point).good().map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),
         };
+        let configured = self.spec.frequency_range.as_ref();
+        if let (Bound::Fixed(_), Some(configured)) = (maximum, configured) {
+            let low = own(minimum).unwrap_or(*configured.start());
+            return Some((low, *configured.end())).filter(|(low, high)| high > low);
+        }
         match (own(minimum), own(maximum)) {
             (Some(low), Some(high)) if high > low => Some((low, high)),
             _ => {
-                let configured = self.spec.frequency_range.as_ref()?;
+                let configured = configured?;
                 match (minimum, maximum) {
                     (Bound::Fixed(low), _) => Some((low, *configured.end())),
                     _ => Some((*configured.start(), *configured.end())),

@@ -80,7 +80,9 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
             Refusal::NotWritable(format!("`{name}` of `{}` cannot be written", drive.spec.name))
         })?;
         let value = checked(drive, index, point, value)?;
+        let asked = index;
         let (index, value) = resolve(drive, index, point, value)?;
+        kin(drive, asked, index, value)?;
         if resolved.iter().any(|(other, _)| *other == index) {
             let what = profile.points.get(index).map_or("", |p| p.name.as_str());
             return Err(Refusal::BadValue(format!(
@@ -134,8 +136,57 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     Ok(Value::Number(number))
 }
 
+/// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other
+/// way round. `asked` was checked itself.
+fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
+    let points = &drive.spec.profile.points;
+    let taken_by = |point: usize| points.get(point).and_then(|p| p.write_to).unwrap_or(point);
+    for (other, point) in points.iter().enumerate() {
+        let Some(limits) = drive
+            .spec
+            .limits
+            .get(&point.name)
+            .filter(|_| other != asked && other != index)
+        else {
+            continue;
+        };
+        let figure = match &point.source {
+            _ if point.write_to == Some(index) => Some(value),
+            Source::Derived(derived) => match derived.band().filter(|(of, ..)| taken_by(*of) == index) {
+                Some((_, minimum, maximum)) => drive
+                    .band(minimum, maximum)
+                    .and_then(|band| derived.value(&[value], Some(band))),
+                None => continue,
+            },
+            Source::Raw(_) => continue,
+        };
+        let Some(figure) = figure.map(Value::as_f64) else {
+            return Err(Refusal::NotWritable(format!(
+                "the limits of `{}` cannot be kept while the drive's frequency range is not known; set frequency_range \
+                 for the drive",
+                point.name
+            )));
+        };
+        if !limits.contains(&figure) {
+            let (low, high, unit) = (limits.start(), limits.end(), &point.unit);
+            return Err(Refusal::BadValue(format!(
+                "`{}` would be {figure} {unit}, outside the limits {low} to {high} {unit}; nothing was written",
+                point.name
+            )));
+        }
+    }
+    Ok(())
+}
+
 /// A derived point becomes the point it rests on; the value must fit the register.
 fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Result<(usize, Value), Refusal> {
+    if let Some(target) = point.write_to {
+        let base = drive.spec.profile.points.get(target).ok_or_else(|| {
+            Refusal::NotWritable(format!("point {target} of `{}` cannot be written", drive.spec.name))
+        })?;
+        let value = checked(drive, target, base, value)?;
+        return resolve(drive, target, base, value);
+    }
     match &point.source {
         Source::Raw(raw) => {
             raw.encode(value, 0)
@@ -240,14 +291,17 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
             )));
         }
         match raw.decode(&words, Kind::Number) {
-            Some(value) => checked(drive, index, point, value)?,
+            Some(value) => {
+                let value = checked(drive, index, point, value)?;
+                kin(drive, index, index, value)?;
+            }
             None => {
                 return Err(Refusal::BadValue(format!(
                     "`{}`: no number; nothing was written",
                     point.name
                 )));
             }
-        };
+        }
     }
     Ok(())
 }

@@ -9,6 +9,7 @@ use super::derive::Derived;
 use super::identify::Expected;
 use super::model::{Kind, ModelPoint, Value};
 use crate::codec::{Protocol, Table};
+use crate::document::Node;
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -21,6 +22,8 @@ pub struct Profile {
     pub source: String,
     /// Whether the profile is part of the program; else it came from a file.
     pub built_in: bool,
+    /// The profile that its file rests on.
+    pub base: Option<String>,
     /// Protocols the family speaks.
     pub protocols: Vec<Protocol>,
     /// Baud rates of the family; empty when any will do.
@@ -47,6 +50,10 @@ pub struct Profile {
     pub faults: BTreeMap<u16, FaultText>,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<usize>>,
+    /// The file as it is, without its base.
+    pub text: String,
+    /// The file with its base, for profiles that rest on this one.
+    pub(super) tree: Node,
 }
 
 /// Text of a fault code.
@@ -71,6 +78,8 @@ pub struct AddressRange {
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
     pub holes: bool,
+    /// When the drive takes a write, for people; empty where the manual says nothing.
+    pub write_when: String,
     /// For people.
     pub note: String,
 }
@@ -115,6 +124,8 @@ pub struct Point {
     pub class: PollClass,
     /// Whether it can be commanded.
     pub write: bool,
+    /// The point of the profile that takes the commands, in the same unit, where the drive is read elsewhere.
+    pub write_to: Option<usize>,
     /// Written as a pulse 0, 1, 0.
     pub pulse: bool,
     /// Written only when the drive is not known to have the value already: it keeps it in a memory that wears.
@@ -387,12 +398,14 @@ impl Point {
         }
     }
 
-    /// What a value of an enumeration means.
+    /// What a value of an enumeration, or a bit with texts, means.
     pub fn text_of(&self, value: Value) -> Option<&str> {
-        match value {
-            Value::Integer(code) => self.texts.get(&code).map(String::as_str),
-            Value::Bool(_) | Value::Number(_) => None,
-        }
+        let code = match value {
+            Value::Integer(code) => code,
+            Value::Bool(state) => i64::from(state),
+            Value::Number(_) => return None,
+        };
+        self.texts.get(&code).map(String::as_str)
     }
 
     /// Its raw source, if it has one.

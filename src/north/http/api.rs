@@ -6,7 +6,7 @@ use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
 use crate::cache::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
-use crate::drive::{Quality, State};
+use crate::drive::{self, Quality, State};
 use crate::plant::{BusHandle, DriveHandle};
 
 /// An error reply.
@@ -128,8 +128,10 @@ impl Serialize for Points<'_> {
         let names = public_points(profile);
         let mut map = serializer.serialize_map(Some(names.len()))?;
         for (index, name) in names {
-            let unit = profile.points.get(index).map_or("", |p| p.unit.as_str());
-            map.serialize_entry(name, &self.point(index, unit))?;
+            let Some(point) = profile.points.get(index) else {
+                continue;
+            };
+            map.serialize_entry(name, &self.point(index, point))?;
         }
         map.end()
     }
@@ -138,6 +140,9 @@ impl Serialize for Points<'_> {
 #[derive(Debug, Serialize)]
 struct Point<'p> {
     value: serde_json::Value,
+    /// What the value of an enumeration means.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    text: Option<&'p str>,
     quality: Quality,
     unit: &'p str,
     age_ms: Option<u64>,
@@ -146,14 +151,16 @@ struct Point<'p> {
 
 impl Points<'_> {
     /// A stale value is told with its quality; of a bad point there is nothing to tell.
-    fn point<'p>(&self, index: usize, unit: &'p str) -> Point<'p> {
+    fn point<'p>(&self, index: usize, point: &'p drive::Point) -> Point<'p> {
         let sample = self.reading.sample(index);
         let told = sample.quality != Quality::Bad;
         let at = sample.at.filter(|_| told);
+        let value = sample.value.filter(|_| told);
         Point {
-            value: value_or_null(sample.value.filter(|_| told)),
+            value: value_or_null(value),
+            text: value.and_then(|value| point.text_of(value)),
             quality: sample.quality,
-            unit,
+            unit: &point.unit,
             age_ms: at.map(|at| millis(self.clock.age(at))),
             time: at.and_then(|at| self.clock.wall(at)),
         }

@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use crate::cache::{BusHealth, Reading, value_or_null};
-use crate::drive::{ModelPoint, Profile, Quality, State, Value};
+use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::BusHandle;
 
@@ -81,6 +81,12 @@ pub(super) struct Shown {
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
 
+/// The text beside a point's value: its key and, while the value is good, the text of it.
+pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String, &str)> {
+    let text = value.and_then(|value| point.text_of(value)).unwrap_or_default();
+    (!point.texts.is_empty()).then(|| (format!("{}_text", point.name), text))
+}
+
 impl Shown {
     pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> Shown {
         let shown = |index| {
@@ -100,6 +106,9 @@ pub(super) struct StateObject<'s> {
     pub(super) shown: &'s Shown,
     /// Names in the order of `shown.points`.
     pub(super) names: &'s [String],
+    /// Their indices in the profile.
+    pub(super) indices: &'s [usize],
+    pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
     pub(super) age: Option<Duration>,
     /// The time of day now.
@@ -118,6 +127,12 @@ impl Serialize for StateObject<'_> {
         let points = || self.names.iter().zip(&self.shown.points);
         for (name, (value, _)) in points() {
             map.serialize_entry(name, &value_or_null(value.map(tidy)))?;
+        }
+        for (index, (value, _)) in self.indices.iter().zip(&self.shown.points) {
+            let point = self.profile.points.get(*index);
+            if let Some((key, text)) = point.and_then(|point| text_beside(point, *value)) {
+                map.serialize_entry(&key, text)?;
+            }
         }
         let differing: serde_json::Map<String, serde_json::Value> = points()
             .filter(|(_, (_, quality))| *quality != self.shown.quality)

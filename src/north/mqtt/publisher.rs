@@ -199,6 +199,8 @@ impl DriveTopics {
             let object = StateObject {
                 shown: &shown,
                 names: &self.names,
+                indices: &self.indices,
+                profile: &reading.spec.profile,
                 fault_text: reading.fault_text(),
                 age: reading.age(),
                 wall,

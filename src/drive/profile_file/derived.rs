@@ -1,0 +1,99 @@
+//! `derive`: points made of other points.
+
+use super::super::derive::{Bound, Derived};
+use super::super::profile::{Point, PollClass, Source};
+use crate::document::{self, Reader};
+
+pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
+    const KNOWN: [&str; 6] = ["band", "percent", "zero", "equal", "all", "lowest_bit"];
+    let kind = reader.parsed("derive", |text| {
+        let known = KNOWN.into_iter().find(|known| *known == text);
+        known.ok_or_else(|| format!("unknown derivation `{text}`; known: {}", KNOWN.join(", ")))
+    })?;
+    let index = |key: &str, name: &str| point_of(reader, key, name, names);
+    let other = |key: &str| -> Option<usize> { index(key, &reader.required::<String>(key)?) };
+    let within = |default: f64| reader.or("within", default);
+    let derived = match kind {
+        "band" | "percent" => {
+            let (of, minimum, maximum) = (
+                other("of"),
+                read_bound(reader, "minimum", names, Some(Bound::Fixed(0.0))),
+                read_bound(reader, "maximum", names, None),
+            );
+            let (of, minimum, maximum) = (of?, minimum?, maximum?);
+            if kind == "band" {
+                Derived::Band { of, minimum, maximum }
+            } else {
+                Derived::Percent { of, minimum, maximum }
+            }
+        }
+        "zero" => Derived::Zero {
+            of: other("of")?,
+            within: within(0.0),
+        },
+        "equal" => {
+            let (of, to) = (other("of"), other("to"));
+            Derived::Equal {
+                of: of?,
+                to: to?,
+                within: within(0.0),
+            }
+        }
+        "all" => {
+            let all: Vec<String> = reader.required("of")?;
+            let of: Option<Vec<usize>> = all.iter().map(|name| index("of", name)).collect();
+            Derived::All { of: of? }
+        }
+        _ => Derived::LowestBit { of: other("of")? },
+    };
+    Some(Source::Derived(derived))
+}
+
+pub(super) fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[String]) -> Option<usize> {
+    let index = names.iter().position(|n| n == name);
+    if index.is_none() {
+        let near = document::nearest(name, names.iter().map(String::as_str));
+        let remedy = near.map_or_else(
+            || "name a point of this profile".to_string(),
+            |n| format!("did you mean `{n}`?"),
+        );
+        reader.problem(key, format!("there is no point `{name}`; {remedy}"));
+    }
+    index
+}
+
+/// The end of a band: the name of a point, or a figure.
+fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<Bound>) -> Option<Bound> {
+    match reader.raw(key).map(|node| &node.value) {
+        None if default.is_some() => default,
+        Some(document::Raw::Float(_) | document::Raw::Integer(_)) => reader.optional(key).map(Bound::Fixed),
+        _ => {
+            let name: String = reader.required(key)?;
+            point_of(reader, key, &name, names).map(Bound::Point)
+        }
+    }
+}
+
+/// What is told of derived points: they rest on points that the drive tells itself.
+pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {
+        return;
+    };
+    for source in derived.rests_on() {
+        if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
+            reader.problem(
+                "derive",
+                format!("`{}` is derived itself; name points that have `at`", point.name),
+            );
+        }
+        if let Some(point) = points
+            .get(source)
+            .filter(|p| p.raw().is_some() && p.class == PollClass::Never)
+        {
+            reader.problem(
+                "derive",
+                format!("`{}` is never read; give it another class", point.name),
+            );
+        }
+    }
+}

@@ -1,0 +1,334 @@
+//! Profile files: TOML to a validated [`Profile`], every fault with its line.
+
+mod base;
+mod derived;
+mod place;
+mod points;
+mod ranges;
+mod reference;
+
+use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use super::model::ModelPoint;
+use super::profile::{AddressRange, FaultText, Point, Profile, Profiles};
+use crate::codec::Protocol;
+use crate::document::{self, Document, Node, Problem, Reader};
+use derived::check_derived;
+use points::{check_object, check_target, read_point};
+use ranges::{Offsets, check_overlaps, read_range};
+
+const BUILT_IN: [(&str, &str); 8] = [
+    ("eaton-hvx-n2.toml", include_str!("../../../profiles/eaton-hvx-n2.toml")),
+    ("eaton-hvx.toml", include_str!("../../../profiles/eaton-hvx.toml")),
+    ("eaton-svx.toml", include_str!("../../../profiles/eaton-svx.toml")),
+    (
+        "teco-7300pa-n2.toml",
+        include_str!("../../../profiles/teco-7300pa-n2.toml"),
+    ),
+    ("teco-7300pa.toml", include_str!("../../../profiles/teco-7300pa.toml")),
+    ("vacon-cx.toml", include_str!("../../../profiles/vacon-cx.toml")),
+    ("vacon-nx-n2.toml", include_str!("../../../profiles/vacon-nx-n2.toml")),
+    ("vacon-nx.toml", include_str!("../../../profiles/vacon-nx.toml")),
+];
+
+impl Profiles {
+    /// The profiles that are part of the program.
+    pub fn built_in() -> Profiles {
+        let mut profiles = Profiles::default();
+        for (file, source) in BUILT_IN {
+            if let Ok(profile) = Profile::parse(file, source, true) {
+                profiles.insert(profile);
+            }
+        }
+        profiles
+    }
+
+    /// Adds the profiles of the files `*.toml` in `directory`; a built-in of the same name is replaced. A file may
+    /// rest on any other one of them (`base`), whatever their order.
+    pub fn load(&mut self, directory: &Path) -> Vec<Problem> {
+        let mut problems = Vec::new();
+        let files = match files_of(directory) {
+            Ok(files) => files,
+            Err(error) => {
+                let message =
+                    format!("cannot read the profile directory: {error}; check `profile_dirs` and permissions");
+                return vec![whole(directory.display().to_string(), "", message)];
+            }
+        };
+        let mut waiting = Vec::new();
+        for path in files {
+            let file = path.display().to_string();
+            match document::read_file(&path) {
+                Ok(source) => waiting.push(Waiting::new(file, source)),
+                Err(problem) => problems.push(problem),
+            }
+        }
+        let mut seen: BTreeMap<String, String> = BTreeMap::new();
+        while let Some(next) = waiting.iter().position(|file| !file.waits_for_any_of(&waiting)) {
+            let Waiting { file, source, .. } = waiting.remove(next);
+            match Profile::parse_over(&file, &source, false, self) {
+                Ok(profile) => {
+                    if let Some(other) = seen.insert(profile.name.clone(), file.clone()) {
+                        let message = format!("profile `{}` is also in {other}; rename one of them", profile.name);
+                        problems.push(whole(file, "name", message));
+                    }
+                    self.insert(profile);
+                }
+                Err(found) => problems.extend(found),
+            }
+        }
+        for file in waiting {
+            let base = file.base.unwrap_or_default();
+            let message = format!("`{base}` rests on this profile in its turn; let one of them have no base");
+            problems.push(whole(file.file, "base", message));
+        }
+        problems
+    }
+}
+
+/// A file whose base may not be read yet.
+struct Waiting {
+    file: String,
+    source: String,
+    name: Option<String>,
+    base: Option<String>,
+}
+
+impl Waiting {
+    fn new(file: String, source: String) -> Waiting {
+        let (name, base) = base::peek(&Document::parse(&file, &source));
+        Waiting {
+            file,
+            source,
+            name,
+            base,
+        }
+    }
+
+    /// A file that replaces the profile it rests on waits for none.
+    fn waits_for_any_of(&self, files: &[Waiting]) -> bool {
+        self.base.is_some() && self.base != self.name && files.iter().any(|other| other.name == self.base)
+    }
+}
+
+/// A problem of a whole file.
+fn whole(file: String, key: &str, message: String) -> Problem {
+    Problem {
+        file,
+        line: None,
+        key: key.to_string(),
+        message,
+    }
+}
+
+fn files_of(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(directory)? {
+        let path = entry?.path();
+        if path.extension().is_some_and(|e| e == "toml") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
+}
+
+impl Profile {
+    /// Reads and validates the profile `source`, the text of `file`, which rests on no other profile but the
+    /// built-in ones.
+    ///
+    /// # Errors
+    /// Every fault of the file, with line and key.
+    pub fn parse(file: &str, source: &str, built_in: bool) -> Result<Profile, Vec<Problem>> {
+        let known = if built_in {
+            Profiles::default()
+        } else {
+            Profiles::built_in()
+        };
+        Profile::parse_over(file, source, built_in, &known)
+    }
+
+    fn parse_over(file: &str, source: &str, built_in: bool, known: &Profiles) -> Result<Profile, Vec<Problem>> {
+        let mut document = Document::parse(file, source);
+        let (_, base) = base::peek(&document);
+        if let Some(under) = base.as_deref().and_then(|base| known.get(base)) {
+            base::lay_over(&mut document, &under.tree, &under.name);
+        }
+        base::change_points(&mut document);
+        let profile = read_profile(&document.reader(), built_in, known);
+        let tree = document.root().clone();
+        let problems = document.into_problems();
+        match profile {
+            Some(profile) if problems.is_empty() => Ok(Profile {
+                text: source.to_string(),
+                tree,
+                ..profile
+            }),
+            _ => Err(problems),
+        }
+    }
+}
+
+fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option<Profile> {
+    let name: Option<String> = reader.required("name");
+    if name.as_deref().is_some_and(|n| !is_name(n, '-')) {
+        reader.problem("name", "the name may hold a-z, 0-9 and -; rename the profile");
+    }
+    let base = read_base(reader, known);
+    let protocols = read_protocols(reader);
+    let addresses = read_pair::<u8>(reader, "addresses").unwrap_or(1..=247);
+    if addresses.is_empty() || *addresses.start() == 0 {
+        reader.problem(
+            "addresses",
+            "the first address is 0 or above the last; write for example [1, 247]",
+        );
+    }
+    let input_is_holding = reader.or("input_is_holding", false);
+    let offsets = Offsets::read(reader);
+    let ranges: Vec<AddressRange> = reader
+        .tables("range")
+        .iter()
+        .filter_map(|table| read_range(table, &offsets))
+        .collect();
+    check_overlaps(reader, &ranges);
+    let tables = reader.tables("point");
+    if tables.is_empty() {
+        reader.problem("point", "the profile has no point; write at least one [[point]]");
+    }
+    let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
+    let mut points: Vec<Point> = (0..)
+        .zip(&tables)
+        .map(|(i, table)| read_point(table, i, &names, &ranges, &offsets))
+        .collect();
+    reference::apply(reader, &mut points);
+    for (index, table) in tables.iter().enumerate() {
+        check_derived(table, index, &points);
+        check_target(table, index, &points);
+        if protocols.contains(&Protocol::N2) {
+            check_object(table, index, &points);
+        }
+    }
+    let mut faults = read_faults(reader, "faults", true);
+    for (code, text) in read_faults(reader, "faults_unverified", false) {
+        faults.entry(code).or_insert(text);
+    }
+    let model = ModelPoint::ALL
+        .iter()
+        .map(|m| points.iter().position(|p| p.model == Some(*m)))
+        .collect();
+    let profile = Profile {
+        name: name.clone().unwrap_or_default(),
+        title: reader.or("title", String::new()),
+        source: reader.or("source", String::new()),
+        built_in,
+        base,
+        protocols,
+        bauds: reader.or("bauds", Vec::new()),
+        addresses,
+        turnaround: reader.or("turnaround", Duration::from_millis(2)),
+        update_period: reader.or("update_period", Duration::from_millis(10)),
+        confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
+        input_is_holding,
+        identify: super::identify::read(reader),
+        simulator: reader.optional("simulator"),
+        ranges,
+        points,
+        faults,
+        model,
+        text: String::new(),
+        tree: Node::empty_table(None),
+    };
+    reader.finish();
+    name.map(|_| profile)
+}
+
+/// The profile this one rests on; the files are one by now, so only an unknown name is left to tell.
+fn read_base(reader: &Reader<'_>, known: &Profiles) -> Option<String> {
+    let base: String = reader.optional("base")?;
+    if known.get(&base).is_none() {
+        let near = document::nearest(&base, known.names()).map(|near| format!("did you mean `{near}`?"));
+        let names: Vec<&str> = known.names().collect();
+        let remedy = near.unwrap_or_else(|| format!("known are {}", names.join(", ")));
+        reader.problem("base", format!("there is no sound profile `{base}`; {remedy}"));
+        // Everything else may be there.
+        reader.tolerate();
+    }
+    Some(base)
+}
+
+fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
+    let names: Vec<String> = reader.required("protocols").unwrap_or_default();
+    let mut protocols = Vec::new();
+    for name in names {
+        match Protocol::from_name(&name) {
+            Some(protocol) => protocols.push(protocol),
+            None => {
+                let known: Vec<&str> = Protocol::ALL.iter().map(|p| p.name()).collect();
+                reader.problem(
+                    "protocols",
+                    format!("unknown protocol `{name}`; known: {}", known.join(", ")),
+                );
+            }
+        }
+    }
+    if protocols.is_empty() && reader.has("protocols") {
+        reader.problem(
+            "protocols",
+            "no protocol that is known is named; write for example [\"modbus-rtu\"]",
+        );
+    }
+    if protocols.len() > 1 && protocols.contains(&Protocol::N2) {
+        reader.problem(
+            "protocols",
+            "n2 has a map of its own; write a profile for n2 and another for Modbus",
+        );
+    }
+    protocols
+}
+
+fn read_pair<T: document::FromNode + Copy + PartialOrd>(reader: &Reader<'_>, key: &str) -> Option<RangeInclusive<T>> {
+    let pair: Vec<T> = reader.optional(key)?;
+    match pair.as_slice() {
+        [low, high] if low <= high => Some(*low..=*high),
+        _ => {
+            reader.problem(key, "two values are wanted, the lower one first; write [low, high]");
+            None
+        }
+    }
+}
+
+fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, FaultText> {
+    let Some(table) = reader.table(key) else {
+        return BTreeMap::new();
+    };
+    let mut faults = BTreeMap::new();
+    for code in table.keys() {
+        let text: Option<String> = table.optional(code);
+        match (code.parse::<u16>(), text) {
+            (Ok(number), Some(text)) => {
+                faults.insert(number, FaultText { text, verified });
+            }
+            (Err(_), _) => table.problem(
+                code,
+                format!("`{code}` is no fault code; write a number from 0 to 65535"),
+            ),
+            (Ok(_), None) => {}
+        }
+    }
+    table.finish();
+    faults
+}
+
+/// Lower-case letters, digits and `joint`, beginning with a letter.
+fn is_name(text: &str, joint: char) -> bool {
+    text.starts_with(|c: char| c.is_ascii_lowercase())
+        && text
+            .chars()
+            .all(|c| c.is_ascii_lowercase() || c.is_ascii_digit() || c == joint)
+}
+
+#[cfg(test)]
+mod tests;

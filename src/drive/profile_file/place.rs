@@ -1,0 +1,142 @@
+//! Where a value lies and what form it has: `at`, `type`, `words`, `invert`, `scale`, `offset`.
+
+use super::super::profile::{AddressRange, Form, Raw, Source, WordOrder, parse_address};
+use super::ranges::{Offsets, read_table};
+use crate::codec::Table;
+use crate::document::Reader;
+
+/// `holding 2100.3`: table, PDU address, bit.
+pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &Offsets) -> Option<Source> {
+    let at: String = reader.required("at")?;
+    let bad =
+        || format!("`{at}` is no place; write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"");
+    let Some((table, place)) = at.split_once(' ') else {
+        reader.problem("at", bad());
+        return None;
+    };
+    let table = read_table(reader, "at", table)?;
+    let (address, bits) = match place.split_once('.') {
+        Some((address, bits)) => (parse_address(address), parse_bits(bits).map(Some)),
+        None => (parse_address(place), Some(None)),
+    };
+    let (Some(address), Some(bits)) = (address, bits) else {
+        reader.problem("at", bad());
+        return None;
+    };
+    let address = offsets.applied(reader, "at", table, address)?;
+    let invert = reader.or("invert", false);
+    let form = read_form(reader, table, bits, invert)?;
+    if reader.has("invert") && !matches!(form, Form::Bit { .. }) {
+        reader.problem("invert", "only a bit can be inverted; leave the key out");
+    }
+    let raw = Raw {
+        table,
+        address,
+        form,
+        scale: reader.or("scale", 1.0),
+        offset: reader.or("offset", 0.0),
+    };
+    if raw.scale == 0.0 {
+        reader.problem(
+            "scale",
+            "a scale of 0 loses every value; write the engineering value of one count",
+        );
+    }
+    check_place(reader, &raw, ranges);
+    Some(Source::Raw(raw))
+}
+
+/// `3` is one bit, `4-7` a field: the first bit and how many.
+fn parse_bits(text: &str) -> Option<(u8, u8)> {
+    let (first, last) = text.split_once('-').unwrap_or((text, text));
+    let (first, last): (u8, u8) = (first.parse().ok()?, last.parse().ok()?);
+    (first <= last && last < 16).then(|| (first, last - first + 1))
+}
+
+fn check_place(reader: &Reader<'_>, raw: &Raw, ranges: &[AddressRange]) {
+    let Raw {
+        table, address, form, ..
+    } = raw;
+    let range = ranges
+        .iter()
+        .find(|r| r.table == *table && r.addresses.contains(address));
+    let Some(range) = range else {
+        reader.problem(
+            "at",
+            format!("{table} {address} lies in no [[range]] of the profile; add the range"),
+        );
+        return;
+    };
+    let items = form.items();
+    if raw.addresses().count() != usize::from(items) || raw.addresses().any(|a| !range.addresses.contains(&a)) {
+        reader.problem(
+            "at",
+            format!("{table} {address} takes {items} registers, which its [[range]] does not hold; widen the range"),
+        );
+    } else if items > range.read {
+        reader.problem(
+            "type",
+            format!(
+                "the value takes {items} registers, its [[range]] reads {}; raise `read` there",
+                range.read
+            ),
+        );
+    }
+}
+
+fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: bool) -> Option<Form> {
+    let kind: Option<String> = reader.optional("type");
+    let words = match reader.optional::<String>("words").as_deref() {
+        None | Some("high-first") => WordOrder::HighFirst,
+        Some("low-first") => WordOrder::LowFirst,
+        Some(other) => {
+            reader.problem(
+                "words",
+                format!("unknown word order `{other}`; write high-first or low-first"),
+            );
+            WordOrder::HighFirst
+        }
+    };
+    match (table.is_bits(), bits, kind.as_deref()) {
+        (true, None, None) => Some(Form::Bit { bit: 0, invert }),
+        (false, Some((bit, 1)), None) => Some(Form::Bit { bit, invert }),
+        (false, Some((first, count)), None) => Some(Form::Bits { first, count }),
+        (false, None, Some(text)) => form_of(reader, text, words),
+        (false, None, None) => Some(Form::U16),
+        (true, _, _) => {
+            reader.problem(
+                "at",
+                "an item of a bit table has neither bit number nor type; leave them out",
+            );
+            None
+        }
+        (false, Some(_), Some(_)) => {
+            reader.problem("type", "a bit has no type; leave the key out");
+            None
+        }
+    }
+}
+
+fn form_of(reader: &Reader<'_>, kind: &str, words: WordOrder) -> Option<Form> {
+    let form = match kind {
+        "u16" => Form::U16,
+        "i16" => Form::I16,
+        "u32" => Form::U32(words),
+        "i32" => Form::I32(words),
+        "f32" => Form::F32(words),
+        other => {
+            reader.problem(
+                "type",
+                format!("unknown type `{other}`; known: u16, i16, u32, i32, f32"),
+            );
+            return None;
+        }
+    };
+    if form.items() == 1 && reader.has("words") {
+        reader.problem(
+            "words",
+            format!("a {kind} is one register and has no word order; leave the key out"),
+        );
+    }
+    Some(form)
+}

@@ -1,0 +1,245 @@
+//! `[[point]]`: one named value.
+
+use std::collections::BTreeMap;
+
+use super::super::derive::Derived;
+use super::super::model::{Kind, ModelPoint};
+use super::super::profile::{AddressRange, Form, Point, PollClass, Source, WordOrder};
+use super::derived::{point_of, read_derived};
+use super::place::read_raw;
+use super::ranges::Offsets;
+use super::{is_name, read_pair};
+use crate::codec::Table;
+use crate::document::Reader;
+
+/// Address of ADI 1 of N2 in the table of input registers.
+const FIRST_ADI: u16 = 0x4000;
+
+pub(super) fn read_point(
+    reader: &Reader<'_>,
+    index: usize,
+    names: &[String],
+    ranges: &[AddressRange],
+    offsets: &Offsets,
+) -> Point {
+    let name: String = reader.required("name").unwrap_or_default();
+    if !is_name(&name, '_') {
+        reader.problem("name", "a point's name is snake_case: a-z, 0-9 and _; rename the point");
+    }
+    if names.iter().take(index).any(|n| *n == name) {
+        reader.problem("name", format!("there are two points `{name}`; rename one of them"));
+    }
+    let model = ModelPoint::from_name(&name);
+    let source = if reader.has("derive") {
+        read_derived(reader, names)
+    } else {
+        read_raw(reader, ranges, offsets)
+    };
+    let found = source.is_some();
+    let unit = match model {
+        Some(model) => {
+            if reader.has("unit") && reader.optional::<String>("unit").as_deref() != Some(model.unit()) {
+                reader.problem(
+                    "unit",
+                    format!("the unit of `{name}` is fixed to `{}`; leave the key out", model.unit()),
+                );
+            }
+            model.unit().to_string()
+        }
+        None => reader.or("unit", String::new()),
+    };
+    let derived = !matches!(source, Some(Source::Raw(_)));
+    let class = if derived { PollClass::Never } else { read_class(reader) };
+    let point = Point {
+        name,
+        model,
+        unit,
+        class,
+        write: reader.or("write", false),
+        write_to: reader
+            .optional::<String>("write_to")
+            .and_then(|name| point_of(reader, "write_to", &name, names)),
+        pulse: reader.or("pulse", false),
+        on_change: reader.or("on_change", false),
+        range: read_pair::<f64>(reader, "range"),
+        texts: read_texts(reader),
+        verified: reader.or("verified", true),
+        note: reader.or("note", String::new()),
+        source: source.unwrap_or(Source::Derived(Derived::All { of: Vec::new() })),
+    };
+    if found {
+        check_kind(reader, &point);
+        check_write(reader, &point, ranges);
+    }
+    check_texts(reader, &point, names);
+    reader.finish();
+    point
+}
+
+fn read_class(reader: &Reader<'_>) -> PollClass {
+    let class = reader.parsed("class", |text| match text {
+        "fast" => Ok(PollClass::Fast),
+        "slow" => Ok(PollClass::Slow),
+        "once" => Ok(PollClass::Once),
+        "never" => Ok(PollClass::Never),
+        other => Err(format!("unknown poll class `{other}`; write fast, slow, once or never")),
+    });
+    class.unwrap_or(PollClass::Slow)
+}
+
+/// Commands for another point: that one must take them, and may not pass them on again.
+pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(point) = points.get(index) else { return };
+    let Some(target) = point.write_to.and_then(|to| points.get(to)) else {
+        return;
+    };
+    if !point.write {
+        reader.problem("write_to", "the point is not written at all; add `write = true`");
+    }
+    if !target.write || target.write_to.is_some() {
+        reader.problem(
+            "write_to",
+            format!(
+                "`{}` takes no commands itself; name a point with `write = true` and without `write_to`",
+                target.name
+            ),
+        );
+    } else if target.kind() != point.kind() {
+        reader.problem(
+            "write_to",
+            format!("`{}` is of another kind; name a point with like values", target.name),
+        );
+    }
+}
+
+/// `[point.texts]`: what the values of an enumeration mean.
+fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
+    let Some(table) = reader.table("texts") else {
+        return BTreeMap::new();
+    };
+    let mut texts = BTreeMap::new();
+    for key in table.keys() {
+        let text: Option<String> = table.optional(key);
+        match (key.parse::<i64>(), text) {
+            (Ok(value), Some(text)) => {
+                texts.insert(value, text);
+            }
+            (Err(_), _) => table.problem(key, format!("`{key}` is no whole number; write value = \"meaning\"")),
+            (Ok(_), None) => {}
+        }
+    }
+    table.finish();
+    texts
+}
+
+/// A point of the common model has the kind of the model; an enumeration and a bit have no scale.
+fn check_kind(reader: &Reader<'_>, point: &Point) {
+    let figure = match &point.source {
+        Source::Raw(raw) => !matches!(raw.form, Form::Bit { .. }),
+        Source::Derived(derived) => !matches!(
+            derived,
+            Derived::Zero { .. } | Derived::Equal { .. } | Derived::All { .. }
+        ),
+    };
+    let key = if reader.has("derive") { "derive" } else { "at" };
+    match point.model.map(ModelPoint::kind) {
+        Some(Kind::Bool) if figure => reader.problem(
+            key,
+            format!(
+                "`{}` is true or false; name a bit, such as \"holding 2100.3\"",
+                point.name
+            ),
+        ),
+        Some(Kind::Number | Kind::Integer) if !figure => {
+            reader.problem(key, format!("`{}` is a figure, not a bit; name a register", point.name))
+        }
+        _ => {}
+    }
+    let scaled = reader.has("scale") || reader.has("offset");
+    if scaled && point.raw().is_some() && point.kind() != Kind::Number {
+        let key = if reader.has("scale") { "scale" } else { "offset" };
+        reader.problem(
+            key,
+            format!(
+                "`{}` is a state or a code, which has no scale; leave the key out",
+                point.name
+            ),
+        );
+    }
+}
+
+fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
+    if point.texts.is_empty() {
+        return;
+    }
+    let beside = format!("{}_text", point.name);
+    if names.contains(&beside) {
+        reader.problem(
+            "name",
+            format!(
+                "the text of `{}` is shown as `{beside}`, which is a point too; rename one of them",
+                point.name
+            ),
+        );
+    }
+}
+
+/// What N2 has: floats at even addresses below 0x4000, internal integers from there on.
+pub(super) fn check_object(reader: &Reader<'_>, index: usize, points: &[Point]) {
+    let Some(raw) = points
+        .get(index)
+        .and_then(Point::raw)
+        .filter(|raw| !raw.table.is_bits())
+    else {
+        return;
+    };
+    let integer = raw.table == Table::Input && raw.address >= FIRST_ADI;
+    match raw.form {
+        Form::F32(WordOrder::HighFirst) if !integer && raw.address % 2 == 0 => {}
+        Form::U16 | Form::I16 if integer => {}
+        _ if integer => reader.problem("at", "an ADI is one register; write type = \"i16\" and no bit"),
+        _ => reader.problem(
+            "at",
+            "AI and AO of N2 are floats at even addresses, number n at 2(n-1); write type = \"f32\" and such an address",
+        ),
+    }
+}
+
+fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
+    if point.pulse && !point.write {
+        reader.problem(
+            "pulse",
+            "only a point that can be written can be a pulse; add `write = true`",
+        );
+    }
+    if point.pulse && point.kind() != Kind::Bool {
+        reader.problem("pulse", "only a bit can be a pulse; leave the key out");
+    }
+    if point.on_change && !point.write {
+        reader.problem(
+            "on_change",
+            "only a point that can be written is written on change; add `write = true`",
+        );
+    }
+    let Some(raw) = point.raw().filter(|_| point.write && !reader.has("write_to")) else {
+        return;
+    };
+    let range = ranges
+        .iter()
+        .find(|r| r.table == raw.table && r.addresses.contains(&raw.address));
+    let (most, items) = (range.map_or(0, |r| r.write), raw.form.items());
+    if most == 0 {
+        reader.problem(
+            "write",
+            format!(
+                "{} {} lies in a read-only range; set `write` there",
+                raw.table, raw.address
+            ),
+        );
+    } else if most < items {
+        reader.problem(
+            "write",
+            format!("the value takes {items} registers, its range writes {most}; raise `write` there"),
+        );
+    }
+}

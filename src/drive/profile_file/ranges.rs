@@ -1,0 +1,128 @@
+//! `[[range]]` and `address_offset`: what may be read and written together.
+
+use std::collections::BTreeMap;
+
+use super::super::profile::AddressRange;
+use crate::codec::Table;
+use crate::document::Reader;
+
+pub(super) fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<Table> {
+    let table = Table::from_name(text);
+    if table.is_none() {
+        reader.problem(
+            key,
+            format!("unknown table `{text}`; known: coil, discrete-input, input, holding"),
+        );
+    }
+    table
+}
+
+pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<AddressRange> {
+    let text: Option<String> = reader.required("table");
+    let table = text.and_then(|text| read_table(reader, "table", &text));
+    let first: Option<u16> = reader.required("first");
+    let last: Option<u16> = reader.required("last");
+    let read: u16 = reader.or("read", 1);
+    let write: u16 = reader.or("write", 0);
+    let holes = reader.or("holes", false);
+    let note = reader.or("note", String::new());
+    let write_when = reader.or("write_when", String::new());
+    let first = first.and_then(|at| offsets.applied(reader, "first", table?, at));
+    let last = last.and_then(|at| offsets.applied(reader, "last", table?, at));
+    let (table, first, last) = match (table, first, last) {
+        (Some(table), Some(first), Some(last)) => (table, first, last),
+        _ => {
+            reader.finish();
+            return None;
+        }
+    };
+    if first > last {
+        reader.problem(
+            "last",
+            format!("{last} lies before the first address {first}; swap them"),
+        );
+    }
+    if read == 0 || read > table.max_read() {
+        reader.problem(
+            "read",
+            format!("{read} is out of range; write 1 to {}", table.max_read()),
+        );
+    }
+    if write > 123 {
+        reader.problem("write", format!("{write} is out of range; write 0 (read-only) to 123"));
+    }
+    reader.finish();
+    Some(AddressRange {
+        table,
+        addresses: first..=last,
+        read,
+        write,
+        holes,
+        write_when,
+        note,
+    })
+}
+
+/// An address lies in one range. A file over a base may give other limits to a part of a range of the base.
+pub(super) fn check_overlaps(reader: &Reader<'_>, ranges: &[AddressRange]) {
+    let tables = reader.tables("range");
+    let mut seen: Vec<(&AddressRange, Option<String>)> = Vec::new();
+    if tables.len() != ranges.len() {
+        // What could not be read was told.
+        return;
+    }
+    for (table, range) in tables.iter().zip(ranges) {
+        // A range of the base, changed or not, still has keys of the base.
+        let of = table.keys().into_iter().find_map(|key| table.place_of(key).env);
+        let overlaps = |other: &AddressRange| {
+            other.table == range.table
+                && other.addresses.start() <= range.addresses.end()
+                && range.addresses.start() <= other.addresses.end()
+        };
+        if let Some((other, _)) = seen.iter().find(|(other, whose)| *whose == of && overlaps(other)) {
+            let (first, last) = (other.addresses.start(), other.addresses.end());
+            table.problem(
+                "first",
+                format!("the range overlaps the one from {first} to {last}; an address lies in one range"),
+            );
+        }
+        seen.push((range, of));
+    }
+}
+
+/// `address_offset`: what the addresses of each table are shifted by on the wire.
+#[derive(Debug, Default)]
+pub(super) struct Offsets(BTreeMap<Table, i64>);
+
+impl Offsets {
+    const TABLES: [Table; 4] = [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding];
+
+    pub(super) fn read(reader: &Reader<'_>) -> Offsets {
+        let mut offsets = Offsets::default();
+        let Some(given) = reader.table("address_offset") else {
+            return offsets;
+        };
+        for table in Self::TABLES {
+            let shift: i64 = given.or(table.name(), 0);
+            if (-1..=1).contains(&shift) {
+                offsets.0.insert(table, shift);
+            } else {
+                given.problem(table.name(), format!("{shift} is out of range; write -1, 0 or 1"));
+            }
+        }
+        given.finish();
+        offsets
+    }
+
+    pub(super) fn applied(&self, reader: &Reader<'_>, key: &str, table: Table, address: u16) -> Option<u16> {
+        let offset = self.0.get(&table).copied().unwrap_or(0);
+        let shifted = u16::try_from(i64::from(address) + offset).ok();
+        if shifted.is_none() {
+            reader.problem(
+                key,
+                format!("{table} {address} shifted by {offset} is no address; correct `address_offset` or the address"),
+            );
+        }
+        shifted
+    }
+}

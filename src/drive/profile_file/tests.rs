@@ -1,0 +1,405 @@
+//! Faults of profile files, each told with its place, and what a sound file means.
+
+use tempfile::TempDir;
+
+use super::super::derive::{Bound, Derived};
+use super::super::profile::{Form, Source};
+use super::*;
+use crate::drive::Value;
+use crate::drive::model::Kind;
+
+/// A profile that is sound, for one more thing to be wrong with.
+const HEAD: &str = r#"
+name = "meter"
+protocols = ["modbus-rtu"]
+[[range]]
+table = "holding"
+first = 0
+last = 99
+read = 10
+write = 10
+"#;
+
+fn told(file: &str, source: &str) -> String {
+    let found = Profile::parse(file, source, false).err().unwrap_or_default();
+    found.iter().map(|p| format!("{p}\n")).collect()
+}
+
+#[test]
+fn built_in_profiles_are_valid() {
+    for (file, source) in BUILT_IN {
+        let found = Profile::parse(file, source, true).err().unwrap_or_default();
+        let text: Vec<String> = found.iter().map(Problem::to_string).collect();
+        assert!(found.is_empty(), "{}", text.join("\n"));
+    }
+    assert_eq!(Profiles::built_in().iter().count(), BUILT_IN.len());
+}
+
+#[test]
+fn every_mistake_is_told() {
+    let source = r#"
+name = "My Meter"
+protocols = ["modbus-rut"]
+[[range]]
+table = "holding"
+first = 10
+last = 5
+[[point]]
+name = "ready"
+at = "holding 10.16"
+[[point]]
+name = "a"
+at = "holding 900"
+scael = 2
+[[point]]
+name = "a"
+at = "holding 7"
+type = "f16"
+unit = "V"
+[faults]
+x = "y"
+"#;
+    let all = told("meter.toml", source);
+    for wanted in [
+        "meter.toml:2, name",
+        "meter.toml:3, protocols; known: modbus-rtu, modbus-ascii, n2",
+        "meter.toml:7, range[0].last",
+        "meter.toml:10, point[0].at",
+        "meter.toml:13, point[1].at; add the range",
+        "meter.toml:14, point[1].scael; did you mean `scale`?",
+        "meter.toml:16, point[2].name",
+        "meter.toml:18, point[2].type; known: u16, i16, u32, i32, f32",
+        "meter.toml:21, faults.x",
+    ] {
+        assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
+    }
+}
+
+/// One mistake each: what stands in a sound point named `a` in line 11, and what is told of it.
+#[test]
+fn each_mistake_of_a_point() {
+    let cases = [
+        ("at = \"holding\"", "m:12, point[0].at; write table and PDU address"),
+        ("at = \"holding 70000\"", "m:12, point[0].at; write table"),
+        ("at = \"holding 1.8-4\"", "m:12, point[0].at; write table"),
+        ("at = \"register 1\"", "unknown table `register`; m:12"),
+        ("at = \"input 1\"", "lies in no [[range]] of the profile; m:12"),
+        (
+            "at = \"holding 99\"\ntype = \"u32\"",
+            "does not hold; m:12, point[0].at; widen the range",
+        ),
+        (
+            "at = \"holding 1.3\"\ntype = \"u16\"",
+            "a bit has no type; m:13, point[0].type",
+        ),
+        (
+            "at = \"holding 1\"\nwords = \"low-first\"\ntype = \"i16\"",
+            "has no word order; m:13, point[0].words",
+        ),
+        (
+            "at = \"holding 1\"\ntype = \"u32\"\nwords = \"little\"",
+            "unknown word order `little`; m:14",
+        ),
+        (
+            "at = \"holding 1\"\ninvert = true",
+            "only a bit can be inverted; m:13, point[0].invert",
+        ),
+        (
+            "at = \"holding 1\"\nscale = 0",
+            "a scale of 0 loses every value; m:13, point[0].scale",
+        ),
+        (
+            "at = \"holding 1\"\nscale = nan",
+            "NaN is no finite number; m:13, point[0].scale",
+        ),
+        (
+            "at = \"holding 1\"\noffset = inf",
+            "inf is no finite number; m:13, point[0].offset",
+        ),
+        (
+            "at = \"holding 1.3\"\nscale = 2",
+            "has no scale; m:13, point[0].scale; leave the key out",
+        ),
+        (
+            "at = \"holding 1\"\noffset = 2\n[point.texts]\n1 = \"on\"",
+            "has no scale; m:13, point[0].offset",
+        ),
+        (
+            "at = \"holding 1\"\nclass = \"quick\"",
+            "unknown poll class `quick`; m:13, point[0].class",
+        ),
+        (
+            "at = \"holding 1\"\nrange = [5, 1]",
+            "two values are wanted, the lower one first; m:13",
+        ),
+        (
+            "at = \"holding 1\"\npulse = true\nwrite = true",
+            "only a bit can be a pulse; m:13",
+        ),
+        (
+            "at = \"holding 1.1\"\npulse = true",
+            "only a point that can be written can be a pulse; m:13",
+        ),
+        (
+            "at = \"holding 1\"\non_change = true",
+            "is written on change; m:13, point[0].on_change",
+        ),
+        (
+            "at = \"holding 1\"\nwrite_to = \"b\"",
+            "there is no point `b`; m:13, point[0].write_to",
+        ),
+        (
+            "at = \"holding 1\"\nwrite = true\nwrite_to = \"a\"",
+            "takes no commands itself; m:14",
+        ),
+        (
+            "at = \"holding 1\"\n[point.texts]\non = \"on\"",
+            "`on` is no whole number; m:14, point[0].texts.on",
+        ),
+        (
+            "derive = \"sum\"",
+            "unknown derivation `sum`; m:12, point[0].derive; known: band, percent",
+        ),
+        ("derive = \"zero\"", "`of` is missing; m:10"),
+        (
+            "derive = \"zero\"\nof = \"b\"",
+            "there is no point `b`; m:13, point[0].of",
+        ),
+        (
+            "derive = \"zero\"\nof = \"a\"",
+            "`a` is derived itself; m:12, point[0].derive",
+        ),
+        ("derive = \"band\"\nof = \"a\"", "`maximum` is missing; m:10"),
+    ];
+    for (lines, wanted) in cases {
+        let all = told("m", &format!("{HEAD}[[point]]\nname = \"a\"\n{lines}\n"));
+        assert!(all.contains(wanted), "{lines}\n{wanted} is missing in\n{all}");
+        assert_eq!(all.lines().count(), 1, "{lines}\n{all}");
+    }
+}
+
+#[test]
+fn each_mistake_of_the_whole() {
+    let point = "[[point]]\nname = \"a\"\nat = \"holding 1\"\n";
+    let range = |more: &str| format!("[[range]]\ntable = \"holding\"\nfirst = 200\nlast = 299\n{more}\n{point}");
+    let top = |line: &str| HEAD.replacen("name", &format!("{line}\nname"), 1) + point;
+    let cases = [
+        (HEAD.to_string(), "the profile has no point; m, point"),
+        (
+            HEAD.to_string() + &range("read = 0"),
+            "0 is out of range; m:14, range[1].read",
+        ),
+        (
+            HEAD.to_string() + &range("read = 126"),
+            "126 is out of range; m:14, range[1].read",
+        ),
+        (
+            HEAD.to_string() + &range("write = 200"),
+            "200 is out of range; m:14, range[1].write",
+        ),
+        (
+            HEAD.to_string() + &range("").replace("200", "50"),
+            "the range overlaps the one from 0 to 99; m:12, range[1].first",
+        ),
+        (top("base = \"vacon\""), "there is no sound profile `vacon`; m:2, base"),
+        (
+            top("addresses = [0, 5]"),
+            "the first address is 0 or above the last; m:2, addresses",
+        ),
+        (
+            top("addresses = [1]"),
+            "two values are wanted, the lower one first; m:2, addresses",
+        ),
+        (top("turnaround = \"5\""), "m:2, turnaround"),
+        (
+            top("address_offset = { holding = 2 }"),
+            "2 is out of range; m:2, address_offset.holding",
+        ),
+        (
+            top("address_offset = { hold = 1 }"),
+            "unknown key `hold`; m:2, address_offset.hold",
+        ),
+        (
+            top("address_offset = { holding = -1 }"),
+            "holding 0 shifted by -1 is no address; m:7, range[0].first",
+        ),
+        (top("remove = [\"b\"]"), "there is no point `b`; m:2, remove"),
+        (top("remove = \"a\""), "that is no list; m:2, remove"),
+        (top("points.b.scale = 2"), "there is no point `b`; m:2, points.b"),
+        (
+            top("points.a.scael = 2"),
+            "unknown key `scael`; m:2, point[0].scael; did you mean `scale`?",
+        ),
+        (
+            top("speed_reference.signed = true"),
+            "no register with a reference in percent; m:2, speed_reference",
+        ),
+        (
+            top("").replace("[\"modbus-rtu\"]", "[\"modbus-rtu\", \"n2\"]"),
+            "n2 has a map of its own; m:4, protocols",
+        ),
+        (
+            top("").replace("[\"modbus-rtu\"]", "[]"),
+            "no protocol that is known is named; m:4, protocols",
+        ),
+        (
+            top("").replace("modbus-rtu", "n2"),
+            "AI and AO of N2 are floats at even addresses, number n at 2(n-1); m:13, point[0].at",
+        ),
+        (
+            HEAD.to_string() + point + "type = \"i32\"\n[[point]]\nname = \"run\"\nat = \"holding 5\"\nwrite = true",
+            "`run` is true or false; m:16, point[1].at; name a bit",
+        ),
+        (
+            HEAD.to_string() + point + "[[point]]\nname = \"motor_current\"\nat = \"holding 5.1\"",
+            "`motor_current` is a figure, not a bit; m:15, point[1].at",
+        ),
+        (
+            HEAD.to_string() + point + "class = \"never\"\n[[point]]\nname = \"b\"\nderive = \"zero\"\nof = \"a\"",
+            "`a` is never read; m:16, point[1].derive",
+        ),
+        (
+            HEAD.to_string() + point + "[point.texts]\n1 = \"x\"\n[[point]]\nname = \"a_text\"\nat = \"holding 5\"",
+            "the text of `a` is shown as `a_text`, which is a point too; m:11, point[0].name",
+        ),
+    ];
+    for (source, wanted) in cases {
+        let all = told("m", &source);
+        assert!(all.contains(wanted), "{source}\n{wanted} is missing in\n{all}");
+    }
+}
+
+#[test]
+fn a_profile_over_another() {
+    let source = r#"
+name = "our-hvx"
+base = "eaton-hvx"
+remove = ["sensor_feedback", "pid_setpoint"]
+points.output_frequency.scale = 0.1
+points.interlocked.invert = false
+[[range]]
+table = "holding"
+first = 100
+read = 8
+[[range]]
+table = "holding"
+first = 500
+last = 509
+read = 4
+[[point]]
+name = "zero_speed"
+at = "holding 2100.9"
+class = "fast"
+[[point]]
+name = "room_temperature"
+at = "holding 500"
+scale = 0.1
+unit = "°C"
+[faults]
+7 = "short circuit"
+"#;
+    let ours = Profile::parse("ours.toml", source, false).unwrap();
+    let hvx = Profiles::built_in().get("eaton-hvx").unwrap().clone();
+    let point = |name: &str| ours.points.get(ours.point_index(name).unwrap()).unwrap();
+    assert_eq!(ours.name, "our-hvx");
+    assert_eq!(ours.simulator, hvx.simulator);
+    assert_eq!(ours.points.len(), hvx.points.len() - 1);
+    assert_eq!(point("output_frequency").raw().unwrap().scale, 0.1);
+    assert_eq!(point("output_frequency").raw().unwrap().form, Form::I16);
+    assert_eq!(
+        point("interlocked").raw().unwrap().form,
+        Form::Bit { bit: 8, invert: false }
+    );
+    assert_eq!(
+        point("zero_speed").raw().unwrap().form,
+        Form::Bit { bit: 9, invert: false }
+    );
+    assert_eq!(ours.range(crate::codec::Table::Holding, 101).unwrap().read, 8);
+    assert_eq!(ours.range(crate::codec::Table::Holding, 505).unwrap().read, 4);
+    assert_eq!(ours.range(crate::codec::Table::Holding, 511).unwrap().read, 8);
+    assert_eq!(ours.fault_text(7), "short circuit");
+    assert_eq!(ours.fault_text(53), "fieldbus fault");
+    let wrong = source.replace("scale = 0.1\nunit", "scale = 0.1\nuint");
+    assert!(
+        told("m", &wrong).contains("unknown key `uint`; m:"),
+        "{}",
+        told("m", &wrong)
+    );
+    // What the file breaks in its base is told by the base's name.
+    let wrong = source.replace("\"sensor_feedback\", \"pid_setpoint\"", "\"maximum_frequency\"");
+    let all = told("m", &wrong);
+    assert!(
+        all.contains("there is no point `maximum_frequency`; profile eaton-hvx, point["),
+        "{all}"
+    );
+}
+
+#[test]
+fn choices_of_the_reference() {
+    let read = |base: &str, lines: &str| {
+        let source = format!("name = \"x\"\nbase = \"{base}\"\n{lines}\n");
+        Profile::parse("x.toml", &source, false).unwrap_or_else(|found| panic!("{}", found[0]))
+    };
+    let of = |profile: &Profile, name: &str| profile.points[profile.point_index(name).unwrap()].clone();
+    let nx = read("vacon-nx", "speed_reference = { signed = false, base = \"max\" }");
+    assert_eq!(of(&nx, "speed_reference").raw().unwrap().form, Form::U16);
+    assert_eq!(of(&nx, "speed_reference").range, Some(0.0..=100.0));
+    let least = |profile: &Profile| match of(profile, "frequency_reference").source {
+        Source::Derived(Derived::Band { minimum, .. }) => minimum,
+        other => panic!("{other:?}"),
+    };
+    assert_eq!(least(&nx), Bound::Fixed(0.0));
+    let hvx = read("eaton-hvx", "speed_reference = { signed = true, base = \"min_max\" }");
+    assert_eq!(of(&hvx, "speed_reference").raw().unwrap().form, Form::I16);
+    assert_eq!(least(&hvx), Bound::Point(hvx.point_index("minimum_frequency").unwrap()));
+    let hertz = read("eaton-svx", "speed_reference.unit = \"hz\"");
+    let raw = of(&hertz, "frequency_reference");
+    assert_eq!((raw.raw().unwrap().address, raw.raw().unwrap().scale), (2002, 0.01));
+    assert!(matches!(
+        of(&hertz, "speed_reference").source,
+        Source::Derived(Derived::Percent { .. })
+    ));
+    let cx = read("vacon-cx", "address_offset = { holding = 1, discrete-input = 1 }");
+    assert_eq!(of(&cx, "frequency_reference").raw().unwrap().address, 1);
+    assert_eq!(of(&cx, "running").raw().unwrap().address, 3);
+    assert_eq!(of(&cx, "output_frequency").raw().unwrap().address, 0);
+    assert_eq!(cx.ranges.last().unwrap().addresses, 9901..=9999);
+}
+
+#[test]
+fn files_rest_on_one_another_in_any_order() {
+    let dir = TempDir::new().unwrap();
+    let write = |file: &str, text: &str| std::fs::write(dir.path().join(file), text).unwrap();
+    write("a.toml", "name = \"a\"\nbase = \"b\"\ntitle = \"A\"\n");
+    write("b.toml", "name = \"b\"\nbase = \"vacon-cx\"\nturnaround = \"9ms\"\n");
+    write(
+        "c.toml",
+        "name = \"vacon-cx\"\nbase = \"vacon-cx\"\nconfirm_within = \"7s\"\n",
+    );
+    let mut profiles = Profiles::built_in();
+    assert_eq!(profiles.load(dir.path()), []);
+    let a = profiles.get("a").unwrap();
+    assert_eq!(a.turnaround, Duration::from_millis(9));
+    assert_eq!(a.confirm_within, Duration::from_secs(7));
+    assert!(!profiles.get("vacon-cx").unwrap().built_in);
+    assert_eq!(a.text, "name = \"a\"\nbase = \"b\"\ntitle = \"A\"\n");
+    write("b.toml", "name = \"b\"\nbase = \"a\"\n");
+    let found = Profiles::built_in().load(dir.path());
+    let text: Vec<String> = found.iter().map(Problem::to_string).collect();
+    assert_eq!(found.len(), 2, "{text:?}");
+    assert!(text[0].contains("`b` rests on this profile in its turn;"), "{text:?}");
+}
+
+#[test]
+fn enumerations_have_texts() {
+    let source = HEAD.to_string()
+        + "[[point]]\nname = \"mode\"\nat = \"holding 1.4-6\"\n[point.texts]\n3 = \"auto\"\n\
+           [[point]]\nname = \"on\"\nat = \"holding 1.0\"\n[point.texts]\n0 = \"off\"\n1 = \"on\"\n";
+    let profile = Profile::parse("m", &source, false).unwrap();
+    let mode = &profile.points[0];
+    let value = mode.raw().unwrap().decode(&[0x0030], mode.kind());
+    assert_eq!((value, mode.kind()), (Some(Value::Integer(3)), Kind::Integer));
+    assert_eq!(mode.text_of(Value::Integer(3)), Some("auto"));
+    assert_eq!(mode.text_of(Value::Integer(4)), None);
+    assert_eq!(profile.points[1].text_of(Value::Bool(true)), Some("on"));
+}
