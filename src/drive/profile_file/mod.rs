@@ -261,6 +261,7 @@ fn read_base(reader: &Reader<'_>, known: &Profiles) -> Option<String> {
 
 fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
     let names: Vec<String> = reader.required("protocols").unwrap_or_default();
+    let none_named = names.is_empty() && reader.has("protocols");
     let mut protocols = Vec::new();
     for name in names {
         match Protocol::from_name(&name) {
@@ -274,11 +275,8 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
             }
         }
     }
-    if protocols.is_empty() && reader.has("protocols") {
-        reader.problem(
-            "protocols",
-            "no protocol that is known is named; write for example [\"modbus-rtu\"]",
-        );
+    if none_named {
+        reader.problem("protocols", "no protocol is named; write for example [\"modbus-rtu\"]");
     }
     if protocols.len() > 1 && protocols.contains(&Protocol::N2) {
         reader.problem(

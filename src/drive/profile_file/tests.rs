@@ -240,7 +240,7 @@ fn each_mistake_of_the_whole() {
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[]"),
-            "no protocol that is known is named; m:4, protocols",
+            "no protocol is named; m:4, protocols",
         ),
         (
             top("").replace("modbus-rtu", "n2"),
