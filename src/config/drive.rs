@@ -23,6 +23,8 @@ pub(super) const ACTIONS: [(&str, LeaseAction); 2] = [("stop", LeaseAction::Stop
 pub(super) const UNITS: RangeInclusive<u8> = 1..=254;
 /// Addresses on a Modbus line; 0 is broadcast.
 pub(super) const ADDRESSES: RangeInclusive<u8> = 1..=247;
+/// Points that a message names.
+const MOST_NAMED: usize = 4;
 /// Most that a frequency of `frequency_range` can be, Hz.
 pub(super) const MOST_HERTZ: f64 = 10_000.0;
 
@@ -250,7 +252,16 @@ fn limited_point<'p>(profile: &'p Profile, key: &str) -> Result<&'p Point, Strin
             .filter(|p| p.write && p.kind() != Kind::Bool)
             .map(|p| p.name.as_str())
     };
-    let known = || writable().collect::<Vec<_>>().join(", ");
+    let known = || {
+        let first = writable().take(MOST_NAMED).collect::<Vec<_>>().join(", ");
+        match writable().count().saturating_sub(MOST_NAMED) {
+            0 => first,
+            more => format!(
+                "{first} and {more} more, see `drivegate profiles show {}`",
+                profile.name
+            ),
+        }
+    };
     let Some(point) = profile.point_index(key).and_then(|i| profile.points.get(i)) else {
         let near = nearest(key, writable()).map_or_else(
             || format!("limits can be set for {}", known()),
