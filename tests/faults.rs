@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 
 use common::{Rig, Setup};
 use drivegate::cache::Outcome as Counted;
-use drivegate::codec::{RequestPdu, Table};
+use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
 use drivegate::drive::profile::Profile;
 use drivegate::plant::DriveHandle;
@@ -32,7 +32,7 @@ const RECOVERY: Duration = Duration::from_millis(150);
 
 fn twins() -> Arc<Profile> {
     let mut text = String::from(
-        "name = \"twins\"\nprotocols = [\"modbus-rtu\"]\n\
+        "name = \"twins\"\nprotocols = [\"modbus-rtu\", \"modbus-ascii\"]\n\
          [[range]]\ntable = \"holding\"\nfirst = 2000\nlast = 2010\nread = 20\nwrite = 20\n\
          [[range]]\ntable = \"holding\"\nfirst = 2100\nlast = 2110\nread = 20\n\
          [[point]]\nname = \"reference\"\nat = \"holding 2002\"\nclass = \"slow\"\nwrite = true\n",
@@ -253,12 +253,19 @@ struct Case {
     tells: Tells,
     write: bool,
     delivery: Delivery,
+    protocol: Protocol,
 }
 
 async fn run(case: &Case) -> Row {
+    let format = match case.protocol {
+        Protocol::ModbusAscii => "7E1",
+        Protocol::ModbusRtu | Protocol::N2 => "8N1",
+    };
     let setup = Setup {
         profile: twins(),
         delivery: case.delivery,
+        protocol: case.protocol,
+        format: LineFormat::new(115_200, format).unwrap(),
         ..Setup::new(&DRIVES, 115_200).tagged()
     };
     let rig = Rig::of(setup, |_| {});
@@ -361,6 +368,7 @@ fn case(fault: &'static str, tells: Tells) -> Case {
         tells,
         write: true,
         delivery: Delivery::Whole,
+        protocol: Protocol::ModbusRtu,
     }
 }
 
@@ -421,6 +429,45 @@ async fn replies_of_others_echoes_and_noise() {
 }
 
 #[tokio::test]
+async fn modbus_ascii_meets_the_same() {
+    let echoing = Case {
+        rates: "echo=1".to_string(),
+        ..case("echo", Tells::Nothing)
+    };
+    let deaf = Case {
+        rates: "echo=0.7,deaf-echo=0.3".to_string(),
+        ..case("echo, drive deaf", Tells::Timeouts)
+    };
+    // A reply without its line feed is incomplete, and that is told when the deadline is over.
+    let cases = [
+        case("drop", Tells::Timeouts),
+        case("truncate", Tells::Corrupt),
+        case("corrupt", Tells::Corrupt),
+        case("double", Tells::Foreign),
+        case("late:20ms", Tells::Nothing),
+        case("late:104ms", Tells::Timeouts),
+        case("late:150ms", Tells::Timeouts),
+        case("foreign-address", Tells::ForeignAndTimeouts),
+        case("foreign-function", Tells::ForeignAndTimeouts),
+        case("stray-address", Tells::Foreign),
+        case("stray-length", Tells::Foreign),
+        echoing,
+        deaf,
+        // Before a colon it is no matter at all.
+        case("noise-before", Tells::Nothing),
+        case("noise-after", Tells::Foreign),
+        case("split", Tells::Nothing),
+        case("exception:4", Tells::Exceptions),
+        case("busy", Tells::Exceptions),
+    ]
+    .map(|case| Case {
+        protocol: Protocol::ModbusAscii,
+        ..case
+    });
+    matrix("Modbus ASCII", &cases).await;
+}
+
+#[tokio::test]
 async fn exceptions_and_busy() {
     let exceptions = [
         "exception:1",
@@ -438,16 +485,21 @@ async fn exceptions_and_busy() {
 async fn all_at_once_and_handed_over_as_a_fifo_does() {
     let all = "deaf=0.03,drop=0.04,truncate=0.04,corrupt=0.05,double=0.05,late:104ms=0.03,late:130ms=0.03,\
                foreign-address=0.04,foreign-length=0.04,stray-function=0.04,noise-before=0.05,noise-after=0.05,busy=0.03";
-    let storm = |fault, delivery| Case {
+    let storm = |fault, delivery, protocol| Case {
         rates: all.to_string(),
         delivery,
+        protocol,
         ..case(fault, Tells::ForeignAndTimeouts)
     };
+    let (rtu, ascii) = (Protocol::ModbusRtu, Protocol::ModbusAscii);
     let mut rows = Vec::new();
     for case in [
-        storm("everything", Delivery::Whole),
-        storm("everything, by character", Delivery::Chunks(1)),
-        storm("everything, by 14", Delivery::Chunks(14)),
+        storm("everything", Delivery::Whole, rtu),
+        storm("everything, by character", Delivery::Chunks(1), rtu),
+        storm("everything, by 14", Delivery::Chunks(14), rtu),
+        storm("ASCII everything", Delivery::Whole, ascii),
+        storm("ASCII, by character", Delivery::Chunks(1), ascii),
+        storm("ASCII, by 14", Delivery::Chunks(14), ascii),
     ] {
         let mut row = run(&case).await;
         // Here exceptions are among it.

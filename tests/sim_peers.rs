@@ -1,5 +1,5 @@
-//! Independent masters on the simulated line: mbpoll (libmodbus) and pymodbus. What they read proves the simulated drive,
-//! and the frames they send and get are the worked frames of the reference.
+//! Independent masters on the simulated line: mbpoll (libmodbus, which has no Modbus ASCII) and pymodbus. What they read
+//! proves the simulated drive, and the frames they send and get are the worked frames of the reference.
 
 #![allow(
     clippy::unwrap_used,
@@ -8,7 +8,7 @@
     reason = "a test may panic, its helpers too"
 )]
 
-use drivegate::codec::LineFormat;
+use drivegate::codec::{LineFormat, Protocol};
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::nx::{NxOptions, StatusBits, UPDATE_PERIOD, status_word};
@@ -19,6 +19,10 @@ use std::time::{Duration, Instant};
 
 /// Drives 1 (showing the status bits of the worked frames) and 2 on a line at 38400 8N1.
 fn line() -> SimulatedBus {
+    line_of(Protocol::ModbusRtu, "8N1")
+}
+
+fn line_of(protocol: Protocol, format: &str) -> SimulatedBus {
     let common = NxOptions {
         status: StatusBits::Common,
         ..NxOptions::default()
@@ -31,7 +35,7 @@ fn line() -> SimulatedBus {
         },
         DriveOptions::nx(2),
     ];
-    let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
+    let rules = LineRules::of(protocol, LineFormat::new(38_400, format).unwrap());
     let mut options = SimulatedBusOptions::new("peers", rules, drives);
     options.transcript = 1000;
     SimulatedBus::start(options).unwrap()
@@ -159,12 +163,32 @@ fn mbpoll_resets_a_fault_and_meets_a_dead_drive() {
 
 #[test]
 fn pymodbus_commands_a_drive() {
-    let line = line();
+    pymodbus_commands(&line(), "rtu");
+}
+
+/// The pseudo-terminal carries 8 bits whatever the format; only the time that a character takes differs.
+#[test]
+fn pymodbus_commands_a_drive_in_ascii() {
+    for format in ["8N1", "7E1", "7N2"] {
+        let line = line_of(Protocol::ModbusAscii, format);
+        pymodbus_commands(&line, "ascii");
+        let s = line.statistics();
+        assert_eq!((s.silence_violations, s.collisions, s.bad_crc), (0, 0, 0), "{format}");
+        let first: Vec<String> = line.transcript().iter().take(2).map(as_text).collect();
+        assert_eq!(first, [":020408340002BC\r\n", ":0204040541200090\r\n"]);
+    }
+}
+
+fn as_text(frame: &drivegate::sim::statistics::Recorded) -> String {
+    String::from_utf8(frame.bytes.clone()).unwrap()
+}
+
+fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
     let root = Path::new(env!("CARGO_MANIFEST_DIR"));
     let mut command = Command::new(root.join(".tools/venv/bin/python"));
     command
         .arg(root.join("tests/peers/simulated_line.py"))
-        .arg(line.address());
+        .args([&line.address(), framer]);
     let (done, text) = run(&mut command, "make the Python environment .tools/venv with pymodbus");
     let minus = |value: i16| (value as u16).to_string();
     let running = format!(

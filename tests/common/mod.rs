@@ -44,6 +44,7 @@ pub fn drive(address: u8) -> String {
 /// How a rig differs from the usual one: one pseudo-terminal at 38400 8N1, process data every 10 ms.
 pub struct Setup {
     pub drives: Vec<DriveOptions>,
+    pub protocol: Protocol,
     pub format: LineFormat,
     pub profile: Arc<Profile>,
     /// Where the simulated line is; the bus opens that, unless `port` says otherwise.
@@ -59,6 +60,7 @@ impl Setup {
     pub fn new(addresses: &[u8], baud: u32) -> Setup {
         Setup {
             drives: addresses.iter().map(|a| DriveOptions::nx(*a)).collect(),
+            protocol: Protocol::ModbusRtu,
             format: LineFormat::new(baud, "8N1").unwrap(),
             profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
             endpoint: None,
@@ -128,7 +130,7 @@ impl Rig {
         let addresses: Vec<u8> = setup.drives.iter().map(|d| d.address).collect();
         let rules = LineRules {
             delivery: setup.delivery,
-            ..LineRules::new(format)
+            ..LineRules::of(setup.protocol, format)
         };
         let options = SimulatedBusOptions {
             endpoint: setup.endpoint.unwrap_or(pty),
@@ -139,7 +141,7 @@ impl Rig {
         let bus_spec = BusSpec {
             name: "line1".to_string(),
             port: setup.port.unwrap_or_else(|| line.address()),
-            protocol: Protocol::ModbusRtu,
+            protocol: setup.protocol,
             format,
             cycle: Duration::from_millis(10),
             slow_cycle: setup.slow_cycle,

@@ -1,11 +1,16 @@
-"""pymodbus as the master of a simulated line: prints one line a step, checked by sim_peers.rs."""
+"""pymodbus as the master of a simulated line: simulated_line.py PORT rtu|ascii prints one line a step, checked by
+sim_peers.rs."""
 
 import sys
 import time
 
+from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient
 
-client = ModbusSerialClient(sys.argv[1], baudrate=38400, parity="N", stopbits=1, timeout=5, retries=0)
+framer = FramerType(sys.argv[2])
+client = ModbusSerialClient(
+    sys.argv[1], framer=framer, baudrate=38400, parity="N", stopbits=1, timeout=5, retries=0
+)
 if not client.connect():
     sys.exit(f"cannot open {sys.argv[1]}")
 
