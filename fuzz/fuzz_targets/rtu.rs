@@ -37,7 +37,8 @@ fuzz_target!(|data: &[u8]| {
                 // A frame is the same whatever follows it.
                 assert_eq!(decode_reply(&request, &line[..used]), decode_reply(&request, line));
             }
-            Decoded::Incomplete => assert!(line.len() < 256, "a frame ends after 256 characters"),
+            // A reply to 43/14 counts its objects, and nonsense may count more than a frame holds; the deadline ends that.
+            Decoded::Incomplete => assert!(line.len() < 256 || line[1] == 43, "a frame ends after 256 characters"),
             _ => {}
         }
     }
