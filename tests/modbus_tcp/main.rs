@@ -14,6 +14,7 @@ mod peers;
 mod process;
 mod requests;
 mod rig;
+mod second_opinion;
 mod tls;
 #[path = "../tools/mod.rs"]
 mod tools;

@@ -1,121 +1,177 @@
-//! Clients that were written elsewhere: Debian's mbpoll, tokio-modbus and pymodbus.
+//! Clients that were written elsewhere work off one script of reads and writes: Debian's mbpoll (libmodbus), pymodbus,
+//! modbus-serial and jsmodbus (Node), tokio-modbus.
 
-use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use drivegate::command::Order;
+use serde::Deserialize;
 use tokio_modbus::client::{Reader, Writer};
 use tokio_modbus::slave::{Slave, SlaveContext};
 
 use crate::rig::Rig;
+use crate::tools;
 
-/// The output of a client, which must end well unless `fails`.
-async fn run(mut command: Command, fails: bool) -> String {
+/// A request of `tests/peers/script.json`, and what must come of it.
+#[derive(Debug, Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Step {
+    what: String,
+    unit: u8,
+    function: u8,
+    address: u16,
+    /// What a read gives; its length is the count.
+    #[serde(default)]
+    expect: Vec<u16>,
+    /// What a write sets.
+    #[serde(default)]
+    values: Vec<u16>,
+    exception: Option<u8>,
+}
+
+fn script() -> Vec<Step> {
+    let text = std::fs::read_to_string(tools::root().join("tests/peers/script.json")).unwrap();
+    serde_json::from_str(&text).unwrap()
+}
+
+/// Whether a client ended well, and what it printed.
+async fn run(mut command: Command) -> (bool, String) {
     let output = tokio::task::spawn_blocking(move || {
         command
             .output()
-            .unwrap_or_else(|why| panic!("{command:?}: {why}; it is needed for this test"))
-    })
-    .await
-    .unwrap();
-    let text = format!(
-        "{}{}",
-        String::from_utf8_lossy(&output.stdout),
-        String::from_utf8_lossy(&output.stderr)
-    );
-    assert_eq!(output.status.success(), !fails, "{text}");
-    text
+            .unwrap_or_else(|why| panic!("{command:?}: {why}; run tests/tools/install.sh"))
+    });
+    let output = output.await.unwrap();
+    let text = [output.stdout, output.stderr].concat();
+    (output.status.success(), String::from_utf8_lossy(&text).into_owned())
 }
 
-/// mbpoll with PDU addresses, one poll.
-fn mbpoll(rig: &Rig, arguments: &[&str], values: &[&str]) -> Command {
-    let mut command = Command::new("mbpoll");
-    let port = rig.address().port().to_string();
-    command.args(["-m", "tcp", "-0", "-1", "-q", "-p", &port]);
-    command.args(arguments).arg("127.0.0.1").args(values);
-    command
+/// The writes of the script that may reach the bus have reached it.
+fn assert_written(rig: &Rig) {
+    let written = rig.buses.iter().flat_map(|bus| bus.orders());
+    let written = written.filter(|order| !matches!(order, Order::Read(_))).count();
+    let wanted = script()
+        .iter()
+        .filter(|s| !s.values.is_empty() && s.exception.is_none())
+        .count();
+    assert_eq!(written, wanted);
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn mbpoll_reads_and_commands() {
+async fn mbpoll() {
     let rig = Rig::new().await;
-    let text = run(mbpoll(&rig, &["-a", "1", "-r", "32768", "-c", "19"], &[]), false).await;
-    for wanted in [
-        "[32768]: \t32931",
-        "[32769]: \t3",
-        "[32772]: \t5000",
-        "[32773]: \t2500",
-        "[32784]: \t65535",
-    ] {
-        assert!(text.contains(wanted), "{wanted} is missing in\n{text}");
+    let port = rig.address().port().to_string();
+    for step in script() {
+        let mut command = Command::new(tools::tool("mbpoll"));
+        let kind = match step.function {
+            1 | 5 | 15 => "0",
+            2 => "1",
+            4 => "3",
+            _ => "4",
+        };
+        command.args(["-m", "tcp", "-0", "-1", "-q", "-o", "10", "-p", &port, "-t", kind]);
+        command.args(["-a", &step.unit.to_string(), "-r", &step.address.to_string()]);
+        if step.values.is_empty() {
+            command.args(["-c", &step.expect.len().to_string()]);
+        }
+        command.arg("127.0.0.1").args(step.values.iter().map(u16::to_string));
+        let (done, text) = run(command).await;
+        let name = match step.exception {
+            None => "",
+            Some(1) => "Illegal function",
+            Some(2) => "Illegal data address",
+            Some(3) => "Illegal data value",
+            Some(10) => "Gateway path unavailable",
+            Some(11) => "Target device failed to respond",
+            Some(code) => panic!("exception {code} is not in the script so far"),
+        };
+        assert!(
+            done == step.exception.is_none() && text.contains(name),
+            "{}: {text}",
+            step.what
+        );
+        for (address, value) in (step.address..).zip(&step.expect).filter(|_| done) {
+            let line = text
+                .lines()
+                .find_map(|line| line.strip_prefix(&format!("[{address}]:")));
+            let shown = line.and_then(|line| line.split_whitespace().next()).unwrap_or_default();
+            assert_eq!(shown, value.to_string(), "{}: {text}", step.what);
+        }
     }
-    let text = run(
-        mbpoll(&rig, &["-a", "1", "-t", "3", "-r", "2100", "-c", "11"], &[]),
-        false,
-    )
-    .await;
-    assert!(text.contains("[2104]: \t1440"), "{text}");
-    let text = run(
-        mbpoll(&rig, &["-a", "1", "-t", "4:float", "-B", "-r", "33280", "-c", "9"], &[]),
-        false,
-    )
-    .await;
-    assert!(
-        text.contains("[33282]: \t25") && text.contains("[33286]: \t12.3"),
-        "{text}"
-    );
-    let text = run(mbpoll(&rig, &["-a", "1", "-r", "33024"], &["1", "5000"]), false).await;
-    assert!(text.contains("Written 2 references"), "{text}");
-    assert!(matches!(rig.buses[0].orders().as_slice(), [Order::Points(values)] if values.len() == 3));
-    let text = run(mbpoll(&rig, &["-a", "2", "-r", "33024"], &["1"]), true).await;
-    assert!(text.contains("Illegal function"), "{text}");
-    let text = run(mbpoll(&rig, &["-a", "3", "-r", "2100"], &[]), true).await;
-    assert!(text.contains("Target device failed to respond"), "{text}");
-    let text = run(mbpoll(&rig, &["-a", "77", "-r", "2100"], &[]), true).await;
-    assert!(text.contains("Gateway path unavailable"), "{text}");
+    assert_written(&rig);
     rig.end().await;
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn tokio_modbus_reads_and_commands() {
+async fn tokio_modbus() {
     let rig = Rig::new().await;
     let mut client = tokio_modbus::client::tcp::connect_slave(rig.address(), Slave(1))
         .await
         .unwrap();
-    assert_eq!(
-        client.read_holding_registers(0x8004, 2).await.unwrap().unwrap(),
-        [5000, 2500]
-    );
-    assert_eq!(client.read_input_registers(500, 2).await.unwrap().unwrap(), [500, 501]);
-    client.write_single_register(0x8101, 2500).await.unwrap().unwrap();
-    client
-        .write_multiple_registers(2000, &[1, 0, 5000])
-        .await
-        .unwrap()
-        .unwrap();
-    let refused = client.write_single_register(2100, 1).await.unwrap().unwrap_err();
-    assert_eq!(refused, tokio_modbus::ExceptionCode::IllegalDataAddress);
-    client.set_slave(Slave(4));
-    assert_eq!(client.read_discrete_inputs(3, 2).await.unwrap().unwrap(), [true, false]);
-    client.write_single_coil(7, false).await.unwrap().unwrap();
-    client.set_slave(Slave(255));
-    assert_eq!(client.read_input_registers(0, 3).await.unwrap().unwrap(), [1, 3, 2]);
+    let numbers = |bits: Vec<bool>| bits.into_iter().map(u16::from).collect::<Vec<u16>>();
+    for step in script() {
+        client.set_slave(Slave(step.unit));
+        let (address, count) = (step.address, step.expect.len() as u16);
+        let bits: Vec<bool> = step.values.iter().map(|v| *v != 0).collect();
+        let none = |()| Vec::new();
+        let answer = match step.function {
+            1 => client.read_coils(address, count).await.unwrap().map(numbers),
+            2 => client.read_discrete_inputs(address, count).await.unwrap().map(numbers),
+            3 => client.read_holding_registers(address, count).await.unwrap(),
+            4 => client.read_input_registers(address, count).await.unwrap(),
+            5 => client.write_single_coil(address, bits[0]).await.unwrap().map(none),
+            6 => client
+                .write_single_register(address, step.values[0])
+                .await
+                .unwrap()
+                .map(none),
+            15 => client.write_multiple_coils(address, &bits).await.unwrap().map(none),
+            _ => client
+                .write_multiple_registers(address, &step.values)
+                .await
+                .unwrap()
+                .map(none),
+        };
+        let wanted = match step.exception {
+            Some(code) => Err(code),
+            None => Ok(step.expect),
+        };
+        assert_eq!(answer.map_err(u8::from), wanted, "{}", step.what);
+    }
+    assert_written(&rig);
     rig.end().await;
-}
-
-/// The Python of the project's tools, else one with pymodbus.
-fn python() -> PathBuf {
-    let venv = Path::new(env!("CARGO_MANIFEST_DIR")).join(".tools/venv/bin/python");
-    if venv.exists() { venv } else { PathBuf::from("python3") }
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn pymodbus_reads_and_commands() {
+async fn pymodbus() {
     let rig = Rig::new().await;
-    let mut command = Command::new(python());
-    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/peers/pymodbus_client.py");
-    command.arg(script).arg(rig.address().port().to_string());
-    let text = run(command, false).await;
-    assert_eq!(text.trim(), "ok");
+    let mut command = Command::new(tools::python());
+    command
+        .arg(tools::root().join("tests/peers/pymodbus_client.py"))
+        .arg(rig.address().port().to_string());
+    assert_eq!(run(command).await, (true, "ok\n".to_string()));
+    assert_written(&rig);
     rig.end().await;
+}
+
+async fn node(library: &str) {
+    let rig = Rig::new().await;
+    let mut command = Command::new(tools::tool("node"));
+    command.env("NODE_PATH", tools::root().join(".tools/node/node_modules"));
+    command
+        .arg(tools::root().join("tests/peers/node_client.js"))
+        .arg(library)
+        .arg(rig.address().port().to_string());
+    assert_eq!(run(command).await, (true, "ok\n".to_string()));
+    assert_written(&rig);
+    rig.end().await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn modbus_serial() {
+    node("modbus-serial").await;
+}
+
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn jsmodbus() {
+    node("jsmodbus").await;
 }

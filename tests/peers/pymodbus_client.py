@@ -1,8 +1,7 @@
-"""Reads and commands a gateway of the Modbus TCP tests with pymodbus: pymodbus_client.py PORT [CA CERTIFICATE KEY].
+"""Works off tests/peers/script.json with pymodbus: pymodbus_client.py PORT [CA CERTIFICATE KEY]. With three files by TLS."""
 
-With three files it speaks TLS.
-"""
-
+import json
+import pathlib
 import ssl
 import sys
 
@@ -25,25 +24,33 @@ def connect(port, files):
     return ModbusTlsClient("127.0.0.1", port=port, sslctx=context)
 
 
+def ask(client, step):
+    where = {"address": step["address"], "device_id": step["unit"]}
+    values, count = step.get("values"), len(step.get("expect", []))
+    bits = [bool(value) for value in values or []]
+    return {
+        1: lambda: client.read_coils(**where, count=count),
+        2: lambda: client.read_discrete_inputs(**where, count=count),
+        3: lambda: client.read_holding_registers(**where, count=count),
+        4: lambda: client.read_input_registers(**where, count=count),
+        5: lambda: client.write_coil(**where, value=bits[0]),
+        6: lambda: client.write_register(**where, value=values[0]),
+        15: lambda: client.write_coils(**where, values=bits),
+        16: lambda: client.write_registers(**where, values=values),
+    }[step["function"]]()
+
+
 def main():
     client = connect(int(sys.argv[1]), sys.argv[2:])
     if not client.connect():
         sys.exit("no connection")
-    reply = client.read_holding_registers(0x8000, count=2, device_id=1)
-    check("status and state", reply.registers, [0x80A3, 3])
-    reply = client.read_input_registers(2100, count=11, device_id=1)
-    check("process data", reply.registers[2:5], [5000, 2500, 1440])
-    reply = client.read_holding_registers(0x8202, count=2, device_id=1)
-    data_type = client.DATATYPE.FLOAT32
-    check("float", client.convert_from_registers(reply.registers, data_type), 25.0)
-    reply = client.write_registers(0x8100, [1, 5000, 0xFFFF], device_id=1)
-    check("command", reply.isError(), False)
-    reply = client.write_register(0x8100, 8, device_id=1)
-    check("command bits", reply.exception_code, 3)
-    reply = client.write_register(0x8100, 1, device_id=2)
-    check("monitored drive", reply.exception_code, 1)
-    reply = client.read_coils(7, count=1, device_id=4)
-    check("coil", reply.bits[:1], [True])
+    for step in json.loads(pathlib.Path(__file__).with_name("script.json").read_text()):
+        reply = ask(client, step)
+        check(step["what"], reply.exception_code if reply.isError() else None, step.get("exception"))
+        if "expect" in step and not reply.isError():
+            wanted = step["expect"]
+            got = [int(bit) for bit in reply.bits[: len(wanted)]] if step["function"] < 3 else reply.registers
+            check(step["what"], got, wanted)
     reply = client.read_device_information(device_id=1)
     check("vendor", reply.information[0], b"drivegate")
     check("product", reply.information[1], b"vacon-nx")

@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Installs what the tests need and this machine lacks: Debian packages, a Python environment and cargo-deny in
+# Installs what the tests need and this machine lacks: Debian packages, Python and Node packages and cargo-deny in
 # .tools, parts of the Rust toolchain. Takes a moment when nothing is missing. Starts no service.
 set -euo pipefail
 cd "$(dirname "${BASH_SOURCE[0]}")/../.."
@@ -7,6 +7,9 @@ cd "$(dirname "${BASH_SOURCE[0]}")/../.."
 # What must be on the PATH (or, with a slash, on disk), and the Debian package that brings it.
 needed=(
     "gcc gcc"
+    "node nodejs"
+    "npm npm"
+    "openssl openssl"
     "curl curl"
     "mosquitto mosquitto"
     "mosquitto_pub mosquitto-clients"
@@ -100,6 +103,20 @@ install_python_packages() {
     fi
 }
 
+# No lock file and no scripts: the two are pure JavaScript, and what they depend on is small and as old as they are.
+install_node_packages() {
+    local list=tests/tools/node/package.json stamp=.tools/node/package.json
+    if ! cmp --quiet $list $stamp; then
+        say "installing the Node packages of $list into .tools/node"
+        rm -rf .tools/node .tools/node.new
+        mkdir .tools/node.new
+        cp $list .tools/node.new/
+        (cd .tools/node.new && npm install --silent --no-package-lock --omit=optional --ignore-scripts --no-audit --no-fund) \
+            </dev/null >&2
+        mv .tools/node.new .tools/node
+    fi
+}
+
 # Unoptimised, cargo-deny builds in a minute on two cores instead of many; its work takes seconds either way.
 install_cargo_deny() {
     if [ "$(cargo-deny --version 2>/dev/null)" != "cargo-deny $cargo_deny" ]; then
@@ -122,4 +139,5 @@ if [ ${#packages[@]} -gt 0 ]; then
 fi
 install_rust_parts
 install_python_packages
+install_node_packages
 install_cargo_deny

@@ -1,0 +1,110 @@
+//! The Modbus TCP server beside others: tokio-modbus, libmodbus with epoll, pymodbus.
+//!
+//! `cargo bench --bench modbus_tcp` (options: `-- --seconds 2 --runs 5`). Every server is a process of its own, reads are
+//! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs. At the end the
+//! rounds of a bus at 115200 baud, without and with that load on the daemon.
+
+mod client;
+#[path = "../common/mod.rs"]
+mod common;
+mod servers;
+
+use std::error::Error;
+use std::process::ExitCode;
+use std::time::Duration;
+
+use client::{Load, load};
+use common::{median, option};
+use servers::Process;
+
+/// Connections and requests in a batch.
+const LOADS: [(usize, usize); 3] = [(1, 1), (16, 1), (16, 8)];
+
+fn main() -> ExitCode {
+    let serve = std::env::args().skip_while(|argument| argument != "--serve").nth(1);
+    let outcome = match serve {
+        Some(name) => servers::serve(&name),
+        None => measure(),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn measure() -> Result<(), Box<dyn Error>> {
+    let time = Duration::from_secs_f64(option("--seconds", 2.0)?);
+    let runs: usize = option("--runs", 5)?;
+    let mut servers = vec![Process::own("drivegate")?, Process::own("tokio-modbus")?];
+    for (name, server) in [("libmodbus", Process::libmodbus()), ("pymodbus", Process::pymodbus())] {
+        match server {
+            Ok(server) => servers.push(server),
+            Err(why) => eprintln!("{name} is left out: {why}"),
+        }
+    }
+    println!("| server | connections × depth | requests/s | batch p50, µs | p99, µs | server µs/request |");
+    println!("|---|---|---|---|---|---|");
+    for (connections, depth) in LOADS {
+        let mut found: Vec<Vec<(Load, f64)>> = servers.iter().map(|_| Vec::new()).collect();
+        for run in 0..runs {
+            for turn in 0..servers.len() {
+                let place = (turn + run) % servers.len();
+                let (Some(server), Some(found)) = (servers.get(place), found.get_mut(place)) else {
+                    continue;
+                };
+                let before = server.cpu();
+                let load =
+                    load(server.address, connections, depth, time).map_err(|why| format!("{}: {why}", server.name))?;
+                found.push((load, (server.cpu() - before) / load.answered.max(1) as f64 * 1e6));
+            }
+        }
+        let rates: Vec<f64> = found
+            .iter()
+            .map(|runs| median(&runs.iter().map(|(l, _)| l.rate).collect::<Vec<_>>()))
+            .collect();
+        for (server, runs) in servers.iter().zip(&found) {
+            let middle = |of: fn(&(Load, f64)) -> f64| median(&runs.iter().map(of).collect::<Vec<_>>());
+            println!(
+                "| {} | {connections} × {depth} | {:.0} | {:.0} | {:.0} | {:.1} |",
+                server.name,
+                middle(|(l, _)| l.rate),
+                middle(|(l, _)| l.p50),
+                middle(|(l, _)| l.p99),
+                middle(|(_, cpu)| *cpu),
+            );
+        }
+        let best = rates.iter().skip(1).copied().fold(0.0, f64::max);
+        if let Some(own) = rates.first() {
+            println!(
+                "| drivegate of the best other | {connections} × {depth} | {:.2} | | | |",
+                own / best.max(1.0)
+            );
+        }
+    }
+    drop(servers);
+    rounds(time * runs as u32)
+}
+
+/// The rounds of a bus, without and with load, in turns.
+fn rounds(time: Duration) -> Result<(), Box<dyn Error>> {
+    let mut daemon = Process::own("line")?;
+    println!("\n| load on the daemon | cycle p50, ms | cycle p99, ms | rounds |\n|---|---|---|---|");
+    for turn in 0..2 {
+        for (connections, depth) in [(0, 0), (16, 1)] {
+            daemon.ask("begin")?;
+            let told = if connections == 0 {
+                std::thread::sleep(time);
+                "none".to_string()
+            } else {
+                let load = load(daemon.address, connections, depth, time)?;
+                format!("{connections} × {depth}, {:.0} requests/s", load.rate)
+            };
+            let figures = daemon.ask("end")?;
+            println!("| {told} ({}) | {} |", turn + 1, figures.replace(' ', " | "));
+        }
+    }
+    Ok(())
+}
