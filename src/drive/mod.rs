@@ -1,6 +1,8 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
 pub mod derive;
+#[cfg(test)]
+mod families_tests;
 pub mod identify;
 pub mod model;
 pub mod plan;
