@@ -3,7 +3,7 @@
 use super::SimTime;
 use super::autopilot::Autopilot;
 use super::cx::{CxDrive, CxOptions};
-use super::model::{DriveState, Model};
+use super::model::{Command, DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
 use super::teco::{TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu};
@@ -218,6 +218,16 @@ impl SimulatedDrive {
         self.model.get_mut().trip(fault);
     }
 
+    /// Commands it as another master on the bus would.
+    pub fn command(&mut self, command: Command) {
+        self.model.get_mut().command(command);
+    }
+
+    /// Pulls the fault reset bit of the bus up or down.
+    pub fn set_reset(&mut self, on: bool) {
+        self.model.get_mut().set_reset(on);
+    }
+
     /// Gives it to the bus, or to panel or terminals.
     pub fn set_remote(&mut self, on: bool) {
         self.model.get_mut().set_remote(on);
@@ -274,6 +284,9 @@ impl SimulatedDrive {
         }
     }
 }
+
+#[cfg(test)]
+mod properties;
 
 #[cfg(test)]
 mod tests {

@@ -99,13 +99,18 @@ impl Motor {
         }
     }
 
+    /// Switches the inverter off at once; the shaft goes on turning.
+    pub fn release(&mut self) {
+        self.fed = false;
+        self.output = 0.0;
+    }
+
     /// One step of `dt` seconds.
     pub fn step(&mut self, dt: f64, feed: Feed, ratings: &Ratings, load: &Load) {
         let before = self.shaft;
         match feed {
             Feed::Off => {
-                self.fed = false;
-                self.output = 0.0;
+                self.release();
                 self.shaft = towards(self.shaft, 0.0, ratings.frequency / COAST_TIME * dt);
             }
             Feed::To(target) => {

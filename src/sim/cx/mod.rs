@@ -141,6 +141,8 @@ impl CxDrive {
     fn pull_reset(&mut self, on: bool) {
         if self.fieldbus && on && !self.coils.reset {
             self.latch.reset();
+            // A run coil that is off already is seen off now.
+            self.latch.obeys(self.coils.run);
         }
         self.coils.reset = on;
     }
@@ -305,6 +307,7 @@ impl Model for CxDrive {
     fn trip(&mut self, fault: u16) {
         if self.latch.trip(fault) {
             self.running = false;
+            self.motor.release();
         }
     }
 

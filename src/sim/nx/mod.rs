@@ -4,6 +4,8 @@
 //! the process data in and refreshes the process data out, so a bit that a master sets and clears within one step is
 //! never seen, as on the real drive.
 
+#[cfg(test)]
+mod eaton_tests;
 mod options;
 pub mod parameters;
 mod registers;
@@ -243,6 +245,9 @@ impl NxDrive {
         if self.latch.trip(code) {
             self.stopping = stop == StopFunction::Ramp && self.motor.fed;
             self.running = false;
+            if !self.stopping {
+                self.motor.release();
+            }
         }
     }
 

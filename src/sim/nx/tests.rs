@@ -5,13 +5,13 @@ use crate::codec::{Exception, Table};
 use std::time::Duration;
 
 /// A drive and its clock.
-struct Bench {
-    drive: NxDrive,
+pub(super) struct Bench {
+    pub(super) drive: NxDrive,
     now: SimTime,
 }
 
 impl Bench {
-    fn new(options: NxOptions) -> Bench {
+    pub(super) fn new(options: NxOptions) -> Bench {
         Bench {
             drive: NxDrive::new(options, SimTime::ZERO),
             now: SimTime::ZERO,
@@ -25,13 +25,13 @@ impl Bench {
         })
     }
 
-    fn wait(&mut self, milliseconds: u64) -> &mut Bench {
+    pub(super) fn wait(&mut self, milliseconds: u64) -> &mut Bench {
         self.now += Duration::from_millis(milliseconds);
         self.drive.advance(self.now);
         self
     }
 
-    fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
+    pub(super) fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         let pdu = RequestPdu::Read {
             table: Table::Holding,
             start,
@@ -58,11 +58,11 @@ impl Bench {
         }
     }
 
-    fn one(&mut self, start: u16) -> u16 {
+    pub(super) fn one(&mut self, start: u16) -> u16 {
         self.read(start, 1).unwrap()[0]
     }
 
-    fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
+    pub(super) fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
         let pdu = match values {
             [value] => RequestPdu::WriteRegister {
                 address: start,
@@ -81,12 +81,12 @@ impl Bench {
     }
 
     /// Writes and waits until the drive has settled.
-    fn command(&mut self, word: u16, reference: i16) {
+    pub(super) fn command(&mut self, word: u16, reference: i16) {
         self.write(2000, &[word, 0, reference as u16]).unwrap();
         self.wait(8000);
     }
 
-    fn status(&mut self) -> u16 {
+    pub(super) fn status(&mut self) -> u16 {
         self.one(2100)
     }
 }

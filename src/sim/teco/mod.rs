@@ -209,7 +209,7 @@ impl TecoDrive {
     /// off.
     fn take_over(&mut self) {
         if self.control.operation & operation::EXTERNAL_FAULT != 0 || self.terminals & terminal::EXTERNAL_FAULT != 0 {
-            self.latch.trip(fault::EXTERNAL);
+            self.trip(fault::EXTERNAL);
         }
         let (run, _) = self.run_command();
         self.running = match self.mode {
@@ -311,6 +311,7 @@ impl Model for TecoDrive {
     fn trip(&mut self, fault: u16) {
         if self.latch.trip(fault & fault::ALL) {
             self.running = false;
+            self.motor.release();
         }
     }
 
