@@ -115,7 +115,7 @@ async fn a_fault_is_told_and_reset() {
     .await;
     rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
     let mut events = rig.events.subscribe();
-    rig.line.with_drive(1, |drive, _| drive.as_nx().unwrap().trip(1));
+    rig.line.with_drive(1, |drive, _| drive.trip(1));
     rig.until("the fault shows", |r| r.state(1) == State::Fault).await;
     assert_eq!(rig.good(1, ModelPoint::FaultCode), Some(Value::Integer(1)));
     let event = events.recv().await.unwrap();

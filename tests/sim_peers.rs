@@ -137,7 +137,7 @@ fn mbpoll_runs_the_start_up_test() {
 #[test]
 fn mbpoll_resets_a_fault_and_meets_a_dead_drive() {
     let line = line();
-    line.with_drive(1, |drive, _| drive.as_nx().unwrap().trip(53));
+    line.with_drive(1, |drive, _| drive.trip(53));
     let (_, text) = mbpoll(&line, "-a 1 -r 98 -c 1");
     assert_eq!(values(&text), [53], "{text}");
     mbpoll(&line, "-a 1 -r 2000 -- 4");

@@ -250,8 +250,7 @@ impl Args {
             line.rules.turnaround = Duration::ZERO;
         }
         for drive in &mut line.drives {
-            let ModelOptions::Nx(nx) = &mut drive.model;
-            nx.trip_register = true;
+            drive.model.set_trip_register(true);
             if self.autopilot {
                 drive.autopilot = Some(self.seed.wrapping_mul(1000).wrapping_add(u64::from(drive.address)));
             }

@@ -4,12 +4,9 @@
 //! control word and reference, until the drive is commanded over the bus; then it lets go for good.
 
 use super::SimTime;
-use super::nx::{Command, NxDrive};
+use super::model::{Command, Model};
 use super::random::Random;
 use std::time::Duration;
-
-/// Faults of the demo: overcurrent, drive overtemperature, motor underload, external fault.
-const FAULTS: [u16; 4] = [1, 14, 17, 51];
 
 /// What the autopilot does next.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -52,7 +49,7 @@ impl Autopilot {
     }
 
     /// Does what is due at `now`.
-    pub fn act(&mut self, drive: &mut NxDrive, now: SimTime) {
+    pub fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
         match self.next {
             Next::Start => {
                 self.changes = self.random.within(2..=5);
@@ -61,13 +58,13 @@ impl Autopilot {
                     reverse: self.random.chance(0.2),
                     reference: self.reference(),
                 };
-                drive.set_fieldbus(self.command);
+                drive.command(self.command);
                 self.then(now, Next::Change, 5_000..=12_000);
             }
             Next::Change if self.changes > 0 => {
                 self.changes -= 1;
                 self.command.reference = self.reference();
-                drive.set_fieldbus(self.command);
+                drive.command(self.command);
                 let next = if self.random.chance(0.08) {
                     Next::Trip
                 } else {
@@ -80,12 +77,13 @@ impl Autopilot {
                     run: false,
                     ..self.command
                 };
-                drive.set_fieldbus(self.command);
+                drive.command(self.command);
                 self.then(now, Next::Start, 5_000..=10_000);
             }
             Next::Trip => {
-                let pick = self.random.within(0..=FAULTS.len() as u64 - 1) as usize;
-                drive.trip(FAULTS.get(pick).copied().unwrap_or(1));
+                let faults = drive.usual_faults();
+                let pick = self.random.within(0..=(faults.len() as u64).saturating_sub(1)) as usize;
+                drive.trip(faults.get(pick).copied().unwrap_or(1));
                 self.then(now, Next::ResetOn, 8_000..=15_000);
             }
             Next::ResetOn => {
@@ -93,7 +91,7 @@ impl Autopilot {
                     run: false,
                     ..self.command
                 };
-                drive.set_fieldbus(self.command);
+                drive.command(self.command);
                 drive.set_reset(true);
                 self.then(now, Next::ResetOff, 100..=100);
             }
@@ -117,7 +115,7 @@ impl Autopilot {
 
 #[cfg(test)]
 mod tests {
-    use super::super::nx::{NxOptions, status_word};
+    use super::super::nx::{NxDrive, NxOptions, status_word};
     use super::*;
 
     /// Ten minutes of one drive: (status, reference) each second.

@@ -2,8 +2,11 @@
 
 use super::SimTime;
 use super::autopilot::Autopilot;
+use super::cx::{CxDrive, CxOptions};
+use super::model::{Command, DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
-use crate::codec::{Reply, RequestPdu};
+use super::teco::{TecoDrive, TecoOptions};
+use crate::codec::{Exception, Reply, RequestPdu};
 use std::time::Duration;
 
 /// Missed actions of an autopilot that lie longer back are passed over.
@@ -23,40 +26,103 @@ pub struct DriveOptions {
 /// The models, each with its options.
 #[derive(Debug, Clone)]
 pub enum ModelOptions {
-    /// Vacon NX.
+    /// Vacon NX, Eaton SVX, Eaton HVX.
     Nx(NxOptions),
+    /// Vacon CX, CXL, CXS.
+    Cx(CxOptions),
+    /// TECO 7300PA with its PA-C card.
+    Teco(TecoOptions),
 }
 
 impl ModelOptions {
+    /// Names that [`ModelOptions::by_name`] knows.
+    pub const NAMES: [&'static str; 5] = ["nx", "svx", "hvx", "cx", "teco"];
+
     /// The model that a profile names in its key `simulator`, with its default options.
     pub fn by_name(name: &str) -> Option<ModelOptions> {
-        match name {
-            "nx" => Some(ModelOptions::Nx(NxOptions::default())),
-            _ => None,
+        Some(match name {
+            "nx" => ModelOptions::Nx(NxOptions::vacon()),
+            "svx" => ModelOptions::Nx(NxOptions::svx()),
+            "hvx" => ModelOptions::Nx(NxOptions::hvx()),
+            "cx" => ModelOptions::Cx(CxOptions::default()),
+            "teco" => ModelOptions::Teco(TecoOptions::default()),
+            _ => return None,
+        })
+    }
+
+    /// Gives the drive the simulator's own register that trips a fault, or takes it away.
+    pub fn set_trip_register(&mut self, on: bool) {
+        match self {
+            ModelOptions::Nx(nx) => nx.trip_register = on,
+            ModelOptions::Cx(cx) => cx.trip_register = on,
+            ModelOptions::Teco(teco) => teco.trip_register = on,
+        }
+    }
+
+    /// PDU address of the holding register that trips a fault when it is switched on; no real drive has it.
+    pub fn trip_address(&self) -> u16 {
+        match self {
+            ModelOptions::Nx(_) => NxOptions::TRIP_ADDRESS,
+            ModelOptions::Cx(_) => CxOptions::TRIP_ADDRESS,
+            ModelOptions::Teco(_) => TecoOptions::TRIP_ADDRESS,
+        }
+    }
+
+    /// Time that the drive takes before it answers, where its manual tells one.
+    pub fn turnaround(&self) -> Option<Duration> {
+        match self {
+            ModelOptions::Nx(_) | ModelOptions::Cx(_) => None,
+            ModelOptions::Teco(_) => Some(TecoOptions::TURNAROUND),
         }
     }
 }
 
 impl DriveOptions {
-    /// A Vacon NX with default options and without autopilot.
-    pub fn nx(address: u8) -> DriveOptions {
+    /// A drive without autopilot.
+    pub fn new(address: u8, model: ModelOptions) -> DriveOptions {
         DriveOptions {
             address,
-            model: ModelOptions::Nx(NxOptions::default()),
+            model,
             autopilot: None,
         }
+    }
+
+    /// A Vacon NX with default options and without autopilot.
+    pub fn nx(address: u8) -> DriveOptions {
+        DriveOptions::new(address, ModelOptions::Nx(NxOptions::default()))
     }
 }
 
 #[derive(Debug, Clone)]
-enum Model {
+enum AnyModel {
     Nx(NxDrive),
+    Cx(CxDrive),
+    Teco(TecoDrive),
+}
+
+impl AnyModel {
+    fn get(&self) -> &dyn Model {
+        match self {
+            AnyModel::Nx(drive) => drive,
+            AnyModel::Cx(drive) => drive,
+            AnyModel::Teco(drive) => drive,
+        }
+    }
+
+    fn get_mut(&mut self) -> &mut dyn Model {
+        match self {
+            AnyModel::Nx(drive) => drive,
+            AnyModel::Cx(drive) => drive,
+            AnyModel::Teco(drive) => drive,
+        }
+    }
 }
 
 /// A drive of any model.
 #[derive(Debug, Clone)]
 pub struct SimulatedDrive {
-    model: Model,
+    model: AnyModel,
+    turnaround: Option<Duration>,
     autopilot: Option<Autopilot>,
     alive: bool,
 }
@@ -64,11 +130,13 @@ pub struct SimulatedDrive {
 impl SimulatedDrive {
     /// A drive that is switched on at `now`.
     pub fn new(options: DriveOptions, now: SimTime) -> SimulatedDrive {
-        let model = match options.model {
-            ModelOptions::Nx(nx) => Model::Nx(NxDrive::new(nx, now)),
-        };
         SimulatedDrive {
-            model,
+            turnaround: options.model.turnaround(),
+            model: match options.model {
+                ModelOptions::Nx(nx) => AnyModel::Nx(NxDrive::new(nx, now)),
+                ModelOptions::Cx(cx) => AnyModel::Cx(CxDrive::new(cx, now)),
+                ModelOptions::Teco(teco) => AnyModel::Teco(TecoDrive::new(teco, now)),
+            },
             autopilot: options.autopilot.map(|seed| Autopilot::new(seed, now)),
             alive: true,
         }
@@ -76,7 +144,7 @@ impl SimulatedDrive {
 
     /// Lives on until `now`.
     pub fn advance(&mut self, now: SimTime) {
-        let Model::Nx(drive) = &mut self.model;
+        let drive = self.model.get_mut();
         if let Some(autopilot) = &mut self.autopilot {
             let earliest = now.saturating_sub(LONGEST_CATCH_UP);
             while autopilot.next_at() <= now {
@@ -90,8 +158,7 @@ impl SimulatedDrive {
 
     /// Whether it answers: connected, and with supply.
     pub fn answers(&self) -> bool {
-        let Model::Nx(drive) = &self.model;
-        self.alive && drive.powered()
+        self.alive && self.model.get().powered()
     }
 
     /// Takes it off the line (it goes on living) or puts it back.
@@ -99,21 +166,86 @@ impl SimulatedDrive {
         self.alive = alive;
     }
 
+    /// Time that it takes before it answers, where its manual tells one.
+    pub fn turnaround(&self) -> Option<Duration> {
+        self.turnaround
+    }
+
     /// A valid message to this drive or to all was on the line.
     pub fn heard(&mut self, now: SimTime) {
         self.advance(now);
-        let Model::Nx(drive) = &mut self.model;
-        drive.heard(now);
+        self.model.get_mut().heard(now);
     }
 
-    /// The reply to a request that came whole at `now`. A write takes the drive from its autopilot for good.
-    pub fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Reply {
+    /// A sound frame was on the line, whomever it is for; to be told before the frame is acted upon.
+    pub fn bus_message(&mut self) {
+        self.model.get_mut().bus_message();
+    }
+
+    /// A frame with a wrong check code was on the line.
+    pub fn bus_error(&mut self) {
+        self.model.get_mut().bus_error();
+    }
+
+    /// The reply to a request that came whole at `now`; `None` when the drive stays silent. A write takes the drive from
+    /// its autopilot for good.
+    pub fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
         self.advance(now);
         if request.is_write() {
             self.autopilot = None;
         }
-        let Model::Nx(drive) = &mut self.model;
-        drive.answer(request, now)
+        self.model.get_mut().answer(request, now)
+    }
+
+    /// The answer to a sound frame whose PDU is no request, for which a plain slave has `exception`; `None` when the
+    /// drive stays silent.
+    pub fn malformed(&mut self, pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
+        self.advance(now);
+        self.model.get_mut().malformed(pdu, exception, now)
+    }
+
+    /// A request to all drives. Nobody answers it; a write takes the drive from its autopilot for good.
+    pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+        self.advance(now);
+        if request.is_write() {
+            self.autopilot = None;
+        }
+        self.model.get_mut().broadcast(request, now);
+    }
+
+    /// Trips it with a fault as its registers show it; 0 does nothing.
+    pub fn trip(&mut self, fault: u16) {
+        self.model.get_mut().trip(fault);
+    }
+
+    /// Commands it as another master on the bus would.
+    pub fn command(&mut self, command: Command) {
+        self.model.get_mut().command(command);
+    }
+
+    /// Pulls the fault reset bit of the bus up or down.
+    pub fn set_reset(&mut self, on: bool) {
+        self.model.get_mut().set_reset(on);
+    }
+
+    /// Gives it to the bus, or to panel or terminals.
+    pub fn set_remote(&mut self, on: bool) {
+        self.model.get_mut().set_remote(on);
+    }
+
+    /// Switches the supply off.
+    pub fn power_off(&mut self) {
+        self.model.get_mut().power_off();
+    }
+
+    /// Switches the supply on again.
+    pub fn power_on(&mut self, now: SimTime) {
+        self.model.get_mut().power_on(now);
+    }
+
+    /// What it looks like from outside.
+    pub fn state(&self) -> DriveState {
+        self.model.get().state()
     }
 
     /// A request to all drives. Nobody answers it, so only writes have an effect.
@@ -128,12 +260,33 @@ impl SimulatedDrive {
         self.autopilot.is_some()
     }
 
-    /// The Vacon NX that it is, if it is one.
+    /// The drive of the Vacon NX family that it is, if it is one.
     pub fn as_nx(&mut self) -> Option<&mut NxDrive> {
-        let Model::Nx(drive) = &mut self.model;
-        Some(drive)
+        match &mut self.model {
+            AnyModel::Nx(drive) => Some(drive),
+            _ => None,
+        }
+    }
+
+    /// The Vacon CX that it is, if it is one.
+    pub fn as_cx(&mut self) -> Option<&mut CxDrive> {
+        match &mut self.model {
+            AnyModel::Cx(drive) => Some(drive),
+            _ => None,
+        }
+    }
+
+    /// The TECO 7300PA that it is, if it is one.
+    pub fn as_teco(&mut self) -> Option<&mut TecoDrive> {
+        match &mut self.model {
+            AnyModel::Teco(drive) => Some(drive),
+            _ => None,
+        }
     }
 }
+
+#[cfg(test)]
+mod properties;
 
 #[cfg(test)]
 mod tests {
@@ -168,7 +321,7 @@ mod tests {
         );
         assert!(!drive.runs_by_itself());
         drive.advance(minute * 5);
-        assert_eq!(drive.as_nx().unwrap().state().output, 0.0, "nobody starts it any more");
+        assert_eq!(drive.state().output, 0.0, "nobody starts it any more");
     }
 
     #[test]
@@ -191,7 +344,7 @@ mod tests {
                 },
                 year
             ),
-            Reply::Registers(_)
+            Some(Reply::Registers(_))
         ));
     }
 }

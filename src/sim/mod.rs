@@ -2,7 +2,9 @@
 //!
 //! The pieces, from the drive to the port:
 //!
-//! - [`nx`]: what a Vacon NX with its option board does (pure), and [`autopilot`], which runs one in a demo.
+//! - [`motor`], [`parameter_set`], [`model`]: what all drives have, and what a drive is to the line.
+//! - [`nx`] (Vacon NX, Eaton SVX and HVX), [`cx`] (Vacon CX), [`teco`] (TECO 7300PA): what the drives with their boards
+//!   do, asked by Modbus PDUs (pure); and [`autopilot`], which runs one in a demo.
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
 //! - [`faults`]: what goes wrong on a line, by chance or by script.
@@ -20,16 +22,21 @@ use std::time::Duration;
 pub mod autopilot;
 pub mod bare_master;
 pub mod broker;
+pub mod cx;
 pub mod drive;
 pub mod endpoint;
 pub mod faults;
 pub mod framing;
 pub mod half_duplex;
+pub mod model;
+pub mod motor;
 pub mod nx;
+pub mod parameter_set;
 pub mod pty;
 pub mod random;
 pub mod slave;
 pub mod statistics;
+pub mod teco;
 pub mod wire;
 
 /// Time since the simulated line was switched on.

@@ -118,7 +118,10 @@ impl Slaves {
         match &asked.request {
             Ok(request) => {
                 let mut pdu = Vec::with_capacity(request.reply_len());
-                drive.answer(request, now).encode(request, &mut pdu);
+                let Some(reply) = drive.answer(request, now) else {
+                    return;
+                };
+                reply.encode(request, &mut pdu);
                 framing::close(asked.protocol, asked.address, &pdu, out);
             }
             Err(exception) => {

@@ -1,30 +1,29 @@
-//! A Vacon NX drive with its OPTC2 or OPTC8 board, as drives.md section 3 and 10 describe it.
+//! A Vacon NX, Eaton SVX or Eaton HVX drive with its OPTC2 or OPTC8 board, as drives.md section 3 and 10 describe it.
 //!
 //! Pure: the time is an argument, and the drive works in steps of 10 ms, its update period. At each step it takes over
 //! the process data in and refreshes the process data out, so a bit that a master sets and clears within one step is
 //! never seen, as on the real drive.
 
-pub mod motor;
+#[cfg(test)]
+mod eaton_tests;
 mod options;
 pub mod parameters;
 mod registers;
+mod signals;
 #[cfg(test)]
 mod tests;
 
-pub use motor::Load;
-pub use options::{NxOptions, StatusBits, Values};
-pub use registers::{Beyond, Hole, Limits, ReadOnly};
+pub use super::model::{Beyond, Command, ReadOnly, UPDATE_PERIOD};
+pub use super::motor::Load;
+pub use options::{Base, NxOptions, SpeedReference, Unit, Values};
+pub use registers::{Hole, Limits};
+pub use signals::StatusBits;
 
-use self::motor::{Drive, Motor};
 use self::parameters::{Parameters, Settings, StopFunction};
 use super::SimTime;
-use std::time::Duration;
-
-/// Inputs are taken over and outputs refreshed every 10 ms (drives.md 3.3).
-pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
-
-/// A drive that nobody looked at for longer skips the rest of the time instead of living through it.
-const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
+use super::model::{AT_REFERENCE_BAND, DriveState, Latch, Model, Steps};
+use super::motor::{Feed, Motor};
+use crate::codec::{Reply, RequestPdu};
 
 /// Registers of process data in and out, IDs 2001..=2011 and 2101..=2111.
 const PROCESS_DATA: usize = 11;
@@ -37,6 +36,16 @@ pub mod control_word {
     pub const REVERSE: u16 = 1 << 1;
     /// Fault reset by rising edge.
     pub const RESET: u16 = 1 << 2;
+    /// HVX: enable bypass.
+    pub const BYPASS: u16 = 1 << 3;
+    /// HVX: pass through to relay output RO1.
+    pub const RELAY_1: u16 = 1 << 10;
+    /// HVX: pass through to relay output RO2.
+    pub const RELAY_2: u16 = 1 << 11;
+    /// HVX: pass through to digital output DO1.
+    pub const DIGITAL_OUTPUT: u16 = 1 << 12;
+    /// HVX: activate fire mode.
+    pub const FIRE_MODE: u16 = 1 << 13;
 }
 
 /// Status word, ID 2101 (drives.md 3.6).
@@ -63,15 +72,16 @@ pub mod status_word {
     pub const ENCODER_REVERSE: u16 = 1 << 9;
     /// Undervoltage fast stop is **not** active.
     pub const NO_UNDERVOLTAGE_STOP: u16 = 1 << 10;
-    /// The bits that all drives of the family have.
-    pub const COMMON: u16 = READY | RUN | REVERSE | FAULT | WARNING | AT_REFERENCE;
+    /// HVX: bypass activated.
+    pub const BYPASS: u16 = 1 << 6;
+    /// HVX: fire mode activated.
+    pub const FIRE_MODE: u16 = 1 << 7;
+    /// HVX: **not** interlocked.
+    pub const NOT_INTERLOCKED: u16 = 1 << 8;
 }
 
 /// Fault code: fieldbus fault (drives.md 3.11).
 pub const FIELDBUS_FAULT: u16 = 53;
-
-/// Output and reference closer than this count as reached, Hz: below what a register can show.
-const AT_REFERENCE_BAND: f64 = 0.005;
 
 /// Where a drive takes its commands from.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -100,26 +110,6 @@ impl ControlPlace {
             ControlPlace::Fieldbus => 3,
         }
     }
-
-    /// Its bit in the general status word, ID 2102 (drives.md 3.7).
-    fn status_bit(self) -> u16 {
-        match self {
-            ControlPlace::Fieldbus => 1 << 13,
-            ControlPlace::Panel => 1 << 14,
-            ControlPlace::Terminals => 1 << 15,
-        }
-    }
-}
-
-/// Run, direction and speed from whoever has the control place.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct Command {
-    /// Run.
-    pub run: bool,
-    /// Counterclockwise.
-    pub reverse: bool,
-    /// Speed reference, 0.01 % of the band between minimum and maximum frequency, -10000..=10000.
-    pub reference: i16,
 }
 
 /// What a drive looks like from outside, for tests and for the demo's display.
@@ -137,7 +127,7 @@ pub struct NxState {
     pub fault: u16,
 }
 
-/// A simulated Vacon NX.
+/// A simulated Vacon NX, Eaton SVX or HVX.
 #[derive(Debug, Clone)]
 pub struct NxDrive {
     options: NxOptions,
@@ -152,19 +142,19 @@ pub struct NxDrive {
     last_control: u16,
     /// Commands of panel and terminals.
     local: Command,
-    /// A run bit is obeyed only after it was seen 0 without a fault.
-    armed: bool,
+    latch: Latch,
     running: bool,
     /// A fault that stops by ramp: the motor is still brought down.
     stopping: bool,
-    fault: u16,
     warning: bool,
     lost_master: bool,
     interlock: bool,
+    /// The hand-off-auto switch of an HVX stands at off.
+    switched_off: bool,
     powered: bool,
     busy_until: SimTime,
     heard: Option<SimTime>,
-    next_step: SimTime,
+    steps: Steps,
 }
 
 impl NxDrive {
@@ -183,45 +173,20 @@ impl NxDrive {
             output: [0; PROCESS_DATA],
             last_control: 0,
             local: Command::default(),
-            armed: true,
+            latch: Latch::new(),
             running: false,
             stopping: false,
-            fault: 0,
             warning: false,
             lost_master: false,
             interlock: false,
+            switched_off: false,
             powered: true,
             busy_until: SimTime::ZERO,
             heard: None,
-            next_step: now + UPDATE_PERIOD,
+            steps: Steps::new(now),
         };
         drive.refresh();
         drive
-    }
-
-    /// Lives on until `now`, in steps of the update period.
-    pub fn advance(&mut self, now: SimTime) {
-        if now.saturating_sub(self.next_step) > LONGEST_CATCH_UP {
-            self.next_step = now - LONGEST_CATCH_UP;
-        }
-        while self.next_step <= now {
-            let at = self.next_step;
-            self.next_step += UPDATE_PERIOD;
-            if self.powered {
-                self.step(at);
-            }
-        }
-    }
-
-    /// A valid message to this drive or to all was on the bus: restarts the supervision.
-    pub fn heard(&mut self, now: SimTime) {
-        self.heard = Some(now);
-        self.lost_master = false;
-    }
-
-    /// Trips the drive with a fault code; 0 does nothing.
-    pub fn trip(&mut self, code: u16) {
-        self.fail(code, StopFunction::Coast);
     }
 
     /// Sets or clears the warning bit.
@@ -250,38 +215,9 @@ impl NxDrive {
         self.local = command;
     }
 
-    /// Writes process data in as another master on the bus would: control word and speed reference.
-    pub fn set_fieldbus(&mut self, command: Command) {
-        let word = u16::from(command.run) * control_word::RUN + u16::from(command.reverse) * control_word::REVERSE;
-        self.set_input(0, word);
-        self.set_input(2, command.reference as u16);
-    }
-
-    /// Pulls the fault reset bit up or down.
-    pub fn set_reset(&mut self, on: bool) {
-        let rest = self.input(0) & !control_word::RESET;
-        self.set_input(0, rest | if on { control_word::RESET } else { 0 });
-    }
-
-    /// Switches the supply off: the drive answers nothing and the motor coasts unseen.
-    pub fn power_off(&mut self) {
-        self.powered = false;
-    }
-
-    /// Switches the supply on again: process data is 0, faults are gone, parameters are kept.
-    pub fn power_on(&mut self, now: SimTime) {
-        let kept = std::mem::take(&mut self.options.parameters);
-        let mut fresh = NxDrive::new(self.options.clone(), now);
-        fresh.options.parameters = kept;
-        fresh.parameters = self.parameters.clone();
-        fresh.settings = fresh.parameters.settings();
-        fresh.refresh();
-        *self = fresh;
-    }
-
-    /// Whether the drive has supply; without it, it answers nothing.
-    pub fn powered(&self) -> bool {
-        self.powered
+    /// Turns the hand-off-auto switch of an HVX to off, or away from it to where the control place stands.
+    pub fn set_switched_off(&mut self, off: bool) {
+        self.switched_off = off;
     }
 
     /// What the drive looks like from outside.
@@ -291,7 +227,7 @@ impl NxDrive {
             control: self.input(0),
             reference: self.input(2) as i16,
             output: self.motor.output,
-            fault: self.fault,
+            fault: self.latch.fault(),
         }
     }
 
@@ -306,40 +242,41 @@ impl NxDrive {
     }
 
     fn fail(&mut self, code: u16, stop: StopFunction) {
-        if code == 0 || self.fault != 0 {
-            return;
+        if self.latch.trip(code) {
+            self.stopping = stop == StopFunction::Ramp && self.motor.fed;
+            self.running = false;
+            if !self.stopping {
+                self.motor.release();
+            }
         }
-        self.stopping = stop == StopFunction::Ramp && self.motor.fed;
-        self.fault = code;
-        self.running = false;
-        self.armed = false;
     }
 
     /// One update period: supervision, commands, motor, process data out.
     fn step(&mut self, now: SimTime) {
         self.supervise(now);
         let command = self.take_over();
-        if !command.run && self.fault == 0 {
-            self.armed = true;
-        }
-        let may_run = self.fault == 0 && !self.interlock;
-        self.running = command.run && self.armed && may_run;
+        let free = !self.interlock && !self.switched_off && !self.bypassed();
+        self.running = self.latch.obeys(command.run) && free;
         let target = self.target(command);
         // A ramped stop keeps the inverter on until the motor stands.
         let ramping_down = self.motor.fed
             && self.motor.output != 0.0
-            && if self.fault == 0 {
-                self.settings.stop == StopFunction::Ramp && !self.interlock
+            && if self.latch.fault() == 0 {
+                self.settings.stop == StopFunction::Ramp && free
             } else {
                 self.stopping
             };
-        let drive = match (self.running, ramping_down) {
-            (true, _) => Drive::To(target),
-            (false, true) => Drive::To(0.0),
-            (false, false) => Drive::Off,
+        let feed = match (self.running, ramping_down) {
+            (true, _) => Feed::To(target),
+            (false, true) => Feed::To(0.0),
+            (false, false) => Feed::Off,
         };
-        self.motor
-            .step(UPDATE_PERIOD.as_secs_f64(), drive, &self.settings, &self.options.load);
+        self.motor.step(
+            UPDATE_PERIOD.as_secs_f64(),
+            feed,
+            &self.settings.motor,
+            &self.options.load,
+        );
         self.refresh();
     }
 
@@ -364,24 +301,41 @@ impl NxDrive {
         let word = self.input(0);
         let risen = word & !self.last_control;
         self.last_control = word;
-        if self.settings.place != ControlPlace::Fieldbus {
-            return self.local;
-        }
-        if risen & control_word::RESET != 0 {
-            self.fault = 0;
+        if self.settings.place == ControlPlace::Fieldbus && risen & control_word::RESET != 0 {
+            self.latch.reset();
             self.stopping = false;
         }
-        Command {
-            run: word & control_word::RUN != 0,
-            reverse: word & control_word::REVERSE != 0,
-            reference: self.input(2) as i16,
-        }
+        self.held()
     }
 
-    /// f = fmin + reference/10000 x (fmax - fmin), the sign exclusive-or the direction bit (drives.md 3.5).
+    /// A control word bit that only the HVX has, while the control word counts.
+    fn hvac(&self, mask: u16) -> bool {
+        self.options.hvac_control && self.settings.place == ControlPlace::Fieldbus && self.last_control & mask != 0
+    }
+
+    /// The motor is on the mains, so the inverter is off. An interlock opens the bypass too.
+    fn bypassed(&self) -> bool {
+        self.hvac(control_word::BYPASS) && !self.interlock
+    }
+
+    /// Fire mode runs the motor at the maximum frequency, whatever run bit and reference say.
+    fn fire_mode(&self) -> bool {
+        self.hvac(control_word::FIRE_MODE)
+    }
+
+    /// The output frequency for a command, drives.md 3.5: the sign exclusive-or the direction bit.
     fn target(&self, command: Command) -> f64 {
-        let share = f64::from(command.reference.unsigned_abs()).min(10_000.0) / 10_000.0;
-        let frequency = self.settings.minimum + share * (self.settings.maximum - self.settings.minimum);
+        let (minimum, maximum) = (self.settings.minimum, self.settings.motor.maximum);
+        if self.fire_mode() {
+            return maximum;
+        }
+        let size = f64::from(command.reference.unsigned_abs());
+        let rule = self.options.reference;
+        let frequency = match (rule.unit, rule.base) {
+            (Unit::Percent, Base::Band) => minimum + size.min(10_000.0) / 10_000.0 * (maximum - minimum),
+            (Unit::Percent, Base::Maximum) => (size.min(10_000.0) / 10_000.0 * maximum).max(minimum),
+            (Unit::Hertz, _) => (size / 100.0).min(maximum).max(minimum),
+        };
         if command.reverse != (command.reference < 0) {
             -frequency
         } else {
@@ -389,43 +343,104 @@ impl NxDrive {
         }
     }
 
-    /// The command that holds now, for the at-reference bit and ID 25.
-    fn command(&self) -> Command {
+    /// The command that holds now.
+    fn held(&self) -> Command {
         match self.settings.place {
             ControlPlace::Fieldbus => Command {
-                run: self.last_control & control_word::RUN != 0,
+                run: self.last_control & control_word::RUN != 0 || self.fire_mode(),
                 reverse: self.last_control & control_word::REVERSE != 0,
                 reference: self.input(2) as i16,
             },
             _ => self.local,
         }
     }
+}
 
-    fn status(&self) -> u16 {
-        let motor = &self.motor;
-        let bit = |on: bool, mask: u16| if on { mask } else { 0 };
-        let reached = self.running && (motor.output - self.target(self.command())).abs() < AT_REFERENCE_BAND;
-        let warned = self.warning || (self.lost_master && self.settings.fieldbus_fault == 1);
-        let word = bit(self.fault == 0 && !self.interlock, status_word::READY)
-            | bit(motor.fed && self.fault == 0, status_word::RUN)
-            | bit(self.turns_reverse(), status_word::REVERSE)
-            | bit(self.fault != 0, status_word::FAULT)
-            | bit(warned, status_word::WARNING)
-            | bit(reached, status_word::AT_REFERENCE)
-            | bit(motor.shaft == 0.0, status_word::ZERO_SPEED)
-            | bit(motor.fed, status_word::FLUX_READY)
-            | bit(motor.shaft < 0.0, status_word::ENCODER_REVERSE)
-            | status_word::NO_SPEED_LIMIT
-            | status_word::NO_UNDERVOLTAGE_STOP;
-        match self.options.status {
-            StatusBits::Full => word,
-            StatusBits::Common => word & status_word::COMMON,
+impl Model for NxDrive {
+    fn advance(&mut self, now: SimTime) {
+        while let Some(at) = self.steps.due(now) {
+            if self.powered {
+                self.step(at);
+            }
         }
     }
 
-    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
-    fn turns_reverse(&self) -> bool {
-        let shaft = self.motor.shaft;
-        shaft < 0.0 || (shaft == 0.0 && self.running && self.target(self.command()) < 0.0)
+    fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
+        self.advance(now);
+        self.heard(now);
+        Some(self.reply(request, now))
+    }
+
+    fn broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+        self.advance(now);
+        self.heard(now);
+        if matches!(
+            request,
+            RequestPdu::WriteRegister { .. } | RequestPdu::WriteRegisters { .. }
+        ) {
+            self.reply(request, now);
+        }
+    }
+
+    /// Restarts the supervision.
+    fn heard(&mut self, now: SimTime) {
+        self.heard = Some(now);
+        self.lost_master = false;
+    }
+
+    fn powered(&self) -> bool {
+        self.powered
+    }
+
+    fn power_off(&mut self) {
+        self.powered = false;
+    }
+
+    fn power_on(&mut self, now: SimTime) {
+        let mut fresh = NxDrive::new(self.options.clone(), now);
+        fresh.parameters = self.parameters.clone();
+        fresh.settings = fresh.parameters.settings();
+        fresh.refresh();
+        *self = fresh;
+    }
+
+    fn trip(&mut self, fault: u16) {
+        self.fail(fault, StopFunction::Coast);
+    }
+
+    /// Overcurrent, drive overtemperature, motor underload, external fault.
+    fn usual_faults(&self) -> &'static [u16] {
+        &[1, 14, 17, 51]
+    }
+
+    fn command(&mut self, command: Command) {
+        let word = u16::from(command.run) * control_word::RUN + u16::from(command.reverse) * control_word::REVERSE;
+        self.set_input(0, word);
+        self.set_input(2, command.reference as u16);
+    }
+
+    fn set_reset(&mut self, on: bool) {
+        let rest = self.input(0) & !control_word::RESET;
+        self.set_input(0, rest | if on { control_word::RESET } else { 0 });
+    }
+
+    fn set_remote(&mut self, on: bool) {
+        self.set_control_place(if on {
+            ControlPlace::Fieldbus
+        } else {
+            ControlPlace::Panel
+        });
+    }
+
+    fn state(&self) -> DriveState {
+        let status = self.status();
+        DriveState {
+            ready: status & status_word::READY != 0,
+            running: status & status_word::RUN != 0,
+            reverse: status & status_word::REVERSE != 0,
+            fault: self.latch.fault(),
+            output: self.motor.output,
+            remote: self.settings.place == ControlPlace::Fieldbus,
+        }
     }
 }

@@ -1,17 +1,8 @@
-//! How a simulated NX is made.
+//! How a simulated NX, SVX or HVX is made. The drives of the family differ in this data and in nothing else.
 
-use super::motor::Load;
-use super::{Hole, Limits, ReadOnly};
+use super::super::motor::Load;
+use super::{Beyond, Hole, Limits, ReadOnly, StatusBits};
 use std::time::Duration;
-
-/// Which status bits the drive shows.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum StatusBits {
-    /// All bits of the Vacon NX: 0x0541 when idle and healthy.
-    Full,
-    /// Only those all drives of the family share, as the worked frames of drives.md print them.
-    Common,
-}
 
 /// What the read-only registers hold.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -23,7 +14,36 @@ pub enum Values {
     Tagged(u8),
 }
 
-/// How a simulated NX is made.
+/// What 100 % of the speed reference is (drives.md 9.2).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Base {
+    /// The band from the minimum frequency (0 %) to the maximum frequency (100 %).
+    Band,
+    /// The maximum frequency; a running drive does not go below the minimum frequency.
+    Maximum,
+}
+
+/// What one count of the speed reference is (drives.md 9.3).
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unit {
+    /// 0.01 %.
+    Percent,
+    /// 0.01 Hz, as Eaton's tables of the Multipurpose and PID applications print it.
+    Hertz,
+}
+
+/// How the speed reference, ID 2003, and the actual speed, ID 2103, are to be read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct SpeedReference {
+    /// Whether a negative reference is allowed; it turns the direction round.
+    pub signed: bool,
+    /// What 100 % is.
+    pub base: Base,
+    /// What one count of ID 2003 is; ID 2103 is always 0.01 %.
+    pub unit: Unit,
+}
+
+/// How a simulated drive of the family is made.
 #[derive(Debug, Clone)]
 pub struct NxOptions {
     /// Load and mains.
@@ -38,6 +58,13 @@ pub struct NxOptions {
     pub timeout: Duration,
     /// Which status bits the drive shows.
     pub status: StatusBits,
+    /// How the speed reference is to be read.
+    pub reference: SpeedReference,
+    /// Hz that one count of the output frequency is, 0.01 or 0.1 (drives.md 9.1).
+    pub frequency_step: f64,
+    /// Whether the control word has the bits of the HVX: bypass (3), pass-through to RO1, RO2 and DO1 (10 to 12) and
+    /// fire mode (13). The others only hand them on to the application.
+    pub hvac_control: bool,
     /// What the read-only registers hold.
     pub values: Values,
     /// Parameters to start with: ID and value; those that a drive does not have or not allow are passed over.
@@ -46,18 +73,80 @@ pub struct NxOptions {
     pub trip_register: bool,
 }
 
-impl Default for NxOptions {
-    fn default() -> Self {
+impl NxOptions {
+    /// PDU address of the simulator's own trip register.
+    pub const TRIP_ADDRESS: u16 = 1998;
+
+    /// Vacon NX.
+    pub fn vacon() -> NxOptions {
         NxOptions {
             load: Load::default(),
-            limits: Limits::default(),
+            limits: Limits::VACON,
             hole: Hole::Exception,
             read_only: ReadOnly::Exception,
             timeout: Duration::from_secs(20),
             status: StatusBits::Full,
+            reference: SpeedReference {
+                signed: true,
+                base: Base::Band,
+                unit: Unit::Percent,
+            },
+            frequency_step: 0.01,
+            hvac_control: false,
             values: Values::Physical,
             parameters: Vec::new(),
             trip_register: false,
         }
+    }
+
+    /// Eaton SVX9000.
+    pub fn svx() -> NxOptions {
+        NxOptions {
+            limits: Limits::EATON,
+            timeout: Duration::from_secs(10),
+            status: StatusBits::Svx,
+            reference: SpeedReference {
+                signed: false,
+                base: Base::Maximum,
+                unit: Unit::Percent,
+            },
+            ..NxOptions::vacon()
+        }
+    }
+
+    /// Eaton HVX9000.
+    pub fn hvx() -> NxOptions {
+        NxOptions {
+            status: StatusBits::Hvx,
+            hvac_control: true,
+            ..NxOptions::svx()
+        }
+    }
+}
+
+impl Default for NxOptions {
+    fn default() -> Self {
+        NxOptions::vacon()
+    }
+}
+
+impl Limits {
+    /// Vacon NX: 30 and 1, process data 20 and 20.
+    pub const VACON: Limits = Limits {
+        read: 30,
+        write: 1,
+        process: 20,
+        beyond: Beyond::Value,
+    };
+    /// Eaton SVX and HVX: 1 and 1, process data 20 and 20.
+    pub const EATON: Limits = Limits {
+        read: 1,
+        ..Limits::VACON
+    };
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Limits::VACON
     }
 }

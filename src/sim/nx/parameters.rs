@@ -3,6 +3,9 @@
 //! The IDs are those of drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
 //! of the All in One applications.
 
+use super::super::motor::Ratings;
+use super::super::parameter_set::ParameterSet;
+pub use super::super::parameter_set::Refused;
 use super::ControlPlace;
 
 /// ID of the minimum frequency, 0.01 Hz.
@@ -36,27 +39,9 @@ pub const OUT_SELECTION: u16 = 852;
 /// Items of process data out 1 to 8 by default (drives.md 3.8): IDs 1 to 7, then the active fault.
 const OUT_DEFAULTS: [u16; 8] = [1, 2, 3, 4, 5, 6, 7, 37];
 
-/// One parameter.
-#[derive(Debug, Clone, Copy)]
-struct Parameter {
-    id: u16,
-    min: u16,
-    max: u16,
-    value: u16,
-}
-
-/// All parameters of one drive, in the order of their IDs. They survive a power cycle.
+/// All parameters of one drive by ID. They survive a power cycle.
 #[derive(Debug, Clone)]
-pub struct Parameters(Vec<Parameter>);
-
-/// Why a parameter cannot be written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Refused {
-    /// No parameter has that ID.
-    Unknown,
-    /// The value is outside the parameter's range.
-    Value,
-}
+pub struct Parameters(ParameterSet);
 
 impl Default for Parameters {
     fn default() -> Self {
@@ -89,20 +74,14 @@ impl Default for Parameters {
             .iter()
             .zip(OUT_SELECTION..)
             .map(|(&item, id)| (id, 0, 1999, item));
-        Parameters(
-            plain
-                .into_iter()
-                .chain(selectors)
-                .map(|(id, min, max, value)| Parameter { id, min, max, value })
-                .collect(),
-        )
+        Parameters(ParameterSet::new(plain.into_iter().chain(selectors)))
     }
 }
 
 impl Parameters {
     /// The value of a parameter.
     pub fn get(&self, id: u16) -> Option<u16> {
-        self.0.iter().find(|p| p.id == id).map(|p| p.value)
+        self.0.get(id)
     }
 
     /// Whether `value` may be written to the parameter `id`.
@@ -110,17 +89,13 @@ impl Parameters {
     /// # Errors
     /// Unknown ID, or a value outside the range; the minimum frequency may not exceed the maximum.
     pub fn check(&self, id: u16, value: u16) -> Result<(), Refused> {
-        let parameter = self.0.iter().find(|p| p.id == id).ok_or(Refused::Unknown)?;
+        self.0.check(id, value)?;
         let crossed = match id {
             MINIMUM_FREQUENCY => value > self.number(MAXIMUM_FREQUENCY),
             MAXIMUM_FREQUENCY => value < self.number(MINIMUM_FREQUENCY),
             _ => false,
         };
-        if crossed || !(parameter.min..=parameter.max).contains(&value) {
-            Err(Refused::Value)
-        } else {
-            Ok(())
-        }
+        if crossed { Err(Refused::Value) } else { Ok(()) }
     }
 
     /// Writes a parameter that [`Parameters::check`] allows.
@@ -129,15 +104,11 @@ impl Parameters {
     /// As [`Parameters::check`]; nothing is written then.
     pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
         self.check(id, value)?;
-        if let Some(parameter) = self.0.iter_mut().find(|p| p.id == id) {
-            parameter.value = value;
-        }
-        Ok(())
+        self.0.set(id, value)
     }
 
-    /// The value of a parameter that every drive has, 0 otherwise.
     fn number(&self, id: u16) -> u16 {
-        self.get(id).unwrap_or(0)
+        self.0.number(id)
     }
 
     /// The parameters that the drive works with, in engineering units.
@@ -145,14 +116,16 @@ impl Parameters {
         let number = |id| f64::from(self.number(id));
         Settings {
             minimum: number(MINIMUM_FREQUENCY) / 100.0,
-            maximum: number(MAXIMUM_FREQUENCY) / 100.0,
-            acceleration: number(ACCELERATION_TIME) / 10.0,
-            deceleration: number(DECELERATION_TIME) / 10.0,
-            voltage: number(NOMINAL_VOLTAGE),
-            frequency: number(NOMINAL_FREQUENCY) / 100.0,
-            speed: number(NOMINAL_SPEED),
-            current: number(NOMINAL_CURRENT) / 10.0,
-            cos_phi: number(COS_PHI) / 100.0,
+            motor: Ratings {
+                maximum: number(MAXIMUM_FREQUENCY) / 100.0,
+                acceleration: number(ACCELERATION_TIME) / 10.0,
+                deceleration: number(DECELERATION_TIME) / 10.0,
+                voltage: number(NOMINAL_VOLTAGE),
+                frequency: number(NOMINAL_FREQUENCY) / 100.0,
+                speed: number(NOMINAL_SPEED),
+                current: number(NOMINAL_CURRENT) / 10.0,
+                cos_phi: number(COS_PHI) / 100.0,
+            },
             place: ControlPlace::from_parameter(self.number(CONTROL_PLACE)),
             stop: if self.number(STOP_FUNCTION) == 0 {
                 StopFunction::Coast
@@ -178,22 +151,8 @@ pub enum StopFunction {
 pub struct Settings {
     /// Minimum frequency, Hz.
     pub minimum: f64,
-    /// Maximum frequency, Hz.
-    pub maximum: f64,
-    /// From 0 to the maximum frequency, s.
-    pub acceleration: f64,
-    /// From the maximum frequency to 0, s.
-    pub deceleration: f64,
-    /// Motor's nominal voltage, V.
-    pub voltage: f64,
-    /// Motor's nominal frequency, Hz.
-    pub frequency: f64,
-    /// Motor's nominal speed, rpm.
-    pub speed: f64,
-    /// Motor's nominal current, A.
-    pub current: f64,
-    /// Motor's cos phi.
-    pub cos_phi: f64,
+    /// The motor and its ramps.
+    pub motor: Ratings,
     /// Where the drive takes its commands from.
     pub place: ControlPlace,
     /// How it stops.
@@ -209,7 +168,6 @@ mod tests {
     #[test]
     fn ranges_and_order() {
         let mut p = Parameters::default();
-        assert!(p.0.windows(2).all(|w| w[0].id < w[1].id), "sorted, no ID twice");
         assert!(
             p.0.iter().all(|p| p.min <= p.value && p.value <= p.max),
             "defaults lie in their ranges"

@@ -1,7 +1,8 @@
-//! The registers of the simulated NX: groups, limits, refusals (drives.md 3.2, 3.3, 3.10).
+//! The registers of the simulated NX family: groups, limits, refusals (drives.md 3.2, 3.3, 3.10).
 
+use super::super::model::{Model, signed, unsigned};
 use super::parameters::{self, Parameters, Refused};
-use super::{ControlPlace, NxDrive, PROCESS_DATA, Values};
+use super::{Base, Beyond, ControlPlace, NxDrive, NxOptions, PROCESS_DATA, Unit, Values, control_word};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::sim::SimTime;
 
@@ -18,38 +19,6 @@ pub struct Limits {
     pub beyond: Beyond,
 }
 
-/// The answer to a count beyond the limit.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Beyond {
-    /// Exception 03, illegal data value.
-    Value,
-    /// Exception 02, illegal data address.
-    Address,
-}
-
-impl Limits {
-    /// Vacon NX: 30 and 1, process data 20 and 20.
-    pub const VACON: Limits = Limits {
-        read: 30,
-        write: 1,
-        process: 20,
-        beyond: Beyond::Value,
-    };
-    /// Eaton SVX and HVX: 1 and 1, process data 20 and 20.
-    pub const EATON: Limits = Limits {
-        read: 1,
-        write: 1,
-        process: 20,
-        beyond: Beyond::Value,
-    };
-}
-
-impl Default for Limits {
-    fn default() -> Self {
-        Limits::VACON
-    }
-}
-
 /// What a register without a meaning inside 2012..=2099 and 2112..=2199 does.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Hole {
@@ -59,17 +28,8 @@ pub enum Hole {
     Zero,
 }
 
-/// What a write to a read-only register does.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ReadOnly {
-    /// Exception 02.
-    Exception,
-    /// Acknowledged and forgotten.
-    Ignored,
-}
-
 /// ID of the simulator's own register that trips a fault.
-const TRIP: u16 = 1999;
+const TRIP: u16 = NxOptions::TRIP_ADDRESS + 1;
 
 /// The groups of drives.md 3.2; a request may not cross their borders.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -99,10 +59,7 @@ impl Group {
 }
 
 impl NxDrive {
-    /// The reply to a request to this drive that came whole at `now`.
-    pub fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Reply {
-        self.advance(now);
-        self.heard(now);
+    pub(super) fn reply(&mut self, request: &RequestPdu, now: SimTime) -> Reply {
         if now < self.busy_until {
             return Reply::Exception(Exception::BUSY);
         }
@@ -126,7 +83,7 @@ impl NxDrive {
         } else {
             self.options.limits.read
         };
-        self.check_count(count, limit)?;
+        self.options.limits.beyond.check(count, limit)?;
         (first..first.saturating_add(count))
             .map(|id| self.register(id, group))
             .collect()
@@ -136,18 +93,15 @@ impl NxDrive {
         let count = u16::try_from(values.len()).map_err(|_| Exception::VALUE)?;
         let (first, group) = self.group_of(start, count)?;
         match group {
-            Group::Actual | Group::FaultCode | Group::ProcessOut => match self.options.read_only {
-                ReadOnly::Exception => Err(Exception::ADDRESS),
-                ReadOnly::Ignored => Ok(()),
-            },
+            Group::Actual | Group::FaultCode | Group::ProcessOut => self.options.read_only.outcome(),
             Group::Parameter => {
-                self.check_count(count, self.options.limits.write)?;
+                self.options.limits.beyond.check(count, self.options.limits.write)?;
                 values
                     .first()
                     .map_or(Err(Exception::VALUE), |&value| self.write_parameter(first, value))
             }
             Group::ProcessIn => {
-                self.check_count(count, self.options.limits.process)?;
+                self.options.limits.beyond.check(count, self.options.limits.process)?;
                 self.write_process(first, values)
             }
         }
@@ -163,18 +117,10 @@ impl NxDrive {
         }
     }
 
-    fn check_count(&self, count: u16, limit: u16) -> Result<(), Exception> {
-        match self.options.limits.beyond {
-            _ if (1..=limit).contains(&count) => Ok(()),
-            Beyond::Value => Err(Exception::VALUE),
-            Beyond::Address => Err(Exception::ADDRESS),
-        }
-    }
-
     fn register(&self, id: u16, group: Group) -> Result<u16, Exception> {
         let value = match group {
             Group::Actual => self.actual_value(id),
-            Group::FaultCode => Some(self.fault),
+            Group::FaultCode => Some(self.latch.fault()),
             Group::Parameter if id == TRIP && self.options.trip_register => return Ok(0),
             Group::Parameter => return self.parameters.get(id).ok_or(Exception::ADDRESS),
             Group::ProcessIn => {
@@ -221,7 +167,7 @@ impl NxDrive {
             self.hole()?;
         }
         let reference = 2usize.checked_sub(at).and_then(|offset| values.get(offset));
-        if reference.is_some_and(|&r| (r as i16).unsigned_abs() > 10_000) {
+        if reference.is_some_and(|&word| !self.allows_reference(word)) {
             return Err(Exception::VALUE);
         }
         for (register, &value) in self.input.iter_mut().skip(at).zip(values) {
@@ -230,29 +176,58 @@ impl NxDrive {
         Ok(())
     }
 
+    fn allows_reference(&self, word: u16) -> bool {
+        let rule = self.options.reference;
+        let most = match rule.unit {
+            Unit::Percent => 10_000,
+            Unit::Hertz => unsigned(self.settings.motor.maximum * 100.0),
+        };
+        let size = if rule.signed {
+            (word as i16).unsigned_abs()
+        } else {
+            word
+        };
+        size <= most
+    }
+
     /// Actual values, IDs 1 to 98 (drives.md 11.1), as refreshed with the process data.
     fn actual_value(&self, id: u16) -> Option<u16> {
-        let (motor, settings) = (&self.motor, &self.settings);
-        let tenths_of_current = unsigned(motor.current(settings) * 10.0);
+        let (motor, settings, ratings) = (&self.motor, &self.settings, &self.settings.motor);
+        let tenths_of_current = unsigned(motor.current(ratings) * 10.0);
         Some(match id {
-            1 => signed(motor.output * 100.0),
-            2 => signed(motor.rpm(settings)),
+            1 => signed(motor.output / self.options.frequency_step),
+            2 => signed(motor.rpm(ratings)),
             3 | 45 => tenths_of_current,
             4 => signed(motor.torque * 10.0),
-            5 => signed(motor.power(settings) * 10.0),
-            6 => unsigned(motor.voltage(settings) * 10.0),
-            7 => unsigned(motor.dc_link(settings, &self.options.load)),
+            5 => signed(motor.power(ratings) * 10.0),
+            6 => unsigned(motor.voltage(ratings) * 10.0),
+            7 => unsigned(motor.dc_link(ratings, &self.options.load)),
             8 => signed(motor.heatsink),
             9 => signed(motor.heat),
             // Terminals with nothing connected, and the outputs of the demo's wiring.
             13 | 14 | 16 | 18 => 0,
             15 => u16::from(self.local.run && settings.place == ControlPlace::Terminals),
-            17 => u16::from(self.running) | (u16::from(self.fault != 0) << 1),
-            25 => signed(self.target(self.command()) * 100.0),
-            26 => unsigned(20.0 * 100.0 * (motor.output / settings.maximum).abs()),
-            37 => self.fault,
+            17 => self.outputs(),
+            25 => signed(self.target(self.held()) * 100.0),
+            26 => unsigned(20.0 * 100.0 * (motor.output / ratings.maximum).abs()),
+            37 => self.latch.fault(),
             _ => return None,
         })
+    }
+
+    /// DO1, RO1 and RO2: an HVX with its outputs programmed for "pass through", or running and fault.
+    fn outputs(&self) -> u16 {
+        let bits = [
+            control_word::DIGITAL_OUTPUT,
+            control_word::RELAY_1,
+            control_word::RELAY_2,
+        ];
+        if self.options.hvac_control {
+            let on = bits.iter().enumerate().filter(|(_, mask)| self.hvac(**mask));
+            on.fold(0, |word, (bit, _)| word | (1 << bit))
+        } else {
+            u16::from(self.running) | (u16::from(self.latch.fault() != 0) << 1)
+        }
     }
 
     /// An item that a selector of process data out may name: an actual value or a parameter.
@@ -260,15 +235,24 @@ impl NxDrive {
         self.actual_value(id).or_else(|| self.parameters.get(id)).unwrap_or(0)
     }
 
+    /// The output frequency in the scale of the speed reference, 0.01 %.
+    fn actual_speed(&self) -> f64 {
+        let (output, minimum, maximum) = (self.motor.output, self.settings.minimum, self.settings.motor.maximum);
+        let (share, whole) = match self.options.reference.base {
+            Base::Maximum => (output.abs(), maximum),
+            // Below the minimum frequency there is no reference to compare with.
+            Base::Band => ((output.abs() - minimum).max(0.0), maximum - minimum),
+        };
+        if whole > 0.0 {
+            (share / whole * 10_000.0).copysign(output)
+        } else {
+            0.0
+        }
+    }
+
     /// Refreshes the process data out.
     pub(super) fn refresh(&mut self) {
-        let band = self.settings.maximum - self.settings.minimum;
-        // Measured in the scale of the reference; below the minimum frequency there is no reference to compare with.
-        let above = (self.motor.output.abs() - self.settings.minimum)
-            .max(0.0)
-            .copysign(self.motor.output);
-        let speed = if band > 0.0 { above / band * 10_000.0 } else { 0.0 };
-        let head = [self.status(), self.settings.place.status_bit(), signed(speed)];
+        let head = [self.status(), self.general_status(), signed(self.actual_speed())];
         let items = (parameters::OUT_SELECTION..).take(PROCESS_DATA - head.len());
         let items: Vec<u16> = items
             .map(|selector| self.item(selected(&self.parameters, selector)))
@@ -281,12 +265,4 @@ impl NxDrive {
 
 fn selected(parameters: &Parameters, selector: u16) -> u16 {
     parameters.get(selector).unwrap_or(0)
-}
-
-fn signed(value: f64) -> u16 {
-    value.round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16 as u16
-}
-
-fn unsigned(value: f64) -> u16 {
-    value.round().clamp(0.0, f64::from(u16::MAX)) as u16
 }

@@ -1,16 +1,17 @@
 //! Behaviour of the simulated NX against drives.md, sections 3 and 10, in virtual time.
 
 use super::*;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Table};
+use std::time::Duration;
 
 /// A drive and its clock.
-struct Bench {
-    drive: NxDrive,
+pub(super) struct Bench {
+    pub(super) drive: NxDrive,
     now: SimTime,
 }
 
 impl Bench {
-    fn new(options: NxOptions) -> Bench {
+    pub(super) fn new(options: NxOptions) -> Bench {
         Bench {
             drive: NxDrive::new(options, SimTime::ZERO),
             now: SimTime::ZERO,
@@ -24,19 +25,19 @@ impl Bench {
         })
     }
 
-    fn wait(&mut self, milliseconds: u64) -> &mut Bench {
+    pub(super) fn wait(&mut self, milliseconds: u64) -> &mut Bench {
         self.now += Duration::from_millis(milliseconds);
         self.drive.advance(self.now);
         self
     }
 
-    fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
+    pub(super) fn read(&mut self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         let pdu = RequestPdu::Read {
             table: Table::Holding,
             start,
             count,
         };
-        let holding = self.drive.answer(&pdu, self.now);
+        let holding = self.drive.answer(&pdu, self.now).unwrap();
         let input = self.drive.answer(
             &RequestPdu::Read {
                 table: Table::Input,
@@ -45,6 +46,7 @@ impl Bench {
             },
             self.now,
         );
+        let input = input.unwrap();
         assert_eq!(
             holding, input,
             "every register answers to 03 and 04 alike (drives.md 3.1)"
@@ -56,11 +58,11 @@ impl Bench {
         }
     }
 
-    fn one(&mut self, start: u16) -> u16 {
+    pub(super) fn one(&mut self, start: u16) -> u16 {
         self.read(start, 1).unwrap()[0]
     }
 
-    fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
+    pub(super) fn write(&mut self, start: u16, values: &[u16]) -> Result<(), Exception> {
         let pdu = match values {
             [value] => RequestPdu::WriteRegister {
                 address: start,
@@ -71,7 +73,7 @@ impl Bench {
                 values: values.to_vec(),
             },
         };
-        match self.drive.answer(&pdu, self.now) {
+        match self.drive.answer(&pdu, self.now).unwrap() {
             Reply::Written => Ok(()),
             Reply::Exception(exception) => Err(exception),
             other => panic!("{other:?}"),
@@ -79,12 +81,12 @@ impl Bench {
     }
 
     /// Writes and waits until the drive has settled.
-    fn command(&mut self, word: u16, reference: i16) {
+    pub(super) fn command(&mut self, word: u16, reference: i16) {
         self.write(2000, &[word, 0, reference as u16]).unwrap();
         self.wait(8000);
     }
 
-    fn status(&mut self) -> u16 {
+    pub(super) fn status(&mut self) -> u16 {
         self.one(2100)
     }
 }
@@ -233,7 +235,7 @@ fn functions_of_other_devices_are_illegal() {
     ] {
         assert_eq!(
             bench.drive.answer(&pdu, bench.now),
-            Reply::Exception(Exception::FUNCTION)
+            Some(Reply::Exception(Exception::FUNCTION))
         );
     }
     bench.drive.set_busy(Duration::from_secs(1));

@@ -116,9 +116,8 @@ fn dead_drives_faults_and_direct_access() {
     assert!(ask(short).is_empty());
     assert_eq!(ask(LONG), REPLY);
     let fault = bus.with_drive(1, |drive, _| {
-        let nx = drive.as_nx().unwrap();
-        nx.trip(14);
-        nx.state().fault
+        drive.trip(14);
+        drive.state().fault
     });
     assert_eq!(fault, Some(14));
     assert_eq!(bus.with_drive(9, |_, _| ()), None);

@@ -1,6 +1,25 @@
-//! The motor behind the simulated drive: ramps, shaft, load, heat (drives.md, section 10).
+//! The motor behind every simulated drive: ramps, shaft, load, heat (drives.md, section 10).
 
-use super::parameters::Settings;
+/// The motor's plate and the drive's ramps, from the parameters of whichever drive it is.
+#[derive(Debug, Clone, Copy)]
+pub struct Ratings {
+    /// Maximum frequency, to which the ramp times belong, Hz.
+    pub maximum: f64,
+    /// From 0 to the maximum frequency, s.
+    pub acceleration: f64,
+    /// From the maximum frequency to 0, s.
+    pub deceleration: f64,
+    /// Nominal voltage, V.
+    pub voltage: f64,
+    /// Nominal frequency, Hz.
+    pub frequency: f64,
+    /// Nominal speed, rpm.
+    pub speed: f64,
+    /// Nominal current, A.
+    pub current: f64,
+    /// cos phi.
+    pub cos_phi: f64,
+}
 
 /// The load and the mains of one drive.
 ///
@@ -43,7 +62,7 @@ const DC_SAG: f64 = 6.0;
 
 /// What the inverter does with the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Drive {
+pub enum Feed {
     /// Nothing: the motor coasts or stands.
     Off,
     /// Turns it towards this frequency, Hz, negative for counterclockwise.
@@ -80,41 +99,46 @@ impl Motor {
         }
     }
 
+    /// Switches the inverter off at once; the shaft goes on turning.
+    pub fn release(&mut self) {
+        self.fed = false;
+        self.output = 0.0;
+    }
+
     /// One step of `dt` seconds.
-    pub fn step(&mut self, dt: f64, drive: Drive, settings: &Settings, load: &Load) {
+    pub fn step(&mut self, dt: f64, feed: Feed, ratings: &Ratings, load: &Load) {
         let before = self.shaft;
-        match drive {
-            Drive::Off => {
-                self.fed = false;
-                self.output = 0.0;
-                self.shaft = towards(self.shaft, 0.0, settings.frequency / COAST_TIME * dt);
+        match feed {
+            Feed::Off => {
+                self.release();
+                self.shaft = towards(self.shaft, 0.0, ratings.frequency / COAST_TIME * dt);
             }
-            Drive::To(target) => {
+            Feed::To(target) => {
                 if !self.fed {
                     // Started on a turning motor: the inverter picks it up at the speed it has.
                     self.fed = true;
                     self.output = self.shaft;
                 }
-                self.output = self.ramp(dt, target, settings);
+                self.output = self.ramp(dt, target, ratings);
                 self.shaft = self.output;
             }
         }
-        let acceleration = (self.shaft - before) / dt / settings.frequency;
+        let acceleration = (self.shaft - before) / dt / ratings.frequency;
         self.torque = if self.fed {
-            self.load_torque(settings, load) + load.inertia * acceleration
+            self.load_torque(ratings, load) + load.inertia * acceleration
         } else {
             0.0
         };
-        let warmth = (self.current(settings) / settings.current).powi(2);
+        let warmth = (self.current(ratings) / ratings.current).powi(2);
         let cool = if self.fed { HEATSINK.0 * warmth } else { 0.0 };
         self.heatsink += (load.ambient + cool - self.heatsink) * dt / HEATSINK.1;
         self.heat += (MOTOR_HEAT.0 * warmth - self.heat) * dt / MOTOR_HEAT.1;
     }
 
     /// The output one step on: down to zero first when the direction changes, then up.
-    fn ramp(&self, dt: f64, target: f64, settings: &Settings) -> f64 {
-        let up = settings.maximum / settings.acceleration.max(0.1) * dt;
-        let down = settings.maximum / settings.deceleration.max(0.1) * dt;
+    fn ramp(&self, dt: f64, target: f64, ratings: &Ratings) -> f64 {
+        let up = ratings.maximum / ratings.acceleration.max(0.1) * dt;
+        let down = ratings.maximum / ratings.deceleration.max(0.1) * dt;
         if self.output * target < 0.0 {
             towards(self.output, 0.0, down)
         } else if target.abs() < self.output.abs() {
@@ -124,8 +148,8 @@ impl Motor {
         }
     }
 
-    fn load_torque(&self, settings: &Settings, load: &Load) -> f64 {
-        let ratio = self.shaft / settings.frequency;
+    fn load_torque(&self, ratings: &Ratings, load: &Load) -> f64 {
+        let ratio = self.shaft / ratings.frequency;
         let magnitude = load.base_torque + (load.full_torque - load.base_torque) * ratio * ratio;
         if self.shaft == 0.0 {
             0.0
@@ -135,10 +159,10 @@ impl Motor {
     }
 
     /// Shaft speed, rpm: the synchronous speed less the slip that the torque costs.
-    pub fn rpm(&self, settings: &Settings) -> f64 {
-        let pole_pairs = (60.0 * settings.frequency / settings.speed.max(1.0)).floor().max(1.0);
+    pub fn rpm(&self, ratings: &Ratings) -> f64 {
+        let pole_pairs = (60.0 * ratings.frequency / ratings.speed.max(1.0)).floor().max(1.0);
         let synchronous = 60.0 / pole_pairs;
-        let slip = (synchronous * settings.frequency - settings.speed).max(0.0) * self.torque / 100.0;
+        let slip = (synchronous * ratings.frequency - ratings.speed).max(0.0) * self.torque / 100.0;
         if self.shaft == 0.0 {
             0.0
         } else {
@@ -147,28 +171,28 @@ impl Motor {
     }
 
     /// Motor current, A: magnetising and torque component at a right angle.
-    pub fn current(&self, settings: &Settings) -> f64 {
+    pub fn current(&self, ratings: &Ratings) -> f64 {
         if !self.fed {
             return 0.0;
         }
-        let magnetising = settings.current * (1.0 - settings.cos_phi * settings.cos_phi).max(0.0).sqrt();
-        let active = settings.current * settings.cos_phi * self.torque / 100.0;
+        let magnetising = ratings.current * (1.0 - ratings.cos_phi * ratings.cos_phi).max(0.0).sqrt();
+        let active = ratings.current * ratings.cos_phi * self.torque / 100.0;
         magnetising.hypot(active)
     }
 
     /// Shaft power, % of nominal; negative while the motor brakes.
-    pub fn power(&self, settings: &Settings) -> f64 {
-        self.torque * self.shaft / settings.frequency
+    pub fn power(&self, ratings: &Ratings) -> f64 {
+        self.torque * self.shaft / ratings.frequency
     }
 
     /// Motor voltage, V: proportional to the frequency up to the nominal one.
-    pub fn voltage(&self, settings: &Settings) -> f64 {
-        settings.voltage * (self.output / settings.frequency).abs().min(1.0)
+    pub fn voltage(&self, ratings: &Ratings) -> f64 {
+        ratings.voltage * (self.output / ratings.frequency).abs().min(1.0)
     }
 
     /// DC link voltage, V.
-    pub fn dc_link(&self, settings: &Settings, load: &Load) -> f64 {
-        1.35 * load.mains - DC_SAG * self.power(settings) / 100.0
+    pub fn dc_link(&self, ratings: &Ratings, load: &Load) -> f64 {
+        1.35 * load.mains - DC_SAG * self.power(ratings) / 100.0
     }
 }
 
@@ -182,47 +206,56 @@ fn towards(from: f64, to: f64, step: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
-    use super::super::parameters::Parameters;
     use super::*;
+
+    const RATINGS: Ratings = Ratings {
+        maximum: 50.0,
+        acceleration: 3.0,
+        deceleration: 3.0,
+        voltage: 400.0,
+        frequency: 50.0,
+        speed: 1500.0,
+        current: 2.2,
+        cos_phi: 0.85,
+    };
 
     #[test]
     fn ramps_by_the_times_of_the_parameters() {
-        let (settings, load) = (Parameters::default().settings(), Load::default());
+        let load = Load::default();
         let mut motor = Motor::new(&load);
-        let steps = |motor: &mut Motor, drive, n| (0..n).for_each(|_| motor.step(0.01, drive, &settings, &load));
-        steps(&mut motor, Drive::To(50.0), 150);
+        let steps = |motor: &mut Motor, feed, n| (0..n).for_each(|_| motor.step(0.01, feed, &RATINGS, &load));
+        steps(&mut motor, Feed::To(50.0), 150);
         assert!(
             (motor.output - 25.0).abs() < 1e-6,
             "half of 50 Hz after half of 3 s: {}",
             motor.output
         );
         assert!(motor.torque > 10.5, "accelerating takes more than the load alone");
-        steps(&mut motor, Drive::To(25.0), 1);
-        assert!((motor.current(&settings) - 1.18).abs() < 0.02);
-        steps(&mut motor, Drive::To(-25.0), 150);
+        steps(&mut motor, Feed::To(25.0), 1);
+        assert!((motor.current(&RATINGS) - 1.18).abs() < 0.02);
+        steps(&mut motor, Feed::To(-25.0), 150);
         assert_eq!(motor.output, 0.0, "through zero on the way to the other direction");
-        steps(&mut motor, Drive::To(-25.0), 151);
+        steps(&mut motor, Feed::To(-25.0), 151);
         assert_eq!(motor.output, -25.0);
-        assert!(motor.rpm(&settings) == -750.0 && motor.power(&settings) > 0.0);
-        steps(&mut motor, Drive::Off, 100);
+        assert!(motor.rpm(&RATINGS) == -750.0 && motor.power(&RATINGS) > 0.0);
+        steps(&mut motor, Feed::Off, 100);
         assert!(motor.output == 0.0 && motor.shaft < -15.0, "coasting");
-        steps(&mut motor, Drive::To(-25.0), 1);
+        steps(&mut motor, Feed::To(-25.0), 1);
         assert!(motor.output < -15.0, "picked up at its speed");
     }
 
     #[test]
     fn slip_of_an_asynchronous_motor() {
-        let mut parameters = Parameters::default();
-        parameters.set(super::super::parameters::NOMINAL_SPEED, 1440).unwrap();
-        let (settings, load) = (
-            parameters.settings(),
-            Load {
-                full_torque: 100.0,
-                ..Load::default()
-            },
-        );
+        let ratings = Ratings {
+            speed: 1440.0,
+            ..RATINGS
+        };
+        let load = Load {
+            full_torque: 100.0,
+            ..Load::default()
+        };
         let mut motor = Motor::new(&load);
-        (0..400).for_each(|_| motor.step(0.01, Drive::To(50.0), &settings, &load));
-        assert!((motor.rpm(&settings) - 1440.0).abs() < 1e-6);
+        (0..400).for_each(|_| motor.step(0.01, Feed::To(50.0), &ratings, &load));
+        assert!((motor.rpm(&ratings) - 1440.0).abs() < 1e-6);
     }
 }

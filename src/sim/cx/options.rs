@@ -1,0 +1,93 @@
+//! How a simulated CX is made.
+
+use super::super::model::Beyond;
+use super::super::motor::Load;
+
+/// Items per message; the manual states no limits and shows one item everywhere (drives.md 9.7).
+#[derive(Debug, Clone, Copy)]
+pub struct Limits {
+    /// Coils or discrete inputs.
+    pub bits: u16,
+    /// Registers.
+    pub registers: u16,
+    /// The answer to more.
+    pub beyond: Beyond,
+}
+
+impl Default for Limits {
+    fn default() -> Self {
+        Limits {
+            bits: 8,
+            registers: 20,
+            beyond: Beyond::Value,
+        }
+    }
+}
+
+/// What is added to the addresses of the manual's tables. Its start-up test uses some that are one higher, so some
+/// boards may have an offset of 1 (drives.md 9.6).
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct AddressOffset {
+    /// Coils.
+    pub coil: u16,
+    /// Discrete inputs.
+    pub discrete_input: u16,
+    /// Input registers.
+    pub input: u16,
+    /// Holding registers.
+    pub holding: u16,
+}
+
+/// What a frequency reference outside Par 1.1 to Par 1.2 does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum OutOfRange {
+    /// Exception 03.
+    Exception,
+    /// The nearest allowed value is taken.
+    Clamp,
+}
+
+/// How a simulated CX is made.
+#[derive(Debug, Clone)]
+pub struct CxOptions {
+    /// Load and mains.
+    pub load: Load,
+    /// Items per message.
+    pub limits: Limits,
+    /// What is added to the addresses.
+    pub offset: AddressOffset,
+    /// What a frequency reference outside Par 1.1 to Par 1.2 does.
+    pub reference_out_of_range: OutOfRange,
+    /// Hz that one count of Par 1.1, 1.2 and 1.9 is. The manual's example reads 50 for Par 1.2.
+    pub frequency_step: f64,
+    /// Days or hours that one count of the operating times n9 and n10 is.
+    pub time_step: f64,
+    /// Whether the fieldbus is the active control source at first.
+    pub fieldbus: bool,
+    /// Parameters to start with: (group, number) and value; those that a drive does not have or not allow are passed
+    /// over.
+    pub parameters: Vec<((u16, u16), u16)>,
+    /// Makes PDU 9999 a holding register of the simulator: writing a number trips that fault. No real drive has it.
+    pub trip_register: bool,
+}
+
+impl CxOptions {
+    /// PDU address of the simulator's own trip register: the last address of group 0, which has no parameter.
+    pub const TRIP_ADDRESS: u16 = 9999;
+}
+
+impl Default for CxOptions {
+    fn default() -> Self {
+        CxOptions {
+            load: Load::default(),
+            limits: Limits::default(),
+            offset: AddressOffset::default(),
+            reference_out_of_range: OutOfRange::Exception,
+            frequency_step: 1.0,
+            time_step: 0.01,
+            fieldbus: true,
+            parameters: Vec::new(),
+            trip_register: false,
+        }
+    }
+}

@@ -1,0 +1,262 @@
+//! What line, board, autopilot and tests need of a simulated drive, whatever its model.
+
+use super::SimTime;
+use crate::codec::{Exception, Reply, RequestPdu};
+use std::fmt;
+use std::time::Duration;
+
+/// A drive lives in steps of that length: the update period of the Vacon boards (drives.md 3.3).
+pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
+
+/// A drive that nobody looked at for longer skips the rest of the time instead of living through it.
+const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
+
+/// Output and reference closer than this count as reached, Hz: below what a register can show.
+pub const AT_REFERENCE_BAND: f64 = 0.005;
+
+/// Run, direction and speed from whoever commands a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Command {
+    /// Run.
+    pub run: bool,
+    /// Counterclockwise.
+    pub reverse: bool,
+    /// Speed reference, 0.01 % of what the drive calls 100 %, -10000..=10000.
+    pub reference: i16,
+}
+
+/// What any drive looks like from outside.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct DriveState {
+    /// It would run if it were told to.
+    pub ready: bool,
+    /// The inverter feeds the motor.
+    pub running: bool,
+    /// The motor turns counterclockwise, or is about to.
+    pub reverse: bool,
+    /// Active fault as the drive's registers show it, 0 for none.
+    pub fault: u16,
+    /// Output frequency, Hz, negative for counterclockwise.
+    pub output: f64,
+    /// It obeys the bus.
+    pub remote: bool,
+}
+
+/// A simulated drive with its Modbus board.
+///
+/// Pure: the time is an argument and never runs backwards. No method panics, whatever it is given.
+pub trait Model: fmt::Debug {
+    /// Lives on until `now`, in steps of [`UPDATE_PERIOD`].
+    fn advance(&mut self, now: SimTime);
+
+    /// The reply to a request to this drive that came whole at `now`; `None` for silence.
+    fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply>;
+
+    /// A request in a sound frame to this drive whose PDU is none that the protocol knows, and the exception that a
+    /// plain slave answers; `None` for silence.
+    fn malformed(&mut self, _pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
+        self.heard(now);
+        Some(exception)
+    }
+
+    /// A request to all drives.
+    fn broadcast(&mut self, request: &RequestPdu, now: SimTime);
+
+    /// A valid message to this drive or to all was on the bus.
+    fn heard(&mut self, _now: SimTime) {}
+
+    /// A sound frame was on the line, whomever it is for. Called before the frame is acted upon.
+    fn bus_message(&mut self) {}
+
+    /// A frame with a wrong check code was on the line.
+    fn bus_error(&mut self) {}
+
+    /// Whether the drive has supply; without it, it answers nothing.
+    fn powered(&self) -> bool;
+
+    /// Switches the supply off: the drive answers nothing and the motor coasts unseen.
+    fn power_off(&mut self);
+
+    /// Switches the supply on again: commands are 0, faults are gone, parameters are as they were kept.
+    fn power_on(&mut self, now: SimTime);
+
+    /// Trips the drive with a fault as its registers show it; 0 does nothing, and so does a second fault.
+    fn trip(&mut self, fault: u16);
+
+    /// Faults that happen now and then, for the autopilot.
+    fn usual_faults(&self) -> &'static [u16];
+
+    /// Commands the drive as another master on the bus would.
+    fn command(&mut self, command: Command);
+
+    /// Pulls the fault reset bit of the bus up or down.
+    fn set_reset(&mut self, on: bool);
+
+    /// Gives the drive to the bus, or to panel or terminals.
+    fn set_remote(&mut self, on: bool);
+
+    /// What it looks like from outside.
+    fn state(&self) -> DriveState;
+}
+
+/// The answer to a count beyond the limit of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Beyond {
+    /// Exception 03, illegal data value.
+    Value,
+    /// Exception 02, illegal data address.
+    Address,
+}
+
+impl Beyond {
+    /// Whether a message may hold so many items.
+    ///
+    /// # Errors
+    /// The exception for none and for too many.
+    pub fn check(self, count: u16, limit: u16) -> Result<(), Exception> {
+        match self {
+            _ if (1..=limit).contains(&count) => Ok(()),
+            Beyond::Value => Err(Exception::VALUE),
+            Beyond::Address => Err(Exception::ADDRESS),
+        }
+    }
+}
+
+/// What a write to a read-only register does.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ReadOnly {
+    /// Exception 02.
+    Exception,
+    /// Acknowledged and forgotten.
+    Ignored,
+}
+
+impl ReadOnly {
+    /// The outcome of such a write.
+    ///
+    /// # Errors
+    /// Exception 02 unless it is ignored.
+    pub fn outcome(self) -> Result<(), Exception> {
+        match self {
+            ReadOnly::Exception => Err(Exception::ADDRESS),
+            ReadOnly::Ignored => Ok(()),
+        }
+    }
+}
+
+/// The steps that a drive has still to live through.
+#[derive(Debug, Clone)]
+pub(super) struct Steps {
+    next: SimTime,
+}
+
+impl Steps {
+    pub(super) fn new(now: SimTime) -> Steps {
+        Steps {
+            next: now + UPDATE_PERIOD,
+        }
+    }
+
+    /// The next step that is due by `now`.
+    pub(super) fn due(&mut self, now: SimTime) -> Option<SimTime> {
+        if now.saturating_sub(self.next) > LONGEST_CATCH_UP {
+            self.next = now - LONGEST_CATCH_UP;
+        }
+        (self.next <= now).then(|| {
+            let at = self.next;
+            self.next += UPDATE_PERIOD;
+            at
+        })
+    }
+}
+
+/// The fault of a drive and what it takes to run again: the run command has to be seen off without a fault before it
+/// is obeyed (drives.md 9.24).
+#[derive(Debug, Clone)]
+pub(super) struct Latch {
+    fault: u16,
+    armed: bool,
+}
+
+impl Latch {
+    pub(super) fn new() -> Latch {
+        Latch { fault: 0, armed: true }
+    }
+
+    /// The active fault, 0 for none.
+    pub(super) fn fault(&self) -> u16 {
+        self.fault
+    }
+
+    /// The first fault stays; false when there is one already or `code` is none.
+    pub(super) fn trip(&mut self, code: u16) -> bool {
+        let fresh = self.fault == 0 && code != 0;
+        if fresh {
+            self.fault = code;
+            self.armed = false;
+        }
+        fresh
+    }
+
+    pub(super) fn reset(&mut self) {
+        self.fault = 0;
+    }
+
+    /// A run command that is there now is not obeyed any more.
+    pub(super) fn disarm(&mut self) {
+        self.armed = false;
+    }
+
+    /// Whether the run command, as it is now, is obeyed.
+    pub(super) fn obeys(&mut self, run: bool) -> bool {
+        if !run && self.fault == 0 {
+            self.armed = true;
+        }
+        run && self.armed && self.fault == 0
+    }
+}
+
+/// A figure as a signed register shows it.
+pub(super) fn signed(value: f64) -> u16 {
+    value.round().clamp(f64::from(i16::MIN), f64::from(i16::MAX)) as i16 as u16
+}
+
+/// A figure as an unsigned register shows it.
+pub(super) fn unsigned(value: f64) -> u16 {
+    value.round().clamp(0.0, f64::from(u16::MAX)) as u16
+}
+
+/// `mask` when `on`.
+pub(super) fn bit(on: bool, mask: u16) -> u16 {
+    if on { mask } else { 0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_latch_wants_a_new_run_command_after_a_fault() {
+        let mut latch = Latch::new();
+        assert!(latch.obeys(true));
+        assert!(latch.trip(7) && !latch.trip(8) && !latch.trip(0));
+        assert!(!latch.obeys(true));
+        assert!(!latch.obeys(false), "seen off, but with the fault");
+        latch.reset();
+        assert!(!latch.obeys(true));
+        assert!(!latch.obeys(false) && latch.obeys(true));
+        latch.disarm();
+        assert!(!latch.obeys(true));
+    }
+
+    #[test]
+    fn steps_catch_up_within_bounds() {
+        let mut steps = Steps::new(SimTime::ZERO);
+        assert_eq!(steps.due(Duration::from_millis(9)), None);
+        assert_eq!(steps.due(Duration::from_millis(25)), Some(Duration::from_millis(10)));
+        assert_eq!(steps.due(Duration::from_millis(25)), Some(Duration::from_millis(20)));
+        assert_eq!(steps.due(Duration::from_millis(25)), None);
+        let year = Duration::from_secs(365 * 86_400);
+        assert_eq!(steps.due(year), Some(year - LONGEST_CATCH_UP));
+    }
+}

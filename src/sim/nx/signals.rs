@@ -1,0 +1,141 @@
+//! Status word and general status word of the family: which drive shows which signal in which bit.
+
+use super::{AT_REFERENCE_BAND, ControlPlace, NxDrive};
+
+/// What a status bit can tell.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Signal {
+    Ready,
+    Running,
+    Reverse,
+    Fault,
+    Warning,
+    AtReference,
+    ZeroSpeed,
+    FluxReady,
+    /// Torque control's speed limit is not active: always so here.
+    NoSpeedLimit,
+    EncoderReverse,
+    /// Undervoltage fast stop is not active: always so here.
+    NoUndervoltageStop,
+    Bypass,
+    FireMode,
+    Interlocked,
+    NotInterlocked,
+    Place(ControlPlace),
+    /// Hand-off-auto switch: auto.
+    Auto,
+    /// Hand-off-auto switch: not off.
+    HoaOn,
+}
+
+/// Which status bits a drive shows.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StatusBits {
+    /// All bits of the Vacon NX: 0x0541 when idle and healthy (drives.md 3.6, 3.7).
+    Full,
+    /// Of the status word only those bits that all drives of the family share, as the worked frames of drives.md print
+    /// them.
+    Common,
+    /// Eaton SVX: the shared bits, and nothing in the general status word; 0x0001 when idle and healthy.
+    Svx,
+    /// Eaton HVX: bypass, fire mode and "not interlocked" too, and the bits of the general status word that its N2 map
+    /// names (drives.md 3.7, 9.16); 0x0101 when idle and healthy.
+    Hvx,
+}
+
+/// Signals by bit.
+type Layout = &'static [(u8, Signal)];
+
+const COMMON: Layout = &[
+    (0, Signal::Ready),
+    (1, Signal::Running),
+    (2, Signal::Reverse),
+    (3, Signal::Fault),
+    (4, Signal::Warning),
+    (5, Signal::AtReference),
+];
+
+const VACON: Layout = &[
+    (6, Signal::ZeroSpeed),
+    (7, Signal::FluxReady),
+    (8, Signal::NoSpeedLimit),
+    (9, Signal::EncoderReverse),
+    (10, Signal::NoUndervoltageStop),
+];
+
+const HVX: Layout = &[(6, Signal::Bypass), (7, Signal::FireMode), (8, Signal::NotInterlocked)];
+
+const VACON_GENERAL: Layout = &[
+    (13, Signal::Place(ControlPlace::Fieldbus)),
+    (14, Signal::Place(ControlPlace::Panel)),
+    (15, Signal::Place(ControlPlace::Terminals)),
+];
+
+const HVX_GENERAL: Layout = &[
+    (0, Signal::Interlocked),
+    (1, Signal::Bypass),
+    (2, Signal::FireMode),
+    (3, Signal::Auto),
+    (4, Signal::HoaOn),
+];
+
+impl StatusBits {
+    /// Bits of the status word beyond the shared ones, and bits of the general status word.
+    fn layouts(self) -> (Layout, Layout) {
+        match self {
+            StatusBits::Full => (VACON, VACON_GENERAL),
+            StatusBits::Common => (&[], VACON_GENERAL),
+            StatusBits::Svx => (&[], &[]),
+            StatusBits::Hvx => (HVX, HVX_GENERAL),
+        }
+    }
+}
+
+impl NxDrive {
+    /// ID 2101.
+    pub(super) fn status(&self) -> u16 {
+        self.word(COMMON) | self.word(self.options.status.layouts().0)
+    }
+
+    /// ID 2102.
+    pub(super) fn general_status(&self) -> u16 {
+        self.word(self.options.status.layouts().1)
+    }
+
+    fn word(&self, layout: Layout) -> u16 {
+        layout
+            .iter()
+            .filter(|(_, signal)| self.shows(*signal))
+            .fold(0, |word, (bit, _)| word | (1 << bit))
+    }
+
+    fn shows(&self, signal: Signal) -> bool {
+        let (motor, fault) = (&self.motor, self.latch.fault());
+        match signal {
+            Signal::Ready => fault == 0 && !self.interlock,
+            Signal::Running => motor.fed && fault == 0,
+            Signal::Reverse => self.turns_reverse(),
+            Signal::Fault => fault != 0,
+            Signal::Warning => self.warning || (self.lost_master && self.settings.fieldbus_fault == 1),
+            Signal::AtReference => self.running && (motor.output - self.target(self.held())).abs() < AT_REFERENCE_BAND,
+            Signal::ZeroSpeed => motor.shaft == 0.0,
+            Signal::FluxReady => motor.fed,
+            Signal::NoSpeedLimit | Signal::NoUndervoltageStop => true,
+            Signal::EncoderReverse => motor.shaft < 0.0,
+            Signal::Bypass => self.bypassed(),
+            Signal::FireMode => self.fire_mode(),
+            Signal::Interlocked => self.interlock,
+            Signal::NotInterlocked => !self.interlock,
+            Signal::Place(place) => self.settings.place == place,
+            Signal::Auto => self.settings.place == ControlPlace::Fieldbus,
+            Signal::HoaOn => !self.switched_off,
+        }
+    }
+
+    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
+    pub(super) fn turns_reverse(&self) -> bool {
+        let shaft = self.motor.shaft;
+        shaft < 0.0 || (shaft == 0.0 && self.running && self.target(self.held()) < 0.0)
+    }
+}

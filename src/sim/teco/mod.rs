@@ -1,0 +1,352 @@
+//! A TECO 7300PA drive with its PA-C card, as drives.md sections 5 and 10 describe it.
+//!
+//! Pure: the time is an argument. Cn-31 supervises the link between the drive and its card only, which never fails here,
+//! so a lost bus master changes nothing: the motor goes on as it was last told.
+
+mod options;
+mod parameters;
+mod registers;
+mod signals;
+#[cfg(test)]
+mod tests;
+
+pub use options::{DetectionLevels, Digits, Mode, TecoOptions};
+
+use self::parameters::{Parameters, function};
+use super::SimTime;
+use super::model::{Command, DriveState, Latch, Model, Steps, UPDATE_PERIOD, unsigned};
+use super::motor::{Feed, Motor, Ratings};
+use crate::codec::{Exception, Reply, RequestPdu};
+
+/// Bits of the operation signals, register 0001H (drives.md 5.3).
+pub mod operation {
+    /// Run.
+    pub const RUN: u16 = 1 << 0;
+    /// Reverse.
+    pub const REVERSE: u16 = 1 << 1;
+    /// External fault.
+    pub const EXTERNAL_FAULT: u16 = 1 << 2;
+    /// Fault reset.
+    pub const RESET: u16 = 1 << 3;
+    /// Multifunction reference 1; 2 to 4 follow.
+    pub const MULTIFUNCTION_1: u16 = 1 << 4;
+}
+
+/// Bits of the fault contents, register 0021H (drives.md 5.4).
+pub mod fault {
+    /// Overcurrent or ground fault.
+    pub const OVERCURRENT: u16 = 1 << 0;
+    /// Overvoltage.
+    pub const OVERVOLTAGE: u16 = 1 << 1;
+    /// Inverter overload.
+    pub const INVERTER_OVERLOAD: u16 = 1 << 2;
+    /// Inverter overheat.
+    pub const OVERHEAT: u16 = 1 << 3;
+    /// External fault.
+    pub const EXTERNAL: u16 = 1 << 7;
+    /// Control circuit.
+    pub const CONTROL_CIRCUIT: u16 = 1 << 8;
+    /// Motor overload.
+    pub const MOTOR_OVERLOAD: u16 = 1 << 9;
+    /// Undervoltage or power loss.
+    pub const POWER: u16 = 1 << 12;
+    /// All bits with a meaning.
+    pub const ALL: u16 =
+        OVERCURRENT | OVERVOLTAGE | INVERTER_OVERLOAD | OVERHEAT | EXTERNAL | CONTROL_CIRCUIT | MOTOR_OVERLOAD | POWER;
+}
+
+/// Drive terminals, bit 0 terminal 1.
+mod terminal {
+    pub(super) const FORWARD: u16 = 1 << 0;
+    pub(super) const REVERSE: u16 = 1 << 1;
+    pub(super) const EXTERNAL_FAULT: u16 = 1 << 2;
+    /// Terminal 5, multifunction reference 1; 6 to 8 follow.
+    pub(super) const MULTIFUNCTION_1: u16 = 1 << 4;
+}
+
+/// Control registers with a meaning.
+#[derive(Debug, Clone, Copy, Default)]
+struct Control {
+    /// 0001H.
+    operation: u16,
+    /// 0002H, 0.01 Hz.
+    frequency: u16,
+    /// 0009H.
+    outputs: u16,
+    /// 000AH and 000BH.
+    analogue: [u16; 2],
+}
+
+/// A simulated TECO 7300PA.
+#[derive(Debug, Clone)]
+pub struct TecoDrive {
+    options: TecoOptions,
+    parameters: Parameters,
+    ratings: Ratings,
+    motor: Motor,
+    mode: Mode,
+    control: Control,
+    /// Terminals 1 to 8.
+    terminals: u16,
+    latch: Latch,
+    running: bool,
+    /// Frequency detection 1 and 2, with their hysteresis.
+    detected: [bool; 2],
+    /// Time above the level of overtorque detection, s.
+    overtorque: f64,
+    powered: bool,
+    steps: Steps,
+}
+
+impl TecoDrive {
+    /// A drive that is switched on at `now`, with the motor at rest.
+    pub fn new(options: TecoOptions, now: SimTime) -> TecoDrive {
+        let parameters = Parameters::new(options.digits, &options.parameters);
+        TecoDrive {
+            ratings: parameters.ratings(),
+            motor: Motor::new(&options.load),
+            mode: options.mode,
+            control: Control::default(),
+            terminals: 0,
+            latch: Latch::new(),
+            running: false,
+            detected: [false; 2],
+            overtorque: 0.0,
+            powered: true,
+            steps: Steps::new(now),
+            parameters,
+            options,
+        }
+    }
+
+    /// Switches the operator between PRGM and DRIVE. A running motor is brought down; it needs a new run command then.
+    pub fn set_mode(&mut self, mode: Mode) {
+        self.mode = mode;
+        self.latch.disarm();
+        self.take_over();
+    }
+
+    /// The operator's mode.
+    pub fn mode(&self) -> Mode {
+        self.mode
+    }
+
+    /// Closes and opens terminals 1 to 8, bit 0 terminal 1.
+    pub fn set_terminals(&mut self, closed: u8) {
+        self.terminals = u16::from(closed);
+        self.take_over();
+    }
+
+    /// A digit of Sn-08, counted from the last.
+    fn operation_digit(&self, from_last: usize) -> bool {
+        self.options
+            .digits
+            .is_set(self.parameters.number(parameters::SN_08), from_last)
+    }
+
+    /// Sn-08 `---0`.
+    fn frequency_from_bus(&self) -> bool {
+        !self.operation_digit(0)
+    }
+
+    /// Sn-08 `--0-`.
+    fn run_from_bus(&self) -> bool {
+        !self.operation_digit(1)
+    }
+
+    /// Run and reverse, from the bus or from the terminals.
+    fn run_command(&self) -> (bool, bool) {
+        if self.run_from_bus() {
+            let word = self.control.operation;
+            (word & operation::RUN != 0, word & operation::REVERSE != 0)
+        } else {
+            let (forward, reverse) = (
+                self.terminals & terminal::FORWARD != 0,
+                self.terminals & terminal::REVERSE != 0,
+            );
+            (forward != reverse, reverse)
+        }
+    }
+
+    /// Whether a multifunction reference or its terminal calls a function.
+    fn calls(&self, wanted: u16) -> bool {
+        (0..4u16).any(|index| {
+            let on = self.control.operation & (operation::MULTIFUNCTION_1 << index) != 0
+                || self.terminals & (terminal::MULTIFUNCTION_1 << index) != 0;
+            on && self.parameters.number(parameters::SN_15 + index) == wanted
+        })
+    }
+
+    fn baseblocked(&self) -> bool {
+        self.calls(function::BASEBLOCK)
+    }
+
+    /// The frequency that holds now, Hz: jog, a multi-step frequency, or the main one, within Cn-15 and Cn-14.
+    fn frequency(&self) -> f64 {
+        let step = u16::from(self.calls(function::STEP_1)) + 2 * u16::from(self.calls(function::STEP_2));
+        let hundredths = if self.calls(function::JOG) {
+            self.parameters.number(parameters::AN_09)
+        } else if step == 0 && self.frequency_from_bus() {
+            self.control.frequency
+        } else {
+            self.parameters.number(parameters::AN_01 + step)
+        };
+        let bound = |register| self.ratings.maximum * f64::from(self.parameters.number(register)) / 100.0;
+        (f64::from(hundredths) / 100.0)
+            .max(bound(parameters::CN_14 + 1))
+            .min(bound(parameters::CN_14))
+    }
+
+    fn target(&self) -> f64 {
+        if self.run_command().1 {
+            -self.frequency()
+        } else {
+            self.frequency()
+        }
+    }
+
+    /// What takes effect at once when a command or a terminal changes: an external fault, and a run command that is seen
+    /// off.
+    fn take_over(&mut self) {
+        if self.control.operation & operation::EXTERNAL_FAULT != 0 || self.terminals & terminal::EXTERNAL_FAULT != 0 {
+            self.trip(fault::EXTERNAL);
+        }
+        let (run, _) = self.run_command();
+        self.running = match self.mode {
+            Mode::Drive => self.latch.obeys(run),
+            Mode::Program => {
+                self.latch.disarm();
+                false
+            }
+        };
+    }
+
+    fn set_operation(&mut self, word: u16) {
+        let risen = word & !self.control.operation;
+        self.control.operation = word;
+        if risen & operation::RESET != 0 {
+            self.latch.reset();
+        }
+        self.take_over();
+    }
+
+    fn step(&mut self) {
+        self.take_over();
+        let feed = if self.latch.fault() != 0 || self.baseblocked() {
+            Feed::Off
+        } else if self.running {
+            Feed::To(self.target())
+        } else if self.motor.fed && self.motor.output != 0.0 {
+            Feed::To(0.0)
+        } else {
+            Feed::Off
+        };
+        let seconds = UPDATE_PERIOD.as_secs_f64();
+        self.motor.step(seconds, feed, &self.ratings, &self.options.load);
+        self.detect(seconds);
+    }
+
+    fn shows_running(&self) -> bool {
+        self.motor.fed && self.latch.fault() == 0
+    }
+
+    fn ready(&self) -> bool {
+        self.mode == Mode::Drive && self.latch.fault() == 0 && !self.baseblocked()
+    }
+
+    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
+    fn turns_reverse(&self) -> bool {
+        let shaft = self.motor.shaft;
+        shaft < 0.0 || (shaft == 0.0 && self.running && self.target() < 0.0)
+    }
+}
+
+impl Model for TecoDrive {
+    fn advance(&mut self, now: SimTime) {
+        while self.steps.due(now).is_some() {
+            if self.powered {
+                self.step();
+            }
+        }
+    }
+
+    fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
+        self.advance(now);
+        Some(self.reply(request).unwrap_or_else(Reply::Exception))
+    }
+
+    fn malformed(&mut self, pdu: &[u8], exception: Exception, _now: SimTime) -> Option<Exception> {
+        registers::refusal(pdu, exception)
+    }
+
+    fn broadcast(&mut self, request: &RequestPdu, now: SimTime) {
+        self.advance(now);
+        if registers::allows_broadcast(request) {
+            let _refused_in_silence = self.reply(request);
+        }
+    }
+
+    fn powered(&self) -> bool {
+        self.powered
+    }
+
+    fn power_off(&mut self) {
+        self.powered = false;
+    }
+
+    fn power_on(&mut self, now: SimTime) {
+        let fresh = TecoDrive::new(self.options.clone(), now);
+        let mut parameters = self.parameters.clone();
+        parameters.reload();
+        *self = TecoDrive {
+            ratings: parameters.ratings(),
+            parameters,
+            terminals: self.terminals,
+            ..fresh
+        };
+        self.latch.disarm();
+        self.take_over();
+    }
+
+    fn trip(&mut self, fault: u16) {
+        if self.latch.trip(fault & fault::ALL) {
+            self.running = false;
+            self.motor.release();
+        }
+    }
+
+    fn usual_faults(&self) -> &'static [u16] {
+        &[fault::OVERCURRENT, fault::OVERHEAT, fault::MOTOR_OVERLOAD, fault::POWER]
+    }
+
+    fn command(&mut self, command: Command) {
+        let share = f64::from(command.reference.unsigned_abs()).min(10_000.0) / 10_000.0;
+        self.control.frequency = unsigned(share * self.ratings.maximum * 100.0);
+        let rest = self.control.operation & !(operation::RUN | operation::REVERSE);
+        let reverse = command.reverse != (command.reference < 0);
+        self.set_operation(rest | u16::from(command.run) * operation::RUN | u16::from(reverse) * operation::REVERSE);
+    }
+
+    fn set_reset(&mut self, on: bool) {
+        let rest = self.control.operation & !operation::RESET;
+        self.set_operation(rest | if on { operation::RESET } else { 0 });
+    }
+
+    /// Sn-08 in RAM: 1100, or 1111 for operator and terminals.
+    fn set_remote(&mut self, on: bool) {
+        let word = self.options.digits.register([true, true, !on, !on]);
+        let _ = self.parameters.set(parameters::SN_08, word);
+        self.take_over();
+    }
+
+    fn state(&self) -> DriveState {
+        DriveState {
+            ready: self.ready(),
+            running: self.shows_running(),
+            reverse: self.turns_reverse(),
+            fault: self.latch.fault(),
+            output: self.motor.output,
+            remote: self.run_from_bus(),
+        }
+    }
+}

@@ -1,0 +1,277 @@
+//! Parameters of the simulated TECO 7300PA by register (drives.md 5.8): which exist, and their images in RAM and EEPROM.
+//!
+//! Ranges are those of the N2 map (drives.md 6.7), where it has one. Defaults that the manual does not tell are plausible
+//! values for a small 440 V drive.
+
+use super::super::motor::Ratings;
+pub(super) use super::super::parameter_set::Refused;
+use super::super::parameter_set::{Parameter, ParameterSet};
+use super::options::Digits;
+
+/// One group of parameters.
+struct Group {
+    first: u16,
+    last: u16,
+    /// Written in PRGM mode only.
+    program_only: bool,
+    /// Registers of the group without a parameter.
+    reserved: &'static [u16],
+}
+
+/// Sn, Cn, On, An, Bn. Sn begins at xx01H, the others at xx00H.
+const GROUPS: [Group; 5] = [
+    Group {
+        first: 0x0101,
+        last: 0x0126,
+        program_only: true,
+        reserved: &[0x011C, 0x011D],
+    },
+    Group {
+        first: 0x0200,
+        last: 0x023E,
+        program_only: true,
+        reserved: &[0x021C, 0x0221, 0x0222, 0x0234, 0x0235, 0x0236, 0x0237, 0x0238, 0x023C],
+    },
+    Group {
+        first: 0x0300,
+        last: 0x0317,
+        program_only: true,
+        reserved: &[0x0303, 0x0304, 0x0305, 0x0309, 0x030C, 0x030D],
+    },
+    Group {
+        first: 0x0400,
+        last: 0x0408,
+        program_only: false,
+        reserved: &[],
+    },
+    Group {
+        first: 0x0500,
+        last: 0x0519,
+        program_only: false,
+        reserved: &[],
+    },
+];
+
+/// On-20 to On-24 are not saved.
+const NOT_SAVED: std::ops::RangeInclusive<u16> = 0x0313..=0x0317;
+
+pub(super) const SN_08: u16 = 0x0108;
+/// Function of the multifunction reference 1; those of 2 to 4 follow.
+pub(super) const SN_15: u16 = 0x010F;
+/// Functions of the outputs R2A-R2C, DO1 and R1A-R1C.
+pub(super) const SN_20: u16 = 0x0114;
+const SN_24: u16 = 0x0118;
+const CN_02: u16 = 0x0201;
+const CN_03: u16 = 0x0202;
+const CN_04: u16 = 0x0203;
+const CN_09: u16 = 0x0208;
+/// Upper bound of the frequency, % of Cn-02; the lower one follows.
+pub(super) const CN_14: u16 = 0x020D;
+pub(super) const CN_21: u16 = 0x0214;
+pub(super) const CN_22: u16 = 0x0215;
+pub(super) const CN_26: u16 = 0x0219;
+pub(super) const CN_27: u16 = 0x021A;
+pub(super) const CN_32: u16 = 0x021F;
+pub(super) const CN_33: u16 = 0x0220;
+/// Frequency command 1; those of 2 to 8 follow.
+pub(super) const AN_01: u16 = 0x0400;
+/// Jog frequency.
+pub(super) const AN_09: u16 = 0x0408;
+const BN_01: u16 = 0x0500;
+const BN_02: u16 = 0x0501;
+
+/// Functions of Sn-15 to Sn-18. The manual tells the default functions and not their numbers.
+pub(super) mod function {
+    pub(in super::super) const STEP_1: u16 = 2;
+    pub(in super::super) const STEP_2: u16 = 3;
+    pub(in super::super) const JOG: u16 = 5;
+    pub(in super::super) const BASEBLOCK: u16 = 7;
+}
+
+/// Parameters whose range or default is known or matters here: (register, minimum, maximum, default). All others take
+/// any value and begin with 0.
+const KNOWN: [(u16, u16, u16, u16); 52] = [
+    (SN_15, 0, 15, function::STEP_1),
+    (0x0110, 0, 15, function::STEP_2),
+    (0x0111, 0, 15, function::JOG),
+    (0x0112, 0, 15, function::BASEBLOCK),
+    (0x0113, 0, 12, 0),
+    (SN_20, 0, 15, 0),
+    (0x0115, 0, 15, 1),
+    (0x0116, 0, 15, 2),
+    (0x0117, 1, 31, 1),
+    (0x011A, 0, 10, 0),
+    (0x011B, 0, 10, 1),
+    (0x0200, 0, 7650, 4400),
+    (CN_02, 10, 1800, 600),
+    (CN_03, 1, 7650, 4400),
+    (CN_04, 10, 1800, 600),
+    (0x0204, 0, 1800, 30),
+    (0x0205, 0, 7650, 300),
+    (0x0206, 0, 1800, 15),
+    (0x0207, 0, 7650, 200),
+    (CN_09, 1, 30_000, 22),
+    (CN_14, 0, 109, 100),
+    (0x020E, 0, 109, 0),
+    (0x020F, 0, 1800, 0),
+    (0x0210, 0, 1800, 0),
+    (0x0211, 0, 1800, 0),
+    (0x0212, 0, 255, 10),
+    (CN_21, 0, 1800, 0),
+    (CN_22, 0, 255, 20),
+    (CN_26, 30, 200, 160),
+    (CN_27, 0, 255, 1),
+    (0x021B, 30, 170, 170),
+    (0x021D, 30, 170, 160),
+    (0x021E, 0, 255, 10),
+    (CN_32, 0, 1800, 0),
+    (CN_33, 0, 1800, 0),
+    (0x0223, 0, 10, 0),
+    (AN_01, 0, 18_000, 0),
+    (0x0401, 0, 18_000, 0),
+    (0x0402, 0, 18_000, 0),
+    (0x0403, 0, 18_000, 0),
+    (0x0404, 0, 18_000, 0),
+    (0x0405, 0, 18_000, 0),
+    (0x0406, 0, 18_000, 0),
+    (0x0407, 0, 18_000, 0),
+    (AN_09, 0, 18_000, 600),
+    (BN_01, 0, 60_000, 30),
+    (BN_02, 0, 60_000, 30),
+    (0x0502, 0, 60_000, 100),
+    (0x0503, 0, 60_000, 100),
+    (0x050C, 1, 1000, 100),
+    (0x050D, 1, 1000, 100),
+    (0x050E, 0, 1000, 100),
+];
+
+/// PID differential time, 0.01 s.
+const BN_16: (u16, u16, u16, u16) = (0x050F, 0, 100, 0);
+
+/// cos phi of the motor; no parameter holds it.
+const COS_PHI: f64 = 0.85;
+
+/// What a register of the parameters is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Place {
+    /// Written in PRGM mode only.
+    pub(super) program_only: bool,
+    /// No parameter: reads as 0, a write is acknowledged and forgotten.
+    pub(super) reserved: bool,
+}
+
+/// What the register is, if it belongs to the parameters.
+pub(super) fn place(register: u16) -> Option<Place> {
+    GROUPS
+        .iter()
+        .find(|group| (group.first..=group.last).contains(&register))
+        .map(|group| Place {
+            program_only: group.program_only,
+            reserved: group.reserved.contains(&register),
+        })
+}
+
+/// The images of the parameters.
+#[derive(Debug, Clone)]
+pub(super) struct Parameters {
+    ram: ParameterSet,
+    eeprom: ParameterSet,
+}
+
+impl Parameters {
+    /// Both images alike.
+    pub(super) fn new(digits: Digits, set: &[(u16, u16)]) -> Parameters {
+        let serial = digits.register([true, true, false, false]);
+        let four = digits.register([true; 4]);
+        // Sn-08 = 1100: run and reference from the serial link. Sn-24 = 1100: 19200 baud, no parity.
+        let coded = [(SN_08, 0, four, serial), (SN_24, 0, four, serial)];
+        let others = GROUPS
+            .iter()
+            .flat_map(|group| group.first..=group.last)
+            .filter(|register| place(*register).is_some_and(|place| !place.reserved))
+            .map(|register| (register, 0, u16::MAX, 0));
+        // The first of equal registers counts.
+        let mut ram = ParameterSet::new(coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others));
+        for &(register, value) in set {
+            let _ = ram.set(register, value);
+        }
+        Parameters {
+            eeprom: ram.clone(),
+            ram,
+        }
+    }
+
+    /// The value in RAM; 0 for a reserved register.
+    pub(super) fn number(&self, register: u16) -> u16 {
+        self.ram.number(register)
+    }
+
+    /// A parameter of that many tenths.
+    pub(super) fn tenths(&self, register: u16) -> f64 {
+        f64::from(self.number(register)) / 10.0
+    }
+
+    pub(super) fn check(&self, register: u16, value: u16) -> Result<(), Refused> {
+        self.ram.check(register, value)
+    }
+
+    /// Writes to RAM.
+    pub(super) fn set(&mut self, register: u16, value: u16) -> Result<(), Refused> {
+        self.ram.set(register, value)
+    }
+
+    /// Copies RAM to EEPROM, but for On-20 to On-24.
+    pub(super) fn save(&mut self) {
+        let saved = self.ram.iter().filter(|parameter| !NOT_SAVED.contains(&parameter.key));
+        for &Parameter { key, value, .. } in saved {
+            let _ = self.eeprom.set(key, value);
+        }
+    }
+
+    /// What a power cycle does: RAM is as the EEPROM.
+    pub(super) fn reload(&mut self) {
+        self.ram = self.eeprom.clone();
+    }
+
+    /// The motor and its ramps.
+    pub(super) fn ratings(&self) -> Ratings {
+        let frequency = self.tenths(CN_04);
+        Ratings {
+            maximum: self.tenths(CN_02),
+            acceleration: self.tenths(BN_01),
+            deceleration: self.tenths(BN_02),
+            voltage: self.tenths(CN_03),
+            frequency,
+            // Four poles without slip: no parameter holds a speed.
+            speed: 30.0 * frequency,
+            current: self.tenths(CN_09),
+            cos_phi: COS_PHI,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_rows_of_the_manual_and_no_other() {
+        let rows: usize = GROUPS
+            .iter()
+            .map(|group| usize::from(group.last - group.first) + 1)
+            .sum();
+        assert_eq!(rows, 160, "as drives.md 5.8 lists them");
+        assert!(
+            KNOWN
+                .iter()
+                .all(|known| place(known.0).is_some_and(|place| !place.reserved))
+        );
+        for register in [0x0100, 0x0127, 0x023F, 0x02FF, 0x0318, 0x0409, 0x051A, 0x0000, 0x0900] {
+            assert_eq!(place(register), None, "{register:04X}");
+        }
+        let parameters = Parameters::new(Digits::Bits, &[]);
+        assert_eq!(parameters.ram.iter().count(), 160 - 17, "17 are reserved");
+        assert!(parameters.ram.iter().all(|p| p.min <= p.value && p.value <= p.max));
+        assert_eq!(parameters.number(SN_08), 0x000C);
+    }
+}
