@@ -324,7 +324,9 @@ impl Model for TecoDrive {
         self.control.frequency = unsigned(share * self.ratings.maximum * 100.0);
         let rest = self.control.operation & !(operation::RUN | operation::REVERSE);
         let reverse = command.reverse != (command.reference < 0);
-        self.set_operation(rest | u16::from(command.run) * operation::RUN | u16::from(reverse) * operation::REVERSE);
+        self.set_operation(
+            rest | (u16::from(command.run) * operation::RUN) | (u16::from(reverse) * operation::REVERSE),
+        );
     }
 
     fn set_reset(&mut self, on: bool) {
