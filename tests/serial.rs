@@ -6,7 +6,6 @@
 #[allow(dead_code, reason = "made for another test too")]
 #[path = "gateway/process.rs"]
 mod process;
-#[allow(dead_code, reason = "each test takes what it needs")]
 mod tools;
 
 use std::path::{Path, PathBuf};

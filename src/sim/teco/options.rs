@@ -52,7 +52,7 @@ impl Digits {
             Digits::Hexadecimal => 16,
         };
         let weight = self.weights().get(from_last).copied().unwrap_or(u16::MAX);
-        register / weight % radix != 0
+        !(register / weight).is_multiple_of(radix)
     }
 }
 
