@@ -33,10 +33,14 @@ pub(super) struct Args {
 #[derive(Debug, clap::Subcommand)]
 enum What {
     /// Shows where the points of a profile lie, how they are scaled and what is known of them.
-    #[command(after_help = "Example:\n  drivegate profiles show vacon-nx")]
+    #[command(after_help = "Examples:\n  drivegate profiles show vacon-nx\n  \
+            drivegate profiles show vacon-nx --toml > /etc/drivegate/profiles/our-nx.toml")]
     Show {
         /// Name of the profile.
         name: String,
+        /// Print the file of the profile, to make one's own of it.
+        #[arg(long)]
+        toml: bool,
     },
 }
 
@@ -57,10 +61,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
         report::errors(&problems);
         return ExitCode::from(EXIT_CONFIG);
     }
-    let Some(What::Show { name }) = &args.what else {
+    let Some(What::Show { name, toml }) = &args.what else {
         return report::print(&list(&profiles));
     };
     match profiles.get(name) {
+        Some(profile) if *toml => report::print(&profile.text),
         Some(profile) => report::print(&show(profile)),
         None => {
             report::errors(&[Problem {
@@ -107,6 +112,7 @@ fn show(profile: &Profile) -> String {
     let mut text = format!("{}: {}\n\n", profile.name, profile.title);
     for (what, value) in [
         ("origin", origin(profile).to_string()),
+        ("based on", profile.base.clone().unwrap_or_default()),
         ("source", profile.source.clone()),
         ("protocols", protocols(profile)),
         ("baud rates", bauds),
@@ -136,7 +142,10 @@ fn show(profile: &Profile) -> String {
             "simulator",
             profile.simulator.clone().unwrap_or_else(|| "none".to_string()),
         ),
-    ] {
+    ]
+    .into_iter()
+    .filter(|(_, value)| !value.is_empty())
+    {
         // Writing to a String cannot fail.
         let _ = writeln!(text, "  {what:<14}{value}");
     }
@@ -161,8 +170,12 @@ fn points(profile: &Profile) -> String {
     for point in &profile.points {
         let (at, form, scale) = place(profile, point);
         let (class, note) = match &point.source {
-            Source::Raw(_) => (point.class.name(), point.note.clone()),
-            Source::Derived(derived) => ("", derivation(profile, derived)),
+            Source::Raw(_) => (point.class.name(), remarks(profile, point)),
+            Source::Derived(derived) => {
+                let made = derivation(profile, derived);
+                let note = Some(remarks(profile, point)).filter(|note| !note.is_empty());
+                ("", note.map_or(made.clone(), |note| format!("{made}; {note}")))
+            }
         };
         let range = point.range.as_ref();
         table.add_row([
@@ -179,6 +192,29 @@ fn points(profile: &Profile) -> String {
         ]);
     }
     report::lines(&table)
+}
+
+/// What else is to be said of a point: where its commands go, how they are written, its texts, its note.
+fn remarks(profile: &Profile, point: &Point) -> String {
+    let mut parts = Vec::new();
+    if let Some(target) = point.write_to {
+        parts.push(format!("commands go to {}", name_of(profile, target)));
+    }
+    if point.on_change {
+        parts.push("written on change only".to_string());
+    }
+    if !point.texts.is_empty() {
+        let texts: Vec<String> = point
+            .texts
+            .iter()
+            .map(|(value, text)| format!("{value} {text}"))
+            .collect();
+        parts.push(texts.join(", "));
+    }
+    if !point.note.is_empty() {
+        parts.push(point.note.clone());
+    }
+    parts.join("; ")
 }
 
 fn verified(verified: bool) -> &'static str {
@@ -262,7 +298,16 @@ fn name_of(profile: &Profile, point: usize) -> &str {
 }
 
 fn ranges(ranges: &[AddressRange]) -> String {
-    let mut table = report::table(["table", "first", "last", "per read", "per write", "holes", "note"]);
+    let mut table = report::table([
+        "table",
+        "first",
+        "last",
+        "per read",
+        "per write",
+        "written",
+        "holes",
+        "note",
+    ]);
     for range in ranges {
         let write = match range.write {
             0 => "read-only".to_string(),
@@ -274,6 +319,7 @@ fn ranges(ranges: &[AddressRange]) -> String {
             range.addresses.end().to_string(),
             range.read.to_string(),
             write,
+            range.write_when.clone(),
             if range.holes { "may be read" } else { "no" }.to_string(),
             range.note.clone(),
         ]);

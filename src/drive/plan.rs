@@ -49,7 +49,8 @@ pub struct Plan {
 impl Plan {
     /// Merges the points of a profile into few requests: addresses of one class that lie together
     /// in one range of the drive, up to the limit of the range. A gap is covered only where the
-    /// range allows holes. An address needed by two classes is read in the faster one only.
+    /// range allows holes. An address needed by two classes, or read with the faster one as such a gap, is read in
+    /// the faster one only.
     pub fn of(profile: &Profile) -> Plan {
         let mut taken: BTreeSet<(Table, u16)> = BTreeSet::new();
         let mut reads = Vec::new();
@@ -60,10 +61,11 @@ impl Plan {
                 .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
                 .map(|raw| (raw.table, raw.address, raw.form.items()))
                 .collect();
-            reads.extend(merge(profile, class, &wanted));
-            for (table, start, items) in wanted {
-                taken.extend((start..).take(usize::from(items)).map(|a| (table, a)));
+            let merged = merge(profile, class, &wanted);
+            for read in &merged {
+                taken.extend((read.start..).take(usize::from(read.count)).map(|a| (read.table, a)));
             }
+            reads.extend(merged);
         }
         Plan { reads }
     }
@@ -231,6 +233,10 @@ mod tests {
         );
         assert_eq!(spans(&profile(&range(0, 99, 10, false), &[1, 3])), [(1, 1), (3, 1)]);
         assert_eq!(spans(&profile(&range(0, 99, 10, true), &[1, 3, 20])), [(1, 3), (20, 1)]);
+        let text = "[[point]]\nname = \"s\"\nat = \"holding 2\"\nclass = \"slow\"\n";
+        let source = profile(&range(0, 99, 10, true), &[1, 3]).text + text;
+        let with_slow = Profile::parse("p.toml", &source, false).unwrap();
+        assert_eq!(spans(&with_slow), [(1, 3)], "a slow point in a gap of a fast read");
         let two = format!("{}\n{}", range(0, 9, 10, false), range(10, 19, 10, false));
         assert_eq!(
             spans(&profile(&two, &[8, 9, 10, 11])),

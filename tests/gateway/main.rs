@@ -17,3 +17,4 @@ mod process;
 mod restart;
 #[path = "../tools/mod.rs"]
 mod tools;
+mod user_profiles;

@@ -327,6 +327,39 @@ mod tests {
     }
 
     #[test]
+    fn enumerations_have_their_text_beside_them() {
+        let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
+             [[point]]\nname = \"mode\"\nat = \"holding 1\"\n[point.texts]\n3 = \"auto\"\n";
+        let profile = Profile::parse("m.toml", source, false).unwrap();
+        let state = |value: Option<i64>| {
+            let shown = Shown {
+                state: State::NotReady,
+                quality: Quality::Good,
+                points: vec![(value.map(Value::Integer), Quality::Good)],
+            };
+            let object = StateObject {
+                shown: &shown,
+                names: &["mode".to_string()],
+                indices: &[0],
+                profile: &profile,
+                fault_text: String::new(),
+                age: None,
+                wall: SystemTime::UNIX_EPOCH,
+            };
+            serde_json::to_value(&object).unwrap()
+        };
+        let told = state(Some(3));
+        assert_eq!((&told["mode"], &told["mode_text"]), (&3.into(), &"auto".into()));
+        let told = state(Some(4));
+        assert_eq!((&told["mode"], &told["mode_text"]), (&4.into(), &"".into()));
+        let told = state(None);
+        assert_eq!(
+            (&told["mode"], &told["mode_text"]),
+            (&serde_json::Value::Null, &"".into())
+        );
+    }
+
+    #[test]
     fn events_of_drives_go_to_their_topic() {
         let topics = Topics::new("drivegate", "hall");
         let mut told = Event {

@@ -1,0 +1,110 @@
+//! The energy meter of docs/profiles.md, made by pymodbus, read with the profile of that page.
+
+use std::path::Path;
+use std::process::Command;
+
+use crate::process::{Running, api, free_port, get, mbpoll_read, mbpoll_write, point, until, until_ready};
+use crate::tools::{python, root};
+
+/// A profile over the example, with a float that is no number.
+const OURS: &str = r#"
+name = "our-meter"
+base = "energy-meter"
+points.current_l1.scale = 10
+[[point]]
+name = "neutral_current"
+at = "input 18"
+type = "f32"
+unit = "A"
+class = "fast"
+"#;
+
+fn configure(folder: &Path, meter: u16, modbus: u16, http: u16) -> String {
+    let profiles = folder.join("profiles");
+    std::fs::create_dir(&profiles).unwrap();
+    std::fs::copy(
+        root().join("docs/energy-meter.toml"),
+        profiles.join("energy-meter.toml"),
+    )
+    .unwrap();
+    std::fs::write(profiles.join("a.toml"), OURS).unwrap();
+    let file = folder.join("drivegate.toml");
+    let text = format!(
+        "[gateway]\nname = \"test\"\nprofile_dirs = [\"profiles\"]\n\
+         [[bus]]\nname = \"line1\"\nport = \"tcp://127.0.0.1:{meter}\"\nbaud = 38400\ncycle = \"50ms\"\nslow_cycle = \"200ms\"\n\
+         response_timeout = \"500ms\"\n\
+         [[bus.drive]]\nname = \"meter\"\naddress = 7\nprofile = \"our-meter\"\naccess = \"control\"\n\
+         limits = {{ current_transformer_ratio = [1, 500] }}\n\
+         [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n\
+         [http]\nlisten = \"127.0.0.1:{http}\"\n"
+    );
+    std::fs::write(&file, text).unwrap();
+    file.display().to_string()
+}
+
+#[test]
+fn the_energy_meter_of_the_page_is_served() {
+    let folder = tempfile::tempdir().unwrap();
+    let (meter, modbus, http) = (free_port(), free_port(), free_port());
+    let peer = root().join("tests/peers/energy_meter.py");
+    let _peer = Running::start(&python(), &[&peer.display().to_string(), &meter.to_string()]);
+    let file = configure(folder.path(), meter, modbus, http);
+    let check = Command::new(env!("CARGO_BIN_EXE_drivegate"))
+        .args(["check", "--config", &file])
+        .output()
+        .unwrap();
+    assert!(check.status.success(), "{check:?}");
+    let _gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    for (name, value) in [
+        ("voltage_l1", serde_json::json!(230.5)),
+        ("current_l1", serde_json::json!(52.0)),
+        ("active_power", serde_json::json!(-2.0)),
+        ("energy", serde_json::json!(1234.56)),
+        ("reactive_balance", serde_json::json!(-2.0)),
+        ("power_factor", serde_json::json!(-0.9)),
+        ("line_frequency", serde_json::json!(49.98)),
+        ("case_temperature", serde_json::json!(31.0)),
+        ("warning", serde_json::json!(true)),
+        ("phase_order_wrong", serde_json::json!(true)),
+        ("tariff", serde_json::json!(5)),
+        ("mode", serde_json::json!(2)),
+        ("no_load", serde_json::json!(false)),
+        ("current_transformer_ratio", serde_json::json!(40.0)),
+        ("relay", serde_json::json!(true)),
+    ] {
+        let read = || Some(point(http, "meter", name)).filter(|v| !v.is_null());
+        assert_eq!(until(name, read), value, "{name}");
+    }
+    let points = api(http, "meter")["points"].clone();
+    assert_eq!(points["tariff"]["text"], "weekend");
+    assert_eq!(points["mode"]["text"], "3 phases, 3 wires");
+    assert_eq!(points["power_factor"].get("text"), None);
+    // What is no number is never served as one.
+    assert_eq!(
+        (
+            &points["neutral_current"]["value"],
+            &points["neutral_current"]["quality"]
+        ),
+        (&().into(), &"bad".into())
+    );
+    let (_, metrics) = get(http, "/metrics").unwrap();
+    let labels = "bus=\"line1\",drive=\"meter\"";
+    for line in [
+        format!("drivegate_drive_energy_kilowatthours{{{labels}}} 1234.56"),
+        format!("drivegate_point_value{{{labels},point=\"tariff\",unit=\"\"}} 5"),
+        format!("drivegate_point_value{{{labels},point=\"active_power\",unit=\"kW\"}} -2"),
+    ] {
+        assert!(metrics.contains(&line), "{line} is missing in\n{metrics}");
+    }
+    assert!(!metrics.contains("neutral_current"), "{metrics}");
+    // The common model and the meter's own registers, through Modbus TCP; 32 bits with the high word first.
+    assert_eq!(mbpoll_read(modbus, 7, 0x800D, 2).unwrap(), [0, 1235]);
+    assert_eq!(mbpoll_read(modbus, 7, 256, 2).unwrap(), [40, 15]);
+    mbpoll_write(modbus, 7, 256, &[100]).unwrap();
+    until("the new ratio", || {
+        (point(http, "meter", "current_transformer_ratio") == 100.0).then_some(())
+    });
+    let refused = mbpoll_write(modbus, 7, 256, &[501]).unwrap_err();
+    assert!(refused.contains("Illegal data value"), "{refused}");
+}
