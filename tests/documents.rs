@@ -7,6 +7,8 @@
     reason = "a test may panic, its helpers too"
 )]
 
+#[path = "documents/drives.rs"]
+mod drives;
 mod tools;
 
 use std::fs;
@@ -59,6 +61,9 @@ fn every_configuration_that_ships_is_valid() {
     let dir = TempDir::new().unwrap();
     for document in documents() {
         for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
+            if is_profile(block) {
+                continue;
+            }
             let name = document.file_stem().unwrap().to_string_lossy().into_owned();
             let path = dir.path().join(format!("{name}-{i}.toml"));
             // A block that shows one section stands in a file that has the others.
@@ -67,6 +72,10 @@ fn every_configuration_that_ships_is_valid() {
             } else {
                 "[gateway]\nname = \"g\"\n\n"
             };
+            // The directory of an installation is not there.
+            let profiles = dir.path().join("profiles");
+            fs::create_dir_all(&profiles).unwrap();
+            let block = block.replace("/etc/drivegate/profiles", &profiles.display().to_string());
             fs::write(&path, format!("{head}{block}")).unwrap();
             configurations.push(path);
         }
@@ -77,6 +86,62 @@ fn every_configuration_that_ships_is_valid() {
             &["check", "--config", &path.display().to_string()],
         );
     }
+}
+
+fn is_profile(block: &str) -> bool {
+    block.contains("\nbase = ") || block.contains("\nprotocols = ")
+}
+
+#[test]
+fn every_profile_that_is_shown_is_sound() {
+    let dir = TempDir::new().unwrap();
+    let page = read(&root().join("docs/profiles.md"));
+    let shown: Vec<String> = blocks(&page, "toml").into_iter().filter(|b| is_profile(b)).collect();
+    assert!(shown.len() >= 4);
+    for (i, block) in shown.iter().enumerate() {
+        fs::write(dir.path().join(format!("{i}.toml")), block).unwrap();
+    }
+    let listed = run_well(
+        Path::new(DRIVEGATE),
+        &["profiles", "--profile-dir", &dir.path().display().to_string()],
+    );
+    for name in ["our-hvx", "our-cx", "our-nx", "energy-meter"] {
+        assert!(listed.contains(name), "{listed}");
+    }
+}
+
+/// Puts `text` between the comment `<!-- name -->` and the next `<!-- end -->` of a page, or fails where it is not
+/// there. `DRIVEGATE_WRITE_DOCS=1` writes the page instead.
+fn generated(page: &str, name: &str, text: &str) {
+    let path = root().join("docs").join(page);
+    let old = read(&path);
+    let start = format!("<!-- {name} -->\n");
+    let (head, rest) = old.split_once(&start).unwrap();
+    let (_, tail) = rest.split_once("<!-- end -->").unwrap();
+    let new = format!("{head}{start}{text}<!-- end -->{tail}");
+    if std::env::var_os("DRIVEGATE_WRITE_DOCS").is_some() {
+        fs::write(&path, new).unwrap();
+    } else {
+        assert!(
+            old == new,
+            "docs/{page} is not what the profiles say; run DRIVEGATE_WRITE_DOCS=1 cargo test --test documents"
+        );
+    }
+}
+
+#[test]
+fn the_page_of_profiles_quotes_the_energy_meter() {
+    let meter = read(&root().join("docs/energy-meter.toml"));
+    generated(
+        "profiles.md",
+        "energy-meter.toml",
+        &format!("\n```toml\n{meter}```\n\n"),
+    );
+}
+
+#[test]
+fn the_page_of_drives_says_what_the_profiles_deliver() {
+    generated("drives.md", "tables", &drives::tables());
 }
 
 #[test]

@@ -403,3 +403,45 @@ fn enumerations_have_texts() {
     assert_eq!(mode.text_of(Value::Integer(4)), None);
     assert_eq!(profile.points[1].text_of(Value::Bool(true)), Some("on"));
 }
+
+/// The page names every key that the loader knows, and no other.
+#[test]
+fn the_page_names_every_key() {
+    let page = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/profiles.md")).unwrap();
+    let meter = std::fs::read_to_string(concat!(env!("CARGO_MANIFEST_DIR"), "/docs/energy-meter.toml")).unwrap();
+    let choices = "[speed_reference]\nsigned = true\n";
+    let mut known = std::collections::BTreeSet::new();
+    for source in BUILT_IN
+        .iter()
+        .map(|(_, source)| *source)
+        .chain([meter.as_str(), choices])
+    {
+        let document = Document::parse("p", source);
+        let _ = read_profile(&document.reader(), true, &Profiles::default());
+        known.extend(document.known_keys());
+    }
+    // Codes and tables are not keys; what is merged beforehand is not read.
+    known.retain(|key| {
+        !["faults.", "faults_unverified.", "address_offset."]
+            .iter()
+            .any(|p| key.starts_with(p))
+    });
+    known.retain(|key| !key.contains("texts."));
+    known.extend(["remove".to_string(), "points".to_string()]);
+    let section = |heading: &str| {
+        let (_, rest) = page.split_once(heading).unwrap();
+        let rows = rest.split("\n#").next().unwrap().lines();
+        let keys = rows.filter_map(|row| row.strip_prefix("| `")?.split('`').next().map(str::to_string));
+        keys.collect::<Vec<_>>()
+    };
+    let mut told = section("\n## Keys of a profile\n");
+    for (heading, path) in [
+        ("\n### `[speed_reference]`\n", "speed_reference."),
+        ("\n### `[[range]]`\n", "range[]."),
+        ("\n### `[[point]]`\n", "point[]."),
+    ] {
+        told.extend(section(heading).into_iter().map(|key| format!("{path}{key}")));
+    }
+    told.sort();
+    assert_eq!(told, known.into_iter().collect::<Vec<_>>());
+}

@@ -1,0 +1,213 @@
+//! The tables of docs/drives.md, made of the built-in profiles.
+
+use std::fmt::Write;
+
+use drivegate::codec::{Protocol, Table};
+use drivegate::drive::profile::{Form, Profile, Profiles};
+use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source};
+
+/// The families, Modbus first.
+const MODBUS: [&str; 5] = ["vacon-nx", "eaton-svx", "eaton-hvx", "vacon-cx", "teco-7300pa"];
+const N2: [&str; 3] = ["vacon-nx-n2", "eaton-hvx-n2", "teco-7300pa-n2"];
+
+pub(crate) fn tables() -> String {
+    let profiles = Profiles::built_in();
+    let mut text = String::from("\n## The common model on Modbus\n\n");
+    text += &model(&profiles, &MODBUS);
+    text += "\n## The common model on Metasys N2\n\n";
+    text += &model(&profiles, &N2);
+    for name in MODBUS.iter().chain(&N2) {
+        if let Some(profile) = profiles.get(name) {
+            text += &family(profile);
+        }
+    }
+    text.push('\n');
+    assert_eq!(
+        profiles.iter().count(),
+        MODBUS.len() + N2.len(),
+        "a family is missing here"
+    );
+    text
+}
+
+fn model(profiles: &Profiles, names: &[&str]) -> String {
+    let mut text = format!(
+        "| point | unit | `{}` |\n|---|---|{}\n",
+        names.join("` | `"),
+        "---|".repeat(names.len())
+    );
+    for point in ModelPoint::ALL {
+        let cells: Vec<String> = names
+            .iter()
+            .map(|name| {
+                let profile = profiles.get(name).unwrap();
+                profile
+                    .model_point(*point)
+                    .map_or_else(|| "-".to_string(), |p| cell(profile, p))
+            })
+            .collect();
+        let _ = writeln!(
+            text,
+            "| `{}` | {} | {} |",
+            point.name(),
+            point.unit(),
+            cells.join(" | ")
+        );
+    }
+    text
+}
+
+/// Place, scale, class, and whether it is verified.
+fn cell(profile: &Profile, point: &Point) -> String {
+    let place = place(profile, point);
+    let class = if point.raw().is_some() {
+        format!(", {}", point.class.name())
+    } else {
+        String::new()
+    };
+    let doubt = if point.verified { "" } else { " **?**" };
+    let target = target(profile, point)
+        .map(|t| format!("; commands: {t}"))
+        .unwrap_or_default();
+    format!("{place}{class}{target}{doubt}")
+}
+
+fn target(profile: &Profile, point: &Point) -> Option<String> {
+    let target = profile.points.get(point.write_to?)?;
+    Some(place(profile, target))
+}
+
+fn place(profile: &Profile, point: &Point) -> String {
+    let raw = match &point.source {
+        Source::Derived(derived) => return derivation(profile, derived),
+        Source::Raw(raw) => raw,
+    };
+    let n2 = profile.protocols == [Protocol::N2];
+    let at = match (raw.table, n2) {
+        (Table::Coil, true) => format!("BO {}", raw.address + 1),
+        (Table::DiscreteInput, true) => format!("BI {}", raw.address + 1),
+        (Table::Input, true) if raw.address >= 0x4000 => format!("ADI {}", raw.address - 0x4000 + 1),
+        (Table::Input, true) => format!("AI {}", raw.address / 2 + 1),
+        (Table::Holding, true) => format!("AO {}", raw.address / 2 + 1),
+        (table, false) => {
+            let short = match table {
+                Table::Coil => "CO",
+                Table::DiscreteInput => "DI",
+                Table::Input => "IR",
+                Table::Holding => "HR",
+            };
+            // TECO's manual numbers its registers in hexadecimal.
+            if profile.protocols == [Protocol::ModbusAscii] {
+                format!("{short} {:04X}H", raw.address)
+            } else {
+                format!("{short} {}", raw.address)
+            }
+        }
+    };
+    let form = match raw.form {
+        Form::Bit { invert, .. } if raw.table.is_bits() => if invert { "!" } else { "" }.to_string(),
+        Form::Bit { bit, invert } => format!(".{bit}{}", if invert { "!" } else { "" }),
+        Form::Bits { first, count } => format!(".{first}-{}", first + count - 1),
+        Form::I16 if !n2 => " ±".to_string(),
+        _ => String::new(),
+    };
+    let scale = if raw.scale == 1.0 {
+        String::new()
+    } else {
+        format!(" × {}", raw.scale)
+    };
+    format!("{at}{form}{scale}")
+}
+
+fn derivation(profile: &Profile, derived: &Derived) -> String {
+    let name = |i: &usize| format!("`{}`", profile.points[*i].name);
+    let end = |bound: &Bound| match bound {
+        Bound::Point(i) => name(i),
+        Bound::Fixed(figure) => figure.to_string(),
+    };
+    match derived {
+        Derived::Band { of, minimum, maximum } => {
+            format!("{} of {} to {}", name(of), end(minimum), end(maximum))
+        }
+        Derived::Percent { of, minimum, maximum } => {
+            format!("{} in {} to {}", name(of), end(minimum), end(maximum))
+        }
+        Derived::Zero { of, .. } => format!("{} is 0", name(of)),
+        Derived::Equal { of, to, .. } => format!("{} is {}", name(of), name(to)),
+        Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
+        Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
+    }
+}
+
+/// What a family has beyond the model.
+fn family(profile: &Profile) -> String {
+    let doubtful = profile.points.iter().filter(|p| !p.verified).count();
+    let mut text = format!(
+        "\n## `{}`: {}\n\nSource: {}.",
+        profile.name, profile.title, profile.source
+    );
+    let mut sure: Vec<String> = Vec::new();
+    let mut unsure: Vec<String> = Vec::new();
+    for (code, fault) in &profile.faults {
+        let told = format!("{code} {}", fault.text);
+        if fault.verified {
+            sure.push(told)
+        } else {
+            unsure.push(told)
+        }
+    }
+    if doubtful > 0 {
+        let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
+    }
+    text += "\n\n| point | unit | place | class | commands | |\n|---|---|---|---|---|---|\n";
+    for point in profile.points.iter().filter(|p| p.model.is_none()) {
+        let class = if point.raw().is_some() { point.class.name() } else { "" };
+        let range = point.range.as_ref().map(|r| format!("{} to {}", r.start(), r.end()));
+        let write = match (point.write, &range) {
+            (true, Some(range)) => range.as_str(),
+            (true, None) => "yes",
+            (false, _) => "",
+        };
+        let doubt = if point.verified { "" } else { "**?** " };
+        let texts: Vec<String> = point
+            .texts
+            .iter()
+            .map(|(value, text)| format!("{value} {text}"))
+            .collect();
+        let mut note = vec![texts.join(", "), point.note.clone()];
+        note.retain(|text| !text.is_empty());
+        let _ = writeln!(
+            text,
+            "| `{}` | {} | {} | {class} | {write} | {doubt}{} |",
+            point.name,
+            point.unit,
+            place(profile, point),
+            note.join("; ")
+        );
+    }
+    let rules: Vec<String> = profile
+        .ranges
+        .iter()
+        .filter(|r| !r.write_when.is_empty())
+        .map(rule)
+        .collect();
+    if !rules.is_empty() {
+        let _ = write!(text, "\nWrites: {}.\n", rules.join("; "));
+    }
+    if !sure.is_empty() {
+        let _ = write!(text, "\nFault texts: {}.\n", sure.join(", "));
+    }
+    if !unsure.is_empty() {
+        let _ = write!(text, "\nFault texts that are not verified: {}.\n", unsure.join(", "));
+    }
+    text
+}
+
+fn rule(range: &drivegate::drive::profile::AddressRange) -> String {
+    let what = if range.note.is_empty() {
+        "registers".to_string()
+    } else {
+        range.note.clone()
+    };
+    format!("{what}: {}", range.write_when)
+}
