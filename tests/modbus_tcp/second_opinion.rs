@@ -16,7 +16,7 @@ use crate::rig::{frame, options, plant};
 /// Any request that a client of tokio-modbus can send, with a number of items that fits a frame.
 fn request() -> impl Strategy<Value = Request<'static>> {
     let (address, count) = (any::<u16>(), 0u16..=300);
-    let span = (address.clone(), count);
+    let span = (address, count);
     let words = |most| prop::collection::vec(any::<u16>(), 1..=most);
     prop_oneof![
         span.clone().prop_map(|(a, n)| Request::ReadCoils(a, n)),
