@@ -10,7 +10,7 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -42,6 +42,12 @@ advisories: tools ## Check dependencies for known vulnerabilities; fetches the a
 
 bench: ## Run the benchmarks
 	cargo bench --locked
+
+FUZZ_RUNS ?= 200000
+fuzz: ## Run every fuzz target FUZZ_RUNS times; wants nightly Rust and cargo-fuzz
+	for target in $$(cargo +nightly fuzz list); do \
+		cargo +nightly fuzz run -s none "$$target" -- -runs=$(FUZZ_RUNS) -max_len=600; \
+	done
 
 clean: ## Remove everything that was built or installed here
 	cargo clean

@@ -59,6 +59,16 @@ fn every_configuration_that_ships_is_valid() {
     let mut configurations = files(&root().join("deploy"), "toml");
     assert!(configurations.len() >= 2);
     let dir = TempDir::new().unwrap();
+    // The certificates that the documentation makes beside its configuration.
+    let (script, tls) = (
+        root().join("docs/modbus-tls-ca.sh"),
+        dir.path().join("tls").display().to_string(),
+    );
+    run_well(&script, &[&tls, "ca"]);
+    run_well(
+        &script,
+        &[&tls, "server", "gateway", "pump-house.example", "192.168.1.5"],
+    );
     for document in documents() {
         for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
             if is_profile(block) {

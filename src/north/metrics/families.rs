@@ -265,7 +265,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "drivegate_modbus_tcp_refused_total",
         "Modbus TCP clients that were not let in, by reason.",
     );
-    for (reason, count) in stats.modbus_tcp.refused() {
+    for (reason, count) in stats.modbus_tcp.refused().filter(|(_, count)| *count > 0) {
         refused.add(vec![("reason", reason.name().to_string())], Figure::Count(count));
     }
     all.push(refused);
