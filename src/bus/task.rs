@@ -278,10 +278,14 @@ impl Worker {
                 (drive, pdu.clone(), Some(urgency))
             }
         };
-        let Some(address) = self.handle.image.drives.get(drive).map(|d| d.spec.address) else {
+        let Some(spec) = self.handle.image.drives.get(drive).map(|d| &d.spec) else {
             return Ok(());
         };
-        let request = Request { address, pdu };
+        let request = Request {
+            address: spec.address,
+            pdu,
+            n2: spec.profile.n2,
+        };
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
         self.handle.image.spec.protocol.encode(&request, &mut frame);
