@@ -248,13 +248,6 @@ impl SimulatedDrive {
         self.model.get().state()
     }
 
-    /// A request to all drives. Nobody answers it, so only writes have an effect.
-    pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
-        if request.is_write() {
-            let _: Reply = self.answer(request, now);
-        }
-    }
-
     /// Whether an autopilot still runs it.
     pub fn runs_by_itself(&self) -> bool {
         self.autopilot.is_some()
