@@ -9,6 +9,7 @@ pub mod predict;
 pub mod probe;
 mod report;
 pub mod schedule;
+pub mod session;
 mod tap;
 mod task;
 pub mod transaction;

@@ -137,6 +137,30 @@ impl Report {
         self.tell(EventKind::Offline, Some(index), None, text);
     }
 
+    pub(super) fn restarted(&self, index: usize) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let text = format!(
+            "drive {} has started anew; it is read again, and takes only commands that come from now on",
+            drive.spec.name
+        );
+        self.tell(EventKind::Restarted, Some(index), None, text);
+    }
+
+    /// A drive told another device type than its profile expects.
+    pub(super) fn unlike(&self, index: usize, device: u8) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        tracing::warn!(
+            bus = %self.image.spec.name, drive = %drive.spec.name,
+            "the drive says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check address \
+             and profile, or set device_type in [n2] of the profile",
+            drive.spec.profile.name, drive.spec.profile.n2.device_type
+        );
+    }
+
     pub(super) fn not_confirmed(&self, late: &NotConfirmed) {
         let Some(drive) = self.image.drives.get(late.drive) else {
             return;

@@ -285,6 +285,23 @@ impl Schedule {
         }
     }
 
+    /// Everything of a drive is read again, what is read once too.
+    pub fn read_again(&mut self, drive: usize, now: Instant) {
+        let Some(drive) = self.drives.get_mut(drive) else {
+            return;
+        };
+        for item in drive.items.iter_mut().filter(|item| !item.refused) {
+            item.wanted = true;
+            item.due = item.due.min(now);
+        }
+    }
+
+    /// Something had to be said to a drive before its poll, which is still due: the others have their turn in between.
+    pub fn session_done(&mut self) {
+        self.probed = true;
+        self.share.polled(Duration::ZERO);
+    }
+
     /// Whether the drive answers.
     pub fn is_online(&self, drive: usize) -> bool {
         self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)

@@ -52,7 +52,7 @@ impl<'r> Tap<'r> {
             direction: Direction::Request,
             drive: self.drive.clone(),
             bytes: self.frame.to_vec(),
-            decode: describe::request(&self.request.pdu),
+            decode: describe::request_on(self.image.spec.protocol, &self.request.pdu),
             verdict: String::new(),
         });
     }

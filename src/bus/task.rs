@@ -9,9 +9,11 @@ use super::desk::{Desk, Job};
 use super::leases::Leases;
 use super::report::Report;
 use super::schedule::{Cadence, Change, Poll, Polled, Schedule};
+use super::session::{Progress, Sessions};
 use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
 use crate::cache::{Outcome as Counted, Snapshot};
-use crate::codec::{Reply, Request, RequestPdu};
+use crate::codec::n2::Session;
+use crate::codec::{Exception, Protocol, Reply, Request, RequestPdu};
 use crate::command::{Command, Outcome, Urgency, written};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
@@ -93,6 +95,10 @@ struct Worker {
     silence: Duration,
     schedule: Schedule,
     desk: Desk,
+    /// What N2 says to drives beside reading them.
+    sessions: Sessions,
+    /// The drive that was spoken to last.
+    spoken_to: usize,
     leases: Leases,
     report: Report,
     stop: Arc<AtomicBool>,
@@ -133,12 +139,18 @@ impl Worker {
         };
         let schedule = Schedule::new(cadence, &plans, cost, now);
         let report = Report::new(handle.image.clone(), events);
+        let sessions = match spec.protocol {
+            Protocol::N2 => Sessions::new(drives.iter().map(|d| d.spec.profile.n2)),
+            Protocol::ModbusRtu | Protocol::ModbusAscii => Sessions::default(),
+        };
         Worker {
             handle,
             options,
             silence,
             schedule,
             desk: Desk::default(),
+            sessions,
+            spoken_to: 0,
             leases,
             report,
             stop,
@@ -199,6 +211,7 @@ impl Worker {
         self.echo = false;
         self.untimed = false;
         self.schedule.reset(now);
+        self.sessions.reset();
         self.handle.queue.open();
         self.report.bus_up();
     }
@@ -249,6 +262,7 @@ impl Worker {
         let count = line.receive(&mut buffer)?;
         if count > 0 {
             let now = Instant::now();
+            self.sessions.strayed(self.spoken_to);
             self.report
                 .noise(buffer.get(..count).unwrap_or_default(), self.quiet_since, now);
             self.quiet_since = now;
@@ -278,13 +292,24 @@ impl Worker {
                 (drive, pdu.clone(), Some(urgency))
             }
         };
-        let Some(address) = self.handle.image.drives.get(drive).map(|d| d.spec.address) else {
+        let Some(spec) = self.handle.image.drives.get(drive).map(|d| &d.spec) else {
             return Ok(());
         };
-        let request = Request { address, pdu };
+        let step = self.sessions.before(drive, urgency, Instant::now());
+        let request = Request {
+            address: spec.address,
+            pdu: step.map_or(pdu, RequestPdu::N2),
+            n2: spec.profile.n2,
+        };
         let mut frame = std::mem::take(&mut self.frame);
         frame.clear();
         self.handle.image.spec.protocol.encode(&request, &mut frame);
+        if frame.is_empty() {
+            self.frame = frame;
+            self.unknown_to_the_protocol(&job);
+            return Ok(());
+        }
+        self.spoken_to = drive;
         let clear = self.wait_for_silence(line, urgency == Some(Urgency::Stop));
         let late = matches!(&job, Job::Command { index, .. } if self.desk.is_late(*index, Instant::now()));
         let result = match clear {
@@ -299,11 +324,82 @@ impl Worker {
         let Some((ended, began, took)) = result? else {
             return Ok(());
         };
-        match job {
-            Job::Poll(poll) => self.polled(&poll, ended, began, took),
-            Job::Command { index, pdu } => self.commanded(index, &pdu, ended, began, took),
+        match (job, step) {
+            (job, Some(step)) => self.session_went_on(&job, drive, step, ended, began, took),
+            (Job::Poll(poll), None) => self.polled(&poll, ended, began, took),
+            (Job::Command { index, pdu }, None) => self.commanded(index, &pdu, ended, began, took),
         }
         Ok(())
+    }
+
+    /// The protocol has no such request, so that the drive has no such address: it is refused without the line.
+    fn unknown_to_the_protocol(&mut self, job: &Job) {
+        let now = Instant::now();
+        let refused = Reply::Exception(Exception::ADDRESS);
+        match job {
+            Job::Poll(poll) => self.polled(poll, Ended::Reply(refused), now, Duration::ZERO),
+            Job::Command { index, pdu } => {
+                let drives = &self.handle.image.drives;
+                self.desk
+                    .ended(*index, pdu, Some(refused), self.options.retries, drives, now);
+            }
+        }
+    }
+
+    /// A step that N2 needs before the job is over. The job is decided on anew, or has failed with it.
+    fn session_went_on(
+        &mut self,
+        job: &Job,
+        drive: usize,
+        step: Session,
+        ended: Ended,
+        began: Instant,
+        took: Duration,
+    ) {
+        let now = Instant::now();
+        let progress = self.sessions.done(drive, step, &ended, now);
+        match progress {
+            Progress::Going | Progress::Failed => {}
+            Progress::Unlike(device) => self.report.unlike(drive, device),
+            Progress::Changed => self.schedule.read_again(drive, now),
+            Progress::Restarted => self.restarted(drive, now),
+        }
+        match job {
+            Job::Poll(poll) if progress == Progress::Failed => {
+                let ended = match ended {
+                    Ended::Corrupt(why) => Ended::Corrupt(why),
+                    Ended::Silent | Ended::Reply(_) => Ended::Silent,
+                };
+                self.polled(poll, ended, began, took);
+            }
+            Job::Poll(_) => self.schedule.session_done(),
+            Job::Command { index, .. } => {
+                if let Some((_, urgency)) = self.desk.begun(*index) {
+                    self.schedule.command_done(urgency, took);
+                }
+                if progress == Progress::Failed {
+                    let (pdu, drives) = (RequestPdu::N2(step), &self.handle.image.drives);
+                    self.desk.ended(*index, &pdu, None, self.options.retries, drives, now);
+                }
+            }
+        }
+    }
+
+    /// The drive has started anew: nothing that is known of it holds.
+    fn restarted(&mut self, drive: usize, now: Instant) {
+        self.desk.shadow.forget(drive);
+        self.schedule.read_again(drive, now);
+        if let Some(image) = self.handle.image.drives.get(drive) {
+            image.update(Snapshot::outlive);
+        }
+        self.report.restarted(drive);
+    }
+
+    /// Late answers are told apart by what they look like, but on N2, where they look like nothing: sessions see to that.
+    fn owes(&mut self, drive: usize, pdu: &RequestPdu, began: Instant, now: Instant) {
+        if self.sessions.is_empty() && (!self.paid || self.desk.debts.owes(drive, now)) {
+            self.desk.debts.given_up(drive, pdu, began, now);
+        }
     }
 
     /// Waits until the line was silent for its time. False when a command came in before (never for a stop).
@@ -357,7 +453,8 @@ impl Worker {
             self.echo,
         );
         // A reply cannot be whole before its own time on the wire is over; baud rates are off by 2 % at most.
-        let earliest = sent + wire.reply.mul_f64(0.9);
+        let least = spec.format.chars(spec.protocol.least_reply_chars(&request.pdu));
+        let earliest = sent + least.mul_f64(0.9);
         let doubtful = self.desk.debts.could_be_doubled(drive, &request.pdu) || !is_unlike_its_reply(&request.pdu);
         if doubtful && !self.untimed {
             transaction.doubt_before(earliest);
@@ -396,10 +493,12 @@ impl Worker {
         };
         self.paid = matches!(ended, Ended::Corrupt(_)) && transaction.is_paid();
         let took = Instant::now().saturating_duration_since(began) + self.silence;
+        let came = wire.reply.min(spec.format.chars(transaction.seen().len()));
         self.report
-            .exchanged(drive, &transaction, &ended, sent + wire.recognition, wire.reply, took);
+            .exchanged(drive, &transaction, &ended, sent + wire.recognition, came, took);
         if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
             self.report.foreign();
+            self.sessions.strayed(drive);
         }
         if let Some(tap) = tap {
             tap.ended(&ended, Instant::now());
@@ -409,7 +508,13 @@ impl Worker {
 
     fn polled(&mut self, poll: &Poll, ended: Ended, began: Instant, took: Duration) {
         let now = Instant::now();
+        // Of a step before the poll this was told already.
+        let heard = self.sessions.heard(poll.drive, &ended);
+        if heard == Progress::Restarted {
+            self.restarted(poll.drive, now);
+        }
         let polled = match &ended {
+            Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
             Ended::Reply(reply) => {
                 self.desk.debts.answered(poll.drive, &poll.read.pdu(), now);
@@ -417,9 +522,7 @@ impl Worker {
                 Polled::Ok
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                if !self.paid || self.desk.debts.owes(poll.drive, now) {
-                    self.desk.debts.given_up(poll.drive, &poll.read.pdu(), began, now);
-                }
+                self.owes(poll.drive, &poll.read.pdu(), began, now);
                 match ended {
                     Ended::Corrupt(_) => Polled::Garbled,
                     _ => Polled::Failed,
@@ -434,6 +537,7 @@ impl Worker {
             Change::Online => self.report.online(poll.drive),
             Change::Offline => {
                 self.desk.shadow.forget(poll.drive);
+                self.sessions.gone(poll.drive);
                 self.report.offline(poll.drive, "it does not answer");
                 let gone = |c: &Command| c.drive == poll.drive;
                 self.handle.queue.lock().remove(now, &Outcome::Offline, gone);
@@ -478,11 +582,23 @@ impl Worker {
             return;
         };
         self.schedule.command_done(urgency, took);
+        let heard = self.sessions.heard(drive, &ended);
+        if heard == Progress::Restarted {
+            self.restarted(drive, now);
+        }
         let reply = match ended {
+            // The drive did not look at it: it is said again, once the drive is identified.
+            Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
+                let (pdu, drives) = (RequestPdu::N2(Session::Identify), &self.handle.image.drives);
+                self.desk.ended(index, &pdu, None, self.options.retries, drives, now);
+                return;
+            }
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
                 let acknowledged = !matches!(reply, Reply::Exception(_));
-                if acknowledged && pdu.is_write() && self.desk.debts.proves_nothing(drive, pdu, began) {
+                let late = urgency == Urgency::Stop && self.sessions.doubts_stop(drive);
+                let late = late || self.desk.debts.proves_nothing(drive, pdu, began);
+                if acknowledged && pdu.is_write() && late {
                     // It goes out once more.
                     self.desk.doubted(index);
                     self.desk.debts.answered(drive, pdu, now);
@@ -494,9 +610,7 @@ impl Worker {
                 Some(reply)
             }
             Ended::Silent | Ended::Corrupt(_) => {
-                if !self.paid || self.desk.debts.owes(drive, now) {
-                    self.desk.debts.given_up(drive, pdu, began, now);
-                }
+                self.owes(drive, pdu, began, now);
                 None
             }
         };

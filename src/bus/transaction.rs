@@ -274,7 +274,11 @@ mod tests {
             start: 732,
             count: 1,
         };
-        let request = Request { address: 1, pdu };
+        let request = Request {
+            address: 1,
+            pdu,
+            n2: Default::default(),
+        };
         let mut frame = Vec::new();
         rtu::encode_request(&request, &mut frame);
         (request, frame)
@@ -373,6 +377,7 @@ mod tests {
                 address: 2000,
                 value: 1,
             },
+            n2: Default::default(),
         };
         let mut frame = Vec::new();
         rtu::encode_request(&request, &mut frame);
@@ -442,7 +447,11 @@ mod tests {
             address: 2000,
             value: 1,
         };
-        let write = Request { address: 1, pdu };
+        let write = Request {
+            address: 1,
+            pdu,
+            n2: Default::default(),
+        };
         let mut bytes = vec![0x37];
         rtu::encode_request(&write, &mut bytes);
         let (ms, protocol) = (Duration::from_millis, Protocol::ModbusRtu);
@@ -511,7 +520,11 @@ mod tests {
             start: 0x20,
             count: 2,
         };
-        let request = Request { address: 1, pdu };
+        let request = Request {
+            address: 1,
+            pdu,
+            n2: Default::default(),
+        };
         let mut frame = Vec::new();
         Protocol::ModbusAscii.encode(&request, &mut frame);
         (request, frame, b":01030400050000F3\r\n")
@@ -606,6 +619,7 @@ mod tests {
         let write = Request {
             address: 1,
             pdu: RequestPdu::WriteRegister { address: 1, value: 1 },
+            n2: Default::default(),
         };
         let mut frame = Vec::new();
         Protocol::ModbusAscii.encode(&write, &mut frame);

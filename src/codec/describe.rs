@@ -5,7 +5,8 @@
 use std::fmt::Write as _;
 use std::ops::Range;
 
-use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table};
+use super::n2::Region;
+use super::{Decoded, Exception, Protocol, Reply, Request, RequestPdu, Table, n2};
 
 /// Values that a line shows; the bytes of the frame have the others.
 const SHOWN: usize = 16;
@@ -99,6 +100,7 @@ fn garbage_len(protocol: Protocol, request: &Request, rest: &[u8], answered: boo
 fn behind(protocol: Protocol, bytes: &[u8]) -> Kind {
     match protocol.open_frame(bytes) {
         Some(_) => Kind::Foreign,
+        None if protocol == Protocol::N2 && n2_answer_in(bytes) => Kind::Foreign,
         None => Kind::Garbage,
     }
 }
@@ -166,13 +168,42 @@ pub fn request(request: &RequestPdu) -> String {
         RequestPdu::DeviceIdentification { code, object } => {
             format!("device identification: code {code} from object {object}")
         }
+        RequestPdu::N2(_) => n2_command(request).unwrap_or_default(),
     }
+}
+
+/// A request as that protocol's users know it: `read AI 2 value` and not `read input 2..3` on N2.
+pub fn request_on(protocol: Protocol, pdu: &RequestPdu) -> String {
+    let own = (protocol == Protocol::N2).then(|| n2_command(pdu)).flatten();
+    own.unwrap_or_else(|| request(pdu))
+}
+
+/// A command of N2: `read AI 2 value`, `override AO 1 = 50`, `identify`.
+fn n2_command(pdu: &RequestPdu) -> Option<String> {
+    use n2::Command;
+    Some(match n2::command_of(pdu)? {
+        Command::Identify => "identify".to_string(),
+        Command::Poll { again: false } => "poll for changes".to_string(),
+        Command::Poll { again: true } => "poll for changes, acknowledged".to_string(),
+        Command::Read { object, .. } => match object.region {
+            Region::Bi | Region::Bo => format!("read {object} state"),
+            _ => format!("read {object} value"),
+        },
+        Command::Override { object, data } => match data.as_slice() {
+            [a, b, c, d] => format!("override {object} = {}", f32::from_be_bytes([*a, *b, *c, *d])),
+            [byte] => format!("override {object} = {byte}"),
+            _ => format!("override {object}"),
+        },
+        Command::Release { object } => format!("release {object}"),
+        _ => return None,
+    })
 }
 
 /// What came back, against its request: `3 registers: 0023 2000 1388`, `exception 02 (illegal data address)`,
 /// `foreign: address 3, function 3, 2 registers`, `7 of 27 bytes`.
 pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
     match protocol.decode(asked, bytes) {
+        Decoded::Reply { reply, .. } if protocol == Protocol::N2 => n2_answer(&asked.pdu, &reply),
         Decoded::Reply { reply, .. } => answer(&reply),
         Decoded::Foreign { .. } => stray(protocol, bytes),
         Decoded::Incomplete => format!("{} of {} bytes", bytes.len(), protocol.reply_chars(&asked.pdu)),
@@ -182,6 +213,9 @@ pub fn reply(protocol: Protocol, asked: &Request, bytes: &[u8]) -> String {
 
 /// Bytes that nobody asked for: a sound frame of somebody else, or noise.
 pub fn stray(protocol: Protocol, bytes: &[u8]) -> String {
+    if protocol == Protocol::N2 {
+        return n2_stray(bytes);
+    }
     let Some((address, pdu)) = protocol.open_frame(bytes) else {
         return no_frame(bytes);
     };
@@ -207,8 +241,46 @@ fn answer(reply: &Reply) -> String {
         Reply::Written => "written".to_string(),
         Reply::Diagnostics(word) => format!("diagnostics: 0x{word:04X}"),
         Reply::DeviceIdentification(bytes) => identification(bytes),
+        Reply::Identified(device) => format!("device type {device:02X}h"),
+        Reply::Changes(digits) if digits.is_empty() => "nothing new".to_string(),
+        Reply::Changes(digits) => format!("changes: {}", counted(digits.len(), "digit")),
         Reply::Exception(code) => code.to_string(),
     }
+}
+
+/// A reply of N2 in the words of its object: `25`, `on`, `acknowledged`, `N11 (…)`.
+fn n2_answer(asked: &RequestPdu, reply: &Reply) -> String {
+    match reply {
+        Reply::Bits(bits) => if bits.first() == Some(&true) { "on" } else { "off" }.to_string(),
+        Reply::Registers(words) => match words.as_slice() {
+            [high, low] => f32::from_bits(u32::from(*high) << 16 | u32::from(*low)).to_string(),
+            [word] => (*word as i16).to_string(),
+            _ => answer(reply),
+        },
+        Reply::Written => "acknowledged".to_string(),
+        Reply::Exception(code) if code.0 & 0x80 != 0 => code.meaning().replacen("N2 ", "N", 1),
+        // Not the drive's words: its own state was called unreliable.
+        Reply::Exception(_) if matches!(asked, RequestPdu::Read { .. }) => "unreliable".to_string(),
+        _ => answer(reply),
+    }
+}
+
+/// A line that nobody asked for: a request of another master, or an answer that came late.
+fn n2_stray(bytes: &[u8]) -> String {
+    if let Some((address, Ok(_))) = n2::Command::decode(bytes) {
+        return format!("foreign: a request to address {address}");
+    }
+    if n2_answer_in(bytes) {
+        return "foreign: an answer that nobody asked for, or too late".to_string();
+    }
+    no_frame(bytes)
+}
+
+/// Whether the bytes are one sound answer of N2.
+fn n2_answer_in(bytes: &[u8]) -> bool {
+    bytes
+        .strip_suffix(b"\r")
+        .is_some_and(|line| n2::Answer::decode(line).is_ok())
 }
 
 /// The objects behind code, conformity, more-follows, next object and count.
@@ -288,6 +360,7 @@ mod tests {
         Request {
             address,
             pdu: pdu.unwrap(),
+            n2: Default::default(),
         }
     }
 
@@ -399,6 +472,7 @@ mod tests {
             let asked = Request {
                 address,
                 pdu: decoded.unwrap(),
+                n2: Default::default(),
             };
             assert_eq!(reply(RTU, &asked, &framed(1, pdu)), text);
         }
@@ -512,6 +586,7 @@ mod tests {
             Request {
                 address,
                 pdu: pdu.unwrap(),
+                n2: Default::default(),
             }
         };
         let echo = b":010300200002DA\r\n";

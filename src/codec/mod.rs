@@ -13,6 +13,7 @@ pub mod wire;
 
 pub use checksum::{crc16, lrc};
 pub use modbus::{Exception, Reply, RequestPdu, Table};
+pub use n2::N2Options;
 pub use wire::{LineFormat, Parity, Silence};
 
 use std::time::Duration;
@@ -26,12 +27,18 @@ pub struct Request {
     pub address: u8,
     /// What is asked.
     pub pdu: RequestPdu,
+    /// What is known of the drive's N2; other protocols do not look at it.
+    pub n2: N2Options,
 }
 
 impl Request {
-    /// Asks the drive at `address`.
+    /// Asks the drive at `address`, of which nothing else is known.
     pub fn new(address: u8, pdu: RequestPdu) -> Request {
-        Request { address, pdu }
+        Request {
+            address,
+            pdu,
+            n2: N2Options::DEFAULT,
+        }
     }
 }
 
@@ -105,9 +112,10 @@ impl Protocol {
         }
     }
 
-    /// The frame of `request`, appended to `out`.
+    /// The frame of `request`, appended to `out`; nothing where the protocol has no such request.
     pub fn encode(self, request: &Request, out: &mut Vec<u8>) {
         match self {
+            Protocol::ModbusRtu | Protocol::ModbusAscii if matches!(request.pdu, RequestPdu::N2(_)) => {}
             Protocol::ModbusRtu => rtu::encode_request(request, out),
             Protocol::ModbusAscii => ascii::encode_request(request, out),
             Protocol::N2 => n2::encode_request(request, out),
@@ -184,7 +192,15 @@ impl Protocol {
         }
     }
 
-    /// Characters on the wire of the regular (not exception) reply's frame.
+    /// Characters on the wire of the shortest regular reply's frame, where replies of several lengths are regular.
+    pub fn least_reply_chars(self, request: &RequestPdu) -> usize {
+        match self {
+            Protocol::ModbusRtu | Protocol::ModbusAscii => self.reply_chars(request),
+            Protocol::N2 => n2::least_reply_chars(request),
+        }
+    }
+
+    /// Characters on the wire of the (longest) regular reply's frame, not of an exception's.
     pub fn reply_chars(self, request: &RequestPdu) -> usize {
         match self {
             Protocol::ModbusRtu => rtu::OVERHEAD + request.reply_len(),

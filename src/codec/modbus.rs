@@ -3,6 +3,7 @@
 //! A master encodes requests and decodes replies; the Modbus TCP server and the simulated drives
 //! do it the other way round with the same types.
 
+use super::n2::Session;
 use serde::{Deserialize, Serialize};
 use std::fmt;
 
@@ -208,6 +209,8 @@ pub enum RequestPdu {
         /// First object.
         object: u8,
     },
+    /// What only a bus of N2 says: no function of Modbus, never encoded as one.
+    N2(Session),
 }
 
 /// A reply of a slave.
@@ -223,6 +226,10 @@ pub enum Reply {
     Diagnostics(u16),
     /// To function 43/14: the bytes after the MEI type.
     DeviceIdentification(Vec<u8>),
+    /// To N2's Identify: the device type.
+    Identified(u8),
+    /// To a poll of N2: the digits of the report, none where nothing changed.
+    Changes(Vec<u8>),
     /// Refused.
     Exception(Exception),
 }
@@ -257,7 +264,7 @@ fn unpack(bytes: &[u8], count: usize) -> Vec<bool> {
 }
 
 impl RequestPdu {
-    /// The function code.
+    /// The function code; 0, which is none, for what is not of Modbus.
     pub fn function(&self) -> u8 {
         match self {
             RequestPdu::Read { table, .. } => table.read_function(),
@@ -269,6 +276,7 @@ impl RequestPdu {
             RequestPdu::MaskWrite { .. } => 22,
             RequestPdu::ReadWrite { .. } => 23,
             RequestPdu::DeviceIdentification { .. } => 43,
+            RequestPdu::N2(_) => 0,
         }
     }
 
@@ -295,6 +303,7 @@ impl RequestPdu {
             RequestPdu::MaskWrite { .. } => 7,
             RequestPdu::ReadWrite { values, .. } => 10 + 2 * values.len(),
             RequestPdu::DeviceIdentification { .. } => 4,
+            RequestPdu::N2(_) => 0,
         }
     }
 
@@ -317,8 +326,12 @@ impl RequestPdu {
 
     /// Appends the PDU to `out`.
     pub fn encode(&self, out: &mut Vec<u8>) {
+        if matches!(self, RequestPdu::N2(_)) {
+            return;
+        }
         out.push(self.function());
         match self {
+            RequestPdu::N2(_) => {}
             RequestPdu::Read { start, count, .. } => {
                 put(out, *start);
                 put(out, *count);
@@ -527,6 +540,7 @@ impl Reply {
                 out.extend_from_slice(&[43, 14]);
                 out.extend_from_slice(body);
             }
+            Reply::Identified(_) | Reply::Changes(_) => encode_exception(request.function(), Exception::FUNCTION, out),
             Reply::Written | Reply::Exception(_) => encode_echo(request, out),
         }
     }

@@ -1,4 +1,4 @@
-//! Metasys N2 (n2.md): the objects of a drive, mapped onto the tables of Modbus.
+//! Metasys N2 (n2.md): frames of both sides, and the objects of a drive mapped onto the tables of Modbus.
 //!
 //! | object | table | addresses | function |
 //! |---|---|---|---|
@@ -7,29 +7,255 @@
 //! | AI n | input register | 2 (n - 1) and the next, float, high word first | read of attribute 3 |
 //! | AO n | holding register | 2 (n - 1) and the next, float, high word first | read of attribute 3; written by override |
 //! | ADI n | input register | 0x4000 + n - 1 | read of attribute 2 |
+//!
+//! A request that means no object has no frame: it never goes on the line. What no manual says stands in one table,
+//! see [`ASSUMPTIONS`]. The master's side is here; [`command`] has the frames themselves, which a simulated drive reads
+//! and answers with the same types.
+
+pub mod assumptions;
+pub mod command;
+pub mod object;
+#[cfg(test)]
+mod tests;
 
 use std::time::Duration;
 
-use super::modbus::RequestPdu;
-use super::{Decoded, Request};
+pub use assumptions::{ASSUMPTIONS, Assumption, N2Options, RegionWidth};
+pub use command::{Answer, Command};
+pub use object::{Object, Region};
+
+use super::modbus::{Reply, RequestPdu, Table};
+use super::{Decoded, Exception, Request};
+use command::hex_value;
 
 /// Least pause between two requests to the same drive (n2.md 4).
 pub const GAP: Duration = Duration::from_millis(5);
 
-/// Appends the request's frame to `out`.
-pub fn encode_request(_request: &Request, _out: &mut Vec<u8>) {}
+/// Longest message, lead and CR included (n2.md 4).
+pub const LONGEST: usize = 256;
+
+/// Baud rate and character format, always (n2.md 1).
+pub const BAUD: u32 = 9600;
+/// Character format, always.
+pub const FORMAT: &str = "8N1";
+/// Time for the first byte of a reply (n2.md 4).
+pub const RESPONSE_TIMEOUT: Duration = Duration::from_millis(250);
+/// Tries after the first (n2.md 4: three tries).
+pub const RETRIES: u32 = 2;
+
+/// What the bus itself says to a drive, beside reads and writes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Session {
+    /// Who is there? A drive that has started anew answers nothing else.
+    Identify,
+    /// What has changed?
+    Poll {
+        /// Acknowledges the report before.
+        again: bool,
+    },
+    /// Gives an overridden object back to the drive's own control.
+    Release {
+        /// Table of the object.
+        table: Table,
+        /// Its first address.
+        address: u16,
+    },
+}
+
+/// The master's command that a request means; `None` where it means no object.
+pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
+    match pdu {
+        RequestPdu::Read { table, start, count } => {
+            let object = Object::at(*table, *start).filter(|object| object.items() == *count)?;
+            let attribute = object.region.value_attribute();
+            Some(Command::Read { object, attribute })
+        }
+        RequestPdu::WriteCoil { address, on } => switch(*address, *on),
+        RequestPdu::WriteCoils { start, bits } => match bits.as_slice() {
+            [on] => switch(*start, *on),
+            _ => None,
+        },
+        RequestPdu::WriteRegisters { start, values } => match values.as_slice() {
+            [high, low] => {
+                let object = Object::at(Table::Holding, *start)?;
+                let data = [high.to_be_bytes(), low.to_be_bytes()].concat();
+                Some(Command::Override { object, data })
+            }
+            _ => None,
+        },
+        RequestPdu::N2(Session::Identify) => Some(Command::Identify),
+        RequestPdu::N2(Session::Poll { again }) => Some(Command::Poll { again: *again }),
+        RequestPdu::N2(Session::Release { table, address }) => {
+            let object = Object::at(*table, *address)?;
+            Some(Command::Release { object })
+        }
+        _ => None,
+    }
+}
+
+fn switch(address: u16, on: bool) -> Option<Command> {
+    let object = Object::at(Table::Coil, address)?;
+    let data = vec![u8::from(on)];
+    Some(Command::Override { object, data })
+}
+
+/// Appends the request's frame to `out`; nothing for a request that means no object.
+pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
+    if let Some(command) = command_of(&request.pdu) {
+        command.encode(request.address, request.n2.region_width, out);
+    }
+}
+
+/// What the regular reply to a request holds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Expected {
+    /// A status byte with the state.
+    State,
+    /// A float, perhaps behind a byte.
+    Float,
+    /// 16 bits, perhaps behind a byte.
+    Integer,
+    /// The device type.
+    Identity,
+    /// Change records, or none.
+    Changes,
+    /// Nothing.
+    Acknowledgement,
+}
+
+fn expected(pdu: &RequestPdu) -> Option<Expected> {
+    Some(match command_of(pdu)? {
+        Command::Read { object, .. } => match object.region {
+            Region::Bi | Region::Bo => Expected::State,
+            Region::Adi => Expected::Integer,
+            _ => Expected::Float,
+        },
+        Command::Identify => Expected::Identity,
+        Command::Poll { .. } => Expected::Changes,
+        _ => Expected::Acknowledgement,
+    })
+}
 
 /// What `bytes` are as the answer to `request`.
-pub fn decode_reply(_request: &Request, _bytes: &[u8]) -> Decoded {
-    Decoded::Incomplete
+///
+/// A reply carries neither address nor command: only its form is checked against what was asked. Blank characters and
+/// the glitches of a line that changes direction are passed over before the first letter.
+pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
+    let Some(begin) = bytes.iter().position(u8::is_ascii_graphic) else {
+        return if bytes.len() > LONGEST {
+            Decoded::Corrupt("no reply in the longest one's characters")
+        } else {
+            Decoded::Incomplete
+        };
+    };
+    let frame = bytes.get(begin..).unwrap_or_default();
+    let Some(length) = frame.iter().position(|byte| *byte == b'\r') else {
+        return unended(frame);
+    };
+    let used = begin + length + 1;
+    let line = frame.get(..length).unwrap_or_default();
+    match line.first() {
+        // The echo of a request, or another master's: nobody's answer.
+        Some(b'>') => Decoded::Foreign { used },
+        _ => match reply_in(request, line) {
+            Ok(reply) => Decoded::Reply { used, reply },
+            Err(why) => Decoded::Corrupt(why),
+        },
+    }
 }
 
-/// Characters of the request's frame.
-pub fn request_chars(_request: &RequestPdu) -> usize {
-    12
+/// A line without its CR: read on, unless it cannot become a reply.
+fn unended(frame: &[u8]) -> Decoded {
+    if frame.len() > LONGEST {
+        return Decoded::Corrupt("no CR in the longest reply's characters");
+    }
+    match frame.split_first() {
+        Some((b'A' | b'a' | b'N' | b'n', rest)) if rest.iter().all(u8::is_ascii_hexdigit) => Decoded::Incomplete,
+        Some((b'>', _)) => Decoded::Incomplete,
+        _ => Decoded::Corrupt("the reply is no A or N and hexadecimal digits"),
+    }
 }
 
-/// Characters of the regular reply's frame.
-pub fn reply_chars(_request: &RequestPdu) -> usize {
-    14
+fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
+    let answer = Answer::decode(line)?;
+    let expected = expected(&request.pdu).ok_or("nothing was asked")?;
+    let data = match answer {
+        // The drive saw a wrong checksum: the line, not the drive, refuses.
+        Answer::Nak(command::CHECKSUM) => return Err("the drive saw a wrong checksum (N02)"),
+        Answer::Nak(code) => return Ok(Reply::Exception(Exception::n2(code))),
+        Answer::Data(digits) if expected == Expected::Changes => return Ok(Reply::Changes(digits)),
+        Answer::Data(digits) => bytes_of(&digits).ok_or("an odd number of digits")?,
+        Answer::Ack => Vec::new(),
+    };
+    let word = |high: u8, low: u8| u16::from_be_bytes([high, low]);
+    match (expected, data.as_slice()) {
+        (Expected::Acknowledgement, []) => Ok(Reply::Written),
+        (Expected::Changes, []) => Ok(Reply::Changes(Vec::new())),
+        (Expected::Identity, [device]) => Ok(Reply::Identified(*device)),
+        (Expected::State, [status]) => Ok(state(*status, &request.n2)),
+        (Expected::Integer, [a, b] | [_, a, b]) => Ok(Reply::Registers(vec![word(*a, *b)])),
+        // Whatever the bits are: what is no number becomes no value where the point is decoded.
+        (Expected::Float, [a, b, c, d] | [_, a, b, c, d]) => Ok(Reply::Registers(vec![word(*a, *b), word(*c, *d)])),
+        (Expected::Acknowledgement, _) => Err("data where an acknowledgement was expected"),
+        (_, []) => Err("an acknowledgement where data was expected"),
+        (Expected::Identity, _) => Err("the reply has not the length of a device type"),
+        (Expected::State, _) => Err("the reply has not the length of a status byte"),
+        (Expected::Integer, _) => Err("the reply has not the length of an integer"),
+        (Expected::Float, _) => Err("the reply has not the length of a float"),
+        (Expected::Changes, _) => Err("the reply is no report of changes"),
+    }
+}
+
+/// The state in a status byte. A value that the drive calls unreliable is none.
+fn state(status: u8, options: &N2Options) -> Reply {
+    let bit = |number: u8| status.checked_shr(u32::from(number)).unwrap_or(0) & 1 == 1;
+    if options.unreliable_bit.is_some_and(bit) {
+        return Reply::Exception(Exception::DEVICE_FAILURE);
+    }
+    Reply::Bits(vec![bit(options.state_bit)])
+}
+
+fn bytes_of(digits: &[u8]) -> Option<Vec<u8>> {
+    if !digits.len().is_multiple_of(2) {
+        return None;
+    }
+    digits
+        .chunks_exact(2)
+        .map(|pair| Some(hex_value(*pair.first()?)? << 4 | hex_value(*pair.get(1)?)?))
+        .collect()
+}
+
+/// Characters of the request's frame, with a region of two characters.
+pub fn request_chars(request: &RequestPdu) -> usize {
+    let mut frame = Vec::with_capacity(24);
+    if let Some(command) = command_of(request) {
+        command.encode(1, RegionWidth::Two, &mut frame);
+    }
+    frame.len()
+}
+
+/// Characters of the longest regular reply's frame: with a byte before the value, or a full report.
+pub fn reply_chars(request: &RequestPdu) -> usize {
+    framed(match expected(request) {
+        Some(Expected::Float) => 10,
+        Some(Expected::Integer) => 6,
+        Some(Expected::Changes) => command::LONGEST_REPORT,
+        Some(Expected::State | Expected::Identity) => 2,
+        Some(Expected::Acknowledgement) | None => 0,
+    })
+}
+
+/// Characters of the shortest regular reply's frame.
+pub fn least_reply_chars(request: &RequestPdu) -> usize {
+    framed(match expected(request) {
+        Some(Expected::Float) => 8,
+        Some(Expected::Integer) => 4,
+        Some(Expected::State | Expected::Identity) => 2,
+        Some(Expected::Changes | Expected::Acknowledgement) | None => 0,
+    })
+}
+
+/// Lead, digits with their checksum, CR.
+fn framed(digits: usize) -> usize {
+    if digits == 0 { 2 } else { 1 + digits + 2 + 1 }
 }

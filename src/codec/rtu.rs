@@ -138,6 +138,7 @@ mod tests {
         Request {
             address: 1,
             pdu: RequestPdu::Read { table, start, count },
+            n2: Default::default(),
         }
     }
 
@@ -148,6 +149,7 @@ mod tests {
                 start,
                 values: values.to_vec(),
             },
+            n2: Default::default(),
         }
     }
 
@@ -155,6 +157,7 @@ mod tests {
         Request {
             address: 1,
             pdu: RequestPdu::WriteRegister { address, value },
+            n2: Default::default(),
         }
     }
 
@@ -170,10 +173,12 @@ mod tests {
         let coil = |address, on| Request {
             address: 1,
             pdu: RequestPdu::WriteCoil { address, on },
+            n2: Default::default(),
         };
         let diag = |subfunction, data| Request {
             address: 1,
             pdu: RequestPdu::Diagnostics { subfunction, data },
+            n2: Default::default(),
         };
         let cases = [
             (read(Table::Holding, 2000, 3), "01 03 07 D0 00 03 05 46"),

@@ -8,7 +8,7 @@ use std::time::Duration;
 use super::derive::Derived;
 use super::identify::Expected;
 use super::model::{Kind, ModelPoint, Value};
-use crate::codec::{Protocol, Table};
+use crate::codec::{N2Options, Protocol, Table};
 use crate::document::Node;
 
 /// A validated profile.
@@ -40,6 +40,8 @@ pub struct Profile {
     pub input_is_holding: bool,
     /// Reads that show the family, for whoever looks for drives.
     pub identify: Vec<Expected>,
+    /// What is known of the family's N2.
+    pub n2: N2Options,
     /// Name of the behaviour that a simulated drive of this profile has.
     pub simulator: Option<String>,
     /// Address ranges with their limits per request, ascending.

@@ -366,6 +366,7 @@ mod tests {
                 start: 2100,
                 count: 2,
             },
+            n2: Default::default(),
         };
         let (mut asked, mut reply) = (Vec::new(), Vec::new());
         rtu::encode_request(&request, &mut asked);

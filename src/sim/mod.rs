@@ -7,6 +7,7 @@
 //!   do, asked by Modbus PDUs (pure); and [`autopilot`], which runs one in a demo.
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
+//! - [`n2`]: the N2 board that a drive may have in the place of its Modbus board.
 //! - [`faults`]: what goes wrong on a line, by chance or by script.
 //! - [`framing`]: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
@@ -30,6 +31,7 @@ pub mod framing;
 pub mod half_duplex;
 pub mod model;
 pub mod motor;
+pub mod n2;
 pub mod nx;
 pub mod parameter_set;
 pub mod pty;

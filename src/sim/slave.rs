@@ -6,7 +6,9 @@
 use super::SimTime;
 use super::drive::{DriveOptions, SimulatedDrive};
 use super::framing;
+use super::n2::{Board, code_of, maps};
 use crate::codec::modbus::encode_exception;
+use crate::codec::n2::{Answer, Command};
 use crate::codec::{Exception, Protocol, RequestPdu};
 use std::collections::BTreeMap;
 
@@ -37,12 +39,16 @@ pub struct Asked {
     pub function: u8,
     /// The request, or why its PDU is refused.
     pub request: Result<RequestPdu, Exception>,
+    /// The command on a line of N2, or the code of its refusal.
+    pub command: Option<Result<Command, u8>>,
 }
 
 /// The drives of one line by address.
 #[derive(Debug, Clone, Default)]
 pub struct Slaves {
     drives: BTreeMap<u8, SimulatedDrive>,
+    /// Their N2 boards, where the line is one of N2.
+    boards: BTreeMap<u8, Board>,
     /// The drive that [`Slaves::advance_next`] served last.
     served: u8,
 }
@@ -50,11 +56,18 @@ pub struct Slaves {
 impl Slaves {
     /// Drives that are switched on at `now`. A later drive with an address already taken replaces the earlier one.
     pub fn new(drives: impl IntoIterator<Item = DriveOptions>, now: SimTime) -> Slaves {
-        let drives = drives
-            .into_iter()
-            .map(|options| (options.address, SimulatedDrive::new(options, now)))
-            .collect();
-        Slaves { drives, served: 0 }
+        let mut slaves = Slaves::default();
+        for options in drives {
+            let (address, map) = (options.address, maps::of(&options.model));
+            slaves.boards.insert(address, Board::new(map, now));
+            slaves.drives.insert(address, SimulatedDrive::new(options, now));
+        }
+        slaves
+    }
+
+    /// The N2 board of a drive.
+    pub fn board(&mut self, address: u8) -> Option<&mut Board> {
+        self.boards.get_mut(&address)
     }
 
     /// A drive of the line.
@@ -88,6 +101,9 @@ impl Slaves {
 
     /// What a whole frame means; a broadcast is acted upon at once.
     pub fn hear(&mut self, protocol: Protocol, frame: &[u8], now: SimTime) -> Heard {
+        if protocol == Protocol::N2 {
+            return self.hear_n2(frame);
+        }
         let Some((address, decoded)) = framing::open(protocol, frame) else {
             return Heard::BadFrame;
         };
@@ -107,6 +123,23 @@ impl Slaves {
             address,
             function,
             request: decoded.map_err(|(_, exception)| exception),
+            command: None,
+        })
+    }
+
+    fn hear_n2(&self, frame: &[u8]) -> Heard {
+        let Some((address, command)) = Command::decode(frame) else {
+            return Heard::BadFrame;
+        };
+        if !self.drives.get(&address).is_some_and(SimulatedDrive::answers) {
+            return Heard::Nobody(address);
+        }
+        Heard::Request(Asked {
+            protocol: Protocol::N2,
+            address,
+            function: 0,
+            request: Err(Exception::FUNCTION),
+            command: Some(command),
         })
     }
 
@@ -115,6 +148,11 @@ impl Slaves {
         let Some(drive) = self.drives.get_mut(&asked.address) else {
             return;
         };
+        if let (Some(command), Some(board)) = (&asked.command, self.boards.get_mut(&asked.address)) {
+            drive.heard(now);
+            board.answer(command, now, &mut |request| drive.answer(request, now), out);
+            return;
+        }
         match &asked.request {
             Ok(request) => {
                 let mut pdu = Vec::with_capacity(request.reply_len());
@@ -143,6 +181,10 @@ impl Slaves {
 
 /// The frame of an exception to a request, appended to `out`; the drive is not asked.
 pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
+    if asked.command.is_some() {
+        Answer::Nak(code_of(exception)).encode(out);
+        return;
+    }
     let mut pdu = Vec::with_capacity(2);
     encode_exception(asked.function, exception, &mut pdu);
     framing::close(asked.protocol, asked.address, &pdu, out);

@@ -8,6 +8,7 @@ use super::drive::{DriveOptions, SimulatedDrive};
 use super::endpoint::{Endpoint, EndpointOptions};
 use super::faults::FaultPlan;
 use super::half_duplex::{HalfDuplex, LineRules, Wire};
+use super::n2::Board;
 use super::slave::Slaves;
 use super::statistics::{Recorded, Statistics, Transcript};
 use crate::line::{poll_until, sharpen_timers, wait_until};
@@ -290,6 +291,13 @@ impl LineControl {
             drive.advance(now);
             act(drive, now)
         })
+    }
+
+    /// Does something with the N2 board of a drive; `None` when there is none with that address.
+    pub fn with_board<R>(&self, address: u8, act: impl FnOnce(&mut Board, SimTime) -> R) -> Option<R> {
+        let mut line = self.0.line();
+        let now = self.0.now();
+        line.slaves().board(address).map(|board| act(board, now))
     }
 
     /// Takes a drive off the line or puts it back; false when there is none with that address.

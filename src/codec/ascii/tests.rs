@@ -9,7 +9,11 @@ fn line(text: &str) -> Vec<u8> {
 }
 
 fn to(address: u8, pdu: RequestPdu) -> Request {
-    Request { address, pdu }
+    Request {
+        address,
+        pdu,
+        n2: Default::default(),
+    }
 }
 
 fn read(start: u16, count: u16) -> Request {

@@ -2,6 +2,7 @@
 
 mod base;
 mod derived;
+mod n2;
 mod place;
 mod points;
 mod ranges;
@@ -203,6 +204,9 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         .zip(&tables)
         .map(|(i, table)| read_point(table, i, &names, &ranges, &offsets))
         .collect();
+    if protocols.contains(&Protocol::N2) {
+        n2::write_on_change(&tables, &mut points);
+    }
     reference::apply(reader, &mut points);
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
@@ -225,8 +229,9 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         source: reader.or("source", String::new()),
         built_in,
         base,
-        protocols,
         bauds: reader.or("bauds", Vec::new()),
+        n2: n2::read_n2(reader, &protocols),
+        protocols,
         addresses,
         turnaround: reader.or("turnaround", Duration::from_millis(2)),
         update_period: reader.or("update_period", Duration::from_millis(10)),

@@ -246,6 +246,7 @@ fn the_measuring_rod_keeps_the_silence() {
                 start: 2100,
                 count: 11,
             },
+            n2: Default::default(),
         })
         .collect();
     let master = BareOptions {

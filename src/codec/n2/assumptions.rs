@@ -1,0 +1,138 @@
+//! What no manual says of N2, in one place. Nothing here was verified on hardware.
+//!
+//! Johnson Controls' own specification is not public, and the manuals of the drives print no frame. What the frames
+//! rest on, and what may turn out otherwise with a real drive, is listed in [`ASSUMPTIONS`]; whatever matters to the
+//! master is an option of a profile, section `[n2]`.
+
+use std::time::Duration;
+
+/// Digits of the region in override and release.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RegionWidth {
+    /// `723…`.
+    One,
+    /// `7203…`.
+    Two,
+}
+
+impl RegionWidth {
+    /// The number in profiles.
+    pub fn digits(self) -> u8 {
+        match self {
+            RegionWidth::One => 1,
+            RegionWidth::Two => 2,
+        }
+    }
+}
+
+/// What a profile says of its drives' N2.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct N2Options {
+    /// Bit of the status byte of BI and BO that is the state, 0..=7.
+    pub state_bit: u8,
+    /// Bit of that byte which calls the state unreliable; `None`: not looked at.
+    pub unreliable_bit: Option<u8>,
+    /// Digits of the region in override and release.
+    pub region_width: RegionWidth,
+    /// Drives are identified before they are asked anything else, and after an exchange that failed.
+    pub identify: bool,
+    /// Device type that a drive is expected to tell.
+    pub device_type: u8,
+    /// An overridden analog output is released afterwards.
+    pub release: bool,
+    /// Pause between two polls for changes; a drive that is not polled takes itself for alone after about 10 minutes.
+    pub poll: Duration,
+}
+
+impl N2Options {
+    /// What holds where a profile says nothing.
+    pub const DEFAULT: N2Options = N2Options {
+        state_bit: 6,
+        unreliable_bit: None,
+        region_width: RegionWidth::Two,
+        identify: true,
+        device_type: 0x10,
+        release: true,
+        poll: Duration::from_secs(30),
+    };
+}
+
+impl Default for N2Options {
+    fn default() -> Self {
+        N2Options::DEFAULT
+    }
+}
+
+/// Bit of a configuration byte that switches the report of changes on; simulator only.
+pub const CONFIG_REPORT_BIT: u8 = 0;
+/// Bit of a status byte that tells an override; simulator only.
+pub const STATUS_OVERRIDE_BIT: u8 = 5;
+/// What the simulator sends for a limit that is switched off.
+pub const INVALID_FLOAT: u32 = 0x7FC0_0000;
+
+/// Something that no manual says.
+#[derive(Debug, Clone, Copy)]
+pub struct Assumption {
+    /// Key of `[n2]` in a profile that changes it; `None` where nothing needs to be changed.
+    pub key: Option<&'static str>,
+    /// What is assumed.
+    pub what: &'static str,
+    /// What it rests on.
+    pub why: &'static str,
+    value: fn(&N2Options) -> String,
+}
+
+impl Assumption {
+    /// The value that holds with those options, as a profile writes it where it has a key.
+    pub fn value(&self, options: &N2Options) -> String {
+        (self.value)(options)
+    }
+}
+
+macro_rules! assumptions {
+    ($($key:expr, $what:literal, $why:literal, $value:expr;)*) => {
+        /// All assumptions, those with a key first.
+        pub const ASSUMPTIONS: &[Assumption] = &[$(Assumption { key: $key, what: $what, why: $why, value: $value },)*];
+    };
+}
+
+assumptions! {
+    Some("state_bit"), "bit of the status byte of BI and BO that is the state",
+        "the manuals name the bit without its place", |o| o.state_bit.to_string();
+    Some("unreliable_bit"), "bit of that byte which calls the state unreliable; such a state is not served",
+        "the manuals name the bit without its place (7 is likely), and the drives at hand are always reliable",
+        |o| o.unreliable_bit.map_or("none".to_string(), |bit| bit.to_string());
+    Some("region_width"), "digits of the region in override and release",
+        "one open master sends 2, and 1 in reads and writes", |o| o.region_width.digits().to_string();
+    Some("identify"), "a drive answers nothing before it was identified, so that goes first",
+        "TECO and others say so; the frame is that of one open master", |o| o.identify.to_string();
+    Some("device_type"), "device type that the drive tells; another one is a warning",
+        "Danfoss, Rockwell and ProSoft print 10h for what is no JCI device", |o| format!("0x{:02X}", o.device_type);
+    Some("release"), "an overridden AO is released at once",
+        "Vacon and Eaton advise it; TECO acknowledges it without action", |o| o.release.to_string();
+    Some("poll"), "pause between two polls for changes",
+        "Vacon and Eaton release what is overridden after about 10 minutes without a poll",
+        |o| humantime::format_duration(o.poll).to_string();
+    None, "checksum: sum of the characters behind the lead, modulo 256",
+        "one open master; fits printed frames of a related protocol", |_| "sum".to_string();
+    None, "nothing new: an acknowledgement without data",
+        "one open master", |_| "A".to_string();
+    None, "records of a report of changes: any data means that something changed, and is read",
+        "no source has the layout; the simulator sends region, number, status and value", |_| "any".to_string();
+    None, "reports are taken with poll 0/4 first and 0/5 after it, 16 at most",
+        "one source each for the order and for the acknowledgement", |_| "0/4, 0/5".to_string();
+    None, "a read may put one byte before the value; it is not looked at",
+        "devices differ", |_| "both".to_string();
+    None, "a refusal has no checksum; one with a checksum is read too",
+        "one open master sends none", |_| "both".to_string();
+    None, "any NaN or infinity means that there is no value",
+        "the manuals name an Invalid Float without its bits; the simulator sends 7FC00000", |_| "no value".to_string();
+    None, "object numbers on the wire are those printed in the maps, from 1",
+        "the manuals print no frame", |_| "from 1".to_string();
+    None, "time is not synchronised",
+        "no source has the payload", |_| "never sent".to_string();
+    None, "bit 0 of a configuration byte switches reports on, bit 5 of a status byte tells an override",
+        "simulator only: the manuals name the bits without their places", |_| "0, 5".to_string();
+    None, "an override of ADI takes 4 digits, of BD 2",
+        "simulator only: by analogy", |_| "4, 2".to_string();
+}

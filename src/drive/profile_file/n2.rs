@@ -1,0 +1,78 @@
+//! `[n2]` of a profile file: what the family's N2 is otherwise than assumed, see [`crate::codec::n2::ASSUMPTIONS`].
+
+use std::ops::RangeInclusive;
+use std::time::Duration;
+
+use crate::codec::n2::RegionWidth;
+use crate::codec::{N2Options, Protocol};
+use crate::document::Reader;
+use crate::drive::profile::Point;
+
+/// Pauses between two polls: drives take themselves for alone after about 10 minutes.
+const POLLS: RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(480);
+
+pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options {
+    let default = N2Options::DEFAULT;
+    let Some(table) = reader.table("n2") else {
+        return default;
+    };
+    if !protocols.contains(&Protocol::N2) {
+        reader.problem(
+            "n2",
+            "the profile does not speak n2; take the section out or add \"n2\" to `protocols`",
+        );
+    }
+    let region_width = match table.or("region_width", default.region_width.digits()) {
+        1 => RegionWidth::One,
+        2 => RegionWidth::Two,
+        other => {
+            table.problem(
+                "region_width",
+                format!("{other} is no width of the region; write 1 or 2"),
+            );
+            default.region_width
+        }
+    };
+    let poll = table.or("poll", default.poll);
+    if !POLLS.contains(&poll) {
+        table.problem(
+            "poll",
+            "the pause between two polls is 1 s to 8 min; drives take themselves for alone after 10 min",
+        );
+    }
+    let options = N2Options {
+        state_bit: read_bit(&table, "state_bit").unwrap_or(default.state_bit),
+        unreliable_bit: read_bit(&table, "unreliable_bit"),
+        region_width,
+        identify: table.or("identify", default.identify),
+        device_type: table.or("device_type", default.device_type),
+        release: table.or("release", default.release),
+        poll,
+    };
+    if options.unreliable_bit == Some(options.state_bit) {
+        table.problem(
+            "unreliable_bit",
+            "the bit is that of the state already; write another one or leave the key out",
+        );
+    }
+    table.finish();
+    options
+}
+
+fn read_bit(table: &Reader<'_>, key: &str) -> Option<u8> {
+    let bit: u8 = table.optional(key)?;
+    if bit > 7 {
+        table.problem(key, format!("a status byte has no bit {bit}; write 0 to 7"));
+    }
+    (bit <= 7).then_some(bit)
+}
+
+/// What is overridden is kept in a memory that wears, or is the same as before: unless a point says otherwise it is
+/// written on change only. Pulses are never left out.
+pub(super) fn write_on_change(tables: &[Reader<'_>], points: &mut [Point]) {
+    for (table, point) in tables.iter().zip(points) {
+        if point.write && !point.pulse && point.raw().is_some() && !table.has("on_change") {
+            point.on_change = true;
+        }
+    }
+}
