@@ -11,6 +11,7 @@ mod reference;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
+use std::sync::LazyLock;
 use std::time::Duration;
 
 use super::model::ModelPoint;
@@ -38,13 +39,16 @@ const BUILT_IN: [(&str, &str); 8] = [
 impl Profiles {
     /// The profiles that are part of the program.
     pub fn built_in() -> Profiles {
-        let mut profiles = Profiles::default();
-        for (file, source) in BUILT_IN {
-            if let Ok(profile) = Profile::parse(file, source, true) {
-                profiles.insert(profile);
+        static READ: LazyLock<Profiles> = LazyLock::new(|| {
+            let mut profiles = Profiles::default();
+            for (file, source) in BUILT_IN {
+                if let Ok(profile) = Profile::parse(file, source, true) {
+                    profiles.insert(profile);
+                }
             }
-        }
-        profiles
+            profiles
+        });
+        READ.clone()
     }
 
     /// Adds the profiles of the files `*.toml` in `directory`; a built-in of the same name is replaced. A file may

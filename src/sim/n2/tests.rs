@@ -46,12 +46,7 @@ impl Bench {
     fn command(&mut self, command: &Result<Command, u8>) -> String {
         let mut out = Vec::new();
         let Bench { drive, board, now } = self;
-        board.answer(
-            command,
-            *now,
-            &mut |request| drive.answer(request, *now),
-            &mut out,
-        );
+        board.answer(command, *now, &mut |request| drive.answer(request, *now), &mut out);
         String::from_utf8(out).unwrap().trim_end().to_string()
     }
 
