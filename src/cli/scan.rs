@@ -15,6 +15,7 @@ use self::snippet::Found;
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::bus::probe::Probe as Asker;
 use crate::bus::transaction::Ended;
+use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 use crate::document::parse_duration;
 use crate::drive::identify::{self, Probe};
@@ -320,7 +321,7 @@ fn hello(protocol: Protocol, address: u8) -> Request {
     };
     let pdu = match protocol {
         Protocol::ModbusRtu | Protocol::ModbusAscii => read,
-        Protocol::N2 => read,
+        Protocol::N2 => RequestPdu::N2(Session::Identify),
     };
     Request::new(address, pdu)
 }

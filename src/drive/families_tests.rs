@@ -464,10 +464,6 @@ fn commands_of_every_family() {
             for point in outputs.filter(|p| p.write) {
                 assert!(point.on_change, "{name}: {}", point.name);
             }
-            assert!(
-                !profile.model_point(ModelPoint::Run).unwrap().on_change,
-                "a stop is always written"
-            );
         }
         // The range of the reference: signed for Vacon NX on Modbus, of maximum frequency for Eaton (9.2).
         if let Source::Derived(Derived::Band { minimum, .. }) =

@@ -437,6 +437,7 @@ fn the_page_names_every_key() {
     let mut told = section("\n## Keys of a profile\n");
     for (heading, path) in [
         ("\n### `[speed_reference]`\n", "speed_reference."),
+        ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[[range]]`\n", "range[]."),
         ("\n### `[[point]]`\n", "point[]."),
     ] {
