@@ -218,3 +218,86 @@ fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
     assert_eq!(seen[10..], ["2", "2"]);
     assert_eq!(line.statistics().broadcasts, 1);
 }
+
+/// A drive 1 of that model, and what pymodbus sees of it.
+fn pymodbus(name: &str, protocol: Protocol, format: &str) -> (SimulatedBus, Vec<String>) {
+    let drive = DriveOptions::new(1, ModelOptions::by_name(name).unwrap());
+    let rules = LineRules::of(protocol, LineFormat::new(19_200, format).unwrap());
+    let line = SimulatedBus::start(SimulatedBusOptions::new(name, rules, vec![drive])).unwrap();
+    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
+    let mut command = Command::new(root.join(".tools/venv/bin/python"));
+    command
+        .arg(root.join("tests/peers/simulated_drives.py"))
+        .args([name, &line.address()]);
+    let (done, text) = run(&mut command, "make the Python environment .tools/venv with pymodbus");
+    assert!(done, "{text}");
+    (line, text.lines().map(str::to_string).collect())
+}
+
+#[test]
+fn pymodbus_runs_a_vacon_cx() {
+    let (line, seen) = pymodbus("cx", Protocol::ModbusRtu, "8N2");
+    let expected = [
+        "idle: 11000000",
+        "reference: 1000",
+        "run: 1",
+        "running: 11100000",
+        "variables: 1000 300",
+        "par 1.2: 50",
+        "above it: exception 3",
+        "no coil: exception 2",
+        "no function: exception 1",
+        "no parameter: exception 2",
+        "broadcast: 00000000",
+        "echo: ",
+        "listened only: 00000000",
+    ];
+    assert_eq!(seen, expected);
+    let s = line.statistics();
+    assert_eq!((s.bad_crc, s.silence_violations, s.broadcasts), (0, 0, 1));
+    assert_eq!(
+        s.requests - s.replies,
+        3,
+        "silence to Listen Only Mode, in it, and to its end"
+    );
+}
+
+#[test]
+fn pymodbus_runs_a_teco() {
+    let (line, seen) = pymodbus("teco", Protocol::ModbusAscii, "7E1");
+    let expected = [
+        "idle: 68 0",
+        "run: ",
+        "running: 165 0",
+        "frequencies: 3000 3000",
+        "17 registers: exception 3",
+        "Cn-02 in DRIVE: exception 34",
+        "Bn-01: 40",
+        "beyond it: exception 33",
+        "no register: exception 2",
+        "no function: exception 1",
+        "save while running: exception 34",
+        "save: 0",
+    ];
+    assert_eq!(seen, expected);
+    assert_eq!(line.statistics().bad_crc, 0);
+}
+
+#[test]
+fn mbpoll_reads_a_vacon_cx() {
+    let drive = DriveOptions::new(1, ModelOptions::by_name("cx").unwrap());
+    let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
+    let line = SimulatedBus::start(SimulatedBusOptions::new("cx", rules, vec![drive])).unwrap();
+    let (_, text) = mbpoll(&line, "-a 1 -t 1 -r 0 -c 5");
+    assert_eq!(values(&text), [1, 1, 0, 0, 0], "{text}");
+    line.with_drive(1, |drive, _| drive.trip(1));
+    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
+    assert_eq!(values(&text), [1], "{text}");
+    mbpoll(&line, "-a 1 -t 0 -r 2 -- 1");
+    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
+    assert_eq!(values(&text), [0], "{text}");
+    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 0 -c 20");
+    assert_eq!(values(&text).len(), 20, "{text}");
+    let (_, text) = mbpoll(&line, "-a 1 -t 4 -r 9900 -c 2");
+    assert_eq!(values(&text), [0, 0], "{text}");
+}

@@ -2,10 +2,10 @@
 
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::cache::DriveSpec;
-use crate::codec::LineFormat;
-use crate::config::{self, BusSettings, Settings};
+use crate::codec::{LineFormat, Protocol};
+use crate::config::{self, BusSettings, Settings, default_format};
 use crate::document::{nearest, parse_duration};
-use crate::drive::profile::Profiles;
+use crate::drive::profile::{Profile, Profiles};
 use crate::sim::drive::{DriveOptions, ModelOptions};
 use crate::sim::endpoint::EndpointOptions;
 use crate::sim::faults::{FaultPlan, NAMES, Rates};
@@ -24,14 +24,16 @@ use tokio::signal::unix::{SignalKind, signal};
 #[command(after_help = format!("Examples:
   drivegate simulate --addresses 1-10 --link /tmp/line1 --baud 38400
   drivegate simulate --addresses 1,2 --link /tmp/line1 --fault drop=0.01,late:150ms=0.01 --seed 7
+  drivegate simulate --profile teco-7300pa --addresses 1-3 --link /tmp/line2
   drivegate simulate --config drivegate.toml
 
 Faults: {NAMES}.
 
-A simulated drive obeys the bus. Writing a fault code to PDU address 1998 (ID 1999, which no real drive has) trips it."))]
+A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive has
+trips it; PDU address by the key `simulator` of the profile: {}.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
-    #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "baud", "format"])]
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
     pub config: Option<PathBuf>,
     /// What the drives are
     #[arg(long, value_name = "PROFILE", default_value = "vacon-nx")]
@@ -48,15 +50,18 @@ pub(super) struct Args {
     /// Serve the line raw over TCP, as a serial device server does
     #[arg(long, value_name = "HOST:PORT")]
     pub listen: Option<SocketAddr>,
-    /// Bits a second
-    #[arg(long, value_name = "BAUD", default_value_t = 38_400, value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
-    pub baud: u32,
-    /// Data bits, parity and stop bits
-    #[arg(long, value_name = "FORMAT", default_value = "8N1")]
-    pub format: String,
-    /// Time between the end of a request and the reply
-    #[arg(long, value_name = "TIME", default_value = "0.5ms", value_parser = parse_duration)]
-    pub turnaround: Duration,
+    /// modbus-rtu, modbus-ascii or n2 [default: what the profile names first]
+    #[arg(long, value_name = "PROTOCOL", value_parser = parse_protocol)]
+    pub protocol: Option<Protocol>,
+    /// Bits a second [default: 38400, or the next lower that the drives have]
+    #[arg(long, value_name = "BAUD", value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
+    pub baud: Option<u32>,
+    /// Data bits, parity and stop bits [default: 8N1, with modbus-ascii 7N2]
+    #[arg(long, value_name = "FORMAT")]
+    pub format: Option<String>,
+    /// Time between the end of a request and the reply [default: what the drive's manual tells, else 0.5ms]
+    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    pub turnaround: Option<Duration>,
     /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
     #[arg(long, value_name = "LIST", default_value = "")]
     pub fault: Rates,
@@ -66,7 +71,7 @@ pub(super) struct Args {
     /// Let the drives start, stop and fault by themselves until a master writes to them
     #[arg(long)]
     pub autopilot: bool,
-    /// Answer requests that come without 3.5 characters of silence too
+    /// Answer Modbus RTU requests that come without 3.5 characters of silence too
     #[arg(long)]
     pub lenient: bool,
     /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
@@ -75,6 +80,35 @@ pub(super) struct Args {
     /// True wire times, or as fast as the programs are
     #[arg(long, value_enum, default_value_t = Speed::Real)]
     pub speed: Speed,
+}
+
+/// Baud rate of a line where nobody asks for another, if the drives have it.
+const USUAL_BAUD: u32 = 38_400;
+
+/// `nx, svx, hvx 1998; cx 9999; ...`
+fn trip_registers() -> String {
+    let mut registers: Vec<(u16, Vec<&str>)> = Vec::new();
+    for name in ModelOptions::NAMES {
+        let Some(address) = ModelOptions::by_name(name).map(|model| model.trip_address()) else {
+            continue;
+        };
+        match registers.iter_mut().find(|(known, _)| *known == address) {
+            Some((_, names)) => names.push(name),
+            None => registers.push((address, vec![name])),
+        }
+    }
+    let text = |(address, names): &(u16, Vec<&str>)| format!("{} {address}", names.join(", "));
+    registers.iter().map(text).collect::<Vec<String>>().join("; ")
+}
+
+fn parse_protocol(text: &str) -> Result<Protocol, String> {
+    let known: Vec<&str> = Protocol::ALL.iter().map(|protocol| protocol.name()).collect();
+    Protocol::from_name(text).ok_or_else(|| format!("`{text}` is no protocol; write {}", known.join(", ")))
+}
+
+/// The simulated drive that a profile names.
+fn model_of(profile: &Profile) -> Option<ModelOptions> {
+    profile.simulator.as_deref().and_then(ModelOptions::by_name)
 }
 
 /// How fast the simulated lines are.
@@ -140,22 +174,11 @@ fn configured(file: &Path) -> Result<Vec<SimulatedBusOptions>, ExitCode> {
 
 fn line_of(bus: &BusSettings) -> Result<SimulatedBusOptions, String> {
     let drive = |spec: &DriveSpec| {
-        let model = spec
-            .profile
-            .simulator
-            .as_deref()
-            .and_then(ModelOptions::by_name)
-            .ok_or_else(|| {
-                let (name, profile) = (&spec.name, &spec.profile.name);
-                format!(
-                    "drives of the profile `{profile}` cannot be simulated; drive `{name}`; give it another profile"
-                )
-            })?;
-        Ok(DriveOptions {
-            address: spec.address,
-            model,
-            autopilot: None,
-        })
+        let model = model_of(&spec.profile).ok_or_else(|| {
+            let (name, profile) = (&spec.name, &spec.profile.name);
+            format!("drives of the profile `{profile}` cannot be simulated; drive `{name}`; give it another profile")
+        })?;
+        Ok(DriveOptions::new(spec.address, model))
     };
     let drives = bus.drives.iter().map(drive).collect::<Result<_, String>>()?;
     let mut line = SimulatedBusOptions::new(
@@ -208,23 +231,32 @@ impl Args {
                 near.unwrap_or(known)
             )
         })?;
-        let model = profile
-            .simulator
-            .as_deref()
-            .and_then(ModelOptions::by_name)
-            .ok_or_else(|| {
-                format!(
-                    "drives of the profile `{}` cannot be simulated; in --profile; choose another",
-                    self.profile
-                )
-            })?;
-        let format = LineFormat::new(self.baud, &self.format).map_err(|error| format!("{error}; in --format"))?;
-        let drives = self.addresses.0.iter().map(|&address| DriveOptions {
-            address,
-            model: model.clone(),
-            autopilot: None,
-        });
-        let mut line = SimulatedBusOptions::new("line", LineRules::new(format), drives.collect());
+        let model = model_of(profile).ok_or_else(|| {
+            format!(
+                "drives of the profile `{}` cannot be simulated; in --profile; choose another",
+                self.profile
+            )
+        })?;
+        let protocol = self.protocol_of(profile, &profiles)?;
+        if let Some(address) = self
+            .addresses
+            .0
+            .iter()
+            .find(|address| !profile.addresses.contains(address))
+        {
+            let (first, last) = profile.addresses.clone().into_inner();
+            return Err(format!(
+                "`{}` has no address {address}; in --addresses; its drives have {first} to {last}",
+                self.profile
+            ));
+        }
+        let usual = profile.bauds.iter().copied().filter(|baud| *baud <= USUAL_BAUD).max();
+        let baud = self.baud.or(usual).unwrap_or(USUAL_BAUD);
+        let format = self.format.as_deref().unwrap_or(default_format(protocol));
+        let format = LineFormat::new(baud, format).map_err(|error| format!("{error}; in --format"))?;
+        let drives = self.addresses.0.iter();
+        let drives = drives.map(|&address| DriveOptions::new(address, model.clone()));
+        let mut line = SimulatedBusOptions::new("line", LineRules::of(protocol, format), drives.collect());
         line.endpoint = match (&self.port, self.listen) {
             (Some(path), _) => EndpointOptions::Port { path: path.clone() },
             (None, Some(listen)) => EndpointOptions::Tcp { listen },
@@ -235,10 +267,41 @@ impl Args {
         Ok(line)
     }
 
+    /// What the drives speak: as asked, or the first that the profile names.
+    fn protocol_of(&self, profile: &Profile, profiles: &Profiles) -> Result<Protocol, String> {
+        let spoken: Vec<&str> = profile.protocols.iter().map(|protocol| protocol.name()).collect();
+        match (self.protocol, profile.protocols.first()) {
+            (Some(wanted), _) if !profile.protocols.contains(&wanted) => {
+                let mut others = profiles.names().filter_map(|name| profiles.get(name));
+                let other = others
+                    .find(|other| other.simulator == profile.simulator && other.protocols.contains(&wanted))
+                    .map(|other| format!("; for {} choose the profile `{}`", wanted.name(), other.name));
+                Err(format!(
+                    "drives of the profile `{}` speak {}; in --protocol{}",
+                    profile.name,
+                    spoken.join(", "),
+                    other.unwrap_or_default()
+                ))
+            }
+            (Some(wanted), _) => Ok(wanted),
+            (None, first) => Ok(first.copied().unwrap_or(Protocol::ModbusRtu)),
+        }
+    }
+
     /// What the other options say about any line.
     fn applied_to(&self, mut line: SimulatedBusOptions) -> SimulatedBusOptions {
         line.faults = FaultPlan::new(self.fault.clone(), self.seed);
-        line.rules.turnaround = self.turnaround;
+        // What is asked for holds for all drives, their own time or not.
+        let turnaround = match self.speed {
+            Speed::Max => Some(Duration::ZERO),
+            Speed::Real => self.turnaround,
+        };
+        if let Some(turnaround) = turnaround {
+            line.rules.turnaround = turnaround;
+            for drive in &mut line.drives {
+                drive.model.take_turnaround_of_line();
+            }
+        }
         line.rules.strict = !self.lenient;
         line.rules.delivery = if self.chunk == 0 {
             Delivery::Whole
@@ -247,7 +310,6 @@ impl Args {
         };
         if self.speed == Speed::Max {
             line.rules.wire = Wire::Instant;
-            line.rules.turnaround = Duration::ZERO;
         }
         for drive in &mut line.drives {
             drive.model.set_trip_register(true);
@@ -388,6 +450,47 @@ mod tests {
         assert!(error.contains("did you mean `vacon-nx`"), "{error}");
         assert!(parse("--format 9N1").unwrap().line().unwrap_err().contains("--format"));
         assert!(parse("--format 8N1").unwrap().line().is_ok());
+        let told = |words: &str| parse(words).unwrap().line().unwrap_err();
+        let error = told("--protocol n2");
+        assert!(
+            error.contains("speak modbus-rtu") && error.contains("`vacon-nx-n2`"),
+            "{error}"
+        );
+        let error = told("--profile teco-7300pa --addresses 30-32");
+        assert!(error.contains("no address 32") && error.contains("1 to 31"), "{error}");
+        assert!(parse("--protocol profibus").unwrap_err().contains("modbus-ascii"));
+    }
+
+    #[test]
+    fn every_built_in_profile_can_be_simulated() {
+        let profiles = Profiles::built_in();
+        for name in profiles.names() {
+            let args = parse(&format!("--profile {name}")).unwrap();
+            let line = args.applied_to(args.line().unwrap());
+            let profile = profiles.get(name).unwrap();
+            assert_eq!(Some(&line.rules.protocol), profile.protocols.first(), "{name}");
+            assert!(
+                profile.bauds.contains(&line.rules.format.baud),
+                "{name}: {}",
+                line.rules.format
+            );
+            let word = format!("{} ", profile.simulator.as_deref().unwrap());
+            let address = line.drives[0].model.trip_address().to_string();
+            assert!(trip_registers().replace(',', " ").contains(&word) && trip_registers().contains(&address));
+        }
+        let line = |words: &str| {
+            let args = parse(words).unwrap();
+            args.applied_to(args.line().unwrap())
+        };
+        let teco = line("--profile teco-7300pa");
+        assert_eq!(teco.rules.format.to_string(), "19200 7N2");
+        assert_eq!(teco.drives[0].model.turnaround(), Some(Duration::from_millis(15)));
+        let teco = line("--profile teco-7300pa --turnaround 3ms");
+        assert_eq!(teco.drives[0].model.turnaround(), None);
+        assert_eq!(teco.rules.turnaround, Duration::from_millis(3));
+        assert_eq!(line("--profile vacon-cx").rules.format.to_string(), "19200 8N1");
+        assert_eq!(line("--profile vacon-nx-n2").rules.format.to_string(), "9600 8N1");
+        assert_eq!(line("").rules.format.to_string(), "38400 8N1");
     }
 
     #[test]

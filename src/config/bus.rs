@@ -206,7 +206,8 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
     baud.map(|_| format)
 }
 
-fn default_format(protocol: Protocol) -> &'static str {
+/// Character format of a bus or a line where none is named.
+pub(crate) fn default_format(protocol: Protocol) -> &'static str {
     match protocol {
         Protocol::ModbusAscii => DEFAULT_ASCII_FORMAT,
         Protocol::ModbusRtu | Protocol::N2 => DEFAULT_FORMAT,

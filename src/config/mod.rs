@@ -15,6 +15,7 @@ mod values;
 
 pub use log::{LogFormat, LogSettings};
 
+pub(crate) use bus::default_format;
 pub(crate) use drive::unknown_profile;
 
 use std::path::{Path, PathBuf};

@@ -68,11 +68,19 @@ impl ModelOptions {
         }
     }
 
-    /// Time that the drive takes before it answers, where its manual tells one.
+    /// Time that the drive takes before it answers, where its manual tells one; otherwise it is the line's.
     pub fn turnaround(&self) -> Option<Duration> {
         match self {
             ModelOptions::Nx(_) | ModelOptions::Cx(_) => None,
-            ModelOptions::Teco(_) => Some(TecoOptions::TURNAROUND),
+            ModelOptions::Teco(teco) => teco.turnaround,
+        }
+    }
+
+    /// Leaves the time before an answer to the rules of the line.
+    pub fn take_turnaround_of_line(&mut self) {
+        match self {
+            ModelOptions::Nx(_) | ModelOptions::Cx(_) => {}
+            ModelOptions::Teco(teco) => teco.turnaround = None,
         }
     }
 }

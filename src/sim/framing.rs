@@ -55,6 +55,15 @@ pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> 
     }
 }
 
+/// The PDU in a sound Modbus frame.
+pub fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
+    match protocol {
+        Protocol::ModbusRtu => rtu::open_frame(frame).map(|(_, pdu)| pdu.to_vec()),
+        Protocol::ModbusAscii => ascii::open_frame(frame).map(|(_, pdu)| pdu),
+        Protocol::N2 => None,
+    }
+}
+
 /// Appends the frame of a Modbus PDU to `out`.
 pub fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     match protocol {

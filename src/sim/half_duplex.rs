@@ -45,7 +45,7 @@ pub struct LineRules {
     /// Baud and character format.
     pub format: LineFormat,
     /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and the
-    /// reply.
+    /// reply. A drive whose manual tells its own time takes that.
     pub turnaround: Duration,
     /// Whether drives ignore a request that comes too early; counted it is anyway.
     pub strict: bool,
@@ -383,7 +383,8 @@ impl HalfDuplex {
         };
         let bursts = self.faults.shape(fault, self.rules.protocol, &frame.bytes, reply, gap);
         self.statistics.replies += u64::from(bursts.iter().any(|burst| burst.kind != Kind::Echo));
-        let mut at = now + self.rules.turnaround;
+        let own = self.slaves.drive(asked.address).and_then(|drive| drive.turnaround());
+        let mut at = now + own.unwrap_or(self.rules.turnaround);
         for burst in bursts {
             if burst.kind == Kind::Echo {
                 // It cannot come earlier: only now is known that this request meets the fault.

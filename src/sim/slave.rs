@@ -37,10 +37,12 @@ pub struct Asked {
     pub address: u8,
     /// The function code as it was sent.
     pub function: u8,
-    /// The request, or why its PDU is refused.
+    /// The request, or what a plain slave answers to its PDU.
     pub request: Result<RequestPdu, Exception>,
     /// The command on a line of N2, or the code of its refusal.
     pub command: Option<Result<Command, u8>>,
+    /// The PDU as it was sent, where it is no request.
+    pub malformed: Vec<u8>,
 }
 
 /// The drives of one line by address.
@@ -105,8 +107,10 @@ impl Slaves {
             return self.hear_n2(frame);
         }
         let Some((address, decoded)) = framing::open(protocol, frame) else {
+            self.drives.values_mut().for_each(SimulatedDrive::bus_error);
             return Heard::BadFrame;
         };
+        self.drives.values_mut().for_each(SimulatedDrive::bus_message);
         if address == BROADCAST {
             self.broadcast(decoded.ok(), now);
             return Heard::Broadcast;
@@ -122,6 +126,10 @@ impl Slaves {
             protocol,
             address,
             function,
+            malformed: match decoded {
+                Ok(_) => Vec::new(),
+                Err(_) => framing::pdu(protocol, frame).unwrap_or_default(),
+            },
             request: decoded.map_err(|(_, exception)| exception),
             command: None,
         })
@@ -139,6 +147,7 @@ impl Slaves {
             address,
             function: 0,
             request: Err(Exception::FUNCTION),
+            malformed: Vec::new(),
             command: Some(command),
         })
     }
@@ -163,8 +172,9 @@ impl Slaves {
                 framing::close(asked.protocol, asked.address, &pdu, out);
             }
             Err(exception) => {
-                drive.heard(now);
-                refuse(asked, *exception, out);
+                if let Some(exception) = drive.malformed(&asked.malformed, *exception, now) {
+                    refuse(asked, exception, out);
+                }
             }
         }
     }
@@ -293,5 +303,62 @@ mod tests {
         assert_eq!(line.hear(RTU, &other, SimTime::ZERO), Heard::Nobody(2));
         line.drive(1).unwrap().set_alive(false);
         assert_eq!(line.hear(RTU, &good, SimTime::ZERO), Heard::Nobody(1));
+    }
+
+    fn cx_and_teco() -> Slaves {
+        let drive = |address, name| DriveOptions::new(address, ModelOptions::by_name(name).unwrap());
+        Slaves::new([drive(1, "cx"), drive(2, "cx"), drive(3, "teco")], SimTime::ZERO)
+    }
+
+    fn framed(protocol: Protocol, address: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut frame = Vec::new();
+        framing::close(protocol, address, pdu, &mut frame);
+        frame
+    }
+
+    /// What a PDU to a drive gets, in either framing.
+    fn ask(line: &mut Slaves, protocol: Protocol, address: u8, pdu: &[u8]) -> Vec<u8> {
+        let mut out = Vec::new();
+        if let Heard::Request(asked) = line.hear(protocol, &framed(protocol, address, pdu), SimTime::ZERO) {
+            line.answer(&asked, SimTime::ZERO, &mut out);
+        }
+        framing::pdu(protocol, &out).unwrap_or_default()
+    }
+
+    /// drives.md 4.6: the counters of a CX know of frames for others and of bad ones.
+    #[test]
+    fn every_drive_hears_the_line() {
+        let mut line = cx_and_teco();
+        let mut bad = framed(RTU, 1, &[2, 0, 0, 0, 1]);
+        bad[2] ^= 1;
+        assert_eq!(line.hear(RTU, &bad, SimTime::ZERO), Heard::BadFrame);
+        ask(&mut line, RTU, 9, &[2, 0, 0, 0, 1]);
+        ask(&mut line, RTU, 2, &[2, 0, 9, 0, 1]);
+        ask(&mut line, RTU, 0, &[5, 0, 0, 0xFF, 0]);
+        ask(&mut line, RTU, 1, &[0x55]);
+        let mut counters = |address| line.drive(address).unwrap().as_cx().unwrap().counters();
+        let (first, second) = (counters(1), counters(2));
+        assert_eq!((first.bus_messages, first.bus_errors), (4, 1));
+        assert_eq!((first.slave_messages, first.no_responses, first.exceptions), (2, 1, 1));
+        assert_eq!(
+            (second.slave_messages, second.no_responses, second.exceptions),
+            (2, 1, 1)
+        );
+    }
+
+    #[test]
+    fn drives_that_stay_silent() {
+        let mut line = cx_and_teco();
+        assert!(ask(&mut line, RTU, 1, &[8, 0, 4, 0, 0]).is_empty(), "Listen Only Mode");
+        assert!(ask(&mut line, RTU, 1, &[2, 0, 0, 0, 1]).is_empty());
+        assert!(ask(&mut line, RTU, 1, &[0x55]).is_empty());
+        let ascii = Protocol::ModbusAscii;
+        assert!(
+            ask(&mut line, ascii, 3, &[0x10, 0, 1, 0, 1, 2, 0]).is_empty(),
+            "byte count"
+        );
+        assert_eq!(ask(&mut line, ascii, 3, &[0x10, 0, 1, 0, 2, 2, 0, 0]), [0x90, 3]);
+        assert_eq!(ask(&mut line, ascii, 3, &[0x04, 0, 0x20, 0, 1]), [0x84, 1]);
+        assert_eq!(ask(&mut line, ascii, 3, &[0x03, 0, 0x40, 0, 1]), [3, 2, 0, 10]);
     }
 }

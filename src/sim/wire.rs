@@ -11,6 +11,7 @@ use super::half_duplex::{HalfDuplex, LineRules, Wire};
 use super::n2::Board;
 use super::slave::Slaves;
 use super::statistics::{Recorded, Statistics, Transcript};
+use crate::codec::Protocol;
 use crate::line::{poll_until, sharpen_timers, wait_until};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd};
 use std::io;
@@ -233,11 +234,17 @@ impl LineControl {
         }
     }
 
-    /// One line for people: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`.
+    /// One line for people: `line1: 10 drives (1-10) at 38400 8N1 on /tmp/line1`, with the protocol
+    /// where it is not Modbus RTU.
     pub fn description(&self) -> String {
-        let (addresses, format) = {
+        let (addresses, format, protocol) = {
             let mut line = self.0.line();
-            (line.slaves().addresses().collect::<Vec<u8>>(), line.rules().format)
+            let addresses: Vec<u8> = line.slaves().addresses().collect();
+            (addresses, line.rules().format, line.rules().protocol)
+        };
+        let protocol = match protocol {
+            Protocol::ModbusRtu => String::new(),
+            other => format!(" {}", other.name()),
         };
         let drives = if addresses.len() == 1 {
             "1 drive".to_string()
@@ -245,7 +252,7 @@ impl LineControl {
             format!("{} drives", addresses.len())
         };
         format!(
-            "{}: {drives} ({}) at {format} on {}",
+            "{}: {drives} ({}) at {format}{protocol} on {}",
             self.0.name,
             ranges(&addresses),
             self.address()

@@ -1,6 +1,6 @@
 //! The wire in virtual time.
 
-use super::super::drive::DriveOptions;
+use super::super::drive::{DriveOptions, ModelOptions};
 use super::*;
 use proptest::prelude::*;
 
@@ -342,5 +342,26 @@ proptest! {
         run(&mut line, now + Duration::from_secs(10));
         prop_assert!(line.wake().is_none(), "the line falls silent");
         prop_assert!(line.statistics().requests <= sound);
+    }
+}
+
+/// drives.md 5.1: the card answers 15 ms after a message, whatever the line's rules have for others.
+#[test]
+fn a_drive_takes_its_own_turnaround() {
+    let format = LineFormat::new(19_200, "7N2").unwrap();
+    for (own, turnaround) in [(true, us(15_000)), (false, us(500))] {
+        let mut model = ModelOptions::by_name("teco").unwrap();
+        if !own {
+            model.take_turnaround_of_line();
+        }
+        let slaves = Slaves::new([DriveOptions::new(1, model)], SimTime::ZERO);
+        let rules = LineRules::of(Protocol::ModbusAscii, format);
+        let mut line = HalfDuplex::new(rules, slaves, FaultPlan::default(), Transcript::new(9));
+        line.on_bytes(b":01080000AA55F8\r\n", us(0));
+        let seen = run(&mut line, us(1_000_000));
+        assert_eq!(
+            seen[0],
+            (2 * format.chars(17) + turnaround, b":01080000AA55F8\r\n".to_vec())
+        );
     }
 }

@@ -83,6 +83,8 @@ pub struct TecoOptions {
     /// Parameters in the EEPROM at first: register and value; those that a drive does not have or not allow are passed
     /// over.
     pub parameters: Vec<(u16, u16)>,
+    /// Time between a message and its answer; `None` leaves it to the line.
+    pub turnaround: Option<Duration>,
     /// Makes 09FFH a register of the simulator: writing a fault mask as 0021H shows it trips the drive. No real drive has
     /// it.
     pub trip_register: bool,
@@ -108,6 +110,7 @@ impl Default for TecoOptions {
             read_only: ReadOnly::Exception,
             locked: Vec::new(),
             parameters: Vec::new(),
+            turnaround: Some(TecoOptions::TURNAROUND),
             trip_register: false,
         }
     }
