@@ -29,8 +29,8 @@ use tokio::signal::unix::{SignalKind, signal};
 
 Faults: {NAMES}.
 
-A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive has
-trips it; PDU address by the key `simulator` of the profile: {}.", trip_registers()))]
+A simulated drive obeys the bus. Writing a fault, as its registers show it, to a holding register that no real drive \
+has trips it; PDU address by the key `simulator` of the profile: {}.", trip_registers()))]
 pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
