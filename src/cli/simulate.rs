@@ -323,15 +323,15 @@ impl Args {
 
 /// Tells where the lines are, and once a second, on a terminal, what goes on; ends on Ctrl-C and SIGTERM.
 fn serve(lines: &[SimulatedBus]) -> io::Result<()> {
+    let mut out = io::stdout();
     for line in lines {
-        println!("{}", line.description());
+        writeln!(out, "{}", line.description())?;
     }
-    println!("Ctrl-C ends the simulation.");
-    io::stdout().flush()?;
+    writeln!(out, "Ctrl-C ends the simulation.")?;
+    out.flush()?;
     let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
     runtime.block_on(watch(lines))?;
-    println!("{}", summary(&total(lines)));
-    Ok(())
+    writeln!(out, "{}", summary(&total(lines)))
 }
 
 async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
