@@ -186,3 +186,99 @@ async fn what_means_no_object_and_what_the_drive_refuses() {
     assert_eq!(rig.read(drive(1), 98, 2).await, Outcome::Exception(Exception::n2(0x10)));
     assert!(rig.read(drive(1), 0, 2).await.is_ok());
 }
+
+/// The objects that the independent slave has.
+const PEER: &str = r#"
+name = "peer"
+title = "An N2 slave in another language"
+protocols = ["n2"]
+[[range]]
+table = "input"
+first = 0
+last = 3
+read = 2
+[[range]]
+table = "discrete-input"
+first = 0
+last = 1
+read = 1
+[[range]]
+table = "holding"
+first = 0
+last = 1
+read = 2
+write = 2
+[[point]]
+name = "output_frequency"
+at = "input 2"
+type = "f32"
+class = "fast"
+[[point]]
+name = "running"
+at = "discrete-input 1"
+class = "fast"
+[[point]]
+name = "speed_reference"
+at = "holding 0"
+type = "f32"
+range = [0.0, 100.0]
+class = "fast"
+write = true
+"#;
+
+/// A slave in Python, ended with the test.
+struct Peer(std::process::Child);
+
+impl Drop for Peer {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// The slave, its port, and the frames that it hears.
+fn peer(form: &str) -> (Peer, String, std::sync::Arc<std::sync::Mutex<Vec<String>>>) {
+    use std::io::{BufRead, BufReader};
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/tests/peers/n2_slave.py");
+    let mut child = std::process::Command::new("python3")
+        .args([script, form])
+        .stdout(std::process::Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut lines = BufReader::new(child.stdout.take().unwrap()).lines();
+    let port = format!("tcp://127.0.0.1:{}", lines.next().unwrap().unwrap());
+    let heard = std::sync::Arc::new(std::sync::Mutex::new(Vec::new()));
+    let all = heard.clone();
+    std::thread::spawn(move || {
+        lines
+            .map_while(Result::ok)
+            .for_each(|line| all.lock().unwrap().push(line))
+    });
+    (Peer(child), port, heard)
+}
+
+#[tokio::test]
+async fn a_slave_that_was_written_elsewhere() {
+    for form in ["plain", "byte"] {
+        let (_peer, port, heard) = peer(form);
+        let profile = drivegate::drive::Profile::parse("peer.toml", PEER, false).unwrap();
+        let setup = Setup {
+            profile: std::sync::Arc::new(profile),
+            port: Some(port),
+            ..setup("vacon-nx-n2", &[1])
+        };
+        let rig = Rig::of(setup, |_| {});
+        is_good(&rig, ModelPoint::OutputFrequency, Value::Number(25.0)).await;
+        is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
+        assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
+        assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
+        is_good(&rig, ModelPoint::SpeedReference, Value::Number(50.0)).await;
+        let heard = heard.lock().unwrap().clone();
+        assert_eq!(
+            heard[..4],
+            ["01FA7", "0104C5", "0105C6", "0111020388"].map(String::from)[..]
+        );
+        let count = |frame: &str| heard.iter().filter(|line| *line == frame).count();
+        assert_eq!((count("017203014248000020"), count("017303018F")), (1, 1));
+    }
+}
