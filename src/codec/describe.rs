@@ -671,7 +671,7 @@ mod tests {
                 bo,
                 "N11\r",
                 "override BO 1 = 1",
-                "N11: invalid command for the data type, or the drive is in DRIVE mode (TECO)",
+                "N11: invalid command for the data type, or only in PRGM mode (TECO)",
             ),
             (
                 RequestPdu::N2(n2::Session::Release { table, address }),
