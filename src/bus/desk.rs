@@ -101,7 +101,9 @@ impl Desk {
                 self.begun.remove(index).finish(Outcome::Offline, now);
                 continue;
             };
-            let running = drive.reading(now, FRESH).is_set(ModelPoint::Running);
+            let reading = drive.reading(now, FRESH);
+            let running = reading.is_set(ModelPoint::Running);
+            execution.look(&reading);
             match execution.next(&self.shadow, &drive.spec.profile, running, now) {
                 Next::Send(pdu) => {
                     // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.

@@ -4,33 +4,41 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use super::confirm::{self, Effect};
+use crate::cache::Reading;
+use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency};
+use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency, written};
 use crate::drive::profile::Form;
-use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
+use crate::drive::{ModelPoint, Point, PollClass, Profile, Raw, Value};
 
 /// The registers of all drives of a bus whose bits are commanded, as the drives have them.
 ///
 /// Filled by reading the drive's own words and by acknowledged writes, never by assumption.
 #[derive(Debug, Default)]
-pub struct Shadow(BTreeMap<(usize, u16), u16>);
+pub struct Shadow(BTreeMap<(usize, Table, u16), u16>);
 
 impl Shadow {
     /// A word that the drive has.
     pub fn learn(&mut self, drive: usize, table: Table, address: u16, word: u16) {
-        if table == Table::Holding {
-            self.0.insert((drive, address), word);
+        if matches!(table, Table::Holding | Table::Coil) {
+            self.0.insert((drive, table, address), word);
         }
     }
 
     /// The word, if it is known.
     pub fn get(&self, drive: usize, address: u16) -> Option<u16> {
-        self.0.get(&(drive, address)).copied()
+        self.0.get(&(drive, Table::Holding, address)).copied()
+    }
+
+    /// Whether the drive is known to have all of that.
+    fn has(&self, drive: usize, table: Table, items: &[(u16, u16)]) -> bool {
+        let has = |(address, word): &(u16, u16)| self.0.get(&(drive, table, *address)) == Some(word);
+        items.iter().all(has)
     }
 
     /// The drive may have started anew: its words are read again before a bit is changed.
     pub fn forget(&mut self, drive: usize) {
-        self.0.retain(|(of, _), _| *of != drive);
+        self.0.retain(|(of, _, _), _| *of != drive);
     }
 }
 
@@ -49,6 +57,14 @@ pub enum Next {
 enum Action {
     /// A raw request, or a register of its own.
     Send(RequestPdu),
+    /// A write of what the drive keeps: left out where it is known to have it already.
+    Change {
+        pdu: RequestPdu,
+        table: Table,
+        items: Vec<(u16, u16)>,
+    },
+    /// Gives what was overridden before back to the drive's own control; that it fails changes nothing.
+    Release(RequestPdu),
     /// Bits of one word, merged into the shadow when they are sent.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
     /// Takes the run command away from a motor that stands, where it is no bit of the word with the reset bit.
@@ -61,6 +77,15 @@ enum Action {
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// Two update periods of the drive.
     Hold(Duration),
+}
+
+/// Whether the drive was asked for what it has before it is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Check {
+    NotYet,
+    Read,
+    /// It does not tell.
+    InVain,
 }
 
 /// A command that the bus has begun.
@@ -87,6 +112,10 @@ pub struct Execution {
     whole: bool,
     /// What the drive last said of its motor.
     running: bool,
+    /// Whether the drive was asked for what it has before it is written.
+    check: Check,
+    /// What is known of the words of the next step is as good as read just now.
+    fresh: bool,
     /// The drive does not tell its own word: bits that the command does not set are written as 0.
     blind: bool,
 }
@@ -109,6 +138,10 @@ impl Execution {
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
         };
+        let actions = actions
+            .into_iter()
+            .flat_map(|action| sparing(action, profile))
+            .collect();
         Execution {
             drive,
             urgency,
@@ -124,8 +157,25 @@ impl Execution {
             in_doubt: false,
             whole,
             running: true,
+            check: Check::NotYet,
+            fresh: false,
             blind: false,
         }
+    }
+
+    /// Looks at how good the knowledge of the words is that the next step would write: read often enough, and good.
+    pub fn look(&mut self, reading: &Reading<'_>) {
+        let (table, addresses): (Table, Vec<u16>) = match self.actions.front() {
+            Some(Action::Change { table, items, .. }) => (*table, items.iter().map(|(a, _)| *a).collect()),
+            _ => return,
+        };
+        let points = &reading.spec.profile.points;
+        let is_read = |p: &Point| p.on_change && matches!(p.class, PollClass::Fast | PollClass::Slow);
+        self.fresh = addresses.iter().all(|address| {
+            let covers = |p: &Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, *address));
+            let mut those = points.iter().enumerate().filter(|(_, p)| covers(p)).peekable();
+            those.peek().is_some() && those.all(|(index, p)| is_read(p) && reading.sample(index).good().is_some())
+        });
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -156,17 +206,25 @@ impl Execution {
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
-            match request(action, self.drive, shadow, profile, running, self.blind) {
+            let known = (self.check, self.fresh, self.blind);
+            match request(action, self.drive, shadow, profile, running, known) {
                 Some(pdu) => return Next::Send(pdu),
-                // Nothing to take away: the pulse starts at once, without the pause behind.
+                // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
+                // overridden that would have to be released.
                 None => {
-                    self.actions.pop_front();
-                    if matches!(self.actions.front(), Some(Action::Hold(_))) {
-                        self.actions.pop_front();
+                    self.pop();
+                    if matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
+                        self.pop();
                     }
                 }
             }
         }
+    }
+
+    fn pop(&mut self) {
+        self.actions.pop_front();
+        self.check = Check::NotYet;
+        self.fresh = false;
     }
 
     /// Its time ran out, and what is left of it was not cut off yet.
@@ -180,6 +238,13 @@ impl Execution {
         // An exception tells nothing of an earlier try that was not answered.
         if sent.is_write() && !matches!(reply, Reply::Exception(_)) {
             self.in_doubt = false;
+        }
+        if let (Some(Action::Release(_)), Reply::Exception(code)) = (self.actions.front(), &reply) {
+            return self.not_released(&code.to_string());
+        }
+        if self.checks(sent) {
+            self.check = learn(self.drive, sent, &reply, shadow);
+            return None;
         }
         if let Reply::Exception(code) = reply {
             let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
@@ -202,8 +267,26 @@ impl Execution {
                 _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
             };
         }
-        self.reply = reply;
-        self.actions.pop_front();
+        if !matches!(self.actions.front(), Some(Action::Release(_))) {
+            self.reply = reply;
+        }
+        self.pop();
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// Whether that request asks for what the drive has before it is written.
+    fn checks(&self, sent: &RequestPdu) -> bool {
+        matches!(
+            (sent, self.actions.front()),
+            (RequestPdu::Read { .. }, Some(Action::Change { .. }))
+        )
+    }
+
+    /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.
+    fn not_released(&mut self, why: &str) -> Option<Outcome> {
+        tracing::warn!("an output was written but not released to the drive's own control: {why}");
+        self.failures = 0;
+        self.pop();
         self.actions.is_empty().then(|| self.success())
     }
 
@@ -212,6 +295,16 @@ impl Execution {
         self.failures += 1;
         self.in_doubt |= sent.is_write();
         let over = self.failures > retries;
+        if over && matches!(self.actions.front(), Some(Action::Release(_))) {
+            return self.not_released("no answer");
+        }
+        if self.checks(sent) && self.urgency == Urgency::Stop {
+            self.check = Check::InVain;
+            return None;
+        }
+        if self.checks(sent) {
+            return over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut));
+        }
         if self.reads_word(sent) && (over || self.urgency == Urgency::Stop) {
             return self.without_word(Outcome::TimedOut);
         }
@@ -397,10 +490,20 @@ fn request(
     shadow: &Shadow,
     profile: &Profile,
     running: bool,
-    blind: bool,
+    (check, fresh, blind): (Check, bool, bool),
 ) -> Option<RequestPdu> {
     let (raw, changes) = match action {
-        Action::Send(pdu) => return Some(pdu.clone()),
+        Action::Send(pdu) | Action::Release(pdu) => return Some(pdu.clone()),
+        Action::Change { pdu, table, items } => {
+            let has = shadow.has(drive, *table, items);
+            return match check {
+                Check::NotYet if fresh && has => None,
+                Check::NotYet if fresh => Some(pdu.clone()),
+                Check::NotYet => read_of(*table, items).or_else(|| Some(pdu.clone())),
+                Check::Read => (!has).then(|| pdu.clone()),
+                Check::InVain => Some(pdu.clone()),
+            };
+        }
         Action::Hold(_) => return None,
         Action::Bits { raw, changes } => (raw, changes.clone()),
         Action::Disarm { .. } if running => return None,
@@ -449,16 +552,57 @@ fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
     }
 }
 
+/// A write that spares the drive's memory, where its words are such that wear: left out when the drive has them, and
+/// what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
+fn sparing(action: Action, profile: &Profile) -> Vec<Action> {
+    let written = match &action {
+        Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),
+        Action::Bits { raw, changes } if raw.table == Table::Coil => changes.first().map(|(_, on)| {
+            let (address, on) = (raw.address, *on);
+            let pdu = RequestPdu::WriteCoil { address, on };
+            (pdu, raw.table, vec![(address, u16::from(on))])
+        }),
+        _ => None,
+    };
+    let Some((pdu, table, items)) = written.filter(|(_, table, items)| profile.writes_on_change(*table, items)) else {
+        return vec![action];
+    };
+    let address = items.first().map(|(address, _)| *address);
+    let release = address
+        .filter(|_| profile.releases(table))
+        .map(|address| Action::Release(RequestPdu::N2(Session::Release { table, address })));
+    let change = Action::Change { pdu, table, items };
+    [change].into_iter().chain(release).collect()
+}
+
+/// The read of the words of a write.
+fn read_of(table: Table, items: &[(u16, u16)]) -> Option<RequestPdu> {
+    let (start, _) = *items.first()?;
+    let count = u16::try_from(items.len()).ok()?;
+    Some(RequestPdu::Read { table, start, count })
+}
+
+/// What the drive has, as it says.
+fn learn(drive: usize, sent: &RequestPdu, reply: &Reply, shadow: &mut Shadow) -> Check {
+    let (RequestPdu::Read { table, start, count }, Some(words)) = (sent, reply.words()) else {
+        return Check::InVain;
+    };
+    for (address, word) in (*start..).zip(&words) {
+        shadow.learn(drive, *table, address, *word);
+    }
+    if words.len() == usize::from(*count) {
+        Check::Read
+    } else {
+        Check::InVain
+    }
+}
+
 /// Acknowledged words are known from then on.
 fn note_write(drive: usize, sent: &RequestPdu, shadow: &mut Shadow) {
-    match sent {
-        RequestPdu::WriteRegister { address, value } => shadow.learn(drive, Table::Holding, *address, *value),
-        RequestPdu::WriteRegisters { start, values } => {
-            for (address, value) in (*start..).zip(values) {
-                shadow.learn(drive, Table::Holding, address, *value);
-            }
+    if let Some((table, items)) = written(sent) {
+        for (address, word) in items {
+            shadow.learn(drive, table, address, word);
         }
-        _ => {}
     }
 }
 

@@ -296,7 +296,13 @@ impl<'a> Line<'a> {
             None => USUAL_BAUDS.to_vec(),
             Some(first) => first.clone(),
         };
-        bauds.retain(|baud| *baud > self.spec.format.baud && lists.clone().all(|list| list.contains(baud)));
+        let allowed = |baud: u32| {
+            let format = self.spec.format;
+            self.spec.protocol.allows(&LineFormat { baud, ..format })
+        };
+        bauds.retain(|baud| {
+            *baud > self.spec.format.baud && allowed(*baud) && lists.clone().all(|list| list.contains(baud))
+        });
         bauds.sort_unstable();
         bauds
     }

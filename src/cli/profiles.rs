@@ -5,6 +5,8 @@ use std::path::PathBuf;
 use std::process::ExitCode;
 
 use super::{EXIT_CONFIG, EXIT_USAGE, report};
+use crate::codec::Protocol;
+use crate::codec::n2::ASSUMPTIONS;
 use crate::config::{Settings, environment, unknown_profile};
 use crate::document::{Problem, format_duration};
 use crate::drive::profile::{AddressRange, Form, Profiles};
@@ -160,7 +162,24 @@ fn show(profile: &Profile) -> String {
         text += "\nFault texts\n\n";
         text += &faults(profile);
     }
+    if profile.protocols.contains(&Protocol::N2) {
+        text += "\nAssumptions about N2, not verified on hardware; those with a key can be changed in [n2] of a profile\n\n";
+        text += &assumptions(profile);
+    }
     text
+}
+
+fn assumptions(profile: &Profile) -> String {
+    let mut table = report::table(["key", "value", "what is assumed", "what it rests on"]);
+    for assumption in ASSUMPTIONS {
+        table.add_row([
+            assumption.key.unwrap_or(""),
+            &assumption.value(&profile.n2),
+            assumption.what,
+            assumption.why,
+        ]);
+    }
+    report::lines(&table)
 }
 
 fn points(profile: &Profile) -> String {

@@ -652,4 +652,54 @@ mod tests {
             prop_assert_eq!(at, bytes.len());
         }
     }
+
+    #[test]
+    fn n2_in_the_words_of_its_objects() {
+        let read = |table, start, count| RequestPdu::Read { table, start, count };
+        let ao = RequestPdu::WriteRegisters {
+            start: 0,
+            values: vec![0x4248, 0],
+        };
+        let bo = RequestPdu::WriteCoil { address: 0, on: true };
+        let (table, address) = (Table::Holding, 0);
+        let cases = [
+            (read(Table::Input, 2, 2), "A41C80000A0\r", "read AI 2 value", "25"),
+            (read(Table::DiscreteInput, 1, 1), "A4064\r", "read BI 2 state", "on"),
+            (read(Table::Input, 0x4000, 1), "A0035C8\r", "read ADI 1 value", "53"),
+            (ao, "A\r", "override AO 1 = 50", "acknowledged"),
+            (
+                bo,
+                "N11\r",
+                "override BO 1 = 1",
+                "N11: invalid command for the data type, or only in PRGM mode (TECO)",
+            ),
+            (
+                RequestPdu::N2(n2::Session::Release { table, address }),
+                "A\r",
+                "release AO 1",
+                "acknowledged",
+            ),
+            (
+                RequestPdu::N2(n2::Session::Identify),
+                "A1061\r",
+                "identify",
+                "device type 10h",
+            ),
+            (
+                RequestPdu::N2(n2::Session::Poll { again: false }),
+                "A\r",
+                "poll for changes",
+                "nothing new",
+            ),
+        ];
+        for (pdu, bytes, asked, told) in cases {
+            assert_eq!(request_on(Protocol::N2, &pdu), asked);
+            assert_eq!(reply(Protocol::N2, &Request::new(1, pdu), bytes.as_bytes()), told);
+        }
+        assert_eq!(stray(Protocol::N2, b">01FA7\r"), "foreign: a request to address 1");
+        assert_eq!(
+            stray(Protocol::N2, b"A1061\r"),
+            "foreign: an answer that nobody asked for, or too late"
+        );
+    }
 }

@@ -108,7 +108,7 @@ impl Protocol {
     pub fn usual_timeout(self) -> Duration {
         match self {
             Protocol::ModbusRtu | Protocol::ModbusAscii => Duration::from_millis(100),
-            Protocol::N2 => Duration::from_millis(250),
+            Protocol::N2 => n2::RESPONSE_TIMEOUT,
         }
     }
 

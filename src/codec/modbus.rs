@@ -510,6 +510,15 @@ fn counted(body: &[u8], at: usize, len: usize) -> Result<&[u8], Exception> {
 }
 
 impl Reply {
+    /// What was read: registers, or bits as 0 and 1.
+    pub fn words(&self) -> Option<Vec<u16>> {
+        match self {
+            Reply::Registers(words) => Some(words.clone()),
+            Reply::Bits(bits) => Some(bits.iter().map(|bit| u16::from(*bit)).collect()),
+            _ => None,
+        }
+    }
+
     /// Appends the reply's PDU to `request` onto `out`.
     pub fn encode(&self, request: &RequestPdu, out: &mut Vec<u8>) {
         if let Reply::Exception(code) = self {

@@ -141,12 +141,12 @@ fn expected(pdu: &RequestPdu) -> Option<Expected> {
 /// A reply carries neither address nor command: only its form is checked against what was asked. Blank characters and
 /// the glitches of a line that changes direction are passed over before the first letter.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
-    let Some(begin) = bytes.iter().position(u8::is_ascii_graphic) else {
-        return if bytes.len() > LONGEST {
-            Decoded::Corrupt("no reply in the longest one's characters")
-        } else {
-            Decoded::Incomplete
-        };
+    let begin = bytes.iter().position(u8::is_ascii_graphic);
+    if begin.unwrap_or(bytes.len()) > LONGEST {
+        return Decoded::Corrupt("no reply in the longest one's characters");
+    }
+    let Some(begin) = begin else {
+        return Decoded::Incomplete;
     };
     let frame = bytes.get(begin..).unwrap_or_default();
     let Some(length) = frame.iter().position(|byte| *byte == b'\r') else {

@@ -9,7 +9,7 @@ use super::{BusSettings, values};
 use crate::bus::BusOptions;
 use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::wire::Silence;
-use crate::codec::{LineFormat, Protocol};
+use crate::codec::{LineFormat, Protocol, n2};
 use crate::document::{Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
 use crate::line::Rs485;
@@ -133,8 +133,8 @@ fn read_options(
     port: Option<&str>,
 ) -> BusOptions {
     let options = BusOptions {
-        response_timeout: values::duration(reader, "response_timeout", DEFAULT_RESPONSE_TIMEOUT, &TIMES),
-        retries: values::number(reader, "retries", DEFAULT_RETRIES, &RETRIES),
+        response_timeout: values::duration(reader, "response_timeout", protocol.usual_timeout(), &TIMES),
+        retries: values::number(reader, "retries", default_retries(protocol), &RETRIES),
         silence: read_silence(reader, protocol, format),
         rs485: values::choice(reader, "rs485", Rs485::Off, &RS485),
     };
@@ -191,6 +191,17 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
             return None;
         }
     };
+    if protocol == Protocol::N2 && !protocol.allows(&format) {
+        let key = if format.baud == n2::BAUD { "format" } else { "baud" };
+        reader.problem(
+            key,
+            format!(
+                "N2 is {} {} always, not {format}; leave `baud` and `format` out",
+                n2::BAUD,
+                n2::FORMAT
+            ),
+        );
+    }
     if protocol == Protocol::ModbusRtu && format.data_bits != 8 {
         reader.problem(
             "format",
@@ -204,6 +215,14 @@ fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
         );
     }
     baud.map(|_| format)
+}
+
+/// N2 tries three times (n2.md 4).
+fn default_retries(protocol: Protocol) -> u32 {
+    match protocol {
+        Protocol::ModbusRtu | Protocol::ModbusAscii => DEFAULT_RETRIES,
+        Protocol::N2 => n2::RETRIES,
+    }
 }
 
 /// Character format of a bus or a line where none is named.

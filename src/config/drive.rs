@@ -23,6 +23,8 @@ pub(super) const ACTIONS: [(&str, LeaseAction); 2] = [("stop", LeaseAction::Stop
 pub(super) const UNITS: RangeInclusive<u8> = 1..=254;
 /// Addresses on a Modbus line; 0 is broadcast.
 pub(super) const ADDRESSES: RangeInclusive<u8> = 1..=247;
+/// Addresses on a line of N2; each family has its own range within.
+pub(super) const N2_ADDRESSES: RangeInclusive<u8> = 1..=255;
 /// Points that a message names.
 const MOST_NAMED: usize = 4;
 /// Most that a frequency of `frequency_range` can be, Hz.
@@ -50,7 +52,7 @@ pub(super) struct Surroundings<'a> {
 
 pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let name = values::name(reader, "-_");
-    let address = read_address(reader);
+    let address = read_address(reader, around.protocol);
     let unit = read_unit(reader, address);
     let profile = read_profile(reader, around, address);
     let access = values::choice(reader, "access", Access::Monitor, &ACCESS);
@@ -88,18 +90,26 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     }
 }
 
-fn read_address(reader: &Reader<'_>) -> Option<u8> {
+fn read_address(reader: &Reader<'_>, protocol: Protocol) -> Option<u8> {
+    let allowed = match protocol {
+        Protocol::ModbusRtu | Protocol::ModbusAscii => ADDRESSES,
+        Protocol::N2 => N2_ADDRESSES,
+    };
+    let most = *allowed.end();
     if !reader.has("address") {
-        reader.problem("address", "`address` is missing; write the drive's address, 1 to 247");
+        reader.problem(
+            "address",
+            format!("`address` is missing; write the drive's address, 1 to {most}"),
+        );
     }
     let address: i64 = reader.optional("address")?;
-    let found = u8::try_from(address).ok().filter(|a| ADDRESSES.contains(a));
+    let found = u8::try_from(address).ok().filter(|a| allowed.contains(a));
     if found.is_none() {
         let what = match address {
             0 => "address 0 is the broadcast, not a drive".to_string(),
             _ => format!("{address} is no address of the protocol"),
         };
-        reader.problem("address", format!("{what}; write 1 to 247"));
+        reader.problem("address", format!("{what}; write 1 to {most}"));
     }
     found
 }
@@ -107,6 +117,12 @@ fn read_address(reader: &Reader<'_>) -> Option<u8> {
 /// The unit id; without one the address serves.
 fn read_unit(reader: &Reader<'_>, address: Option<u8>) -> Option<u8> {
     if !reader.has("unit") {
+        if let Some(address) = address.filter(|address| !UNITS.contains(address)) {
+            reader.problem(
+                "address",
+                format!("unit {address} is the gateway itself, so the drive needs another one; add `unit`, 1 to 254"),
+            );
+        }
         return address;
     }
     let unit: i64 = reader.optional("unit")?;

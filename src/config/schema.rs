@@ -153,7 +153,10 @@ fn drive() -> Value {
         &["name", "address", "profile"],
         [
             ("name", name("Name of the drive, unique in the gateway.", "-_")),
-            ("address", number("Address on the bus.", &drive::ADDRESSES)),
+            (
+                "address",
+                number("Address on the bus; 247 at most on Modbus.", &drive::N2_ADDRESSES),
+            ),
             (
                 "profile",
                 pattern(

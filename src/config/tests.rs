@@ -455,6 +455,37 @@ fn the_format_without_a_word_is_that_of_the_protocol() {
 }
 
 #[test]
+fn a_bus_of_n2_has_its_own_defaults() {
+    let bus = |more: &str| {
+        format!("[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/tty1\"\nprotocol = \"n2\"\n{more}")
+    };
+    let options = settings(&bus("")).buses[0].options.clone();
+    assert_eq!(
+        (options.response_timeout, options.retries),
+        (Duration::from_millis(250), 2)
+    );
+    for (more, key) in [("baud = 38400\n", "baud"), ("format = \"8E1\"\n", "format")] {
+        let (loaded, _) = load(&bus(more));
+        let told = loaded
+            .errors
+            .iter()
+            .find(|e| e.message.contains("N2 is 9600 8N1 always"))
+            .unwrap();
+        assert!(told.key.ends_with(key), "{told}");
+    }
+    let drive = |address: u8, more: &str| {
+        bus(&format!(
+            "[[bus.drive]]\nname = \"d\"\naddress = {address}\nprofile = \"teco-7300pa-n2\"\n{more}"
+        ))
+    };
+    assert!(load(&drive(254, "")).0.settings.is_some());
+    assert!(load(&drive(255, "unit = 1\n")).0.settings.is_some());
+    assert!(load(&drive(255, "")).0.settings.is_none(), "unit 255 is the gateway");
+    let nx = drive(248, "").replace("teco-7300pa-n2", "vacon-nx-n2");
+    assert!(load(&nx).0.settings.is_none(), "the family's range decides");
+}
+
+#[test]
 fn a_reload_sees_what_changed() {
     let one = settings(&FULL);
     assert_eq!(one, settings(&FULL));

@@ -470,6 +470,26 @@ impl Profile {
         }
     }
 
+    /// Whether a write of these items is left out when the drive has them already: it keeps them in a memory that wears.
+    /// On N2 that holds for what no point names too. A stop is none of these, nor is a pulse.
+    pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
+        let spared = |address: u16| {
+            let covers = |p: &&Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, address));
+            let mut points = self.points.iter().filter(covers).peekable();
+            match points.peek() {
+                Some(_) => points.all(|p| p.on_change),
+                None => self.protocols.contains(&Protocol::N2),
+            }
+        };
+        let stops = |(address, value): &(u16, u16)| self.is_stop(table, *address, *value);
+        items.iter().all(|(address, _)| spared(*address)) && !items.iter().any(stops)
+    }
+
+    /// Whether what is written to that table is released afterwards: an analog output of N2.
+    pub fn releases(&self, table: Table) -> bool {
+        table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
+    }
+
     /// Whether writing `value` to that register (or coil) takes the run command away: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
         self.run_bit().is_some_and(|(raw, bit, invert)| {

@@ -161,9 +161,13 @@ impl Rig {
         };
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let options = BusOptions {
-            response_timeout: Duration::from_millis(100),
-            retries: 1,
-            silence: Silence::Chars,
+            response_timeout: setup.protocol.usual_timeout(),
+            retries: if setup.protocol == Protocol::N2 { 2 } else { 1 },
+            silence: if setup.protocol == Protocol::N2 {
+                Silence::Spec
+            } else {
+                Silence::Chars
+            },
             rs485: setup.rs485,
         };
         let leases = Leases::new(events.clone(), writes.clone());
