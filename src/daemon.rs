@@ -148,7 +148,7 @@ impl Daemon {
         }
         for bus in wanted {
             tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
-            let task = self.start_bus(&bus)?;
+            let task = self.start_bus(&bus, settings.stale_after_written)?;
             kept.push((bus, task));
         }
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
@@ -165,7 +165,7 @@ impl Daemon {
         Ok(())
     }
 
-    fn start_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
+    fn start_bus(&self, bus: &BusSettings, stale_after_written: bool) -> Result<BusTask, StartError> {
         let failed = |error: std::io::Error| {
             StartError(format!(
                 "cannot start bus `{}`: {error}; free memory or file descriptors",
@@ -173,8 +173,11 @@ impl Daemon {
             ))
         };
         let before = self.plant.load();
+        let (cycle, slow_cycle) = bus.achievable();
+        // Where nobody wrote when process data is stale, three rounds of a slow line are not.
+        let stale_floor = if stale_after_written { Duration::ZERO } else { 3 * cycle };
         let drives = bus.drives.iter().map(|spec| {
-            let image = DriveImage::new(spec.clone(), bus.spec.slow_cycle);
+            let image = DriveImage::new(spec.clone(), slow_cycle).with_stale_floor(stale_floor);
             // A bus that starts anew does not set a running drive free of its supervision.
             if let Some(same) = before
                 .drive(&spec.name)

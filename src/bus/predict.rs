@@ -7,7 +7,7 @@
 use std::fmt;
 use std::time::Duration;
 
-use super::schedule::SLOW_SHARE;
+use super::schedule::{SLOW_SHARE, slow_share};
 use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
@@ -216,12 +216,17 @@ impl<'a> Line<'a> {
     /// Share of the line that slow requests can have: the idle time of a round as far as whole requests fit, or
     /// the share that they get in any case.
     fn room(&self, rounds: &Rounds) -> f64 {
+        self.room_beside(rounds, slow_share(self.shares(rounds).1))
+    }
+
+    /// The same where they get `least` in any case.
+    fn room_beside(&self, rounds: &Rounds, least: f64) -> f64 {
         if rounds.fast == 0.0 {
             return 1.0;
         }
         let cycle = self.spec.cycle.as_secs_f64().max(1e-6);
         let fitting = ((cycle - rounds.fast).max(0.0) / rounds.longest_slow.max(1e-6)).floor();
-        (fitting * rounds.mean_slow() / cycle).max(SLOW_SHARE)
+        (fitting * rounds.mean_slow() / cycle).max(least)
     }
 
     /// Seconds from round to round, fast and slow.
@@ -331,7 +336,7 @@ impl<'a> Line<'a> {
         if fast_missed {
             return self.shortest_cycle(rounds).map(cycle).into_iter().collect();
         }
-        let slow_cycle = Remedy::SlowCycle(whole_milliseconds(rounds.slow / self.room(rounds)));
+        let slow_cycle = Remedy::SlowCycle(whole_milliseconds(rounds.slow / self.room_beside(rounds, SLOW_SHARE)));
         let roomy = self.roomy_cycle(rounds).map(cycle);
         [slow_cycle].into_iter().chain(roomy).collect()
     }

@@ -22,6 +22,17 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 pub const COMMANDS_IN_A_ROW: u32 = 8;
 /// Share of a saturated line that slow polls get at least.
 pub const SLOW_SHARE: f64 = 0.05;
+/// Share that they get at most, however much they ask for.
+const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
+/// Share that slow polls get while something was never read: what is not known yet is worth more than what is known.
+const FIRST_SHARE: f64 = 0.5;
+
+/// Share of a saturated line that slow polls get, of which their cadence asks for `demand`: with many requests (one for
+/// each object on N2) they get more than the least, and come round in six times their cadence.
+pub fn slow_share(demand: f64) -> f64 {
+    (demand / 6.0).clamp(SLOW_SHARE, MOST_SLOW_SHARE)
+}
+
 /// Credit that slow polls gather while none is due, in requests of the longest kind.
 const MOST_CREDIT: f64 = 1.5;
 
@@ -117,6 +128,8 @@ pub struct Schedule {
     new_slow: Option<RoundStart>,
     /// Time on the line that slow polls have to get before fast ones.
     slow_credit: Duration,
+    /// Share of all time that the credit grows by.
+    slow_share: f64,
     /// Why the poll that was chosen last has its turn.
     turn: Turn,
     /// Until when the credit is reckoned.
@@ -152,6 +165,10 @@ impl Schedule {
         let slow = drives.iter().flat_map(|drive| &drive.items);
         let slow = slow.filter(|item| item.read.class != PollClass::Fast);
         let longest = slow.map(|item| item.cost).max().unwrap_or_default();
+        let regular = drives.iter().flat_map(|drive| &drive.items);
+        let regular = regular.filter(|item| item.read.class == PollClass::Slow);
+        let work: Duration = regular.map(|item| item.cost).sum();
+        let demand = work.as_secs_f64() / cadence.slow.as_secs_f64().max(1e-6);
         Schedule {
             cadence,
             drives,
@@ -162,6 +179,7 @@ impl Schedule {
             slow_started: None,
             new_slow: None,
             slow_credit: Duration::ZERO,
+            slow_share: slow_share(demand),
             turn: Turn::Due,
             earned_until: now,
             most_credit: longest.mul_f64(MOST_CREDIT),
@@ -324,7 +342,9 @@ impl Schedule {
     fn earn(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.earned_until);
         self.earned_until = now;
-        self.slow_credit = (self.slow_credit + passed.mul_f64(SLOW_SHARE)).min(self.most_credit);
+        let first = self.drives.iter().any(DriveSchedule::has_unread);
+        let share = if first { FIRST_SHARE } else { self.slow_share };
+        self.slow_credit = (self.slow_credit + passed.mul_f64(share)).min(self.most_credit);
     }
 
     fn start_round(&mut self, now: Instant) {

@@ -113,6 +113,8 @@ pub struct DriveImage {
     pub plan: Plan,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
+    /// Process data of a line that cannot be faster is not stale before that age.
+    stale_floor: Duration,
     snapshot: ArcSwap<Snapshot>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
@@ -131,12 +133,18 @@ impl DriveImage {
             spec,
             plan,
             slow_cycle,
+            stale_floor: Duration::ZERO,
             snapshot,
             outcomes,
             turnaround: AtomicU64::new(0),
             lease: Mutex::default(),
             supervisions: AtomicU64::new(0),
         }
+    }
+
+    /// Process data is not stale before that age: the line cannot renew it faster.
+    pub fn with_stale_floor(self, stale_floor: Duration) -> DriveImage {
+        DriveImage { stale_floor, ..self }
     }
 
     /// What is known now; stays as it is while the caller holds it.
@@ -158,7 +166,7 @@ impl DriveImage {
             spec: &self.spec,
             snapshot,
             now,
-            stale_after,
+            stale_after: stale_after.max(self.stale_floor),
             slow_cycle: self.slow_cycle,
         }
     }

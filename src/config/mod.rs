@@ -42,6 +42,8 @@ pub struct Settings {
     pub profiles: Profiles,
     /// Age from which a sample of process data is stale.
     pub stale_after: Duration,
+    /// `stale_after` was written: it holds for slow lines too.
+    pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
     /// Absent: not started.
@@ -66,6 +68,16 @@ pub struct BusSettings {
 }
 
 impl BusSettings {
+    /// The cadences that drives are measured by: those of the configuration, or what the line can carry at best.
+    pub fn achievable(&self) -> (Duration, Duration) {
+        let prediction = self.predict();
+        let spec = &self.spec;
+        (
+            spec.cycle.max(prediction.fast_cycle.unwrap_or_default()),
+            spec.slow_cycle.max(prediction.slow_cycle.unwrap_or_default()),
+        )
+    }
+
     /// Wire times, cycles and load to be expected.
     pub fn predict(&self) -> Prediction {
         predict::predict(&self.spec, self.options.silence, &self.drives)
@@ -195,6 +207,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         stale_after: modbus_tcp
             .as_ref()
             .map_or(modbus_tcp::DEFAULT_STALE_AFTER, |m| m.stale_after),
+        stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
@@ -228,8 +241,8 @@ fn judge(
     }
     if reader.document().is_sound() {
         // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
-        let stale_after = modbus_tcp.map_or(modbus_tcp::DEFAULT_STALE_AFTER, |m| m.stale_after);
-        warn_of_cadence(reader, buses, stale_after, modbus_tcp.map(|m| &m.stale_place));
+        let written = modbus_tcp.filter(|m| m.stale_written);
+        warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
     }
 }
 
@@ -294,8 +307,9 @@ fn warn_of_emptiness(reader: &Reader<'_>) {
     }
 }
 
-/// Cadences that the line cannot carry, and samples that age faster than they are renewed.
-fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Duration, stale_place: Option<&Place>) {
+/// Cadences that the line cannot carry, and process data that ages faster than it is renewed where somebody wrote when it
+/// is stale.
+fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Option<(Duration, &Place)>) {
     for found in buses {
         let Some(settings) = &found.settings else { continue };
         let prediction = settings.predict();
@@ -304,26 +318,16 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Durat
             let place = if shortage.fast.is_some() { fast } else { slow };
             reader.document().warning(place, shortage.message());
         }
-        let place = stale_place.unwrap_or(&found.cadence.0);
-        for (class, cycle, limit) in [
-            ("process data", prediction.fast_cycle, stale_after),
-            (
-                "slow points",
-                prediction.slow_cycle,
-                stale_after + 2 * settings.spec.slow_cycle,
-            ),
-        ] {
-            if let Some(cycle) = cycle.filter(|cycle| *cycle > limit) {
-                let (cycle, limit) = (cycle.as_secs_f64() * 1e3, limit.as_secs_f64() * 1e3);
-                reader.document().warning(
-                    place,
-                    format!(
-                        "{class} of bus `{}` are renewed every {cycle:.0} ms and stale after {limit:.0} ms; \
-                         raise stale_after of [modbus_tcp] or lighten the bus",
-                        settings.spec.name
-                    ),
-                );
-            }
+        if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
+            && cycle > limit
+        {
+            let (cycle, limit) = (cycle.as_secs_f64() * 1e3, limit.as_secs_f64() * 1e3);
+            let text = format!(
+                "process data of bus `{}` is renewed every {cycle:.0} ms and stale after {limit:.0} ms; raise \
+                 stale_after, leave it out, or lighten the bus",
+                settings.spec.name
+            );
+            reader.document().warning(place, text);
         }
     }
 }

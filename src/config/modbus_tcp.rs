@@ -37,6 +37,7 @@ pub(super) struct ModbusTcp {
     /// Absent when a certificate or key cannot be used, which is a problem already told.
     pub(super) options: Option<modbus_tcp::Options>,
     pub(super) stale_after: Duration,
+    pub(super) stale_written: bool,
     pub(super) stale_place: Place,
     pub(super) addresses: Vec<Address>,
     /// What each listener shows: `None` all buses.
@@ -85,6 +86,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     let idle_timeout = read_idle(reader);
     let uncached = values::choice(reader, "uncached", Uncached::Forward, &UNCACHED);
     let stale_after = values::duration(reader, "stale_after", DEFAULT_STALE_AFTER, &bus::TIMES);
+    let stale_written = reader.has("stale_after");
     reader.finish();
     let Found {
         listeners,
@@ -106,6 +108,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
     ModbusTcp {
         options,
         stale_after,
+        stale_written,
         stale_place: reader.place_of("stale_after"),
         addresses,
         selections,

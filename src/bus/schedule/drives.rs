@@ -25,6 +25,8 @@ pub(super) struct Item {
     pub(super) failures: u32,
     /// A read of the once class that is still to be done.
     pub(super) wanted: bool,
+    /// Never answered so far.
+    pub(super) unread: bool,
     /// Since when a command changed what it reads: it goes before the round, so that the command is confirmed soon.
     pub(super) asked: Option<Instant>,
     /// When the parts of a refused block may be joined again: perhaps it was refused by mistake.
@@ -69,6 +71,7 @@ impl Item {
             refused: false,
             failures: 0,
             wanted: true,
+            unread: true,
             asked: None,
             whole_again: None,
         }
@@ -84,6 +87,12 @@ impl Item {
 }
 
 impl DriveSchedule {
+    /// Whether something of a drive that answers was never read, the process data apart.
+    pub(super) fn has_unread(&self) -> bool {
+        let unread = |item: &Item| item.unread && !item.refused && item.failures == 0 && item.is_slow();
+        self.presence == Presence::Online && self.items.iter().any(unread)
+    }
+
     pub(super) fn has_fast(&self) -> bool {
         self.items.iter().any(|i| i.read.class == PollClass::Fast)
     }

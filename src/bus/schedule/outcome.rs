@@ -37,6 +37,7 @@ impl Schedule {
             change = drive.refused(poll.read, exception, now);
         } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.failures = 0;
+            item.unread = false;
             if std::mem::take(&mut item.refused) {
                 // The bad point is sound again: it is read with its neighbours.
                 item.whole_again = Some(now);

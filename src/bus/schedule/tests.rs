@@ -469,7 +469,8 @@ fn a_dear_slow_poll_gets_its_turn_on_a_saturated_slow_line() {
             }
         }
     }
-    assert!((8..=14).contains(&slow), "{slow} slow polls in 300 s");
+    // They ask for nearly three lines and get a third of one.
+    assert!((65..=75).contains(&slow), "{slow} slow polls in 300 s");
 }
 
 #[test]
@@ -486,8 +487,8 @@ fn many_dead_drives_at_start_do_not_keep_the_others_waiting() {
                 last = Some(*at);
             }
         }
-        // A round, one probe between two fast polls.
-        assert!(longest < Duration::from_millis(600), "drive {drive}: {longest:?}");
+        // A round, one probe between two fast polls, and first reads.
+        assert!(longest < Duration::from_millis(700), "drive {drive}: {longest:?}");
     }
     assert_eq!(bench.offline.len(), 28);
 }
