@@ -160,7 +160,7 @@ fn request(address: u8) -> Request {
         start: 2100,
         count: 11,
     };
-    Request { address, pdu }
+    Request::new(address, pdu)
 }
 
 fn rod(format: LineFormat) -> BareOptions {

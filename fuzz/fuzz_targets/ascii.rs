@@ -43,7 +43,7 @@ fuzz_target!(|data: &[u8]| {
     };
     slave(line);
     if let Ok(pdu) = RequestPdu::decode(pdu) {
-        let request = Request { address: 1, pdu };
+        let request = Request::new(1, pdu);
         master(&request, line);
         exchange(&request, line, usize::from(choices >> 4) + 1, choices & ECHO != 0);
     }
@@ -56,7 +56,7 @@ fn slave(line: &[u8]) {
     assert!(open_frame(whole).is_some() && whole.ends_with(b"\r\n"));
     if let Ok(pdu) = decoded {
         let mut again = Vec::new();
-        encode_request(&Request { address, pdu: pdu.clone() }, &mut again);
+        encode_request(&Request::new(address, pdu.clone()), &mut again);
         assert_eq!(decode_request(&again), Some((address, Ok(pdu))));
     }
 }

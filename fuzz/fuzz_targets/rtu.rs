@@ -24,13 +24,13 @@ fuzz_target!(|data: &[u8]| {
     }
     if let Some((address, Ok(request))) = decode_request(line) {
         let mut again = Vec::new();
-        let request = Request { address, pdu: request };
+        let request = Request::new(address, request);
         encode_request(&request, &mut again);
         assert_eq!(decode_request(&again), Some((address, Ok(request.pdu))));
         assert!(open_frame(line).is_some());
     }
     if let Ok(pdu) = RequestPdu::decode(pdu) {
-        let request = Request { address: 1, pdu };
+        let request = Request::new(1, pdu);
         match decode_reply(&request, line) {
             Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                 assert!((4..=line.len()).contains(&used));
