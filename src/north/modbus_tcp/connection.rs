@@ -100,6 +100,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 half_frame_since = None;
                 self.touch();
                 self.give_way(taken.frames).await;
+                if self.since_yield == 0 && cancel.is_cancelled() {
+                    return Err(End::Cancelled);
+                }
             }
             let full = self.dialogue.is_full();
             if !full && self.dialogue.has_more() {
@@ -113,12 +116,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
             let waits = self.dialogue.is_waiting();
             let (space, waiting) = self.dialogue.parts();
-            let event = tokio::select! {
-                () = &mut cancelled => return Err(End::Cancelled),
-                Some(finished) = waiting.next() => Event::Answer(finished),
-                count = self.stream.read(space), if !full && !client_done => Event::Input(count?),
-                () = expired(half_frame_since) => return Err(End::HalfFrame),
-                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+            let reads = !full && !client_done;
+            let at_once = if reads {
+                self.stream.read(space).now_or_never()
+            } else {
+                None
+            };
+            let event = match at_once {
+                Some(count) => Event::Input(count?),
+                None => {
+                    // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
+                    // task may go on on another thread, later.
+                    self.since_yield = 0;
+                    tokio::select! {
+                        () = &mut cancelled => return Err(End::Cancelled),
+                        Some(finished) = waiting.next() => Event::Answer(finished),
+                        count = self.stream.read(space), if reads => Event::Input(count?),
+                        () = expired(half_frame_since) => return Err(End::HalfFrame),
+                        timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+                    }
+                }
             };
             match event {
                 Event::Answer(finished) => {
