@@ -5,6 +5,7 @@ use std::io;
 use std::pin::Pin;
 use std::time::Duration;
 
+use futures_util::FutureExt;
 use futures_util::stream::StreamExt;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::{Instant, Sleep};
@@ -82,19 +83,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn run(&mut self, cancel: &CancellationToken) -> Result<Infallible, End> {
         let mut client_done = false;
         let mut half_frame_since: Option<Instant> = None;
+        // One future for all turns: it enters the token's list once, not with every request.
+        let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
             let worked = self.dialogue.work(std::time::Instant::now());
             self.dialogue.collect();
-            tokio::select! {
-                biased;
-                () = cancel.cancelled() => return Err(End::Cancelled),
-                flushed = flush(&mut self.stream, &mut self.dialogue) => flushed?,
+            if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
+                tokio::select! {
+                    biased;
+                    () = &mut cancelled => return Err(End::Cancelled),
+                    flushed = flush(&mut self.stream, &mut self.dialogue) => flushed?,
+                }
             }
             let taken = worked?;
             if taken.frames > 0 {
                 half_frame_since = None;
                 self.touch();
                 self.give_way(taken.frames).await;
+                if self.since_yield == 0 && cancel.is_cancelled() {
+                    return Err(End::Cancelled);
+                }
             }
             let full = self.dialogue.is_full();
             if !full && self.dialogue.has_more() {
@@ -108,12 +116,26 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
             let waits = self.dialogue.is_waiting();
             let (space, waiting) = self.dialogue.parts();
-            let event = tokio::select! {
-                () = cancel.cancelled() => return Err(End::Cancelled),
-                Some(finished) = waiting.next() => Event::Answer(finished),
-                count = self.stream.read(space), if !full && !client_done => Event::Input(count?),
-                () = expired(half_frame_since) => return Err(End::HalfFrame),
-                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+            let reads = !full && !client_done;
+            let at_once = if reads {
+                self.stream.read(space).now_or_never()
+            } else {
+                None
+            };
+            let event = match at_once {
+                Some(count) => Event::Input(count?),
+                None => {
+                    // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
+                    // task may go on on another thread, later.
+                    self.since_yield = 0;
+                    tokio::select! {
+                        () = &mut cancelled => return Err(End::Cancelled),
+                        Some(finished) = waiting.next() => Event::Answer(finished),
+                        count = self.stream.read(space), if reads => Event::Input(count?),
+                        () = expired(half_frame_since) => return Err(End::HalfFrame),
+                        timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+                    }
+                }
             };
             match event {
                 Event::Answer(finished) => {
@@ -197,11 +219,25 @@ impl Idle {
     }
 }
 
+/// Writes the output if the stream takes all of it without waiting, as it nearly always does: no timer, no registration.
+fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<bool, End> {
+    let output = &mut dialogue.output;
+    while !output.is_empty() {
+        match stream.write(output).now_or_never().transpose()? {
+            None => return Ok(false),
+            Some(0) => return Err(io::Error::from(io::ErrorKind::WriteZero).into()),
+            Some(count) if count == output.len() => {
+                output.clear();
+                return Ok(stream.flush().now_or_never().transpose()?.is_some());
+            }
+            Some(count) => drop(output.drain(..count)),
+        }
+    }
+    Ok(true)
+}
+
 /// Writes the output; when it is dropped half way, the output keeps what was not written.
 async fn flush<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<(), End> {
-    if dialogue.output.is_empty() {
-        return Ok(());
-    }
     let output = &mut dialogue.output;
     while !output.is_empty() {
         // The time runs anew with every byte taken: a slow line is no reason to give a client up.
