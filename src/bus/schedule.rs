@@ -459,7 +459,12 @@ impl Schedule {
     }
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
-        let mut best: Option<(Instant, Poll, Duration)> = None;
+        // What is read once when a drive comes online goes first: commands in percent rest on its frequencies.
+        let rank = |item: &Item| {
+            let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
+            (!first, item.due)
+        };
+        let mut best: Option<((bool, Instant), (Instant, Poll, Duration))> = None;
         for (index, drive) in self
             .drives
             .iter()
@@ -467,17 +472,17 @@ impl Schedule {
             .filter(|(_, d)| d.presence == Presence::Online)
         {
             for item in drive.items.iter().filter(|i| i.is_slow() && i.due <= now) {
-                if best.as_ref().is_none_or(|(due, _, _)| item.due < *due) {
+                if best.as_ref().is_none_or(|(least, _)| rank(item) < *least) {
                     let poll = Poll {
                         drive: index,
                         read: item.read,
                         probe: false,
                     };
-                    best = Some((item.due, poll, item.cost));
+                    best = Some((rank(item), (item.due, poll, item.cost)));
                 }
             }
         }
-        best
+        best.map(|(_, slow)| slow)
     }
 
     /// When something is due; a slow poll that is due but does not fit before the round waits for the round.

@@ -482,4 +482,62 @@ mod tests {
             Exception::FUNCTION
         );
     }
+
+    /// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
+    fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Order) -> Result<Admitted, Refusal> {
+        let profile = Profiles::built_in().get("teco-7300pa").unwrap().clone();
+        let mut spec = drive(Access::Control).spec;
+        spec.profile = Arc::clone(&profile);
+        let image = DriveImage::new(spec, Duration::from_secs(1));
+        image.update(|s| {
+            s.link = Link::Online(std::time::SystemTime::now());
+            if let Some(maximum) = maximum {
+                s.store(Table::Holding, 0x0201, &[maximum], Instant::now());
+            }
+        });
+        let order = order(&|name| profile.point_index(name).unwrap());
+        admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    }
+
+    #[test]
+    fn a_command_goes_where_the_drive_takes_it_within_the_limits_of_the_other_unit() {
+        let set = |maximum, name: &str, value: f64| {
+            in_hertz(maximum, |point| {
+                Order::Points(vec![(point(name), Value::Number(value))])
+            })
+        };
+        let command = Profiles::built_in()
+            .get("teco-7300pa")
+            .unwrap()
+            .point_index("frequency_command")
+            .unwrap();
+        for (name, value) in [
+            ("speed_reference", 50.0),
+            ("frequency_reference", 30.0),
+            ("frequency_command", 30.0),
+        ] {
+            let admitted = set(Some(600), name, value).unwrap();
+            assert_eq!(
+                admitted.order,
+                Order::Points(vec![(command, Value::Number(30.0))]),
+                "{name}"
+            );
+        }
+        // 80 % of 60 Hz is 48 Hz.
+        for (name, value) in [
+            ("speed_reference", 81.0),
+            ("frequency_reference", 49.0),
+            ("frequency_command", 49.0),
+        ] {
+            assert_eq!(
+                set(Some(600), name, value).unwrap_err().exception(),
+                Exception::VALUE,
+                "{name}"
+            );
+            assert!(set(None, name, value).is_err(), "{name}: what 80 % are is not known");
+        }
+        let raw = |value| in_hertz(Some(600), |_| write(0x0002, value));
+        assert!(raw(4800).is_ok());
+        assert_eq!(raw(4801).unwrap_err().exception(), Exception::VALUE);
+    }
 }

@@ -2,7 +2,7 @@
 
 use std::fmt::Write;
 
-use drivegate::codec::{Protocol, Table};
+use drivegate::codec::{N2Options, Protocol, Table, n2};
 use drivegate::drive::profile::{Form, Profile, Profiles};
 use drivegate::drive::{Bound, Derived, ModelPoint, Point, Source};
 
@@ -21,6 +21,7 @@ pub(crate) fn tables() -> String {
             text += &family(profile);
         }
     }
+    text += &assumptions();
     text.push('\n');
     assert_eq!(
         profiles.iter().count(),
@@ -199,6 +200,20 @@ fn family(profile: &Profile) -> String {
     }
     if !unsure.is_empty() {
         let _ = write!(text, "\nFault texts that are not verified: {}.\n", unsure.join(", "));
+    }
+    text
+}
+
+/// What no manual says of N2.
+fn assumptions() -> String {
+    let mut text = String::from(
+        "\n## Assumptions about Metasys N2\n\nNone of these was verified on hardware. Those with a key can be changed \
+         in `[n2]` of a profile.\n\n| key | value | assumption | why |\n|---|---|---|---|\n",
+    );
+    for one in n2::ASSUMPTIONS {
+        let key = one.key.map(|key| format!("`{key}`")).unwrap_or_default();
+        let value = one.value(&N2Options::DEFAULT);
+        let _ = writeln!(text, "| {key} | {value} | {} | {} |", one.what, one.why);
     }
     text
 }
