@@ -438,6 +438,7 @@ fn the_page_names_every_key() {
     for (heading, path) in [
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
+        ("\n### `[n2]`\n", "n2."),
         ("\n### `[[range]]`\n", "range[]."),
         ("\n### `[[point]]`\n", "point[]."),
     ] {
