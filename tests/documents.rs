@@ -99,7 +99,8 @@ fn every_configuration_that_ships_is_valid() {
 }
 
 fn is_profile(block: &str) -> bool {
-    block.contains("\nbase = ") || block.contains("\nprotocols = ") || block.starts_with("[n2]")
+    let named = block.contains("\nbase = ") || block.contains("\nprotocols = ");
+    named && !block.contains("[mqtt]") || block.starts_with("[n2]")
 }
 
 #[test]
