@@ -464,7 +464,7 @@ impl Schedule {
             let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
             (!first, item.due)
         };
-        let mut best: Option<((bool, Instant), (Instant, Poll, Duration))> = None;
+        let (mut least, mut best) = (None, None);
         for (index, drive) in self
             .drives
             .iter()
@@ -472,17 +472,18 @@ impl Schedule {
             .filter(|(_, d)| d.presence == Presence::Online)
         {
             for item in drive.items.iter().filter(|i| i.is_slow() && i.due <= now) {
-                if best.as_ref().is_none_or(|(least, _)| rank(item) < *least) {
+                if least.is_none_or(|least| rank(item) < least) {
                     let poll = Poll {
                         drive: index,
                         read: item.read,
                         probe: false,
                     };
-                    best = Some((rank(item), (item.due, poll, item.cost)));
+                    least = Some(rank(item));
+                    best = Some((item.due, poll, item.cost));
                 }
             }
         }
-        best.map(|(_, slow)| slow)
+        best
     }
 
     /// When something is due; a slow poll that is due but does not fit before the round waits for the round.
