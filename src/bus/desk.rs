@@ -102,7 +102,8 @@ impl Desk {
                 continue;
             };
             let reading = drive.reading(now, FRESH);
-            let running = reading.is_set(ModelPoint::Running);
+            // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
+            let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
             execution.look(&reading);
             match execution.next(&self.shadow, &drive.spec.profile, running, now) {
                 Next::Send(pdu) => {

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate::bus::leases::Leases;
+use drivegate::bus::predict::predict;
 use drivegate::bus::{BusOptions, BusTask};
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, OnShutdown};
 use drivegate::codec::wire::Silence;
@@ -146,14 +147,22 @@ impl Rig {
             cycle: Duration::from_millis(10),
             slow_cycle: setup.slow_cycle,
         };
-        let images = addresses.iter().map(|address| {
+        let specs = addresses.iter().map(|address| {
             let mut spec = DriveSpec {
                 profile: setup.profile.clone(),
                 ..spec(*address)
             };
             change(&mut spec);
-            Arc::new(DriveImage::new(spec, bus_spec.slow_cycle))
+            spec
         });
+        let specs: Vec<DriveSpec> = specs.collect();
+        // Points of a slow line are measured by what it can carry, as the daemon does.
+        let achieved = predict(&bus_spec, Silence::Chars, &specs);
+        let slow_cycle = bus_spec.slow_cycle.max(achieved.slow_cycle.unwrap_or_default());
+        let floor = 3 * bus_spec.cycle.max(achieved.fast_cycle.unwrap_or_default());
+        let images = specs
+            .into_iter()
+            .map(|spec| Arc::new(DriveImage::new(spec, slow_cycle).with_stale_floor(floor)));
         let image = Arc::new(BusImage::new(bus_spec.clone(), images.collect()));
         let handle = BusHandle {
             image,

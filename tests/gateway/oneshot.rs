@@ -6,6 +6,7 @@ use std::process::Command;
 use tempfile::TempDir;
 
 use crate::process::{Running, free_port, until};
+use crate::tools::tool;
 
 /// How a command ended, what it printed and what it complained of.
 struct Ran {
@@ -78,6 +79,22 @@ impl Line {
         rows[0]["value"].clone()
     }
 
+    /// Trips pump-1 by the simulators' own register, as another master would.
+    fn trip(&self) {
+        let gateway = std::net::TcpStream::connect(("127.0.0.1", self.modbus)).is_ok();
+        let tcp = ["-m", "tcp", "-p", &self.modbus.to_string()].map(ToString::to_string);
+        let rtu = ["-m", "rtu", "-b", "38400", "-P", "none"].map(ToString::to_string);
+        let mut arguments = if gateway { tcp.to_vec() } else { rtu.to_vec() };
+        let place = if gateway { "127.0.0.1".to_string() } else { self.port() };
+        arguments.extend(["-a", "1", "-0", "-r", "1998", "-1", &place, "1"].map(ToString::to_string));
+        let output = Command::new(tool("mbpoll")).args(&arguments).output().unwrap();
+        assert!(
+            output.status.success(),
+            "{arguments:?}: {}",
+            String::from_utf8_lossy(&output.stderr)
+        );
+    }
+
     /// Start, look, refuse, stop: the same whoever has the port.
     fn operate(&self) {
         let all = self.command("read", &["pump-1"]);
@@ -105,6 +122,13 @@ impl Line {
             assert!(ran.err.contains(wanted), "{arguments:?}: {}", ran.err);
         }
         assert_eq!(self.value("speed_reference"), 50.0, "refused is not written");
+        // A fault while it runs (the simulators' own register), and its reset: the motor stays where it is.
+        self.trip();
+        until("the fault", || (self.value("fault") == true).then_some(()));
+        let reset = self.command("write", &["pump-1", "fault_reset=true"]);
+        assert_eq!(reset.code, 0, "{}", reset.err);
+        until("no fault", || (self.value("fault") == false).then_some(()));
+        assert_eq!(self.value("running"), false, "a reset starts nothing");
         let stopped = self.command("write", &["pump-1", "run=false"]);
         assert_eq!(stopped.code, 0, "{}", stopped.err);
         until("a motor that stands", || (self.value("running") == false).then_some(()));

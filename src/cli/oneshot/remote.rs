@@ -244,6 +244,8 @@ impl Remote {
             both if both == RUN | REVERSE => 0,
             // No read stands in the way of a stop.
             RUN if set & RUN == 0 => self.command_word(spec).unwrap_or(0),
+            // A reset must not start a motor that stands, whatever run command is left over from before the fault.
+            0 if !self.runs(spec)? => self.command_word(spec).unwrap_or(0) & !RUN,
             _ => self.command_word(spec)?,
         };
         let word = (old & !mask & (RUN | REVERSE)) | set;
@@ -260,6 +262,22 @@ impl Remote {
         } else {
             frequency.into_iter().chain([command]).collect()
         })
+    }
+
+    /// Whether the motor runs, and not with a fault.
+    fn runs(&mut self, spec: &DriveSpec) -> Result<bool, String> {
+        let mut runs = false;
+        for (point, wanted) in [(ModelPoint::Running, true), (ModelPoint::Fault, false)] {
+            let Some(point) = spec.profile.model_point(point) else {
+                continue;
+            };
+            let (sample, _) = self.sample(spec, point)?;
+            runs = sample.good().is_some_and(|value| value.as_bool() == wanted);
+            if !runs {
+                break;
+            }
+        }
+        Ok(runs)
     }
 
     /// The bits that are not commanded stay as the drive has them.
