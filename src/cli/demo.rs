@@ -6,11 +6,12 @@ use std::process::ExitCode;
 use tokio_util::sync::CancellationToken;
 
 use super::{EXIT_FAILED, report};
-use crate::codec::LineFormat;
+use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
 use crate::daemon::Daemon;
+use crate::drive::profile::Profiles;
 use crate::sim::broker::Broker;
-use crate::sim::drive::DriveOptions;
+use crate::sim::drive::{DriveOptions, ModelOptions};
 use crate::sim::endpoint::EndpointOptions;
 use crate::sim::half_duplex::{LineRules, Wire};
 use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
@@ -36,8 +37,69 @@ pub(super) enum Speed {
     Max,
 }
 
-/// One simulated line of the demo: name, baud, drives by name.
-const LINES: [(&str, u32, &[&str]); 2] = [("line1", 38_400, &["pump-1", "pump-2"]), ("line2", 115_200, &["fan-1"])];
+/// One simulated line of the demo.
+struct DemoLine {
+    name: &'static str,
+    protocol: Protocol,
+    baud: u32,
+    format: &'static str,
+    /// `cycle` and `slow_cycle`.
+    cadence: [&'static str; 2],
+    /// Drives with their profiles, addresses from 1 on.
+    drives: &'static [(&'static str, &'static str)],
+}
+
+/// Every protocol, every family of the reference.
+const LINES: [DemoLine; 5] = [
+    DemoLine {
+        name: "line1",
+        protocol: Protocol::ModbusRtu,
+        baud: 38_400,
+        format: "8N1",
+        cadence: ["10ms", "1s"],
+        drives: &[("pump-1", "vacon-nx"), ("pump-2", "vacon-nx")],
+    },
+    DemoLine {
+        name: "line2",
+        protocol: Protocol::ModbusRtu,
+        baud: 115_200,
+        format: "8N1",
+        cadence: ["10ms", "1s"],
+        drives: &[("fan-1", "vacon-nx")],
+    },
+    DemoLine {
+        name: "line3",
+        protocol: Protocol::ModbusRtu,
+        baud: 19_200,
+        format: "8N1",
+        cadence: ["200ms", "2s"],
+        drives: &[
+            ("blower-1", "eaton-svx"),
+            ("blower-2", "eaton-hvx"),
+            ("mixer-1", "vacon-cx"),
+        ],
+    },
+    DemoLine {
+        name: "line4",
+        protocol: Protocol::ModbusAscii,
+        baud: 19_200,
+        format: "7N2",
+        cadence: ["100ms", "1s"],
+        drives: &[("conveyor-1", "teco-7300pa")],
+    },
+    DemoLine {
+        name: "line5",
+        protocol: Protocol::N2,
+        baud: 9600,
+        format: "8N1",
+        cadence: ["1500ms", "10s"],
+        drives: &[
+            ("ahu-1", "vacon-nx-n2"),
+            ("ahu-2", "eaton-hvx-n2"),
+            ("ahu-3", "teco-7300pa-n2"),
+        ],
+    },
+];
 
 /// The ports that the demo takes when they are free.
 const MQTT: u16 = 1883;
@@ -127,21 +189,30 @@ async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, 
 }
 
 fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
-    let start = |(name, baud, drives): &(&str, u32, &[&str])| {
-        let format = LineFormat::new(*baud, "8N1").map_err(|e| std::io::Error::other(e.to_string()))?;
-        let mut rules = LineRules::new(format);
+    let profiles = Profiles::built_in();
+    let model = |profile: &str| -> std::io::Result<ModelOptions> {
+        let simulator = profiles.get(profile).and_then(|profile| profile.simulator.clone());
+        let model = simulator.as_deref().and_then(ModelOptions::by_name);
+        model.ok_or_else(|| std::io::Error::other(format!("drives of the profile `{profile}` cannot be simulated")))
+    };
+    let start = |line: &DemoLine| {
+        let format = LineFormat::new(line.baud, line.format).map_err(|e| std::io::Error::other(e.to_string()))?;
+        let mut rules = LineRules::of(line.protocol, format);
         if speed == Speed::Max {
             rules.wire = Wire::Instant;
         }
-        let drives = (1..).zip(*drives).map(|(address, _)| {
-            // Different seeds, so that the drives do not move in step.
-            let seed = u64::from(*baud) + u64::from(address);
-            DriveOptions {
-                autopilot: Some(seed),
-                ..DriveOptions::nx(address)
-            }
-        });
-        let options = SimulatedBusOptions::new(name, rules, drives.collect());
+        let drives: std::io::Result<Vec<DriveOptions>> = (1..)
+            .zip(line.drives)
+            .map(|(address, (_, profile))| {
+                // Different seeds, so that the drives do not move in step.
+                let seed = u64::from(line.baud) + u64::from(address);
+                Ok(DriveOptions {
+                    autopilot: Some(seed),
+                    ..DriveOptions::new(address, model(profile)?)
+                })
+            })
+            .collect();
+        let options = SimulatedBusOptions::new(line.name, rules, drives?);
         SimulatedBus::start(SimulatedBusOptions {
             endpoint: EndpointOptions::Pty { link: None },
             ..options
@@ -168,13 +239,21 @@ fn configuration(ports: &[String], sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
     let mut text = "[gateway]\nname = \"demo\"\n".to_string();
     let mut unit = 0;
-    for ((name, baud, drives), port) in LINES.iter().zip(ports) {
-        text += &format!("\n[[bus]]\nname = \"{name}\"\nport = \"{port}\"\nprotocol = \"modbus-rtu\"\nbaud = {baud}\n");
-        text += "format = \"8N1\"\nsilence = \"chars\"\ncycle = \"10ms\"\n";
-        for (address, drive) in (1..).zip(*drives) {
+    for (line, port) in LINES.iter().zip(ports) {
+        let DemoLine { name, baud, format, .. } = line;
+        let ([cycle, slow_cycle], protocol) = (line.cadence, line.protocol.name());
+        text += &format!("\n[[bus]]\nname = \"{name}\"\nport = \"{port}\"\nprotocol = \"{protocol}\"\nbaud = {baud}\n");
+        text += &format!("format = \"{format}\"\ncycle = \"{cycle}\"\nslow_cycle = \"{slow_cycle}\"\n");
+        if line.protocol == Protocol::ModbusRtu {
+            text += "silence = \"chars\"\n";
+        }
+        for (address, (drive, profile)) in (1..).zip(line.drives) {
             unit += 1;
-            text += &format!("\n[[bus.drive]]\nname = \"{drive}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
-            text += &format!("unit = {unit}\naccess = \"control\"\nturnaround = \"0.5ms\"\n");
+            text += &format!("\n[[bus.drive]]\nname = \"{drive}\"\naddress = {address}\nprofile = \"{profile}\"\n");
+            text += &format!("unit = {unit}\naccess = \"control\"\n");
+            if *profile == "vacon-nx" {
+                text += "turnaround = \"0.5ms\"\n";
+            }
         }
     }
     text += &format!("\n[modbus_tcp]\nlisten = [\"{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n");
@@ -184,18 +263,32 @@ fn configuration(ports: &[String], sides: &Sides) -> String {
 
 fn welcome(ports: &[String], sides: &Sides) -> String {
     let http = sides.http;
-    let drives: Vec<&str> = LINES.iter().flat_map(|(_, _, drives)| drives.iter().copied()).collect();
+    let mut unit = 0;
     let lines: Vec<String> = LINES
         .iter()
         .zip(ports)
-        .map(|((name, baud, drives), port)| format!("  {name}: {} at {baud} 8N1 on {port}", drives.join(", ")))
+        .map(|(line, port)| {
+            let drives = line.drives.iter().map(|(name, profile)| {
+                unit += 1;
+                format!("{name} ({profile}, unit {unit})")
+            });
+            let drives: Vec<String> = drives.collect();
+            let protocol = line.protocol.name();
+            format!(
+                "  {}  {protocol} {} {} on {port}\n         {}",
+                line.name,
+                line.baud,
+                line.format,
+                drives.join(", ")
+            )
+        })
         .collect();
     let (modbus, mqtt) = (sides.modbus.port(), sides.mqtt.port());
     format!(
         "\
-drivegate {version} demo: simulated Vacon NX drives, true wire timing, no hardware.
+drivegate {version} demo: simulated drives of every family and protocol, true wire timing, no hardware.
 {lines}
-The drives {drives} start, stop, ramp and now and then fault by themselves until you command them.
+The drives start, stop, ramp and now and then fault by themselves until you command them.
 
 Look
   http://{http}/                       status page in a browser
@@ -204,6 +297,8 @@ Look
   mosquitto_sub -h 127.0.0.1 -p {mqtt} -v -t 'drivegate/#'
   mbpoll -m tcp -p {modbus} -a 1 -0 -r 32768 -c 19 -1 127.0.0.1          common model of pump-1 (unit 1)
   mbpoll -m tcp -p {modbus} -a 1 -0 -r 2100 -c 11 -1 127.0.0.1           its own registers, IDs 2101 to 2111
+  mbpoll -m tcp -p {modbus} -a 7 -0 -r 32768 -c 19 -1 127.0.0.1          the same of conveyor-1, a TECO on Modbus ASCII
+  mbpoll -m tcp -p {modbus} -a 8 -0 -r 32768 -c 19 -1 127.0.0.1          the same of ahu-1, a Vacon NX on Metasys N2
 
 Command pump-1
   mosquitto_pub -h 127.0.0.1 -p {mqtt} -q 1 -t drivegate/demo/drive/pump-1/set -m '{{\"run\": true, \"speed_reference\": 50}}'
@@ -215,6 +310,5 @@ Command pump-1
 Ctrl-C ends the demo.",
         version = env!("CARGO_PKG_VERSION"),
         lines = lines.join("\n"),
-        drives = drives.join(", "),
     )
 }

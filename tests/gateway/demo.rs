@@ -30,7 +30,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     );
     until_ready(http);
     let drives: Vec<serde_json::Value> = serde_json::from_str(&get(http, "/api/v1/drives").unwrap().1).unwrap();
-    assert_eq!(drives.len(), 3);
+    assert_eq!(drives.len(), 10);
     // By themselves the drives move.
     until("a drive that runs by itself", || {
         ["pump-1", "pump-2", "fan-1"]
@@ -52,6 +52,17 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     until("pump-1 at its reference", || {
         (point(http, "pump-1", "output_frequency") == 25.0).then_some(())
     });
+
+    // The same words for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run, read, stop.
+    for (unit, name, half) in [(7, "conveyor-1", 3000), (8, "ahu-1", 2500)] {
+        mbpoll_write(modbus, unit, 33_025, &[5000]).unwrap();
+        mbpoll_write(modbus, unit, 33_024, &[1]).unwrap();
+        until(&format!("{name} at half speed"), || {
+            let registers = mbpoll_read(modbus, unit, 32_768, 19).ok()?;
+            (registers.get(1) == Some(&3) && registers.get(5) == Some(&half)).then_some(())
+        });
+        mbpoll_write(modbus, unit, 33_024, &[0]).unwrap();
+    }
 
     assert_eq!(mbpoll_read(modbus, 1, 32_768, 19).unwrap().get(5), Some(&2500));
     mbpoll_write(modbus, 1, 33_024, &[0]).unwrap();
