@@ -15,7 +15,8 @@ use serde_json::Value;
 use crate::rig::{Rig, options, words};
 use crate::tools;
 
-/// A bus for each built-in profile, with a drive to command and one to look at.
+/// A bus for each built-in profile, with a drive to command and one to look at. What stands in the registers makes no
+/// frequency range for every family, so that is configured.
 fn configuration() -> String {
     let mut text = "[gateway]\nname = \"all\"\n[modbus_tcp]\nwrite = [\"127.0.0.1\"]\n".to_string();
     for (place, profile) in Profiles::built_in().iter().enumerate() {
@@ -28,7 +29,7 @@ fn configuration() -> String {
             let (unit, name) = (2 * place + address, &profile.name);
             let _ = writeln!(
                 text,
-                "[[bus.drive]]\nname = \"d{unit}\"\naddress = {address}\nunit = {unit}\nprofile = \"{name}\"\naccess = \"{access}\""
+                "[[bus.drive]]\nname = \"d{unit}\"\naddress = {address}\nunit = {unit}\nprofile = \"{name}\"\naccess = \"{access}\"\nfrequency_range = [0, 50]"
             );
         }
     }
