@@ -274,10 +274,10 @@ async fn a_slave_that_was_written_elsewhere() {
         assert!(rig.set(1, &[("speed_reference", 50.0)]).await.is_ok());
         is_good(&rig, ModelPoint::SpeedReference, Value::Number(50.0)).await;
         let heard = heard.lock().unwrap().clone();
-        assert_eq!(
-            heard[..4],
-            ["01FA7", "0104C5", "0105C6", "0111020388"].map(String::from)[..]
-        );
+        assert_eq!(heard[..3], ["01FA7", "0104C5", "0105C6"].map(String::from)[..]);
+        for read in ["0111020388", "0112020288"] {
+            assert!(heard.iter().any(|frame| frame == read), "{read}");
+        }
         let count = |frame: &str| heard.iter().filter(|line| *line == frame).count();
         assert_eq!((count("017203014248000020"), count("017303018F")), (1, 1));
     }
