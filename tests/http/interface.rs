@@ -162,7 +162,11 @@ async fn a_good_drive() {
         })
     );
     let names: Vec<&String> = points.as_object().unwrap().keys().collect();
-    assert_eq!(names.len(), plant::nx().points.len());
+    assert_eq!(names.len(), drivegate::cache::public_points(&plant::nx()).len());
+    assert!(
+        !names.contains(&&"process_data_in_1".to_string()),
+        "what is never read is not told"
+    );
     for (name, value, unit) in [
         ("output_frequency", json!(25.0), "Hz"),
         ("motor_current", json!(4.2), "A"),
