@@ -215,3 +215,46 @@ fn what_a_search_prints_passes_check() {
     );
     assert!(Path::new(&line.port()).exists());
 }
+
+/// Each family is found on the line that its simulator makes, and what is printed for it passes `check` and is read.
+#[test]
+fn every_family_is_found_by_reading() {
+    // SVX and HVX answer alike to every read.
+    let families = [
+        ("vacon-nx", "modbus-rtu", "38400", "8N1"),
+        ("eaton-svx", "modbus-rtu", "38400", "8N1"),
+        ("eaton-hvx", "modbus-rtu", "38400", "8N1"),
+        ("vacon-cx", "modbus-rtu", "19200", "8N1"),
+        ("teco-7300pa", "modbus-ascii", "19200", "7N2"),
+        ("vacon-nx-n2", "n2", "9600", "8N1"),
+        ("eaton-hvx-n2", "n2", "9600", "8N1"),
+        ("teco-7300pa-n2", "n2", "9600", "8N1"),
+    ];
+    for (profile, protocol, baud, format) in families {
+        let directory = TempDir::new().unwrap();
+        let link = directory.path().join("line");
+        let port = link.to_str().unwrap();
+        let _drives = Running::drivegate(&["simulate", "--profile", profile, "--addresses", "2", "--link", port]);
+        until("the line", || link.exists().then_some(()));
+        let line = ["--protocol", protocol, "--baud", baud, "--format", format];
+        let ran = drivegate(&[&["scan", "--port", port, "--addresses", "1-3"], &line[..]].concat());
+        assert_eq!(ran.code, 0, "{profile}: {}", ran.err);
+        assert!(ran.err.contains(profile), "{profile}: {}", ran.err);
+        assert!(
+            ran.out.contains(&format!("protocol = \"{protocol}\"")),
+            "{profile}: {}",
+            ran.out
+        );
+        let found = directory.path().join("found.toml");
+        std::fs::write(&found, &ran.out).unwrap();
+        let config = found.to_str().unwrap();
+        assert_eq!(
+            drivegate(&["check", "--config", config]).code,
+            0,
+            "{profile}: {}",
+            ran.out
+        );
+        let read = drivegate(&["read", "--config", config, "drive-1", "ready", "output_frequency"]);
+        assert_eq!(read.code, 0, "{profile}: {}{}", read.out, read.err);
+    }
+}
