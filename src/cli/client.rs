@@ -21,6 +21,8 @@ const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 const SILENCE: Duration = Duration::from_secs(35);
 /// Longest reply that is no stream, longest line of a stream.
 const MOST_BYTES: usize = 1 << 20;
+/// Longest document: some thousand drives with all their points.
+const MOST_DOCUMENT: usize = 1 << 26;
 
 /// Where a gateway's HTTP server is: `http://host:port`, with a path where a proxy has put it below one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -205,6 +207,38 @@ impl EventStream {
             Err(_) => ClientError::Strange(url, format!("the server answers `{status}` and no stream")),
         }
     }
+}
+
+/// Asks for a document; `path` begins with a slash.
+///
+/// # Errors
+/// When the gateway cannot be reached, refuses, or is none.
+pub(super) async fn get_json(url: &Url, path: &str) -> Result<serde_json::Value, ClientError> {
+    let late = || ClientError::Unreachable(url.clone(), "it does not answer within 10 s".to_string());
+    let whole = async {
+        let (wire, response) = ask(url, path).await?;
+        let status = response.status();
+        let mut stream = EventStream {
+            url: url.clone(),
+            wire,
+            body: response.into_body(),
+            parser: Parser::default(),
+        };
+        if status != StatusCode::OK {
+            return Err(stream.refusal(status).await);
+        }
+        let mut text = Vec::new();
+        while let Some(chunk) = stream.chunk().await {
+            let chunk = chunk.map_err(|error| ClientError::Ended(url.clone(), format!(" ({error})")))?;
+            text.extend_from_slice(&chunk);
+            if text.len() > MOST_DOCUMENT {
+                return Err(ClientError::Strange(url.clone(), "a reply without end".to_string()));
+            }
+        }
+        serde_json::from_slice(&text)
+            .map_err(|error| ClientError::Strange(url.clone(), format!("the reply is no JSON ({error})")))
+    };
+    timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
 }
 
 async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {

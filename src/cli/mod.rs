@@ -17,6 +17,7 @@ mod scan;
 mod schema;
 mod simulate;
 mod trace;
+mod watch;
 mod write;
 
 use std::path::PathBuf;
@@ -70,6 +71,7 @@ commands! {
     Scan => scan,
     Read => read,
     Write => write,
+    Watch => watch,
     Trace => trace,
     Simulate => simulate,
     Profiles => profiles,

@@ -1,0 +1,209 @@
+//! `drivegate watch`: the drives and lines of a running gateway, live.
+
+use std::io::{self, IsTerminal, Write};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use serde_json::Value;
+use tokio::signal::unix::{SignalKind, signal};
+
+use super::client::{Url, get_json};
+use super::{EXIT_FAILED, report};
+
+/// Pause between two looks.
+const PAUSE: Duration = Duration::from_millis(500);
+
+/// Shows the drives and lines of a running gateway, live.
+///
+/// On a terminal the table is renewed twice a second until Ctrl-C; else it is printed once.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:\n  drivegate watch\n  drivegate watch --url http://10.0.0.5:9488 --once")]
+pub(super) struct Args {
+    /// The gateway's HTTP server.
+    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
+    url: Url,
+    /// Print the table once and end.
+    #[arg(long)]
+    once: bool,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    super::block_on(async {
+        match watch(args).await {
+            Ok(code) => code,
+            Err(message) => {
+                report::error(&message);
+                ExitCode::from(EXIT_FAILED)
+            }
+        }
+    })
+}
+
+async fn watch(args: &Args) -> Result<ExitCode, String> {
+    let live = !args.once && io::stdout().is_terminal();
+    if !live {
+        return Ok(report::print(&page(&args.url).await?));
+    }
+    let signals = |error: io::Error| format!("cannot hear Ctrl-C: {error}; the system; free file descriptors");
+    let mut interrupt = signal(SignalKind::interrupt()).map_err(signals)?;
+    let mut terminate = signal(SignalKind::terminate()).map_err(signals)?;
+    let mut tick = tokio::time::interval(PAUSE);
+    loop {
+        tokio::select! {
+            _ = interrupt.recv() => return Ok(ExitCode::SUCCESS),
+            _ = terminate.recv() => return Ok(ExitCode::SUCCESS),
+            _ = tick.tick() => {}
+        }
+        // A gateway that restarts is waited for.
+        let text = match page(&args.url).await {
+            Ok(text) => text,
+            Err(why) => format!("{why}\n\ntrying again\n"),
+        };
+        let mut stdout = io::stdout().lock();
+        // From the top, each line cleared behind its end, the rest of the screen below.
+        let text = text.replace('\n', "\x1b[K\r\n");
+        if write!(stdout, "\x1b[H{text}\x1b[J")
+            .and_then(|()| stdout.flush())
+            .is_err()
+        {
+            return Ok(ExitCode::SUCCESS);
+        }
+    }
+}
+
+async fn page(url: &Url) -> Result<String, String> {
+    let buses = get_json(url, "/api/v1/buses")
+        .await
+        .map_err(|error| error.to_string())?;
+    let drives = get_json(url, "/api/v1/drives")
+        .await
+        .map_err(|error| error.to_string())?;
+    Ok(format!("{}\n{}", lines(&buses), table(&drives)))
+}
+
+fn lines(buses: &Value) -> String {
+    let mut table = report::table([
+        "bus",
+        "state",
+        "line",
+        "load",
+        "fast ms",
+        "slow ms",
+        "drives",
+        "exchanges",
+        "errors",
+        "queue",
+    ]);
+    for bus in buses.as_array().into_iter().flatten() {
+        let load = at(bus, "/load_ratio").as_f64().unwrap_or_default();
+        table.add_row([
+            text(at(bus, "/name")),
+            text(at(bus, "/state")),
+            format!(
+                "{} {} {}",
+                text(at(bus, "/protocol")),
+                text(at(bus, "/baud")),
+                text(at(bus, "/format"))
+            ),
+            format!("{:.1} %", load * 100.0),
+            fixed(at(bus, "/fast/cycle_ms"), 1),
+            fixed(at(bus, "/slow/cycle_ms"), 0),
+            format!("{} of {}", text(at(bus, "/online")), text(at(bus, "/drives"))),
+            text(at(bus, "/transactions")),
+            text(at(bus, "/errors")),
+            text(at(bus, "/queue_depth")),
+        ]);
+    }
+    report::lines(&table)
+}
+
+fn table(drives: &Value) -> String {
+    let mut table = report::table([
+        "drive",
+        "unit",
+        "profile",
+        "state",
+        "age ms",
+        "Hz",
+        "rpm",
+        "A",
+        "reference %",
+        "turnaround ms",
+        "fault",
+    ]);
+    for drive in drives.as_array().into_iter().flatten() {
+        let good = |name: &str, digits: usize| {
+            let point = at(drive, &format!("/points/{name}"));
+            // What is not good is not shown as a figure.
+            if at(point, "/quality") == "good" {
+                fixed(at(point, "/value"), digits)
+            } else {
+                String::new()
+            }
+        };
+        table.add_row([
+            text(at(drive, "/name")),
+            text(at(drive, "/unit")),
+            text(at(drive, "/profile")),
+            text(at(drive, "/state")),
+            text(at(drive, "/age_ms")),
+            good("output_frequency", 2),
+            good("motor_speed", 0),
+            good("motor_current", 1),
+            good("speed_reference", 2),
+            fixed(at(drive, "/turnaround_ms"), 2),
+            text(at(drive, "/fault_text")),
+        ]);
+    }
+    report::lines(&table)
+}
+
+/// What stands there, or nothing.
+fn at<'v>(value: &'v Value, pointer: &str) -> &'v Value {
+    value.pointer(pointer).unwrap_or(&Value::Null)
+}
+
+fn text(value: &Value) -> String {
+    match value {
+        Value::Null => String::new(),
+        Value::String(text) => text.clone(),
+        other => other.to_string(),
+    }
+}
+
+fn fixed(value: &Value, digits: usize) -> String {
+    value
+        .as_f64()
+        .map_or_else(String::new, |number| format!("{number:.digits$}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use serde_json::json;
+
+    use super::*;
+
+    #[test]
+    fn what_is_not_good_is_no_figure() {
+        let point = |value: f64, quality: &str| json!({"value": value, "quality": quality});
+        let drives = json!([{
+            "name": "pump-1", "unit": 1, "profile": "vacon-nx", "state": "running", "age_ms": 12, "fault_text": "",
+            "turnaround_ms": 0.5,
+            "points": {"output_frequency": point(25.0, "good"), "motor_current": point(4.2, "stale")},
+        }]);
+        let text = table(&drives);
+        let row = text.lines().last().unwrap();
+        assert!(
+            row.contains("pump-1") && row.contains("25.00") && !row.contains("4.2"),
+            "{text}"
+        );
+    }
+
+    #[test]
+    fn a_line_that_never_had_a_round() {
+        let buses = json!([{"name": "line1", "state": "down", "protocol": "n2", "baud": 9600, "format": "8N1", "online": 0, "drives": 2,
+            "load_ratio": 0.0, "fast": {"cycle_ms": null}, "slow": {"cycle_ms": null}, "transactions": 0, "errors": 0, "queue_depth": 0}]);
+        let text = lines(&buses);
+        assert!(text.contains("n2 9600 8N1") && text.contains("0 of 2"), "{text}");
+    }
+}
