@@ -18,19 +18,22 @@
 //! In the order in which they may use each other, a later one the earlier ones; `tests/layering.rs` holds them to it.
 //!
 //! - [`document`]: TOML that knows the line of every key and collects all faults.
-//! - [`codec`]: requests and replies to and from bytes. Pure.
-//! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); which requests read them. Pure.
+//! - [`codec`]: requests and replies to and from bytes: Modbus RTU ([`codec::rtu`]) and ASCII ([`codec::ascii`]), Metasys N2
+//!   ([`codec::n2`], whose objects lie in the tables of Modbus). Pure.
+//! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); points made of others
+//!   ([`drive::derive`]); which requests read them ([`drive::plan`]); how a family is known ([`drive::identify`]). Pure.
 //! - [`event`]: what happened, told once.
 //! - [`cache`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
-//! - [`bus`]: one exchange, what comes next, and the task that does it.
+//! - [`bus`]: one exchange ([`bus::transaction`]), what comes next ([`bus::schedule`]), what N2 wants said beside
+//!   ([`bus::session`]), commands step by step ([`bus::execute`]), leases, and the task that does it.
 //! - [`north`]: the servers, and the public register map.
-//! - [`sim`]: simulated drives on a simulated wire, and the broker of the demo.
+//! - [`sim`]: simulated drives of every family on a simulated wire, and the broker of the demo.
 //! - [`config`]: file and environment to settings, every fault in one run.
 //! - [`daemon`]: wiring, reload, the order of stopping.
-//! - [`cli`]: one file a command.
+//! - [`cli`]: one file a command; `read` and `write` are a client of a running gateway, or a bus of their own without one.
 //!
 //! # Deliberately absent
 //!
@@ -41,7 +44,7 @@
 //! - A database, a user interface that writes, and plug-ins: profiles are declarative.
 //! - The async runtime on the way of the line: 3.5 characters are shorter than its timer's step.
 //!
-//! Why things are as they are stands in `docs/architecture.md`.
+//! Why things are as they are, and which file a change belongs to, stands in `docs/architecture.md`.
 
 pub mod bus;
 pub mod cache;

@@ -7,7 +7,7 @@ use arc_swap::ArcSwap;
 use tokio::sync::oneshot;
 
 use crate::cache::{BusImage, DriveImage, Reading};
-use crate::codec::Table;
+use crate::codec::{Table, describe};
 use crate::command::{
     self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats,
 };
@@ -265,7 +265,7 @@ impl DriveHandle {
                     .collect();
                 parts.join(" ")
             }
-            Order::Write(pdu) | Order::Read(pdu) => format!("{pdu:?}"),
+            Order::Write(pdu) | Order::Read(pdu) => describe::request_on(self.bus.image.spec.protocol, pdu),
         }
     }
 }

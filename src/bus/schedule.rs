@@ -2,8 +2,8 @@
 //!
 //! Order: stop, other commands, forwarded reads, due fast polls, due slow polls.
 //! Four rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
-//! of a line that is busy with polls than process data; slow polls that had less than 5 % of the time go before fast
-//! ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! of a line that is busy with polls than process data; slow polls that had less than their share of the time
+//! ([`slow_share`]) go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
 
 mod drives;
 mod outcome;

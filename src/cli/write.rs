@@ -98,11 +98,7 @@ fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, Strin
         let (answer, confirmed) = alone.write(values).await;
         alone.stop().await;
         if !answer.outcome.is_ok() {
-            let code = answer.outcome.code();
-            return Err(format!(
-                "{what}: {}; drive `{}` ({code})",
-                answer.outcome, target.spec.name
-            ));
+            return Err(format!("{what}: {} ({})", answer.outcome, answer.outcome.code()));
         }
         let seen = match confirmed {
             Some(after) => format!("seen {:.0} ms after it was given", after.as_secs_f64() * 1000.0),

@@ -86,7 +86,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         if resolved.iter().any(|(other, _)| *other == index) {
             let what = profile.points.get(index).map_or("", |p| p.name.as_str());
             return Err(Refusal::BadValue(format!(
-                "the command sets `{what}` twice; send one reference only"
+                "the command sets `{what}` twice; name each point once, and one reference only"
             )));
         }
         resolved.push((index, value));

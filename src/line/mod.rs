@@ -51,7 +51,7 @@ pub enum OpenError {
         reason: String,
     },
     /// The device server cannot be reached.
-    #[error("cannot reach {port}: {reason}")]
+    #[error("cannot reach {port}: {reason}; check address and port, and that the device server is on")]
     Tcp {
         /// Address.
         port: String,

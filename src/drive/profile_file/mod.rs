@@ -59,7 +59,7 @@ impl Profiles {
             Ok(files) => files,
             Err(error) => {
                 let message =
-                    format!("cannot read the profile directory: {error}; check `profile_dirs` and permissions");
+                    format!("cannot read the profile directory: {error}; check its path and its permissions");
                 return vec![whole(directory.display().to_string(), "", message)];
             }
         };

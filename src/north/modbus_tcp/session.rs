@@ -13,7 +13,7 @@ use super::shared::{Authority, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Reply, RequestPdu, Table, describe};
 use crate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::Profile;
 use crate::north::ModbusTcpStats;
@@ -328,7 +328,7 @@ impl Session {
         Box::pin(async move {
             let answer = match order {
                 Ok(order) => drive.order(order, origin, may_write, DEFAULT_EXPIRY).await,
-                Err(refusal) => drive.refuse(&format!("{request:?}"), refusal, origin),
+                Err(refusal) => drive.refuse(&describe::request(&request), refusal, origin),
             };
             let name = drive.image.spec.name.clone();
             if resets && !answer.outcome.is_ok() {
