@@ -28,6 +28,8 @@ pub enum EventKind {
     FaultEnd,
     /// A drive has started anew.
     Restarted,
+    /// A drive says that it is another device than its profile expects.
+    UnlikeProfile,
     /// A lease ran out and its action was taken.
     Supervision,
     /// A drive that takes commands has neither a lease nor a response of its own to a silent master.
@@ -51,6 +53,7 @@ impl EventKind {
             EventKind::Fault => "fault",
             EventKind::FaultEnd => "fault_end",
             EventKind::Restarted => "restarted",
+            EventKind::UnlikeProfile => "unlike_profile",
             EventKind::Supervision => "supervision",
             EventKind::Unsupervised => "unsupervised",
             EventKind::RefusedCommand => "refused_command",

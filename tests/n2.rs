@@ -6,11 +6,12 @@ mod common;
 use std::time::Duration;
 
 use common::{Rig, Setup, drive};
-use drivegate::codec::{Exception, Protocol};
+use drivegate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
 use drivegate::command::Outcome;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
+use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 
 fn setup(profile: &str, addresses: &[u8]) -> Setup {
@@ -74,6 +75,76 @@ async fn a_drive_is_identified_drained_read_and_commanded() {
     );
 }
 
+/// The speed reference of a simulated drive itself, in hundredths of a percent.
+fn reference(rig: &Rig, address: u8) -> u16 {
+    let (table, start, count) = (Table::Holding, 2002, 1);
+    let read = RequestPdu::Read { table, start, count };
+    match rig.line.with_drive(address, |drive, now| drive.answer(&read, now)) {
+        Some(Some(Reply::Registers(words))) => words[0],
+        other => panic!("{other:?}"),
+    }
+}
+
+#[tokio::test]
+async fn a_late_answer_of_one_drive_is_never_taken_for_anothers() {
+    let rig = Rig::of(setup("vacon-nx-n2", &[1, 2]), |_| {});
+    rig.until("both answer", |r| {
+        r.state(1) == State::Ready && r.state(2) == State::Ready
+    })
+    .await;
+    assert!(rig.set(1, &[("speed_reference", 50.0), ("run", 1.0)]).await.is_ok());
+    assert!(rig.set(2, &[("speed_reference", 20.0)]).await.is_ok());
+    is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
+    is_good(&rig, ModelPoint::OutputFrequency, Value::Number(25.0)).await;
+    rig.until("the other one's reference", |r| {
+        r.good(2, ModelPoint::SpeedReference) == Some(Value::Number(20.0))
+    })
+    .await;
+    // From just behind the timeout to the end of the rest.
+    let late = "late:255ms=0.03,late:275ms=0.03,late:300ms=0.03,late:350ms=0.03,late:450ms=0.03";
+    let faults = FaultPlan::new(late.parse().unwrap(), 7).only(&[1]);
+    rig.line.set_faults(faults);
+    let told = |address, point| rig.sample(address, point).value.map(Value::as_f64);
+    let watch = async {
+        for _ in 0..3000 {
+            for (address, point, expected) in [
+                (1, ModelPoint::OutputFrequency, &[25.0][..]),
+                (1, ModelPoint::Running, &[1.0]),
+                (1, ModelPoint::SpeedReference, &[50.0]),
+                (2, ModelPoint::OutputFrequency, &[0.0]),
+                (2, ModelPoint::Running, &[0.0]),
+                (2, ModelPoint::SpeedReference, &[20.0, 21.0]),
+                (2, ModelPoint::MotorCurrent, &[0.0]),
+            ] {
+                let value = told(address, point);
+                assert!(
+                    value.is_none_or(|value| expected.contains(&value)),
+                    "drive {address}: {} = {value:?}",
+                    point.name()
+                );
+            }
+            tokio::time::sleep(Duration::from_millis(3)).await;
+        }
+    };
+    let command = async {
+        let mut taken = 0;
+        for turn in 1.. {
+            let wanted = 20 + turn % 2;
+            if rig.set(2, &[("speed_reference", f64::from(wanted))]).await.is_ok() {
+                assert_eq!(reference(&rig, 2), 100 * wanted as u16, "acknowledged, and so it is");
+                taken += 1;
+            }
+            if taken == 20 {
+                break;
+            }
+        }
+    };
+    tokio::join!(watch, command);
+    assert!(rig.line.statistics().faults > 5);
+    assert!(rig.handle(2).image.snapshot().link.is_online());
+    assert!(count(&rig, ">02F") > 5, "the fence of the line");
+}
+
 #[tokio::test]
 async fn what_the_drive_has_already_is_not_written_again() {
     let rig = Rig::of(setup("vacon-nx-n2", &[1]), |_| {});
@@ -122,6 +193,60 @@ async fn a_drive_that_starts_anew_in_mid_run() {
     is_good(&rig, ModelPoint::OutputFrequency, Value::Number(25.0)).await;
     assert!(rig.set(1, &[("run", 0.0)]).await.is_ok());
     assert!(rig.handle(1).image.snapshot().link.is_online());
+    // Its supply fails for less time than it takes to be missed.
+    let identified = count(&rig, ">01F");
+    rig.line.with_drive(1, |drive, now| {
+        drive.power_off();
+        drive.power_on(now);
+    });
+    rig.until("it waits for Identify once more", |r| count(r, ">01F") > identified)
+        .await;
+    let event = tokio::time::timeout(Duration::from_secs(5), events.recv())
+        .await
+        .unwrap()
+        .unwrap();
+    assert_eq!(event.kind, EventKind::Restarted);
+}
+
+#[tokio::test]
+async fn a_profile_of_what_is_read_once_and_a_device_of_another_type() {
+    let text = r#"
+name = "names-only"
+title = "What is read once"
+protocols = ["n2"]
+[n2]
+poll = "1s"
+device_type = 0x12
+[[range]]
+table = "input"
+first = 2
+last = 3
+read = 2
+[[point]]
+name = "output_frequency"
+at = "input 2"
+type = "f32"
+class = "once"
+"#;
+    let profile = drivegate::drive::Profile::parse("once.toml", text, false).unwrap();
+    let setup = Setup {
+        profile: std::sync::Arc::new(profile),
+        ..setup("vacon-nx-n2", &[1])
+    };
+    let rig = Rig::of(setup, |_| {});
+    is_good(&rig, ModelPoint::OutputFrequency, Value::Number(0.0)).await;
+    let unlike = |event: &drivegate::event::Event| event.kind == EventKind::UnlikeProfile;
+    let told: Vec<_> = rig.events.recent().into_iter().filter(|event| unlike(event)).collect();
+    assert_eq!(told.len(), 1);
+    assert!(told[0].text.contains("type 10h") && told[0].text.contains("expects 12h"));
+    let before = count(&rig, ">0104");
+    rig.until("it is polled though nothing is read", |r| {
+        count(r, ">0104") > before + 2
+    })
+    .await;
+    rig.line.set_alive(1, false);
+    rig.until("and missed", |r| !r.handle(1).image.snapshot().link.is_online())
+        .await;
 }
 
 #[tokio::test]

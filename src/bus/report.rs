@@ -153,12 +153,12 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
-        tracing::warn!(
-            bus = %self.image.spec.name, drive = %drive.spec.name,
-            "the drive says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check address \
-             and profile, or set device_type in [n2] of the profile",
-            drive.spec.profile.name, drive.spec.profile.n2.device_type
+        let text = format!(
+            "drive {} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check address and \
+             profile, or set device_type in [n2] of the profile",
+            drive.spec.name, drive.spec.profile.name, drive.spec.profile.n2.device_type
         );
+        self.tell(EventKind::UnlikeProfile, Some(index), None, text);
     }
 
     pub(super) fn not_confirmed(&self, late: &NotConfirmed) {

@@ -314,6 +314,19 @@ impl Schedule {
         }
     }
 
+    /// A drive is to be asked for something, of what is read once too: so that it is not left alone.
+    pub fn ask(&mut self, drive: usize, now: Instant) {
+        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
+        let mut sound = items
+            .into_iter()
+            .flatten()
+            .filter(|item| !item.refused && item.failures == 0);
+        if let Some(item) = sound.find(|item| item.read.class != PollClass::Fast) {
+            item.wanted = true;
+            item.due = item.due.min(now);
+        }
+    }
+
     /// Something had to be said to a drive before its poll, which is still due: the others have their turn in between.
     pub fn session_done(&mut self) {
         self.probed = true;

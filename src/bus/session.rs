@@ -4,9 +4,11 @@
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
 //! is read. `N00` at any time means that it has started anew: the same again.
 //!
-//! A reply names neither drive nor request. After an exchange that was not answered, or not believably, a late value
-//! could pass for the next one; so the next thing said to that drive is Identify, whose answer no value looks like. A
-//! stop does not wait for that: its acknowledgement is not taken for true, it goes out once more.
+//! A reply names neither drive nor request. After an exchange that was not answered, or not believably, a late value of
+//! one drive could pass for that of another. So the whole line has a fence then: it rests for the time of another reply,
+//! and the next thing said, to whichever drive, is Identify, whose answer no float and no acknowledgement looks like. A
+//! state does (a byte of 10h), and a late identity looks like a state; so a poll comes behind, whose answer is neither.
+//! A stop does not wait for that: its acknowledgement is not taken for true, it goes out once more.
 
 use std::time::Instant;
 
@@ -30,12 +32,22 @@ enum Phase {
     Ready,
 }
 
+/// What has to be answered in its own form before an answer on the line is believed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum Fence {
+    /// Nothing: no answer is owed.
+    #[default]
+    Open,
+    /// Identify, and a poll behind it.
+    Identify,
+    /// A poll.
+    Poll,
+}
+
 #[derive(Debug, Clone)]
 struct Drive {
     options: N2Options,
     phase: Phase,
-    /// An exchange was not answered: a late answer may still come.
-    fence: bool,
     /// A stop went out behind such an exchange and was acknowledged, perhaps late and by mistake.
     stop_repeated: bool,
     polled: Option<Instant>,
@@ -62,7 +74,13 @@ pub enum Progress {
 
 /// The sessions with the drives of a bus; none on a bus of another protocol.
 #[derive(Debug, Default)]
-pub struct Sessions(Vec<Drive>);
+pub struct Sessions {
+    drives: Vec<Drive>,
+    /// Of the line, not of a drive: the answer that is owed could pass for that of any drive.
+    fence: Fence,
+    /// Until then the line rests: what comes meanwhile is nobody's answer.
+    rest: Option<Instant>,
+}
 
 impl Sessions {
     /// Sessions with drives of these options.
@@ -70,34 +88,35 @@ impl Sessions {
         let drive = |options: N2Options| Drive {
             phase: first(&options),
             options,
-            fence: false,
             stop_repeated: false,
             polled: None,
             proved: false,
             device: None,
         };
-        Sessions(drives.into_iter().map(drive).collect())
+        Sessions {
+            drives: drives.into_iter().map(drive).collect(),
+            ..Sessions::default()
+        }
     }
 
     /// Whether the bus has sessions at all.
     pub fn is_empty(&self) -> bool {
-        self.0.is_empty()
+        self.drives.is_empty()
     }
 
     /// What must be said to the drive before it is read (`None`) or commanded.
     pub fn before(&mut self, drive: usize, command: Option<Urgency>, now: Instant) -> Option<Session> {
-        let drive = self.0.get_mut(drive)?;
-        let fenced = drive.fence && drive.options.identify && command != Some(Urgency::Stop);
-        if fenced || matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
+        let fence = self.fence;
+        let drive = self.drives.get_mut(drive)?;
+        let fenced = drive.options.identify && command != Some(Urgency::Stop);
+        if (fenced && fence == Fence::Identify) || matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
             return Some(Session::Identify);
         }
-        if command.is_some() {
+        let fenced = fenced && fence == Fence::Poll;
+        if command.is_some() && !fenced {
             return None;
         }
-        let due = drive
-            .polled
-            .is_none_or(|at| now.saturating_duration_since(at) >= drive.options.poll);
-        if drive.phase == Phase::Ready && due {
+        if drive.phase == Phase::Ready && (fenced || drive.is_due(now)) {
             drive.report();
         }
         match drive.phase {
@@ -109,15 +128,24 @@ impl Sessions {
     /// A step that [`Sessions::before`] gave is over.
     pub fn done(&mut self, drive: usize, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.heard(drive, ended);
-        let Some(drive) = self.0.get_mut(drive) else {
-            return Progress::Failed;
-        };
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
             return if step == Session::Identify {
                 Progress::Failed
             } else {
                 heard
             };
+        };
+        if self.is_late_identity(step, reply) {
+            self.raise();
+            return Progress::Failed;
+        }
+        self.fence = match (self.fence, step) {
+            (Fence::Identify, Session::Identify) => Fence::Poll,
+            (Fence::Poll, Session::Poll { .. }) => Fence::Open,
+            (fence, _) => fence,
+        };
+        let Some(drive) = self.drives.get_mut(drive) else {
+            return Progress::Failed;
         };
         match (step, reply) {
             (Session::Identify, reply) => drive.identified(reply),
@@ -127,9 +155,34 @@ impl Sessions {
         }
     }
 
+    /// Whether the answer to a poll behind a fence is that to an Identify which was thought to be answered.
+    fn is_late_identity(&self, step: Session, reply: &Reply) -> bool {
+        let (Fence::Poll, Session::Poll { .. }, Reply::Changes(digits)) = (self.fence, step, reply) else {
+            return false;
+        };
+        let told = |device: u8| digits.eq_ignore_ascii_case(format!("{device:02X}").as_bytes());
+        let mut drives = self.drives.iter();
+        drives.any(|drive| told(drive.options.device_type) || drive.device.is_some_and(told))
+    }
+
+    /// An answer is owed, or one came that nobody asked for.
+    fn raise(&mut self) {
+        self.fence = Fence::Identify;
+        for drive in &mut self.drives {
+            drive.stop_repeated = false;
+        }
+    }
+
     /// Any exchange with the drive is over; [`Progress::Failed`] where it was refused though just identified.
     pub fn heard(&mut self, drive: usize, ended: &Ended) -> Progress {
-        let Some(drive) = self.0.get_mut(drive) else {
+        if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
+            if self.drives.is_empty() {
+                return Progress::Going;
+            }
+            self.raise();
+            return Progress::Failed;
+        }
+        let Some(drive) = self.drives.get_mut(drive) else {
             return Progress::Going;
         };
         match ended {
@@ -140,41 +193,61 @@ impl Sessions {
                 if known { Progress::Restarted } else { Progress::Failed }
             }
             Ended::Reply(Reply::Identified(_)) => Progress::Going,
-            Ended::Reply(_) => {
+            _ => {
                 drive.proved = true;
                 Progress::Going
-            }
-            Ended::Silent | Ended::Corrupt(_) => {
-                drive.fence = true;
-                drive.stop_repeated = false;
-                Progress::Failed
             }
         }
     }
 
     /// Characters came that nobody asked for: perhaps the answer to what was asked last.
-    pub fn strayed(&mut self, drive: usize) {
-        if let Some(drive) = self.0.get_mut(drive) {
-            drive.fence = true;
+    pub fn strayed(&mut self) {
+        if !self.drives.is_empty() {
+            self.raise();
         }
+    }
+
+    /// The drive owes an answer, which may come until then. A drive that is known to be away owes none, so that it does
+    /// not cost the others more than its probes.
+    pub fn owes(&mut self, drive: usize, until: Instant) {
+        if self.drives.get(drive).is_some_and(|drive| drive.proved) {
+            self.rest = self.rest.max(Some(until));
+        }
+    }
+
+    /// Whether an answer is owed, so that what cannot be believed may be that one.
+    pub fn is_fenced(&self) -> bool {
+        self.fence != Fence::Open
+    }
+
+    /// Until when nothing but a stop goes on the line.
+    pub fn rest(&self) -> Option<Instant> {
+        self.rest
     }
 
     /// Whether the acknowledgement of a stop proves nothing, because it may be that of what was not answered before.
     /// The stop goes out once more, and only once.
     pub fn doubts_stop(&mut self, drive: usize) -> bool {
-        let Some(drive) = self.0.get_mut(drive) else {
+        let fenced = self.is_fenced();
+        let Some(drive) = self.drives.get_mut(drive) else {
             return false;
         };
-        let doubted = drive.fence && !drive.stop_repeated;
+        let doubted = fenced && !drive.stop_repeated;
         drive.stop_repeated = doubted;
         doubted
     }
 
+    /// Drives that are due for a poll and would not be asked otherwise, because nothing of them is read so often.
+    pub fn neglected(&self, now: Instant) -> impl Iterator<Item = usize> {
+        let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
+        let drives = self.drives.iter().enumerate();
+        drives.filter(move |(_, drive)| due(drive)).map(|(index, _)| index)
+    }
+
     /// The drive does not answer any more: it is asked again by Identify.
     pub fn gone(&mut self, drive: usize) {
-        if let Some(drive) = self.0.get_mut(drive) {
+        if let Some(drive) = self.drives.get_mut(drive) {
             drive.phase = first(&drive.options);
-            drive.fence = false;
             drive.proved = false;
             drive.polled = None;
         }
@@ -182,7 +255,9 @@ impl Sessions {
 
     /// The port was lost: all drives are found anew.
     pub fn reset(&mut self) {
-        (0..self.0.len()).for_each(|drive| self.gone(drive));
+        (0..self.drives.len()).for_each(|drive| self.gone(drive));
+        self.fence = Fence::Open;
+        self.rest = None;
     }
 }
 
@@ -191,6 +266,11 @@ fn first(options: &N2Options) -> Phase {
 }
 
 impl Drive {
+    fn is_due(&self, now: Instant) -> bool {
+        let since = |at| now.saturating_duration_since(at);
+        self.polled.is_none_or(|at| since(at) >= self.options.poll)
+    }
+
     /// The drive is asked what has changed.
     fn report(&mut self) {
         self.phase = Phase::Reporting {
@@ -200,17 +280,21 @@ impl Drive {
     }
 
     fn identified(&mut self, reply: &Reply) -> Progress {
-        self.fence = false;
-        if matches!(self.phase, Phase::Unknown | Phase::Waiting) {
-            self.report();
+        match self.phase {
+            Phase::Unknown | Phase::Waiting => self.report(),
+            // What is acknowledged may never have come.
+            Phase::Reporting { left, .. } => self.phase = Phase::Reporting { left, again: false },
+            Phase::Ready => {}
         }
-        match reply {
-            Reply::Identified(device) if *device != self.options.device_type && self.device != Some(*device) => {
-                self.device = Some(*device);
-                Progress::Unlike(*device)
-            }
-            // One that refuses to be identified is there all the same.
-            _ => Progress::Going,
+        // One that refuses to be identified is there all the same.
+        let Reply::Identified(device) = reply else {
+            return Progress::Going;
+        };
+        let before = self.device.replace(*device);
+        if *device != self.options.device_type && before != Some(*device) {
+            Progress::Unlike(*device)
+        } else {
+            Progress::Going
         }
     }
 
@@ -338,6 +422,11 @@ mod tests {
             assert_eq!(bench.done(IDENTIFY, &Ended::Silent), Progress::Failed);
             assert_eq!(bench.before(None), Some(IDENTIFY));
             assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+            assert_eq!(bench.before(Some(Urgency::Command)), Some(POLL));
+            assert_eq!(bench.before(Some(Urgency::Stop)), None);
+            assert_eq!(bench.before(None), Some(POLL));
+            assert_eq!(bench.done(POLL, &changes(b"")), Progress::Going);
+            assert_eq!(bench.before(Some(Urgency::Command)), None);
             assert_eq!(bench.before(None), None, "no report again");
         }
     }
@@ -349,6 +438,95 @@ mod tests {
         bench.sessions.heard(0, &Ended::Silent);
         assert!(bench.sessions.doubts_stop(0));
         assert!(!bench.sessions.doubts_stop(0));
+    }
+
+    /// Two drives that were identified and read.
+    fn two() -> Sessions {
+        let now = Instant::now();
+        let mut sessions = Sessions::new([N2Options::DEFAULT, N2Options::DEFAULT]);
+        for drive in 0..2 {
+            sessions.done(drive, IDENTIFY, &identity(), now);
+            sessions.done(drive, POLL, &changes(b""), now);
+            sessions.heard(drive, &value());
+            assert_eq!(sessions.before(drive, None, now), None);
+        }
+        sessions
+    }
+
+    #[test]
+    fn the_fence_is_of_the_line() {
+        let now = Instant::now();
+        let mut sessions = two();
+        sessions.heard(0, &Ended::Silent);
+        assert_eq!(sessions.before(1, None, now), Some(IDENTIFY), "another drive's value");
+        assert_eq!(sessions.before(1, Some(Urgency::Command), now), Some(IDENTIFY));
+        assert_eq!(sessions.before(1, Some(Urgency::Stop), now), None);
+        assert!(sessions.doubts_stop(1), "another drive's acknowledgement");
+        assert!(!sessions.doubts_stop(1));
+        sessions.done(1, IDENTIFY, &identity(), now);
+        assert_eq!(sessions.before(0, None, now), Some(POLL));
+        sessions.done(0, POLL, &changes(b""), now);
+        assert_eq!(
+            (sessions.before(0, None, now), sessions.before(1, None, now)),
+            (None, None)
+        );
+        assert!(!sessions.doubts_stop(0));
+        // Characters of nobody, whoever was spoken to.
+        sessions.strayed();
+        assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+        // A drive that goes away leaves the fence to the others.
+        sessions.gone(0);
+        assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+        sessions.reset();
+        sessions.done(1, IDENTIFY, &identity(), now);
+        assert_eq!(
+            sessions.before(1, Some(Urgency::Command), now),
+            None,
+            "a port that was opened anew owes nothing"
+        );
+    }
+
+    #[test]
+    fn a_state_that_looks_like_an_identity_opens_no_fence() {
+        let now = Instant::now();
+        let mut sessions = two();
+        sessions.heard(0, &Ended::Silent);
+        // A late state of 10h; the identity of the other drive comes when that is polled.
+        sessions.done(1, IDENTIFY, &identity(), now);
+        assert_eq!(sessions.done(1, POLL, &changes(b"10"), now), Progress::Failed);
+        assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+        sessions.done(1, IDENTIFY, &identity(), now);
+        assert_eq!(sessions.before(1, None, now), Some(POLL));
+        assert_eq!(
+            sessions.done(1, POLL, &changes(b"12"), now),
+            Progress::Going,
+            "no device is a 12h"
+        );
+        assert_eq!(sessions.before(1, None, now), Some(AGAIN), "it is a report");
+        assert_eq!(sessions.before(0, None, now), None);
+    }
+
+    #[test]
+    fn the_line_rests_for_a_drive_that_is_there() {
+        let (now, later) = (Instant::now(), Instant::now() + Duration::from_millis(250));
+        let mut sessions = two();
+        assert_eq!(sessions.rest(), None);
+        sessions.owes(0, later);
+        sessions.owes(1, now);
+        assert_eq!(sessions.rest(), Some(later));
+        sessions.reset();
+        sessions.owes(0, later);
+        assert_eq!(sessions.rest(), None, "a probe does not keep the others waiting");
+    }
+
+    #[test]
+    fn who_is_not_asked_is_polled_all_the_same() {
+        let now = Instant::now();
+        let mut sessions = two();
+        assert_eq!(sessions.neglected(now).count(), 0);
+        let later = now + N2Options::DEFAULT.poll + Duration::from_secs(1);
+        sessions.gone(0);
+        assert_eq!(sessions.neglected(later).collect::<Vec<_>>(), [1]);
     }
 
     #[test]

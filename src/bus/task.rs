@@ -97,8 +97,6 @@ struct Worker {
     desk: Desk,
     /// What N2 says to drives beside reading them.
     sessions: Sessions,
-    /// The drive that was spoken to last.
-    spoken_to: usize,
     leases: Leases,
     report: Report,
     stop: Arc<AtomicBool>,
@@ -150,7 +148,6 @@ impl Worker {
             schedule,
             desk: Desk::default(),
             sessions,
-            spoken_to: 0,
             leases,
             report,
             stop,
@@ -240,6 +237,9 @@ impl Worker {
             for late in self.desk.not_confirmed(&self.handle.image.drives, now) {
                 self.report.not_confirmed(&late);
             }
+            for drive in self.sessions.neglected(now) {
+                self.schedule.ask(drive, now);
+            }
             self.report.tick(now);
         }
         Ok(())
@@ -262,7 +262,7 @@ impl Worker {
         let count = line.receive(&mut buffer)?;
         if count > 0 {
             let now = Instant::now();
-            self.sessions.strayed(self.spoken_to);
+            self.sessions.strayed();
             self.report
                 .noise(buffer.get(..count).unwrap_or_default(), self.quiet_since, now);
             self.quiet_since = now;
@@ -309,12 +309,13 @@ impl Worker {
             self.unknown_to_the_protocol(&job);
             return Ok(());
         }
-        self.spoken_to = drive;
         let clear = self.wait_for_silence(line, urgency == Some(Urgency::Stop));
         let late = matches!(&job, Job::Command { index, .. } if self.desk.is_late(*index, Instant::now()));
         let result = match clear {
             // What came too late while the line fell silent is not sent.
             Ok(true) if late => Ok(None),
+            // What was heard meanwhile may be an answer that nobody waits for any more.
+            Ok(true) if self.sessions.before(drive, urgency, Instant::now()) != step => Ok(None),
             Ok(true) => self.exchange(line, drive, &request, &frame).map(Some),
             // A command came in meanwhile: what goes next is decided anew.
             Ok(false) => Ok(None),
@@ -404,9 +405,11 @@ impl Worker {
 
     /// Waits until the line was silent for its time. False when a command came in before (never for a stop).
     fn wait_for_silence(&mut self, line: &Line, stop: bool) -> Result<bool, Lost> {
-        let give_up = Instant::now() + self.silence + BABBLE;
+        let now = Instant::now();
+        let rest = self.sessions.rest().filter(|_| !stop).unwrap_or(now);
+        let give_up = rest.max(now) + self.silence + BABBLE;
         loop {
-            let free = self.quiet_since + self.silence;
+            let free = rest.max(self.quiet_since + self.silence);
             let wake = (!stop).then(|| self.handle.queue.wake_fd());
             match line.wait(free.min(give_up), wake, true)? {
                 Woken::Time if Instant::now() >= give_up => {
@@ -492,13 +495,19 @@ impl Worker {
             Ended::Silent | Ended::Corrupt(_) => transaction.doubted(),
         };
         self.paid = matches!(ended, Ended::Corrupt(_)) && transaction.is_paid();
+        // Behind a fence what came instead of the reply may be what was owed, and the reply is still to come.
+        let owed = !self.paid || self.sessions.is_fenced();
+        if owed && matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
+            self.sessions
+                .owes(drive, Instant::now() + self.options.response_timeout);
+        }
         let took = Instant::now().saturating_duration_since(began) + self.silence;
         let came = wire.reply.min(spec.format.chars(transaction.seen().len()));
         self.report
             .exchanged(drive, &transaction, &ended, sent + wire.recognition, came, took);
         if matches!(ended, Ended::Reply(_)) && !transaction.rest().is_empty() {
             self.report.foreign();
-            self.sessions.strayed(drive);
+            self.sessions.strayed();
         }
         if let Some(tap) = tap {
             tap.ended(&ended, Instant::now());

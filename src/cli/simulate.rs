@@ -74,6 +74,9 @@ pub(super) struct Args {
     /// Answer Modbus RTU requests that come without 3.5 characters of silence too
     #[arg(long)]
     pub lenient: bool,
+    /// Put a byte, the object's status, before the values that are read over N2, as some devices do
+    #[arg(long)]
+    pub n2_leading_byte: bool,
     /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
@@ -303,6 +306,7 @@ impl Args {
             }
         }
         line.rules.strict = !self.lenient;
+        line.boards.leading_byte = self.n2_leading_byte;
         line.rules.delivery = if self.chunk == 0 {
             Delivery::Whole
         } else {
@@ -429,6 +433,9 @@ mod tests {
         assert!(line.drives.iter().all(|drive| drive.autopilot.is_none()));
         let args = parse("--listen 127.0.0.1:4001 --autopilot --speed max").unwrap();
         let line = args.applied_to(args.line().unwrap());
+        assert!(!line.boards.leading_byte);
+        let n2 = parse("--profile vacon-nx-n2 --link /tmp/l --n2-leading-byte").unwrap();
+        assert!(n2.applied_to(n2.line().unwrap()).boards.leading_byte);
         assert_eq!(line.rules.wire, Wire::Instant);
         assert!(line.drives.iter().all(|drive| drive.autopilot.is_some()));
     }

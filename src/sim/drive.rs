@@ -133,6 +133,8 @@ pub struct SimulatedDrive {
     turnaround: Option<Duration>,
     autopilot: Option<Autopilot>,
     alive: bool,
+    /// How often it was switched on again.
+    power_cycles: u32,
 }
 
 impl SimulatedDrive {
@@ -147,6 +149,7 @@ impl SimulatedDrive {
             },
             autopilot: options.autopilot.map(|seed| Autopilot::new(seed, now)),
             alive: true,
+            power_cycles: 0,
         }
     }
 
@@ -249,6 +252,12 @@ impl SimulatedDrive {
     /// Switches the supply on again.
     pub fn power_on(&mut self, now: SimTime) {
         self.model.get_mut().power_on(now);
+        self.power_cycles = self.power_cycles.wrapping_add(1);
+    }
+
+    /// How often it was switched on again: what hangs on its supply has started anew as often.
+    pub fn power_cycles(&self) -> u32 {
+        self.power_cycles
     }
 
     /// What it looks like from outside.

@@ -6,7 +6,7 @@
 use super::SimTime;
 use super::drive::{DriveOptions, SimulatedDrive};
 use super::framing;
-use super::n2::{Board, code_of, maps};
+use super::n2::{Board, BoardOptions, code_of, maps};
 use crate::codec::modbus::encode_exception;
 use crate::codec::n2::{Answer, Command};
 use crate::codec::{Exception, Protocol, RequestPdu};
@@ -65,6 +65,13 @@ impl Slaves {
             slaves.drives.insert(address, SimulatedDrive::new(options, now));
         }
         slaves
+    }
+
+    /// Makes all N2 boards so.
+    pub fn set_boards(&mut self, options: BoardOptions) {
+        for board in self.boards.values_mut() {
+            board.options = options;
+        }
     }
 
     /// The N2 board of a drive.
@@ -159,6 +166,7 @@ impl Slaves {
         };
         if let (Some(command), Some(board)) = (&asked.command, self.boards.get_mut(&asked.address)) {
             drive.heard(now);
+            board.fed(drive.power_cycles(), now);
             board.answer(command, now, &mut |request| drive.answer(request, now), out);
             return;
         }

@@ -8,7 +8,7 @@ use super::drive::{DriveOptions, SimulatedDrive};
 use super::endpoint::{Endpoint, EndpointOptions};
 use super::faults::FaultPlan;
 use super::half_duplex::{HalfDuplex, LineRules, Wire};
-use super::n2::Board;
+use super::n2::{Board, BoardOptions};
 use super::slave::Slaves;
 use super::statistics::{Recorded, Statistics, Transcript};
 use crate::codec::Protocol;
@@ -33,6 +33,8 @@ pub struct SimulatedBusOptions {
     pub rules: LineRules,
     /// The drives on it.
     pub drives: Vec<DriveOptions>,
+    /// How their boards are made, where they speak N2.
+    pub boards: BoardOptions,
     /// What goes wrong.
     pub faults: FaultPlan,
     /// Frames that the transcript keeps; 0 for none.
@@ -50,6 +52,7 @@ impl SimulatedBusOptions {
             endpoint: EndpointOptions::Pty { link: None },
             rules,
             drives,
+            boards: BoardOptions::default(),
             faults: FaultPlan::default(),
             transcript: 0,
             spin: SPIN,
@@ -155,6 +158,7 @@ impl SimulatedBus {
             endpoint,
             mut rules,
             drives,
+            boards,
             faults,
             transcript,
             spin,
@@ -165,7 +169,8 @@ impl SimulatedBus {
         }
         let format = rules.format;
         let port = Endpoint::open(&endpoint, &format)?;
-        let slaves = Slaves::new(drives, SimTime::ZERO);
+        let mut slaves = Slaves::new(drives, SimTime::ZERO);
+        slaves.set_boards(boards);
         let shared = Arc::new(Shared {
             name: name.clone(),
             start: Instant::now(),

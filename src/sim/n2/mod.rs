@@ -69,6 +69,8 @@ pub struct Board {
     /// Records that are not acknowledged yet, a reply each.
     reports: VecDeque<Vec<u8>>,
     polled: SimTime,
+    /// Power cycles of the drive that the board has gone through with it.
+    power_cycles: u32,
 }
 
 impl Board {
@@ -83,14 +85,25 @@ impl Board {
             reported: BTreeMap::new(),
             reports: VecDeque::new(),
             polled: now,
+            power_cycles: 0,
         }
     }
 
     /// The board starts anew: as after a power cycle or a warm reset.
     pub fn restart(&mut self, now: SimTime) {
-        let options = self.options;
-        *self = Board::new(self.map, now);
-        self.options = options;
+        let (options, power_cycles) = (self.options, self.power_cycles);
+        *self = Board {
+            options,
+            power_cycles,
+            ..Board::new(self.map, now)
+        };
+    }
+
+    /// The drive, which feeds the board, was switched on again that often so far.
+    pub fn fed(&mut self, power_cycles: u32, now: SimTime) {
+        if std::mem::replace(&mut self.power_cycles, power_cycles) != power_cycles {
+            self.restart(now);
+        }
     }
 
     /// The answer to a command, appended to `out`; `Err` is the code that the frame itself deserves. Nothing is appended

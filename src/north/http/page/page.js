@@ -307,7 +307,7 @@ async function tick() {
 // ---- Events
 
 const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", supervision: "amber", unsupervised: "amber", refused_command: "amber",
-  restarted: "amber", not_confirmed: "amber", fault_end: "green", online: "green", bus_up: "green" };
+  restarted: "amber", unlike_profile: "amber", not_confirmed: "amber", fault_end: "green", online: "green", bus_up: "green" };
 let lastEvent = "";
 
 function addEvent(time, kind, subject, words) {
