@@ -74,7 +74,11 @@ impl Drop for Pty {
 /// Makes `link` point to `target`, in place of an older link.
 fn point(link: &Path, target: &Path) -> io::Result<()> {
     let explain = |error: io::Error| {
-        let text = format!("cannot link {} to {}: {error}; choose a path that may be written", link.display(), target.display());
+        let text = format!(
+            "cannot link {} to {}: {error}; choose a path that may be written",
+            link.display(),
+            target.display()
+        );
         io::Error::new(error.kind(), text)
     };
     match fs::symlink_metadata(link) {

@@ -258,3 +258,24 @@ fn every_family_is_found_by_reading() {
         assert_eq!(read.code, 0, "{profile}: {}{}", read.out, read.err);
     }
 }
+
+#[test]
+fn watch_shows_a_running_gateway_and_says_when_there_is_none() {
+    let line = Line::start();
+    let http = free_port();
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    std::fs::write(line.config(), format!("{text}[http]\nlisten = \"127.0.0.1:{http}\"\n")).unwrap();
+    let url = format!("http://127.0.0.1:{http}");
+    let none = drivegate(&["watch", "--url", &url]);
+    assert_eq!(none.code, 1);
+    assert!(none.err.contains("cannot reach the gateway"), "{}", none.err);
+    let _gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+    let shown = until("both drives", || {
+        let ran = drivegate(&["watch", "--url", &url]);
+        (ran.code == 0 && ran.out.matches(" ready ").count() == 2).then_some(ran.out)
+    });
+    assert!(
+        shown.contains("modbus-rtu 38400 8N1") && shown.contains("2 of 2"),
+        "{shown}"
+    );
+}

@@ -58,8 +58,7 @@ impl Profiles {
         let files = match files_of(directory) {
             Ok(files) => files,
             Err(error) => {
-                let message =
-                    format!("cannot read the profile directory: {error}; check its path and its permissions");
+                let message = format!("cannot read the profile directory: {error}; check its path and its permissions");
                 return vec![whole(directory.display().to_string(), "", message)];
             }
         };
