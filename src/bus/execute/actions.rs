@@ -1,0 +1,244 @@
+//! The steps of a command in the order that is safe, and the request that each of them is.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::time::Duration;
+
+use super::shadow::Shadow;
+use crate::codec::n2::Session;
+use crate::codec::{RequestPdu, Table};
+use crate::command::written;
+use crate::drive::profile::Form;
+use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
+
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Action {
+    /// A raw request, or a register of its own.
+    Send(RequestPdu),
+    /// A write of what the drive keeps: left out where it is known to have it already.
+    Change {
+        pdu: RequestPdu,
+        table: Table,
+        items: Vec<(u16, u16)>,
+    },
+    /// Gives what was overridden before back to the drive's own control; that it fails changes nothing.
+    Release(RequestPdu),
+    /// Bits of one word, merged into the shadow when they are sent.
+    Bits { raw: Raw, changes: Vec<(u8, bool)> },
+    /// Takes the run command away from a motor that stands, where it is no bit of the word with the reset bit.
+    Disarm { raw: Raw, bit: u8, invert: bool },
+    /// Takes the reset bit (and the run bit of a motor that stands) away, if set.
+    PulseLow { raw: Raw, bit: u8, invert: bool },
+    /// Sets the reset bit.
+    PulseHigh { raw: Raw, bit: u8, invert: bool },
+    /// Takes the reset bit away again.
+    PulseEnd { raw: Raw, bit: u8, invert: bool },
+    /// Two update periods of the drive.
+    Hold(Duration),
+}
+
+/// Whether the drive was asked for what it has before it is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Check {
+    NotYet,
+    Read,
+    /// It does not tell.
+    InVain,
+}
+
+/// A word and the bits of it that change.
+type WordChange = (Raw, Vec<(u8, bool)>);
+
+/// Whether a command sets every bit of the profile that can be commanded, reset bits apart.
+pub(super) fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> bool {
+    let level = |p: &Point| p.write && !p.pulse && p.raw().is_some_and(|r| matches!(r.form, Form::Bit { .. }));
+    let mut bits = profile.points.iter().enumerate().filter(|(_, p)| level(p));
+    bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
+}
+
+pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque<Action> {
+    let mut numbers = VecDeque::new();
+    let mut pulses = VecDeque::new();
+    let mut words: BTreeMap<(Table, u16), WordChange> = BTreeMap::new();
+    for (index, value) in values {
+        let Some(point) = profile.points.get(*index) else {
+            continue;
+        };
+        let Some(raw) = point.raw() else { continue };
+        match raw.form {
+            Form::Bit { bit, invert } if point.pulse => {
+                if value.as_bool() {
+                    let hold = Action::Hold(2 * profile.update_period);
+                    let elsewhere = |run: &Raw| (run.table, run.address) != (raw.table, raw.address);
+                    if let Some((run, bit, invert)) = profile.run_bit().filter(|(run, ..)| elsewhere(run)) {
+                        let raw = run.clone();
+                        pulses.push_back(Action::Disarm { raw, bit, invert });
+                    }
+                    pulses.push_back(Action::PulseLow {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                    pulses.push_back(hold.clone());
+                    pulses.push_back(Action::PulseHigh {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                    pulses.push_back(hold);
+                    pulses.push_back(Action::PulseEnd {
+                        raw: raw.clone(),
+                        bit,
+                        invert,
+                    });
+                }
+            }
+            Form::Bit { bit, invert } => {
+                let entry = words
+                    .entry((raw.table, raw.address))
+                    .or_insert_with(|| (raw.clone(), Vec::new()));
+                entry.1.push((bit, value.as_bool() != invert));
+            }
+            Form::Bits { first, count } => {
+                let Some(word) = raw.encode(*value, 0).ok().and_then(|words| words.first().copied()) else {
+                    continue;
+                };
+                let entry = words
+                    .entry((raw.table, raw.address))
+                    .or_insert_with(|| (raw.clone(), Vec::new()));
+                let bits = first..first.saturating_add(count);
+                entry.1.extend(bits.map(|bit| (bit, (word >> bit) & 1 == 1)));
+            }
+            _ => {
+                // Admitted values fit; one that does not is left out rather than sent wrong.
+                let pdu = raw
+                    .encode(*value, 0)
+                    .ok()
+                    .and_then(|words| write_of(raw.address, words));
+                numbers.extend(pdu.map(Action::Send));
+            }
+        }
+    }
+    // The run command of a drive whose bits are coils goes first in a stop, and last, behind the direction, otherwise.
+    let run = profile.run_bit().map(|(raw, ..)| (raw.table, raw.address));
+    let run = run.and_then(|place| words.remove(&place));
+    let others = words.into_values();
+    let action = |(raw, changes): WordChange| Action::Bits { raw, changes };
+    if stop {
+        let bits = run.into_iter().chain(others).map(action);
+        bits.chain(numbers).chain(pulses).collect()
+    } else {
+        let bits = others.chain(run).map(action);
+        numbers.into_iter().chain(pulses).chain(bits).collect()
+    }
+}
+
+fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
+    match words.as_slice() {
+        [] => None,
+        [value] => Some(RequestPdu::WriteRegister { address, value: *value }),
+        _ => Some(RequestPdu::WriteRegisters {
+            start: address,
+            values: words,
+        }),
+    }
+}
+
+/// The request of an action with the shadow as it is now; a read where the shadow does not know the word;
+/// `None` where there is nothing to do. `blind`: the word cannot be read.
+pub(super) fn request(
+    action: &Action,
+    drive: usize,
+    shadow: &Shadow,
+    profile: &Profile,
+    running: bool,
+    (check, fresh, blind): (Check, bool, bool),
+) -> Option<RequestPdu> {
+    let (raw, changes) = match action {
+        Action::Send(pdu) | Action::Release(pdu) => return Some(pdu.clone()),
+        Action::Change { pdu, table, items } => {
+            let has = shadow.has(drive, *table, items);
+            return match check {
+                Check::NotYet if fresh && has => None,
+                Check::NotYet if fresh => Some(pdu.clone()),
+                Check::NotYet => read_of(*table, items).or_else(|| Some(pdu.clone())),
+                Check::Read => (!has).then(|| pdu.clone()),
+                Check::InVain => Some(pdu.clone()),
+            };
+        }
+        Action::Hold(_) => return None,
+        Action::Bits { raw, changes } => (raw, changes.clone()),
+        Action::Disarm { .. } if running => return None,
+        Action::Disarm { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
+        Action::PulseHigh { raw, bit, invert } => (raw, vec![(*bit, !invert)]),
+        Action::PulseEnd { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
+        Action::PulseLow { raw, bit, invert } => {
+            let mut changes = vec![(*bit, *invert)];
+            // A reset must not start the motor: a run bit left over from before the fault is taken away.
+            if !running && let Some(run) = standing_run_bit(profile, raw) {
+                changes.push(run);
+            }
+            (raw, changes)
+        }
+    };
+    if raw.table == Table::Coil {
+        let on = changes.first().is_some_and(|(_, on)| *on);
+        return Some(RequestPdu::WriteCoil {
+            address: raw.address,
+            on,
+        });
+    }
+    let Some(old) = shadow.get(drive, raw.address).or(blind.then_some(0)) else {
+        return Some(RequestPdu::Read {
+            table: raw.table,
+            start: raw.address,
+            count: 1,
+        });
+    };
+    let value = changes.iter().fold(
+        old,
+        |word, (bit, on)| if *on { word | (1 << bit) } else { word & !(1 << bit) },
+    );
+    let idle = matches!(action, Action::PulseLow { .. } | Action::Disarm { .. }) && value == old;
+    (!idle).then_some(RequestPdu::WriteRegister {
+        address: raw.address,
+        value,
+    })
+}
+
+fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
+    let run = profile.model_point(ModelPoint::Run)?.raw()?;
+    match run.form {
+        Form::Bit { bit, invert } if run.table == of.table && run.address == of.address => Some((bit, invert)),
+        _ => None,
+    }
+}
+
+/// A write that spares the drive's memory, where its words are such that wear: left out when the drive has them, and
+/// what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
+pub(super) fn sparing(action: Action, profile: &Profile) -> Vec<Action> {
+    let written = match &action {
+        Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),
+        Action::Bits { raw, changes } if raw.table == Table::Coil => changes.first().map(|(_, on)| {
+            let (address, on) = (raw.address, *on);
+            let pdu = RequestPdu::WriteCoil { address, on };
+            (pdu, raw.table, vec![(address, u16::from(on))])
+        }),
+        _ => None,
+    };
+    let Some((pdu, table, items)) = written.filter(|(_, table, items)| profile.writes_on_change(*table, items)) else {
+        return vec![action];
+    };
+    let address = items.first().map(|(address, _)| *address);
+    let release = address
+        .filter(|_| profile.releases(table))
+        .map(|address| Action::Release(RequestPdu::N2(Session::Release { table, address })));
+    let change = Action::Change { pdu, table, items };
+    [change].into_iter().chain(release).collect()
+}
+
+/// The read of the words of a write.
+fn read_of(table: Table, items: &[(u16, u16)]) -> Option<RequestPdu> {
+    let (start, _) = *items.first()?;
+    let count = u16::try_from(items.len()).ok()?;
+    Some(RequestPdu::Read { table, start, count })
+}

@@ -1,0 +1,280 @@
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::sync::oneshot::Receiver;
+
+use super::*;
+use crate::command::{Answer, Origin, SourceKind, WriteStats};
+use crate::drive::Value;
+use crate::drive::profile::Profiles;
+
+struct Bench {
+    profile: Arc<Profile>,
+    shadow: Shadow,
+    now: Instant,
+    /// Control word and reference as the drive has them.
+    drive: BTreeMap<u16, u16>,
+    running: bool,
+}
+
+impl Bench {
+    fn new(control_word: u16) -> Bench {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let drive = BTreeMap::from([(2000, control_word), (2002, 0)]);
+        Bench {
+            profile,
+            shadow: Shadow::default(),
+            now: Instant::now(),
+            drive,
+            running: false,
+        }
+    }
+
+    fn begin(&self, points: &[(&str, f64)], urgency: Urgency) -> (Execution, Receiver<Answer>) {
+        let values = points
+            .iter()
+            .map(|(name, v)| {
+                let index = self.profile.point_index(name).unwrap();
+                let bool = matches!(*name, "run" | "reverse" | "fault_reset");
+                (
+                    index,
+                    if bool {
+                        Value::Bool(*v != 0.0)
+                    } else {
+                        Value::Number(*v)
+                    },
+                )
+            })
+            .collect();
+        let origin = Origin {
+            kind: SourceKind::Mqtt,
+            who: "t".into(),
+        };
+        let stats = Arc::new(WriteStats::default());
+        let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
+        let expires = self.now + Duration::from_secs(1);
+        let command = Command {
+            drive: 0,
+            order: Order::Points(values),
+            urgency,
+            reference_only: false,
+            expires,
+            ticket,
+        };
+        (Execution::new(command, &self.profile), receiver)
+    }
+
+    /// Runs the command against a drive that does as it is told; the writes as (ms, address, value).
+    fn run(&mut self, execution: &mut Execution) -> Vec<(u128, u16, u16)> {
+        let start = self.now;
+        let mut writes = Vec::new();
+        for _ in 0..50 {
+            match execution.next(&self.shadow, &self.profile, self.running, self.now) {
+                Next::Done => return writes,
+                Next::Wait(until) => self.now = until,
+                Next::Send(pdu) => {
+                    let reply = match pdu {
+                        RequestPdu::Read { start, .. } => Reply::Registers(vec![self.drive[&start]]),
+                        RequestPdu::WriteRegister { address, value } => {
+                            writes.push(((self.now - start).as_millis(), address, value));
+                            self.drive.insert(address, value);
+                            Reply::Written
+                        }
+                        _ => unreachable!(),
+                    };
+                    if execution.answered(&pdu, reply, &mut self.shadow).is_some() {
+                        return writes;
+                    }
+                }
+            }
+        }
+        panic!("the command does not end");
+    }
+}
+
+#[test]
+fn bits_of_others_are_kept_and_the_word_is_read_first() {
+    let mut bench = Bench::new(0x0800);
+    let (mut execution, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    assert!(matches!(
+        execution.next(&bench.shadow, &bench.profile, false, bench.now),
+        Next::Send(RequestPdu::Read {
+            start: 2000,
+            count: 1,
+            ..
+        })
+    ));
+    assert_eq!(bench.run(&mut execution), [(0, 2000, 0x0801)]);
+    assert_eq!(execution.success(), Outcome::Acknowledged(Reply::Written));
+}
+
+#[test]
+fn safe_order() {
+    let mut bench = Bench::new(0);
+    let (mut start, _a) = bench.begin(
+        &[("run", 1.0), ("reverse", 1.0), ("speed_reference", 50.0)],
+        Urgency::Command,
+    );
+    assert_eq!(
+        bench.run(&mut start),
+        [(0, 2002, 5000), (0, 2000, 3)],
+        "reference before run, one control word"
+    );
+    let (mut stop, _b) = bench.begin(&[("speed_reference", 0.0), ("run", 0.0)], Urgency::Stop);
+    assert_eq!(
+        bench.run(&mut stop),
+        [(0, 2000, 2), (0, 2002, 0)],
+        "stop before anything"
+    );
+}
+
+#[test]
+fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
+    let mut bench = Bench::new(0);
+    let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+    assert_eq!(bench.run(&mut reset), [(0, 2000, 4), (20, 2000, 0)]);
+    // The bit is set already, and so is the run bit of a motor that stands with a fault.
+    let mut bench = Bench::new(0x0005);
+    let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+    assert_eq!(bench.run(&mut reset), [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0)]);
+    // A motor that runs keeps its run bit.
+    let mut bench = Bench::new(0x0001);
+    bench.running = true;
+    let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+    assert_eq!(bench.run(&mut reset), [(0, 2000, 5), (20, 2000, 1)]);
+    // Reset and run in one command: a new edge after the pulse.
+    let mut bench = Bench::new(0x0001);
+    let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
+    assert_eq!(
+        bench.run(&mut both),
+        [(0, 2000, 0), (20, 2000, 4), (40, 2000, 0), (40, 2000, 1)]
+    );
+}
+
+#[test]
+fn a_stop_purges_what_was_begun() {
+    let mut bench = Bench::new(0);
+    bench.shadow.learn(0, Table::Holding, 2000, 0);
+    let (mut start, _a) = bench.begin(&[("run", 1.0), ("speed_reference", 50.0)], Urgency::Command);
+    let sent = RequestPdu::WriteRegister {
+        address: 2002,
+        value: 5000,
+    };
+    assert_eq!(
+        start.next(&bench.shadow, &bench.profile, false, bench.now),
+        Next::Send(sent.clone())
+    );
+    assert_eq!(start.answered(&sent, Reply::Written, &mut bench.shadow), None);
+    assert!(start.purge(), "the run bit is not sent any more");
+    assert_eq!(start.success(), Outcome::Purged);
+}
+
+#[test]
+fn a_stop_lets_a_pulse_end() {
+    let mut bench = Bench::new(0);
+    bench.shadow.learn(0, Table::Holding, 2000, 0);
+    let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
+    let high = RequestPdu::WriteRegister {
+        address: 2000,
+        value: 4,
+    };
+    assert_eq!(
+        both.next(&bench.shadow, &bench.profile, false, bench.now),
+        Next::Send(high.clone())
+    );
+    assert_eq!(both.answered(&high, Reply::Written, &mut bench.shadow), None);
+    assert!(!both.purge());
+    assert_eq!(bench.run(&mut both), [(20, 2000, 0)], "no run behind the stop");
+    assert_eq!(both.success(), Outcome::Purged);
+}
+
+#[test]
+fn exceptions_and_silence_end_it() {
+    let bench = Bench::new(0);
+    let mut shadow = Shadow::default();
+    let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+    let sent = RequestPdu::WriteRegister {
+        address: 2002,
+        value: 100,
+    };
+    let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut shadow);
+    assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
+    let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+    assert_eq!(command.failed(&sent, 1), None);
+    assert_eq!(command.failed(&sent, 1), Some(Outcome::TimedOut));
+}
+
+/// What the command sends next.
+fn sends(bench: &Bench, command: &mut Execution) -> RequestPdu {
+    match command.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
+        Next::Send(pdu) => pdu,
+        other => panic!("{other:?}"),
+    }
+}
+
+fn word(value: u16) -> RequestPdu {
+    RequestPdu::WriteRegister { address: 2000, value }
+}
+
+#[test]
+fn a_stop_does_not_depend_on_a_read() {
+    let mut bench = Bench::new(1);
+    bench.running = true;
+    let refused = Reply::Exception(Exception::BUSY);
+    for answer in [Some(refused), None] {
+        let (mut stop, _a) = bench.begin(&[("run", 0.0)], Urgency::Stop);
+        let read = sends(&bench, &mut stop);
+        assert!(!read.is_write());
+        let ended = match answer {
+            Some(reply) => stop.answered(&read, reply, &mut bench.shadow),
+            None => stop.failed(&read, 3),
+        };
+        assert_eq!(ended, None);
+        assert_eq!(sends(&bench, &mut stop), word(0));
+    }
+}
+
+#[test]
+fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
+    let mut bench = Bench::new(0);
+    let refused = || Reply::Exception(Exception::ADDRESS);
+    let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    let read = sends(&bench, &mut start);
+    assert_eq!(start.answered(&read, refused(), &mut bench.shadow), None);
+    assert_eq!(sends(&bench, &mut start), word(1));
+    assert!(start.answered(&word(1), Reply::Written, &mut bench.shadow).is_some());
+    assert_eq!(
+        bench.shadow.get(0, 2000),
+        Some(1),
+        "known from the acknowledged write on"
+    );
+    // A read that is never answered: after the tries.
+    let mut bench = Bench::new(0);
+    let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    assert_eq!(start.failed(&read, 1), None);
+    assert_eq!(sends(&bench, &mut start), read);
+    assert_eq!(start.failed(&read, 1), None);
+    assert_eq!(sends(&bench, &mut start), word(1));
+    // A drive that is only busy is not overruled.
+    let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    let busy = start.answered(&read, Reply::Exception(Exception::BUSY), &mut bench.shadow);
+    assert_eq!(busy, Some(Outcome::Exception(Exception::BUSY)));
+}
+
+#[test]
+fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
+    let mut bench = Bench::new(1);
+    bench.running = true;
+    let refused = || Reply::Exception(Exception::ADDRESS);
+    for points in [&[("reverse", 1.0)][..], &[("run", 1.0)], &[("fault_reset", 1.0)]] {
+        let (mut command, _a) = bench.begin(points, Urgency::Command);
+        let read = sends(&bench, &mut command);
+        let ended = command.answered(&read, refused(), &mut bench.shadow);
+        assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
+    }
+    let (mut both, _a) = bench.begin(&[("run", 1.0), ("reverse", 1.0)], Urgency::Command);
+    let read = sends(&bench, &mut both);
+    assert_eq!(both.answered(&read, refused(), &mut bench.shadow), None);
+    assert_eq!(sends(&bench, &mut both), word(3));
+}
