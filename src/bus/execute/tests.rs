@@ -9,6 +9,8 @@ use crate::command::{Answer, Origin, SourceKind, WriteStats};
 use crate::drive::Value;
 use crate::drive::profile::Profiles;
 
+mod on_change;
+
 struct Bench {
     profile: Arc<Profile>,
     shadow: Shadow,
@@ -20,10 +22,9 @@ struct Bench {
 
 impl Bench {
     fn new(control_word: u16) -> Bench {
-        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
         let drive = BTreeMap::from([(2000, control_word), (2002, 0)]);
         Bench {
-            profile,
+            profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
             shadow: Shadow::default(),
             now: Instant::now(),
             drive,

@@ -1,0 +1,159 @@
+//! Writes of what a drive keeps in a memory that wears: overrides of N2.
+
+use super::*;
+use crate::codec::n2::Session;
+
+/// 50 % as the float of AO 1.
+const HALF: [u16; 2] = [0x4248, 0x0000];
+
+fn bench() -> Bench {
+    Bench {
+        profile: Profiles::built_in().get("vacon-nx-n2").unwrap().clone(),
+        ..Bench::new(0)
+    }
+}
+
+fn read(table: Table, count: u16) -> RequestPdu {
+    let start = 0;
+    RequestPdu::Read { table, start, count }
+}
+
+fn override_ao() -> RequestPdu {
+    let (start, values) = (0, HALF.to_vec());
+    RequestPdu::WriteRegisters { start, values }
+}
+
+fn release() -> RequestPdu {
+    let (table, address) = (Table::Holding, 0);
+    RequestPdu::N2(Session::Release { table, address })
+}
+
+fn coil(address: u16, on: bool) -> RequestPdu {
+    RequestPdu::WriteCoil { address, on }
+}
+
+fn reference(bench: &Bench) -> Execution {
+    bench.begin(&[("speed_reference", 50.0)], Urgency::Command).0
+}
+
+#[test]
+fn what_the_drive_has_is_read_and_not_written() {
+    let mut bench = bench();
+    let mut command = reference(&bench);
+    assert_eq!(sends(&bench, &mut command), read(Table::Holding, 2));
+    let has = Reply::Registers(HALF.to_vec());
+    assert_eq!(command.answered(&read(Table::Holding, 2), has, &mut bench.shadow), None);
+    // Neither override nor release.
+    let next = command.next(&bench.shadow, &bench.profile, false, bench.now);
+    assert_eq!(next, Next::Done);
+    assert_eq!(command.success(), Outcome::Acknowledged(Reply::Written));
+}
+
+#[test]
+fn what_was_read_just_now_is_not_read_again() {
+    for (known, next) in [(HALF[0], None), (0, Some(override_ao()))] {
+        let mut bench = bench();
+        bench.shadow.learn(0, Table::Holding, 0, known);
+        bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
+        let mut command = reference(&bench);
+        command.fresh = true;
+        let expected = next.map_or(Next::Done, Next::Send);
+        assert_eq!(command.next(&bench.shadow, &bench.profile, false, bench.now), expected);
+    }
+    // What is known from long ago is.
+    let mut bench = bench();
+    bench.shadow.learn(0, Table::Holding, 0, HALF[0]);
+    bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
+    let mut command = reference(&bench);
+    assert_eq!(sends(&bench, &mut command), read(Table::Holding, 2));
+}
+
+#[test]
+fn a_drive_that_does_not_tell_is_written() {
+    let mut bench = bench();
+    let mut command = reference(&bench);
+    let check = sends(&bench, &mut command);
+    let refused = Reply::Exception(Exception::n2(0x10));
+    assert_eq!(command.answered(&check, refused, &mut bench.shadow), None);
+    assert_eq!(sends(&bench, &mut command), override_ao());
+}
+
+#[test]
+fn a_release_is_behind_the_override_and_may_fail() {
+    let refused = Reply::Exception(Exception::n2(0x11));
+    for answer in [Some(Reply::Written), Some(refused), None] {
+        let mut bench = bench();
+        let mut command = reference(&bench);
+        command.fresh = true;
+        assert_eq!(sends(&bench, &mut command), override_ao());
+        assert_eq!(
+            command.answered(&override_ao(), Reply::Written, &mut bench.shadow),
+            None
+        );
+        assert_eq!(sends(&bench, &mut command), release());
+        let ended = match answer {
+            Some(reply) => command.answered(&release(), reply, &mut bench.shadow),
+            None => {
+                assert_eq!(command.failed(&release(), 1), None, "it is tried again");
+                assert_eq!(sends(&bench, &mut command), release());
+                command.failed(&release(), 1)
+            }
+        };
+        assert_eq!(ended, Some(Outcome::Acknowledged(Reply::Written)));
+        assert!(!command.in_doubt(), "what was overridden is known");
+    }
+}
+
+#[test]
+fn an_override_that_is_refused_is_not_released() {
+    let mut bench = bench();
+    let mut command = reference(&bench);
+    command.fresh = true;
+    assert_eq!(sends(&bench, &mut command), override_ao());
+    let refused = Exception::n2(0x10);
+    let ended = command.answered(&override_ao(), Reply::Exception(refused), &mut bench.shadow);
+    assert_eq!(ended, Some(Outcome::Exception(refused)));
+}
+
+#[test]
+fn a_stop_is_never_left_out() {
+    let mut bench = bench();
+    bench.shadow.learn(0, Table::Coil, 0, 0);
+    for urgency in [Urgency::Stop, Urgency::Command] {
+        let (mut stop, _answer) = bench.begin(&[("run", 0.0)], urgency);
+        stop.fresh = true;
+        assert_eq!(sends(&bench, &mut stop), coil(0, false));
+    }
+    // A start is.
+    bench.shadow.learn(0, Table::Coil, 0, 1);
+    let (mut start, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    start.fresh = true;
+    let next = start.next(&bench.shadow, &bench.profile, true, bench.now);
+    assert_eq!(next, Next::Done);
+}
+
+#[test]
+fn a_pulse_is_never_left_out() {
+    let mut bench = bench();
+    bench.running = true;
+    for (address, word) in [(0, 0), (2, 0)] {
+        bench.shadow.learn(0, Table::Coil, address, word);
+    }
+    let (mut reset, _answer) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+    let mut sent = Vec::new();
+    loop {
+        reset.fresh = true;
+        match reset.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
+            Next::Wait(until) => bench.now = until,
+            Next::Done => break,
+            Next::Send(pdu) => {
+                let over = reset.answered(&pdu, Reply::Written, &mut bench.shadow).is_some();
+                sent.push(pdu);
+                if over {
+                    break;
+                }
+            }
+        }
+    }
+    assert_eq!(sent, [coil(2, false), coil(2, true), coil(2, false)]);
+}
