@@ -1,0 +1,256 @@
+use std::time::Duration;
+
+use super::*;
+
+const IDENTIFY: Session = Session::Identify;
+const POLL: Session = Session::Poll { again: false };
+const AGAIN: Session = Session::Poll { again: true };
+
+struct Bench {
+    sessions: Sessions,
+    now: Instant,
+}
+
+fn bench() -> Bench {
+    Bench {
+        sessions: Sessions::new([N2Options::DEFAULT]),
+        now: Instant::now(),
+    }
+}
+
+fn changes(digits: &[u8]) -> Ended {
+    Ended::Reply(Reply::Changes(digits.to_vec()))
+}
+
+fn identity() -> Ended {
+    Ended::Reply(Reply::Identified(0x10))
+}
+
+fn value() -> Ended {
+    Ended::Reply(Reply::Registers(vec![0x4248, 0]))
+}
+
+fn restarted() -> Ended {
+    Ended::Reply(Reply::Exception(Exception::N2_RESTARTED))
+}
+
+impl Bench {
+    fn before(&mut self, command: Option<Urgency>) -> Option<Session> {
+        self.sessions.before(0, command, self.now)
+    }
+
+    fn done(&mut self, step: Session, ended: &Ended) -> Progress {
+        self.sessions.done(0, step, ended, self.now)
+    }
+
+    /// Identified, its report taken, and read once.
+    fn ready() -> Bench {
+        let mut bench = bench();
+        bench.done(IDENTIFY, &identity());
+        bench.done(POLL, &changes(b""));
+        bench.sessions.heard(0, &value());
+        assert_eq!(bench.before(None), None);
+        bench
+    }
+}
+
+#[test]
+fn identify_report_read() {
+    let mut bench = bench();
+    assert_eq!(bench.before(None), Some(IDENTIFY));
+    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY), "it would answer N00");
+    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(bench.before(Some(Urgency::Stop)), None, "a stop waits for no report");
+    assert_eq!(bench.before(None), Some(POLL));
+    assert_eq!(bench.done(POLL, &changes(b"102404248")), Progress::Going);
+    assert_eq!(bench.before(None), Some(AGAIN));
+    assert_eq!(bench.done(AGAIN, &changes(b"")), Progress::Changed);
+    assert_eq!(bench.before(None), None);
+    bench.now += N2Options::DEFAULT.poll;
+    assert_eq!(bench.before(Some(Urgency::Command)), None);
+    assert_eq!(
+        bench.before(None),
+        Some(POLL),
+        "a drive that is not polled takes itself for alone"
+    );
+    assert_eq!(bench.done(POLL, &changes(b"")), Progress::Going);
+    assert_eq!(bench.before(None), None);
+}
+
+#[test]
+fn a_report_that_never_ends() {
+    let mut bench = bench();
+    bench.done(IDENTIFY, &identity());
+    let mut polls = 0;
+    while let Some(step) = bench.before(None) {
+        bench.done(step, &changes(b"10240"));
+        polls += 1;
+    }
+    assert_eq!(polls, MOST_POLLS);
+}
+
+#[test]
+fn a_fence_after_every_exchange_that_failed() {
+    for ended in [Ended::Silent, Ended::Corrupt("x")] {
+        let mut bench = Bench::ready();
+        assert_eq!(bench.sessions.heard(0, &ended), Progress::Failed);
+        assert_eq!(bench.before(None), Some(IDENTIFY));
+        assert_eq!(bench.before(Some(Urgency::Command)), Some(IDENTIFY));
+        assert_eq!(bench.before(Some(Urgency::Stop)), None);
+        assert_eq!(bench.done(IDENTIFY, &Ended::Silent), Progress::Failed);
+        assert_eq!(bench.before(None), Some(IDENTIFY));
+        assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+        assert_eq!(bench.before(Some(Urgency::Command)), Some(POLL));
+        assert_eq!(bench.before(Some(Urgency::Stop)), None);
+        assert_eq!(bench.before(None), Some(POLL));
+        assert_eq!(bench.done(POLL, &changes(b"")), Progress::Going);
+        assert_eq!(bench.before(Some(Urgency::Command)), None);
+        assert_eq!(bench.before(None), None, "no report again");
+    }
+}
+
+#[test]
+fn a_stop_behind_an_unanswered_exchange_goes_out_twice() {
+    let mut bench = Bench::ready();
+    assert!(!bench.sessions.doubts_stop(0));
+    bench.sessions.heard(0, &Ended::Silent);
+    assert!(bench.sessions.doubts_stop(0));
+    assert!(!bench.sessions.doubts_stop(0));
+}
+
+/// Two drives that were identified and read.
+fn two() -> Sessions {
+    let now = Instant::now();
+    let mut sessions = Sessions::new([N2Options::DEFAULT, N2Options::DEFAULT]);
+    for drive in 0..2 {
+        sessions.done(drive, IDENTIFY, &identity(), now);
+        sessions.done(drive, POLL, &changes(b""), now);
+        sessions.heard(drive, &value());
+        assert_eq!(sessions.before(drive, None, now), None);
+    }
+    sessions
+}
+
+#[test]
+fn the_fence_is_of_the_line() {
+    let now = Instant::now();
+    let mut sessions = two();
+    sessions.heard(0, &Ended::Silent);
+    assert_eq!(sessions.before(1, None, now), Some(IDENTIFY), "another drive's value");
+    assert_eq!(sessions.before(1, Some(Urgency::Command), now), Some(IDENTIFY));
+    assert_eq!(sessions.before(1, Some(Urgency::Stop), now), None);
+    assert!(sessions.doubts_stop(1), "another drive's acknowledgement");
+    assert!(!sessions.doubts_stop(1));
+    sessions.done(1, IDENTIFY, &identity(), now);
+    assert_eq!(sessions.before(0, None, now), Some(POLL));
+    sessions.done(0, POLL, &changes(b""), now);
+    assert_eq!(
+        (sessions.before(0, None, now), sessions.before(1, None, now)),
+        (None, None)
+    );
+    assert!(!sessions.doubts_stop(0));
+    // Characters of nobody, whoever was spoken to.
+    sessions.strayed();
+    assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+    // A drive that goes away leaves the fence to the others.
+    sessions.gone(0);
+    assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+    sessions.reset();
+    sessions.done(1, IDENTIFY, &identity(), now);
+    assert_eq!(
+        sessions.before(1, Some(Urgency::Command), now),
+        None,
+        "a port that was opened anew owes nothing"
+    );
+}
+
+#[test]
+fn a_state_that_looks_like_an_identity_opens_no_fence() {
+    let now = Instant::now();
+    let mut sessions = two();
+    sessions.heard(0, &Ended::Silent);
+    // A late state of 10h; the identity of the other drive comes when that is polled.
+    sessions.done(1, IDENTIFY, &identity(), now);
+    assert_eq!(sessions.done(1, POLL, &changes(b"10"), now), Progress::Failed);
+    assert_eq!(sessions.before(1, None, now), Some(IDENTIFY));
+    sessions.done(1, IDENTIFY, &identity(), now);
+    assert_eq!(sessions.before(1, None, now), Some(POLL));
+    assert_eq!(
+        sessions.done(1, POLL, &changes(b"12"), now),
+        Progress::Going,
+        "no device is a 12h"
+    );
+    assert_eq!(sessions.before(1, None, now), Some(AGAIN), "it is a report");
+    assert_eq!(sessions.before(0, None, now), None);
+}
+
+#[test]
+fn the_line_rests_for_a_drive_that_is_there() {
+    let (now, later) = (Instant::now(), Instant::now() + Duration::from_millis(250));
+    let mut sessions = two();
+    assert_eq!(sessions.rest(), None);
+    sessions.owes(0, later);
+    sessions.owes(1, now);
+    assert_eq!(sessions.rest(), Some(later));
+    sessions.reset();
+    sessions.owes(0, later);
+    assert_eq!(sessions.rest(), None, "a probe does not keep the others waiting");
+}
+
+#[test]
+fn who_is_not_asked_is_polled_all_the_same() {
+    let now = Instant::now();
+    let mut sessions = two();
+    assert_eq!(sessions.neglected(now).count(), 0);
+    let later = now + N2Options::DEFAULT.poll + Duration::from_secs(1);
+    sessions.gone(0);
+    assert_eq!(sessions.neglected(later).collect::<Vec<_>>(), [1]);
+}
+
+#[test]
+fn a_restart_begins_anew() {
+    let mut bench = Bench::ready();
+    assert_eq!(bench.sessions.heard(0, &restarted()), Progress::Restarted);
+    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY));
+    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(bench.before(None), Some(POLL));
+    assert_eq!(bench.done(POLL, &restarted()), Progress::Failed, "identified in vain");
+    assert_eq!(bench.before(None), Some(IDENTIFY));
+}
+
+#[test]
+fn a_drive_that_is_no_vendors_device_is_told_once() {
+    let mut bench = bench();
+    let other = Ended::Reply(Reply::Identified(0x11));
+    assert_eq!(bench.done(IDENTIFY, &other), Progress::Unlike(0x11));
+    assert_eq!(bench.done(IDENTIFY, &other), Progress::Going);
+}
+
+#[test]
+fn drives_that_are_not_to_be_identified() {
+    let options = N2Options {
+        identify: false,
+        poll: Duration::from_secs(60),
+        ..N2Options::DEFAULT
+    };
+    let mut bench = Bench {
+        sessions: Sessions::new([options]),
+        now: Instant::now(),
+    };
+    assert_eq!(bench.before(None), Some(POLL));
+    bench.done(POLL, &changes(b""));
+    bench.sessions.heard(0, &Ended::Silent);
+    assert_eq!(bench.before(None), None);
+    bench.sessions.heard(0, &value());
+    bench.sessions.heard(0, &restarted());
+    assert_eq!(bench.before(None), Some(IDENTIFY), "it asked for it");
+}
+
+#[test]
+fn other_buses_have_none() {
+    let mut sessions = Sessions::default();
+    assert!(sessions.is_empty());
+    assert_eq!(sessions.before(0, None, Instant::now()), None);
+    assert_eq!(sessions.heard(0, &Ended::Silent), Progress::Going);
+    assert!(!sessions.doubts_stop(0));
+}
