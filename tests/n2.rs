@@ -1,5 +1,10 @@
 //! The bus against simulated drives with N2 boards, on a pseudo-terminal with true wire timing.
-#![allow(clippy::unwrap_used, clippy::indexing_slicing, reason = "a test may panic")]
+#![allow(
+    clippy::unwrap_used,
+    clippy::indexing_slicing,
+    clippy::panic,
+    reason = "a test may panic"
+)]
 
 mod common;
 
