@@ -1,12 +1,13 @@
 //! The bus: one owner of the line, one transaction at a time.
 
+pub mod asker;
 pub mod confirm;
 pub mod debts;
 pub mod desk;
+mod exchange;
 pub mod execute;
 pub mod leases;
 pub mod predict;
-pub mod probe;
 mod report;
 pub mod schedule;
 pub mod session;

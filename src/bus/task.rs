@@ -6,11 +6,12 @@ use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::desk::{Desk, Job};
+use super::exchange::await_reply;
 use super::leases::Leases;
 use super::report::Report;
 use super::schedule::{Cadence, Change, Poll, Polled, Schedule};
 use super::session::{Progress, Sessions};
-use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
+use super::transaction::{Ended, Transaction, is_unlike_its_reply};
 use crate::cache::{Outcome as Counted, Snapshot};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Protocol, Reply, Request, RequestPdu};
@@ -463,31 +464,15 @@ impl Worker {
             transaction.doubt_before(earliest);
         }
         self.quiet_since = sent;
-        let mut buffer = [0u8; 512];
-        let mut step = transaction.on_time(began);
-        let ended = loop {
-            match step {
-                Step::Done(ended) => break ended,
-                Step::Wait(until) => {
-                    let woken = line.wait(until, None, false)?;
-                    let now = Instant::now();
-                    step = match woken {
-                        Woken::Readable => {
-                            let count = line.receive(&mut buffer)?;
-                            if count > 0 {
-                                self.quiet_since = self.quiet_since.max(now);
-                            }
-                            let bytes = buffer.get(..count).unwrap_or_default();
-                            if let Some(tap) = &mut tap {
-                                tap.heard(bytes, now);
-                            }
-                            transaction.on_bytes(now, bytes)
-                        }
-                        _ => transaction.on_time(now),
-                    };
-                }
+        let quiet_since = &mut self.quiet_since;
+        let ended = await_reply(line, &mut transaction, began, |bytes, now| {
+            if !bytes.is_empty() {
+                *quiet_since = now.max(*quiet_since);
             }
-        };
+            if let Some(tap) = &mut tap {
+                tap.heard(bytes, now);
+            }
+        })?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         self.untimed |= match &ended {
             Ended::Reply(Reply::Exception(_)) => false,

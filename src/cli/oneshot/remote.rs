@@ -9,13 +9,12 @@ use crate::cache::DriveSpec;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::profile::Form;
 use crate::drive::{Bound, ModelPoint, Point, Quality, Raw, Sample, Source, Value};
+use crate::north::modbus_tcp::frame::{self, Header};
 
 /// Time to connect.
 const CONNECT: Duration = Duration::from_millis(500);
 /// Time for an answer: a command may wait for its turn, a forwarded read for a slow line.
 const ANSWER: Duration = Duration::from_secs(10);
-/// Bytes before the PDU.
-const HEADER: usize = 7;
 /// The command block (`docs/modbus-tcp.md`).
 const COMMAND: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
@@ -87,24 +86,29 @@ impl Remote {
         let failed =
             |error: std::io::Error| format!("the gateway does not answer: {error}; {}; try again", self.address);
         self.transaction = self.transaction.wrapping_add(1);
-        let mut body = vec![self.unit];
-        pdu.encode(&mut body);
-        let mut frame = self.transaction.to_be_bytes().to_vec();
-        frame.extend([0, 0]);
-        frame.extend((body.len() as u16).to_be_bytes());
-        frame.extend(body);
-        self.stream.write_all(&frame).map_err(failed)?;
-        let mut header = [0u8; HEADER];
-        self.stream.read_exact(&mut header).map_err(failed)?;
-        let [high, low, _, _, length_high, length_low, _] = header;
-        let length = usize::from(u16::from_be_bytes([length_high, length_low]));
-        if u16::from_be_bytes([high, low]) != self.transaction || !(2..=254).contains(&length) {
-            return Err(format!("no Modbus TCP reply; {}; check the address", self.address));
+        let header = Header {
+            transaction: self.transaction,
+            unit: self.unit,
+        };
+        let mut request = Vec::new();
+        frame::encode(header, &mut request, |out| pdu.encode(out));
+        self.stream.write_all(&request).map_err(failed)?;
+        let strange = || format!("no Modbus TCP reply; {}; check the address", self.address);
+        let mut received = Vec::new();
+        loop {
+            if let Some(reply) = frame::decode(&received).map_err(|_| strange())? {
+                return match reply.header == header {
+                    true => Reply::decode(pdu, reply.pdu)
+                        .map_err(|_| format!("the reply does not fit the request; {}; try again", self.address)),
+                    false => Err(strange()),
+                };
+            }
+            let mut buffer = [0u8; 512];
+            match self.stream.read(&mut buffer).map_err(failed)? {
+                0 => return Err(failed(std::io::ErrorKind::UnexpectedEof.into())),
+                count => received.extend(buffer.iter().take(count)),
+            }
         }
-        let mut reply = vec![0u8; length - 1];
-        self.stream.read_exact(&mut reply).map_err(failed)?;
-        Reply::decode(pdu, &reply)
-            .map_err(|_| format!("the reply does not fit the request; {}; try again", self.address))
     }
 
     /// The points with their values, each read as the drive itself numbers it.

@@ -3,36 +3,36 @@
 use crate::codec::modbus::MAX_PDU;
 
 /// Bytes before the PDU: transaction id, protocol id, length, unit id.
-pub(super) const HEADER: usize = 7;
+pub(crate) const HEADER: usize = 7;
 /// Longest frame.
-pub(super) const MAX_FRAME: usize = HEADER + MAX_PDU;
+pub(crate) const MAX_FRAME: usize = HEADER + MAX_PDU;
 /// Offset of the length field; it counts unit id and PDU.
 const LENGTH: usize = 4;
 
 /// Whom a frame belongs to.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Header {
+pub(crate) struct Header {
     /// Comes back in the reply.
-    pub(super) transaction: u16,
+    pub(crate) transaction: u16,
     /// Unit id.
-    pub(super) unit: u8,
+    pub(crate) unit: u8,
 }
 
 /// A request frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Frame<'b> {
-    pub(super) header: Header,
+pub(crate) struct Frame<'b> {
+    pub(crate) header: Header,
     /// At least the function code.
-    pub(super) function: u8,
+    pub(crate) function: u8,
     /// Function code and what follows.
-    pub(super) pdu: &'b [u8],
+    pub(crate) pdu: &'b [u8],
     /// Bytes that the frame takes in the buffer.
-    pub(super) used: usize,
+    pub(crate) used: usize,
 }
 
 /// No Modbus client: where its next frame begins cannot be known, so the connection is closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
-pub(super) enum NotModbus {
+pub(crate) enum NotModbus {
     #[error("protocol id {0} instead of 0")]
     Protocol(u16),
     #[error("length {0}, which is not 2 to 254")]
@@ -43,7 +43,7 @@ pub(super) enum NotModbus {
 ///
 /// # Errors
 /// As soon as the header shows it, without waiting for the rest.
-pub(super) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
+pub(crate) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
     if let [_, _, high, low, ..] = bytes
         && (*high, *low) != (0, 0)
     {
@@ -80,8 +80,8 @@ pub(super) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
     }))
 }
 
-/// Appends a reply frame; `pdu` writes its PDU.
-pub(super) fn encode(header: Header, out: &mut Vec<u8>, pdu: impl FnOnce(&mut Vec<u8>)) {
+/// Appends a frame; `pdu` writes its PDU.
+pub(crate) fn encode(header: Header, out: &mut Vec<u8>, pdu: impl FnOnce(&mut Vec<u8>)) {
     let begin = out.len();
     out.extend_from_slice(&header.transaction.to_be_bytes());
     out.extend_from_slice(&[0, 0, 0, 0, header.unit]);

@@ -9,7 +9,7 @@ mod certificate;
 mod connection;
 mod dialogue;
 mod door;
-mod frame;
+pub(crate) mod frame;
 mod identify;
 mod offline;
 mod places;

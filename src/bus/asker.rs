@@ -2,17 +2,18 @@
 
 use std::time::{Duration, Instant};
 
-use super::transaction::{Ended, Step, Transaction};
+use super::exchange::await_reply;
+use super::transaction::{Ended, Transaction};
 use crate::codec::{LineFormat, Protocol, Request};
 use crate::drive::plan::WireTime;
-use crate::line::{Line, Lost};
+use crate::line::{Line, Lost, Woken};
 
 /// A line that does not fall silent is spoken on after this time.
 const BABBLE: Duration = Duration::from_millis(300);
 
 /// A line with its settings.
 #[derive(Debug)]
-pub struct Probe<'l> {
+pub struct Asker<'l> {
     line: &'l Line,
     protocol: Protocol,
     format: LineFormat,
@@ -22,10 +23,10 @@ pub struct Probe<'l> {
     frame: Vec<u8>,
 }
 
-impl Probe<'_> {
+impl Asker<'_> {
     /// Speaks `protocol` on an open line; `timeout` is the time for the first byte of a reply.
-    pub fn new(line: &Line, protocol: Protocol, format: LineFormat, silence: Duration, timeout: Duration) -> Probe<'_> {
-        Probe {
+    pub fn new(line: &Line, protocol: Protocol, format: LineFormat, silence: Duration, timeout: Duration) -> Asker<'_> {
+        Asker {
             line,
             protocol,
             format,
@@ -55,37 +56,16 @@ impl Probe<'_> {
         let begun = Instant::now();
         self.line.send(&frame)?;
         let sent = begun + self.format.chars(frame.len());
-        let ended = {
-            let mut transaction =
-                Transaction::new(self.protocol, request, &frame, sent, self.timeout, wire.reply, false);
-            self.await_reply(&mut transaction, begun)
-        };
+        let mut transaction = Transaction::new(self.protocol, request, &frame, sent, self.timeout, wire.reply, false);
+        let quiet_since = &mut self.quiet_since;
+        let ended = await_reply(self.line, &mut transaction, begun, |bytes, now| {
+            if !bytes.is_empty() {
+                *quiet_since = now;
+            }
+        });
         self.quiet_since = self.quiet_since.max(sent);
         self.frame = frame;
         ended
-    }
-
-    fn await_reply(&mut self, transaction: &mut Transaction<'_>, begun: Instant) -> Result<Ended, Lost> {
-        let mut buffer = [0u8; 512];
-        let mut step = transaction.on_time(begun);
-        loop {
-            let until = match step {
-                Step::Done(ended) => return Ok(ended),
-                Step::Wait(until) => until,
-            };
-            let woken = self.line.wait(until, None, false)?;
-            let now = Instant::now();
-            step = match woken {
-                crate::line::Woken::Readable => {
-                    let count = self.line.receive(&mut buffer)?;
-                    if count > 0 {
-                        self.quiet_since = now;
-                    }
-                    transaction.on_bytes(now, buffer.get(..count).unwrap_or_default())
-                }
-                _ => transaction.on_time(now),
-            };
-        }
     }
 
     fn fall_silent(&mut self) -> Result<(), Lost> {
@@ -94,7 +74,7 @@ impl Probe<'_> {
         loop {
             let free = (self.quiet_since + self.silence).min(give_up);
             match self.line.wait(free, None, true)? {
-                crate::line::Woken::Readable => {
+                Woken::Readable => {
                     if self.line.receive(&mut buffer)? > 0 {
                         self.quiet_since = Instant::now();
                     }
