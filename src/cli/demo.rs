@@ -289,9 +289,11 @@ fn welcome(ports: &[String], sides: &Sides) -> String {
 drivegate {version} demo: simulated drives of every family and protocol, true wire timing, no hardware.
 {lines}
 The drives start, stop, ramp and now and then fault by themselves until you command them.
+mbpoll and the mosquitto clients below are programs of others: apt install mbpoll mosquitto-clients
 
 Look
   http://{http}/                       status page in a browser
+  {program} watch --url http://{http}
   curl -s http://{http}/metrics | grep output_frequency
   curl -s http://{http}/api/v1/drives/pump-1
   mosquitto_sub -h 127.0.0.1 -p {mqtt} -v -t 'drivegate/#'
@@ -310,5 +312,6 @@ Command pump-1
 Ctrl-C ends the demo.",
         version = env!("CARGO_PKG_VERSION"),
         lines = lines.join("\n"),
+        program = std::env::current_exe().map_or_else(|_| "drivegate".to_string(), |path| path.display().to_string()),
     )
 }
