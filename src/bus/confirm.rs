@@ -227,11 +227,11 @@ impl Confirmations {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
+
     use std::sync::Arc;
 
     use super::*;
-    use crate::cache::{Access, DriveImage, DriveSpec, Link, OnShutdown};
+    use crate::cache::{Access, DriveImage, DriveSpec, Link};
     use crate::codec::{Reply, RequestPdu, Table};
     use crate::command::{Origin, Outcome, SourceKind, Ticket, WriteStats};
     use crate::drive::profile::Profiles;
@@ -246,17 +246,9 @@ mod tests {
     impl Bench {
         fn new() -> Bench {
             let spec = DriveSpec {
-                name: "d".to_string(),
-                bus: "b".to_string(),
-                address: 1,
-                unit: 1,
-                profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
                 access: Access::Control,
-                limits: BTreeMap::new(),
-                supervision: None,
-                on_shutdown: OnShutdown::Hold,
                 turnaround: Duration::ZERO,
-                frequency_range: None,
+                ..DriveSpec::new("d", "b", 1, Profiles::built_in().get("vacon-nx").unwrap().clone())
             };
             let drive = DriveImage::new(spec, Duration::from_secs(1));
             drive.update(|s| s.link = Link::Online(std::time::SystemTime::now()));

@@ -8,7 +8,7 @@ use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::bus::schedule::{Cadence, Change, Polled};
-use crate::cache::{Access, DriveSpec, Link, OnShutdown};
+use crate::cache::{Access, DriveSpec, Link};
 use crate::codec::{Exception, Table};
 use crate::command::{Answer, CAPACITY, CommandQueue, Order, Origin, SourceKind, Ticket, WriteStats, admit};
 use crate::drive::profile::Profiles;
@@ -118,17 +118,9 @@ impl Model {
         let now = Instant::now();
         let drive = |index: usize| {
             let spec = DriveSpec {
-                name: format!("d{index}"),
-                bus: "b".to_string(),
-                address: 1,
-                unit: 1,
-                profile: profile.clone(),
                 access: Access::Control,
-                limits: BTreeMap::new(),
-                supervision: None,
-                on_shutdown: OnShutdown::Hold,
                 turnaround: Duration::ZERO,
-                frequency_range: None,
+                ..DriveSpec::new(&format!("d{index}"), "b", 1, profile.clone())
             };
             Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
         };

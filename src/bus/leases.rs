@@ -152,10 +152,9 @@ impl Owed {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
 
     use super::*;
-    use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, OnShutdown, Supervision};
+    use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision};
     use crate::codec::{Exception, LineFormat, Protocol, Reply, Table};
     use crate::command::{CommandQueue, Outcome};
     use crate::drive::profile::Profiles;
@@ -169,20 +168,13 @@ mod tests {
     impl Bench {
         fn new(action: LeaseAction) -> Bench {
             let spec = DriveSpec {
-                name: "d".to_string(),
-                bus: "b".to_string(),
-                address: 1,
-                unit: 1,
-                profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
                 access: Access::Control,
-                limits: BTreeMap::new(),
                 supervision: Some(Supervision {
                     timeout: Duration::from_secs(5),
                     action,
                 }),
-                on_shutdown: OnShutdown::Hold,
                 turnaround: Duration::ZERO,
-                frequency_range: None,
+                ..DriveSpec::new("d", "b", 1, Profiles::built_in().get("vacon-nx").unwrap().clone())
             };
             let bus = BusSpec {
                 name: "b".to_string(),

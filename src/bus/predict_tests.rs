@@ -3,7 +3,6 @@ use std::time::Instant;
 
 use super::super::schedule::{Cadence, Decision, Polled, Schedule};
 use super::*;
-use crate::cache::{Access, OnShutdown};
 use crate::codec::Protocol;
 use crate::drive::Profile;
 
@@ -31,17 +30,9 @@ fn profile(bauds: &str, slow: usize) -> Arc<Profile> {
 
 fn drives(profile: &Arc<Profile>, count: u8) -> Vec<DriveSpec> {
     let drive = |address| DriveSpec {
-        name: format!("d{address}"),
-        bus: "b".into(),
-        address,
-        unit: address,
-        profile: profile.clone(),
-        access: Access::Monitor,
         limits: Default::default(),
-        supervision: None,
-        on_shutdown: OnShutdown::Hold,
         turnaround: profile.turnaround,
-        frequency_range: None,
+        ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
     };
     (1..=count).map(drive).collect()
 }

@@ -37,12 +37,12 @@ pub(super) fn own_response(reading: &Reading<'_>) -> OwnResponse {
 
 #[cfg(test)]
 mod tests {
-    use std::collections::BTreeMap;
+
     use std::sync::Arc;
     use std::time::{Duration, Instant, SystemTime};
 
     use super::*;
-    use crate::cache::{Access, DriveImage, DriveSpec, Link, OnShutdown};
+    use crate::cache::{Access, DriveImage, DriveSpec, Link};
     use crate::codec::Table;
     use crate::drive::Profile;
 
@@ -51,17 +51,14 @@ mod tests {
 
     fn drive(points: &str) -> DriveImage {
         let spec = DriveSpec {
-            name: "d".to_string(),
-            bus: "b".to_string(),
-            address: 1,
-            unit: 1,
-            profile: Arc::new(Profile::parse("p.toml", &format!("{START}{points}"), false).unwrap()),
             access: Access::Control,
-            limits: BTreeMap::new(),
-            supervision: None,
-            on_shutdown: OnShutdown::Hold,
             turnaround: Duration::ZERO,
-            frequency_range: None,
+            ..DriveSpec::new(
+                "d",
+                "b",
+                1,
+                Arc::new(Profile::parse("p.toml", &format!("{START}{points}"), false).unwrap()),
+            )
         };
         let image = DriveImage::new(spec, Duration::from_secs(1));
         image.update(|s| s.link = Link::Online(SystemTime::now()));

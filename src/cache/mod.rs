@@ -303,6 +303,23 @@ impl BusImage {
 }
 
 impl DriveSpec {
+    /// A drive with nothing configured but where it is and what it is: only monitored, its unit is its address.
+    pub fn new(name: &str, bus: &str, address: u8, profile: Arc<Profile>) -> DriveSpec {
+        DriveSpec {
+            name: name.to_string(),
+            bus: bus.to_string(),
+            address,
+            unit: address,
+            turnaround: profile.turnaround,
+            profile,
+            access: Access::Monitor,
+            limits: BTreeMap::new(),
+            supervision: None,
+            on_shutdown: OnShutdown::Hold,
+            frequency_range: None,
+        }
+    }
+
     /// Percent of the speed range as Hz, or Hz as percent, with the band `minimum..maximum` in Hz.
     pub fn percent_of(frequency: f64, minimum: f64, maximum: f64) -> Option<f64> {
         let span = maximum - minimum;

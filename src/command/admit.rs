@@ -323,24 +323,17 @@ mod tests {
     use std::time::{Duration, Instant};
 
     use super::*;
-    use crate::cache::{DriveImage, DriveSpec, Link, OnShutdown};
+    use crate::cache::{DriveImage, DriveSpec, Link};
     use crate::codec::Exception;
     use crate::drive::profile::Profiles;
 
     fn drive(access: Access) -> DriveImage {
         let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
         let spec = DriveSpec {
-            name: "pump-1".to_string(),
-            bus: "line1".to_string(),
-            address: 1,
-            unit: 1,
-            profile: Arc::clone(&profile),
             access,
             limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
-            supervision: None,
-            on_shutdown: OnShutdown::Hold,
             turnaround: Duration::from_millis(2),
-            frequency_range: None,
+            ..DriveSpec::new("pump-1", "line1", 1, Arc::clone(&profile))
         };
         let image = DriveImage::new(spec, Duration::from_secs(1));
         image.update(|s| {

@@ -2,14 +2,13 @@
 // Each test file uses its own part; a rig that cannot be built fails its test.
 #![allow(dead_code, unreachable_pub, clippy::unwrap_used, clippy::panic, clippy::expect_used)]
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate::bus::leases::Leases;
 use drivegate::bus::predict::predict;
 use drivegate::bus::{BusOptions, BusTask};
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, OnShutdown};
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
 use drivegate::command::{CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
@@ -87,17 +86,14 @@ impl Setup {
 
 fn spec(address: u8) -> DriveSpec {
     DriveSpec {
-        name: drive(address),
-        bus: "line1".to_string(),
-        address,
-        unit: address,
-        profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
         access: Access::Control,
-        limits: BTreeMap::new(),
-        supervision: None,
-        on_shutdown: OnShutdown::Hold,
         turnaround: Duration::from_micros(500),
-        frequency_range: None,
+        ..DriveSpec::new(
+            &drive(address),
+            "line1",
+            address,
+            Profiles::built_in().get("vacon-nx").unwrap().clone(),
+        )
     }
 }
 

@@ -1,6 +1,5 @@
 //! A plant made by hand: no bus runs, the images are filled here.
 
-use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -8,7 +7,7 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, OnShutdown, Outcome, PollCycle};
+use drivegate::cache::{BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PollCycle};
 use drivegate::codec::{LineFormat, Protocol, Table};
 use drivegate::command::{self, CommandQueue, Origin, SourceKind, Ticket, WriteStats};
 use drivegate::drive::model::Kind;
@@ -92,17 +91,8 @@ pub(crate) fn nx_faulted(address: u16) -> u16 {
 
 pub(crate) fn drive(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
     let spec = DriveSpec {
-        name: name.to_string(),
-        bus: bus.to_string(),
-        address,
-        unit: address,
-        profile: profile.clone(),
-        access: Access::Monitor,
-        limits: BTreeMap::new(),
-        supervision: None,
-        on_shutdown: OnShutdown::Hold,
         turnaround: Duration::from_millis(2),
-        frequency_range: None,
+        ..DriveSpec::new(name, bus, address, profile.clone())
     };
     Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
 }

@@ -1,6 +1,5 @@
 //! A plant built by hand with simulated buses behind it, a server in front of it, and a bare client.
 
-use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr, SocketAddr};
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex};
@@ -8,7 +7,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Link, OnShutdown, Supervision};
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
 use drivegate::codec::{LineFormat, Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Command, CommandQueue, Order, Outcome, Urgency};
 use drivegate::drive::profile::{Profile, Profiles};
@@ -189,20 +188,13 @@ pub(crate) fn listener() -> Listener {
 
 fn spec(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: Access) -> DriveSpec {
     DriveSpec {
-        name: name.to_string(),
-        bus: bus.to_string(),
-        address: unit,
-        unit,
-        profile: profile.clone(),
         access,
-        limits: BTreeMap::new(),
         supervision: Some(Supervision {
             timeout: Duration::from_secs(3600),
             action: LeaseAction::Hold,
         }),
-        on_shutdown: OnShutdown::Hold,
         turnaround: Duration::from_millis(2),
-        frequency_range: None,
+        ..DriveSpec::new(name, bus, unit, profile.clone())
     }
 }
 

@@ -10,7 +10,7 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, OnShutdown};
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 use drivegate::codec::{LineFormat, Protocol, Reply, Table};
 use drivegate::command::{CommandQueue, Order, Outcome, Urgency};
 use drivegate::drive::Value;
@@ -519,17 +519,10 @@ pub(crate) fn plant(drives: &[&str]) -> Plant {
             Access::Control
         };
         let spec = DriveSpec {
-            name: (*name).to_string(),
-            bus: "line1".to_string(),
-            address,
-            unit: address,
-            profile: Arc::clone(&profile),
             access,
             limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
-            supervision: None,
-            on_shutdown: OnShutdown::Hold,
             turnaround: Duration::from_millis(2),
-            frequency_range: None,
+            ..DriveSpec::new(name, "line1", address, Arc::clone(&profile))
         };
         Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
     });

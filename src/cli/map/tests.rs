@@ -1,9 +1,8 @@
-use std::collections::BTreeMap;
 use std::time::Duration;
 
 use super::export::quoted;
 use super::*;
-use crate::cache::{BusSpec, OnShutdown};
+use crate::cache::BusSpec;
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::profile::Profiles;
 
@@ -11,17 +10,9 @@ fn plant() -> Plant {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
     let drive = |name: &str, unit, access| {
         let spec = DriveSpec {
-            name: name.to_string(),
-            bus: "line1".to_string(),
-            address: unit,
-            unit,
-            profile: profile.clone(),
             access,
-            limits: BTreeMap::new(),
-            supervision: None,
-            on_shutdown: OnShutdown::Hold,
             turnaround: Duration::ZERO,
-            frequency_range: None,
+            ..DriveSpec::new(name, "line1", unit, profile.clone())
         };
         Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
     };

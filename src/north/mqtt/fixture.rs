@@ -1,10 +1,9 @@
 //! A small plant for tests.
 
-use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, OnShutdown};
+use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 use crate::codec::{LineFormat, Protocol, Table};
 use crate::command::CommandQueue;
 use crate::drive::profile::Profiles;
@@ -15,17 +14,9 @@ pub(super) fn plant(drives: &[&str]) -> Plant {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
     let images = drives.iter().zip(1..).map(|(name, address)| {
         let spec = DriveSpec {
-            name: (*name).to_string(),
-            bus: "line1".to_string(),
-            address,
-            unit: address,
-            profile: Arc::clone(&profile),
             access: Access::Control,
-            limits: BTreeMap::new(),
-            supervision: None,
-            on_shutdown: OnShutdown::Hold,
             turnaround: Duration::from_millis(2),
-            frequency_range: None,
+            ..DriveSpec::new(name, "line1", address, Arc::clone(&profile))
         };
         Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
     });

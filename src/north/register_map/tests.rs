@@ -1,8 +1,7 @@
-use std::collections::BTreeMap;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
-use crate::cache::{Access, DriveImage, DriveSpec, Link, OnShutdown};
+use crate::cache::{Access, DriveImage, DriveSpec, Link};
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
@@ -15,17 +14,9 @@ fn nx() -> Profile {
 
 fn image(profile: Profile) -> DriveImage {
     let spec = DriveSpec {
-        name: "pump-1".to_string(),
-        bus: "line1".to_string(),
-        address: 1,
-        unit: 1,
-        profile: profile.into(),
         access: Access::Control,
-        limits: BTreeMap::new(),
-        supervision: None,
-        on_shutdown: OnShutdown::Hold,
         turnaround: Duration::from_millis(2),
-        frequency_range: None,
+        ..DriveSpec::new("pump-1", "line1", 1, profile.into())
     };
     DriveImage::new(spec, Duration::from_secs(1))
 }
