@@ -253,7 +253,7 @@ fn line(runtime: &tokio::runtime::Runtime) -> Result<(), Box<dyn Error>> {
             .filter(|f| f.direction == Direction::ToDrives && f.bytes.starts_with(&round));
         let starts: Vec<f64> = starts.map(|f| f.start.as_secs_f64() * 1e3).collect();
         let cycles: Vec<f64> = starts.windows(2).filter_map(|w| Some(w.last()? - w.first()?)).collect();
-        println!("{:.4} {:.4} {}", median(&cycles), quantile(&cycles, 0.99), cycles.len());
+        println!("{:.4} {:.4}", median(&cycles), quantile(&cycles, 0.99));
     }
     runtime.block_on(daemon.stop());
     Ok(())

@@ -245,7 +245,7 @@ impl Args {
             .addresses
             .0
             .iter()
-            .find(|address| !profile.addresses.contains(address))
+            .find(|address| !profile.addresses.contains::<u8>(address))
         {
             let (first, last) = profile.addresses.clone().into_inner();
             return Err(format!(

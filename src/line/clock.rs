@@ -5,22 +5,41 @@ use rustix::io::Errno;
 use std::io;
 use std::num::NonZeroU64;
 use std::time::{Duration, Instant};
+use thread_priority::unix::{
+    RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
+};
+use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
-/// Precedence of a thread that serves a line, on the scale of `nice`.
-const PRECEDENCE: i32 = -10;
+/// Precedence of a thread that serves a line, in real time (1 to 99). Interrupt threads of the kernel stand at 50.
+const REAL_TIME: u8 = 10;
+/// The same on the scale of `nice`, where real time is not allowed.
+const NICE: i32 = -10;
 
 /// Asks the kernel to wake this thread at the time it named: by default it may be 50 microseconds late, to save power.
-/// And to let it go before others that want the processor, which the kernel allows to root, with CAP_SYS_NICE and within
-/// RLIMIT_NICE: a thread of a line needs little time, but needs it at once. Where either is refused, waits are later and
-/// nothing else changes.
+/// And to let it go before all ordinary ones that want the processor, since a thread of a line needs little time, but
+/// needs it at once: in real time, which the kernel allows to root, with CAP_SYS_NICE and within RLIMIT_RTPRIO; else by
+/// `nice` (RLIMIT_NICE). Among ordinary threads even the first may wait for the next tick, 4 ms later, while the machine
+/// is busy. Where everything is refused, waits are later and nothing else changes.
 pub fn sharpen_timers() {
     if let Err(error) = rustix::thread::set_current_timer_slack(NonZeroU64::new(1)) {
         tracing::debug!("timer slack stays as it is: {error}");
     }
+    let Err(refused) = real_time() else {
+        return;
+    };
     // Linux takes "this process" for the calling thread alone.
-    if let Err(error) = rustix::process::setpriority_process(None, PRECEDENCE) {
-        tracing::debug!("no precedence over other threads: {error}");
+    match rustix::process::setpriority_process(None, NICE) {
+        Ok(()) => tracing::debug!("no real time, but nice {NICE}: {refused}"),
+        Err(error) => tracing::debug!("no precedence over other threads: no real time: {refused}; no nice: {error}"),
     }
+}
+
+fn real_time() -> Result<(), String> {
+    let priority = ThreadPriorityValue::try_from(REAL_TIME)?;
+    // Round robin: the threads of two lines do not wait for each other longer than a slice.
+    let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
+        .map_err(|error| error.to_string())
 }
 
 /// Waits until one of `fds` is ready or it is `until`; whether one is ready. A signal ends the wait early.
@@ -90,6 +109,38 @@ impl WakeUps {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    /// Whether the system lets a thread of this process run in real time, asked by other means.
+    fn allowed() -> bool {
+        let ask = format!("import os; os.sched_setscheduler(0, os.SCHED_RR, os.sched_param({REAL_TIME}))");
+        let output = std::process::Command::new("python3").args(["-c", &ask]).output();
+        output.expect("python3 runs").status.success()
+    }
+
+    #[test]
+    fn a_thread_of_a_line_takes_real_time_where_it_may_and_nobody_else_does() {
+        let policy = || {
+            let stat = std::fs::read_to_string("/proc/thread-self/stat").unwrap();
+            let fields: Vec<u32> = stat
+                .rsplit(')')
+                .next()
+                .unwrap()
+                .split_whitespace()
+                .skip(37)
+                .take(2)
+                .map(|f| f.parse().unwrap())
+                .collect();
+            (fields[0], fields[1])
+        };
+        let own = std::thread::spawn(move || {
+            sharpen_timers();
+            policy()
+        });
+        // Fields 40 and 41 of proc_pid_stat(5): priority in real time, policy; 2 is round robin.
+        let expected = if allowed() { (u32::from(REAL_TIME), 2) } else { (0, 0) };
+        assert_eq!(own.join().unwrap(), expected);
+        assert_eq!(policy(), (0, 0), "only the thread that asked");
+    }
 
     #[test]
     fn the_spin_follows_the_wake_ups() {

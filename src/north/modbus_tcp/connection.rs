@@ -3,6 +3,7 @@
 use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
+use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt;
@@ -13,6 +14,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
 use super::frame::NotModbus;
+use super::lookout::{Lookout, Turns};
 use super::session::{Finished, Session};
 
 /// Time for the rest of a frame.
@@ -52,10 +54,12 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
 ) {
     tracing::debug!(client = session.who(), "Modbus TCP: connected");
     let mut connection = Connection {
+        turns: session.turns(),
         stream,
         dialogue: Dialogue::new(session),
         since_yield: 0,
         idle: idle_timeout.map(Idle::new),
+        lookout: Lookout::new(std::time::Instant::now()),
     };
     let end = match connection.run(&cancel).await {
         Ok(never) => match never {},
@@ -77,6 +81,8 @@ struct Connection<S> {
     /// Requests since others had their turn.
     since_yield: usize,
     idle: Option<Idle>,
+    lookout: Lookout,
+    turns: Arc<Turns>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
@@ -114,28 +120,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             // While it is the gateway that does not read on, a half frame is nobody's fault.
             let half = self.dialogue.has_input() && !full && !client_done;
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
-            let waits = self.dialogue.is_waiting();
-            let (space, waiting) = self.dialogue.parts();
             let reads = !full && !client_done;
-            let at_once = if reads {
-                self.stream.read(space).now_or_never()
-            } else {
-                None
-            };
-            let event = match at_once {
-                Some(count) => Event::Input(count?),
-                None => {
-                    // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
-                    // task may go on on another thread, later.
-                    self.since_yield = 0;
-                    tokio::select! {
-                        () = &mut cancelled => return Err(End::Cancelled),
-                        Some(finished) = waiting.next() => Event::Answer(finished),
-                        count = self.stream.read(space), if reads => Event::Input(count?),
-                        () = expired(half_frame_since) => return Err(End::HalfFrame),
-                        timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
-                    }
-                }
+            let event = tokio::select! {
+                biased;
+                event = self.next(reads, half_frame_since) => event?,
+                () = &mut cancelled => return Err(End::Cancelled),
             };
             match event {
                 Event::Answer(finished) => {
@@ -146,6 +135,41 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 Event::Input(count) => self.dialogue.received(count),
             }
         }
+    }
+
+    /// Waits for input, if the connection `reads`, and for answers of the bus.
+    async fn next(&mut self, reads: bool, half_frame_since: Option<Instant>) -> Result<Event, End> {
+        let waits = self.dialogue.is_waiting();
+        let (space, waiting) = self.dialogue.parts();
+        let began = std::time::Instant::now();
+        let (mut read, mut looked) = (None, false);
+        if reads {
+            read = self.stream.read(space).now_or_never();
+        }
+        if read.is_none() {
+            // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
+            // task may go on on another thread, later.
+            self.since_yield = 0;
+            if reads
+                && !waits
+                && let Some(patience) = self.lookout.patience(began)
+            {
+                looked = true;
+                read = look_out(&mut self.stream, space, &mut self.lookout, &self.turns, patience).await;
+            }
+        }
+        let count = match read {
+            Some(count) => count?,
+            None => tokio::select! {
+                Some(finished) = waiting.next() => return Ok(Event::Answer(finished)),
+                count = self.stream.read(space), if reads => count?,
+                () = expired(half_frame_since) => return Err(End::HalfFrame),
+                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
+            },
+        };
+        self.lookout
+            .served(self.turns.next(), began, std::time::Instant::now(), looked);
+        Ok(Event::Input(count))
     }
 
     /// The client uses its connection.
@@ -217,6 +241,26 @@ impl Idle {
             idle.timer.as_mut().reset(end);
         }
     }
+}
+
+/// Watches for input without sleeping; everything else on this thread goes first.
+async fn look_out<S: AsyncRead + Unpin>(
+    stream: &mut S,
+    space: &mut [u8],
+    lookout: &mut Lookout,
+    turns: &Turns,
+    patience: Duration,
+) -> Option<io::Result<usize>> {
+    let began = std::time::Instant::now();
+    let read = loop {
+        tokio::task::yield_now().await;
+        let read = stream.read(space).now_or_never();
+        if read.is_some() || began.elapsed() >= patience || lookout.is_disturbed(turns.last()) {
+            break read;
+        }
+    };
+    lookout.spent(began.elapsed());
+    read
 }
 
 /// Writes the output if the stream takes all of it without waiting, as it nearly always does: no timer, no registration.

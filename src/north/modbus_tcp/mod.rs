@@ -11,6 +11,7 @@ mod dialogue;
 mod door;
 pub(crate) mod frame;
 mod identify;
+mod lookout;
 mod offline;
 mod places;
 mod session;

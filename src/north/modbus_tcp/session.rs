@@ -9,6 +9,7 @@ use futures_util::FutureExt;
 
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
+use super::lookout::Turns;
 use super::shared::{Authority, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
@@ -96,6 +97,11 @@ impl Session {
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
         &self.authority.who
+    }
+
+    /// The turns of all connections.
+    pub(super) fn turns(&self) -> Arc<Turns> {
+        self.shared.turns.clone()
     }
 
     fn stats(&self) -> &ModbusTcpStats {

@@ -6,6 +6,7 @@ use std::time::Instant;
 
 use arc_swap::ArcSwap;
 
+use super::lookout::Turns;
 use super::{Options, Seldom};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
@@ -18,6 +19,7 @@ pub(super) struct Shared {
     /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
     command_words: Mutex<HashMap<String, u16>>,
     tls_log: Mutex<Seldom>,
+    pub(super) turns: Arc<Turns>,
 }
 
 impl Shared {
@@ -27,6 +29,7 @@ impl Shared {
             stats,
             command_words: Mutex::default(),
             tls_log: Mutex::default(),
+            turns: Arc::default(),
         }
     }
 
