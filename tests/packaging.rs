@@ -111,12 +111,13 @@ fn the_unit_is_clean() {
 /// 0 is locked up entirely, 100 not at all; what is left is the network, the serial ports and their group.
 #[test]
 fn the_unit_is_sandboxed() {
+    // 1.6 without the real time of the line's thread, which costs two entries.
     let dir = TempDir::new().unwrap();
     let arguments = [
         "security",
         "--offline=true",
         "--no-pager",
-        "--threshold=16",
+        "--threshold=18",
         &unit(&dir),
     ];
     run_well(&tool("systemd-analyze"), &arguments);

@@ -7,7 +7,7 @@ use drivegate::codec::{Exception, RequestPdu, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::north::modbus_tcp::Uncached;
 
-use crate::rig::{Client, Rig, options, registers, words, write};
+use crate::rig::{Client, Rig, n2_plant, options, registers, words, write};
 
 #[tokio::test]
 async fn device_identification() {
@@ -188,6 +188,42 @@ async fn forwarded_reads_are_the_clients_own() {
         [read(Table::Input, 500, 2), read(Table::Holding, 20_000, 125)],
         "what no range of the profile names is the drive's to refuse"
     );
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
+    let rig = Rig::of(n2_plant(), options()).await;
+    let mut client = rig.client().await;
+    let read = |table, start, count| Order::Read(RequestPdu::Read { table, start, count });
+    // BI 6 and 7 are polled, BI 8 to 10 never; the simulated bus says that every third bit is set.
+    assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [2, 1, 0b1_0011]);
+    let asked: Vec<Order> = (7..10).map(|at| read(Table::DiscreteInput, at, 1)).collect();
+    assert_eq!(rig.buses[0].orders(), asked);
+    // Half of AI 1, AI 2 from the cache, half of AI 11.
+    assert_eq!(client.ask(1, &words(4, &[2, 2])).await, registers(4, &[0x41C8, 0]));
+    assert_eq!(rig.buses[0].orders(), []);
+    assert_eq!(client.ask(1, &words(4, &[21, 1])).await, registers(4, &[21]));
+    assert_eq!(
+        client.ask(1, &words(4, &[201, 4])).await,
+        registers(4, &[201, 202, 203, 204])
+    );
+    let asked = [20, 200, 202, 204].map(|at| read(Table::Input, at, 2));
+    assert_eq!(rig.buses[0].orders(), asked);
+    assert_eq!(
+        client.ask(1, &words(4, &[508, 4])).await,
+        [0x84, 2],
+        "there is no AI 256"
+    );
+    assert_eq!(rig.buses[0].orders(), []);
+    // The first that fails ends it.
+    rig.buses[0].answers(|_| Some(Outcome::TimedOut));
+    assert_eq!(client.ask(1, &words(2, &[7, 8])).await, [0x82, 0x0B]);
+    assert_eq!(rig.buses[0].orders().len(), 1);
+    // Nothing is asked when part of it is stale.
+    rig.drive("fan-1").update(|s| s.link = Link::Offline(SystemTime::now()));
+    assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [0x82, 0x0B]);
+    assert_eq!(rig.buses[0].orders(), []);
     rig.end().await;
 }
 

@@ -198,11 +198,11 @@ fn spec(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: Access)
     }
 }
 
-fn bus(name: &str, drives: Vec<DriveSpec>) -> BusHandle {
+fn bus(name: &str, protocol: Protocol, drives: Vec<DriveSpec>) -> BusHandle {
     let spec = BusSpec {
         name: name.to_string(),
         port: format!("/dev/{name}"),
-        protocol: Protocol::ModbusRtu,
+        protocol,
         format: LineFormat::new(38_400, "8N1").unwrap(),
         cycle: Duration::from_millis(10),
         slow_cycle: Duration::from_secs(1),
@@ -248,7 +248,7 @@ pub(crate) fn plant() -> Plant {
 pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
     let bus = |name: &str, mut drives: Vec<DriveSpec>| {
         drives.iter_mut().for_each(&change);
-        bus(name, drives)
+        bus(name, Protocol::ModbusRtu, drives)
     };
     let profiles = Profiles::built_in();
     let nx = profiles.get("vacon-nx").unwrap();
@@ -272,13 +272,33 @@ pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
         s.store(Table::Coil, 7, &[1], now);
         s.store(Table::Input, 5, &[77], now);
     });
+    plant_of(vec![line1, line2])
+}
+
+fn plant_of(buses: Vec<BusHandle>) -> Plant {
     Plant {
         gateway: "pump-house".to_string(),
         stale_after: Duration::from_secs(3600),
-        buses: vec![line1, line2],
+        buses,
         events: Events::default(),
         writes: Arc::default(),
     }
+}
+
+/// Unit 1 is a Vacon NX with an N2 board of which BI 6 and BI 7 and AI 2 were read.
+pub(crate) fn n2_plant() -> Plant {
+    let profiles = Profiles::built_in();
+    let profile = profiles.get("vacon-nx-n2").unwrap();
+    let drives = vec![spec("fan-1", "n2", 1, profile, Access::Control)];
+    let n2 = bus("n2", Protocol::N2, drives);
+    n2.image.drives[0].update(|s| {
+        let now = Instant::now();
+        s.link = Link::Online(SystemTime::now());
+        s.fast_at = Some(now);
+        s.store(Table::DiscreteInput, 5, &[1, 1], now);
+        s.store(Table::Input, 2, &[0x41C8, 0], now);
+    });
+    plant_of(vec![n2])
 }
 
 impl Rig {

@@ -13,9 +13,10 @@ use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
+use super::errand::Finished;
 use super::frame::NotModbus;
 use super::lookout::{Lookout, Turns};
-use super::session::{Finished, Session};
+use super::session::Session;
 
 /// Time for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);

@@ -6,8 +6,9 @@ use std::time::Instant;
 use futures_util::FutureExt;
 use futures_util::stream::{FuturesUnordered, StreamExt};
 
+use super::errand::{Finished, Waiting};
 use super::frame::{self, MAX_FRAME, NotModbus};
-use super::session::{Finished, Session, Waiting};
+use super::session::Session;
 
 /// Room for input at first: a frame and its successor. A thousand idle clients should cost no memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;

@@ -9,6 +9,7 @@ mod certificate;
 mod connection;
 mod dialogue;
 mod door;
+mod errand;
 pub(crate) mod frame;
 mod identify;
 mod lookout;

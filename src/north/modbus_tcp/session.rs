@@ -1,12 +1,11 @@
 //! What the requests of one client mean, and what is answered.
 
-use std::future::Future;
-use std::pin::Pin;
 use std::sync::Arc;
 use std::time::Instant;
 
 use futures_util::FutureExt;
 
+use super::errand::{Errand, Finished, Waiting, Work, pieces};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
 use super::lookout::Turns;
@@ -14,8 +13,8 @@ use super::shared::{Authority, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
-use crate::codec::{Exception, Reply, RequestPdu, Table, describe};
-use crate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{Order, Outcome};
 use crate::drive::Profile;
 use crate::north::ModbusTcpStats;
 use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
@@ -25,18 +24,6 @@ use crate::plant::{BusHandle, DriveHandle};
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
 /// Function codes that every drive has here, by the blocks from 0x8000 on and the identification.
 const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
-
-/// A request that waits for the bus.
-pub(super) type Waiting = Pin<Box<dyn Future<Output = Finished> + Send>>;
-
-/// A request whose answer is known.
-#[derive(Debug)]
-pub(super) struct Finished {
-    header: Header,
-    request: RequestPdu,
-    drive: String,
-    outcome: Outcome,
-}
 
 /// What becomes of a request.
 enum Decision {
@@ -52,16 +39,6 @@ impl From<Exception> for Decision {
     fn from(exception: Exception) -> Decision {
         Decision::Exception(exception)
     }
-}
-
-/// A request on its way to a drive.
-struct Errand {
-    drive: DriveHandle,
-    request: RequestPdu,
-    /// The order, or why there is none.
-    order: Result<Order, Refusal>,
-    /// The order carries a fault reset that came by 0x8100.
-    resets: bool,
 }
 
 /// One client.
@@ -128,7 +105,7 @@ impl Session {
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
             Decision::Drive(errand) => {
-                let mut waiting = self.send(frame.header, *errand);
+                let mut waiting = errand.send(frame.header, &self.shared, &self.authority);
                 match (&mut waiting).now_or_never() {
                     Some(finished) => self.finish(&finished, out),
                     None => return Some(waiting),
@@ -189,7 +166,7 @@ impl Session {
         // Authority comes before everything that the request could be wrong in.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
-                Ok(request) => order(drive, Order::Write(request.clone()), request),
+                Ok(request) => errand(drive, request.clone(), Work::Order(Order::Write(request))),
                 Err(_) => Exception::FUNCTION.into(),
             };
         }
@@ -225,7 +202,7 @@ impl Session {
             RequestPdu::Read { table, start, count } if has_function => {
                 self.raw_read(drive, request, table, start, count, now)
             }
-            _ if has_function => order(drive, Order::Write(request.clone()), request),
+            _ if has_function => errand(drive, request.clone(), Work::Order(Order::Write(request))),
             _ => Exception::FUNCTION.into(),
         }
     }
@@ -276,7 +253,8 @@ impl Session {
         if !drive.bus_up() {
             return Exception::GATEWAY_PATH.into();
         }
-        match drive.reading(now).words(table, start, count) {
+        let reading = drive.reading(now);
+        match reading.words(table, start, count) {
             Ok(words) if table.is_bits() => {
                 Decision::Reply(request, Reply::Bits(words.iter().map(|w| *w != 0).collect()))
             }
@@ -286,8 +264,12 @@ impl Session {
             Err(Unavailable::NotPolled) if self.shared.options.uncached == Uncached::Refuse => {
                 Exception::ADDRESS.into()
             }
-            Err(Unavailable::NotPolled) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
-            Err(Unavailable::NotPolled) => order(drive, Order::Read(request.clone()), request),
+            Err(Unavailable::NotPolled) => match pieces(drive.bus.image.spec.protocol, &reading, table, start, count) {
+                Err(code) => code.into(),
+                Ok(Some(pieces)) => errand(drive, request, Work::Pieces(pieces)),
+                Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
+                Ok(None) => errand(drive, request.clone(), Work::Order(Order::Read(request))),
+            },
         }
     }
 
@@ -300,61 +282,29 @@ impl Session {
             *last = write.word.unwrap_or(*last);
             Ok((write, resets))
         });
-        let (order, resets) = match write {
+        let (work, resets) = match write {
             // A heartbeat alone is no command: it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.image.renew_lease(now);
                 return Decision::Reply(request, Reply::Written);
             }
-            Ok((CommandWrite { points, .. }, resets)) => (Ok(Order::Points(points)), resets),
-            Err(refusal) => (Err(refusal), false),
+            Ok((CommandWrite { points, .. }, resets)) => (Work::Order(Order::Points(points)), resets),
+            Err(refusal) => (Work::Refused(refusal), false),
         };
         Decision::Drive(Box::new(Errand {
             drive: drive.clone(),
             request,
-            order,
+            work,
             resets,
         }))
     }
-
-    /// Sends a request to its drive; the first poll queues it.
-    fn send(&self, header: Header, errand: Errand) -> Waiting {
-        let Errand {
-            drive,
-            request,
-            order,
-            resets,
-        } = errand;
-        let origin = Origin {
-            kind: SourceKind::ModbusTcp,
-            who: self.authority.who.clone(),
-        };
-        let may_write = self.authority.may_write;
-        let shared = self.shared.clone();
-        Box::pin(async move {
-            let answer = match order {
-                Ok(order) => drive.order(order, origin, may_write, DEFAULT_EXPIRY).await,
-                Err(refusal) => drive.refuse(&describe::request(&request), refusal, origin),
-            };
-            let name = drive.image.spec.name.clone();
-            if resets && !answer.outcome.is_ok() {
-                shared.with_command_word(&name, |word| *word = register_map::without_reset(*word));
-            }
-            Finished {
-                header,
-                request,
-                drive: name,
-                outcome: answer.outcome,
-            }
-        })
-    }
 }
 
-fn order(drive: &DriveHandle, order: Order, request: RequestPdu) -> Decision {
+fn errand(drive: &DriveHandle, request: RequestPdu, work: Work) -> Decision {
     Decision::Drive(Box::new(Errand {
         drive: drive.clone(),
         request,
-        order: Ok(order),
+        work,
         resets: false,
     }))
 }
