@@ -168,6 +168,60 @@ fn alone_and_through_the_gateway() {
     drop(gateway);
 }
 
+/// An exception tells the kind of reason only; a gateway with [http] is asked for the words in its audit.
+#[test]
+fn a_refusal_is_told_in_the_words_of_the_gateway() {
+    let line = Line::start();
+    let refused = |arguments: &[&str]| {
+        let ran = line.command("write", arguments);
+        assert_eq!(ran.code, 1, "{arguments:?}: {}", ran.err);
+        ran.err
+    };
+    let through = format!("through the gateway at 127.0.0.1:{}", line.modbus);
+    let start = || {
+        let gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+        gateway.until_printed("drivegate runs");
+        until("both drives", || {
+            let read = |drive| line.command("read", &[drive, "run"]).code == 0;
+            (read("pump-1") && read("pump-5")).then_some(())
+        });
+        gateway
+    };
+    let without = start();
+    let told = refused(&["pump-5", "run=true"]);
+    assert!(told.contains("exception 01 (not allowed: "), "{told}");
+    // A configuration that names an HTTP server which does not run yet changes nothing.
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    std::fs::write(
+        line.config(),
+        format!("{text}[http]\nlisten = \"127.0.0.1:{}\"\n", free_port()),
+    )
+    .unwrap();
+    assert!(refused(&["pump-5", "run=true"]).contains("exception 01 (not allowed: "));
+    drop(without);
+    let _with = start();
+    for (arguments, wanted) in [
+        (
+            &["pump-5", "run=true"][..],
+            "pump-5 run=true: drive `pump-5` is only monitored; set access = \"control\" for it (not_allowed); ",
+        ),
+        (
+            &["pump-1", "speed_reference=81"],
+            "pump-1 speed_reference=81 %: `speed_reference` = 81 % is outside the limits 0 to 80 %; nothing was written \
+             (bad_value); ",
+        ),
+    ] {
+        let told = refused(arguments);
+        assert_eq!(told.trim_end(), format!("error: {wanted}{through}"), "{arguments:?}");
+        let told = refused(&["pump-1", "speed_reference=20", "fieldbus_fault_response=4"]);
+        assert!(told.contains("(bad_value); through"), "{told}");
+        assert!(
+            told.contains("; other values of this command were written before"),
+            "{told}"
+        );
+    }
+}
+
 #[test]
 fn what_a_search_prints_passes_check() {
     let line = Line::start();
