@@ -313,6 +313,50 @@ fn every_family_is_found_by_reading() {
     }
 }
 
+/// The way of docs/commissioning.md to a CX board that counts from 1.
+#[test]
+fn a_board_that_counts_from_one_shows_by_reading() {
+    let directory = TempDir::new().unwrap();
+    let link = directory.path().join("line1");
+    let _drive = Running::drivegate(&[
+        "simulate",
+        "--profile",
+        "vacon-cx",
+        "--cx-address-offset",
+        "holding=1,discrete-input=1",
+        "--link",
+        link.to_str().unwrap(),
+    ]);
+    until("the line", || link.exists().then_some(()));
+    let profiles = directory.path().join("profiles");
+    std::fs::create_dir(&profiles).unwrap();
+    let shifted = "name = \"cx-from-one\"\nbase = \"vacon-cx\"\naddress_offset = { holding = 1, discrete-input = 1 }\n";
+    std::fs::write(profiles.join("cx-from-one.toml"), shifted).unwrap();
+    let config = directory.path().join("drivegate.toml");
+    let read = |profile: &str| {
+        let text = format!(
+            "[gateway]\nname = \"plant\"\nprofile_dirs = [\"profiles\"]\n[[bus]]\nname = \"line1\"\nport = \"line1\"\n\
+             baud = 19200\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
+        );
+        std::fs::write(&config, text).unwrap();
+        let config = config.to_str().unwrap();
+        let points = ["ready", "minimum_frequency", "maximum_frequency", "frequency_reference"];
+        drivegate(&[&["read", "--config", config, "--json", "fan-1"][..], &points].concat())
+    };
+    let values = |ran: &Ran| -> Vec<serde_json::Value> {
+        let rows: Vec<serde_json::Value> = serde_json::from_str(&ran.out).unwrap();
+        rows.into_iter().map(|row| row["value"].clone()).collect()
+    };
+    let from_one = read("cx-from-one");
+    assert_eq!(from_one.code, 0, "{}{}", from_one.out, from_one.err);
+    let truth = values(&from_one);
+    assert_eq!(truth[0], true);
+    assert_eq!(truth[2], 50.0);
+    let from_zero = read("vacon-cx");
+    assert_eq!(from_zero.code, 1, "{}{}", from_zero.out, from_zero.err);
+    assert_ne!(values(&from_zero)[1..], truth[1..]);
+}
+
 #[test]
 fn watch_shows_a_running_gateway_and_says_when_there_is_none() {
     let line = Line::start();
