@@ -5,10 +5,14 @@
 //! file. A key is known when somebody asked for it: [`Reader::finish`] reports the others, with
 //! the nearest known one.
 
+mod file;
+
+pub use file::read_file;
+
 use std::cell::{Cell, RefCell};
 use std::collections::BTreeSet;
 use std::fmt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Duration;
 
 use serde::Serialize;
@@ -853,19 +857,6 @@ pub fn parse_size(text: &str) -> Result<u64, String> {
         .checked_shl(shift)
         .filter(|v| v >> shift == number)
         .ok_or_else(bad)
-}
-
-/// Reads a file for a document; the problem says why it cannot.
-///
-/// # Errors
-/// One problem that names the file.
-pub fn read_file(path: &Path) -> Result<String, Problem> {
-    std::fs::read_to_string(path).map_err(|error| Problem {
-        file: path.display().to_string(),
-        line: None,
-        key: String::new(),
-        message: format!("cannot read the file: {error}; check the path and its permissions"),
-    })
 }
 
 #[cfg(test)]

@@ -2,10 +2,12 @@
 
 mod common;
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use common::{Rig, drive};
+use drivegate::bus::transaction::{Ended, Step, Transaction};
 use drivegate::cache::{Access, LeaseAction, Supervision};
+use drivegate::codec::{Protocol, Reply, Request, RequestPdu, Table, rtu};
 use drivegate::command::Outcome;
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
@@ -20,6 +22,39 @@ fn hex(frames: &[Recorded], direction: Direction) -> Vec<String> {
         .filter(|f| f.direction == direction)
         .map(|f| text(&f.bytes))
         .collect()
+}
+
+/// A byte count with which no frame exists does not hold the line until the deadline: the exchange ends, to be tried
+/// again, once no more of it comes; and the reply is still found behind it.
+#[test]
+fn a_reply_of_impossible_length_ends_the_exchange_before_its_deadline() {
+    let pdu = RequestPdu::Read {
+        table: Table::Holding,
+        start: 2100,
+        count: 1,
+    };
+    let request = Request::new(1, pdu);
+    let mut frame = Vec::new();
+    rtu::encode_request(&request, &mut frame);
+    let (now, ms) = (Instant::now(), Duration::from_millis);
+    let begin = || Transaction::new(Protocol::ModbusRtu, &request, &frame, now, ms(100), ms(7), false);
+    let mut transaction = begin();
+    let Step::Wait(until) = transaction.on_bytes(now, &[1, 3, 0xFF]) else {
+        panic!("the rest may still be on the line")
+    };
+    assert!(
+        until <= now + ms(8),
+        "the time of a reply and a pause: {:?}",
+        until - now
+    );
+    let why = "the reply announces more than 256 characters";
+    assert_eq!(transaction.on_time(until), Step::Done(Ended::Corrupt(why)));
+    let mut transaction = begin();
+    transaction.on_bytes(now, &[1, 3, 0xFF]);
+    let mut reply = Vec::new();
+    rtu::encode_frame(1, &[3, 2, 0, 9], &mut reply);
+    let ended = Ended::Reply(Reply::Registers(vec![9]));
+    assert_eq!(transaction.on_bytes(now + ms(3), &reply), Step::Done(ended));
 }
 
 #[tokio::test]

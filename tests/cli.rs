@@ -122,6 +122,27 @@ fn errors_and_warnings_go_to_stderr_in_the_form_of_the_contract() {
     assert_eq!(run(&["check", "--config", &path]).err, "");
 }
 
+#[test]
+fn a_file_that_is_no_text_is_told_as_such() {
+    let folder = tempfile::tempdir().unwrap();
+    let file = folder.path().join("plant.toml");
+    let path = file.to_str().unwrap();
+    let wanted = |byte: &str, line: usize, column: usize| {
+        format!(
+            "error: the file is no text: byte 0x{byte} at line {line}, column {column}; {path}:{line}; \
+             save it as UTF-8 text, or name the file that was meant\n"
+        )
+    };
+    fs::write(&file, b"[gateway]\nname = \"a\" # 20 \xB0C\n").unwrap();
+    for command in ["check", "run"] {
+        let latin = run(&[command, "--config", path]);
+        assert_eq!((latin.code, latin.err), (Some(78), wanted("B0", 2, 17)), "{command}");
+    }
+    fs::copy(BINARY, &file).unwrap();
+    let program = run(&["check", "--config", path]);
+    assert_eq!((program.code, program.err), (Some(78), wanted("00", 1, 8)));
+}
+
 fn keys(value: &Value) -> Vec<&str> {
     value.as_object().unwrap().keys().map(String::as_str).collect()
 }

@@ -4,6 +4,7 @@
 //! with the gateway's own bus.
 
 pub(super) mod alone;
+pub(super) mod reason;
 pub(super) mod remote;
 
 use std::path::Path;

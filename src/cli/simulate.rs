@@ -6,6 +6,7 @@ use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
 use crate::document::{nearest, parse_duration};
 use crate::drive::profile::{Profile, Profiles};
+use crate::sim::cx::AddressOffset;
 use crate::sim::drive::{DriveOptions, ModelOptions};
 use crate::sim::endpoint::EndpointOptions;
 use crate::sim::faults::{FaultPlan, NAMES, Rates};
@@ -77,6 +78,9 @@ pub(super) struct Args {
     /// Put a byte, the object's status, before the values that are read over N2, as some devices do
     #[arg(long)]
     pub n2_leading_byte: bool,
+    /// Add 1 to the addresses of tables of each Vacon CX, as boards may that count from 1: holding=1,discrete-input=1
+    #[arg(long, value_name = "LIST")]
+    pub cx_address_offset: Option<AddressOffset>,
     /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
@@ -240,6 +244,13 @@ impl Args {
                 self.profile
             )
         })?;
+        if self.cx_address_offset.is_some() && !matches!(model, ModelOptions::Cx(_)) {
+            return Err(format!(
+                "drives of the profile `{}` have no address offset; in --cx-address-offset; leave it away, or choose \
+                 vacon-cx in --profile",
+                self.profile
+            ));
+        }
         let protocol = self.protocol_of(profile, &profiles)?;
         if let Some(address) = self
             .addresses
@@ -316,6 +327,9 @@ impl Args {
             line.rules.wire = Wire::Instant;
         }
         for drive in &mut line.drives {
+            if let (ModelOptions::Cx(cx), Some(offset)) = (&mut drive.model, self.cx_address_offset) {
+                cx.offset = offset;
+            }
             drive.model.set_trip_register(true);
             if self.autopilot {
                 drive.autopilot = Some(self.seed.wrapping_mul(1000).wrapping_add(u64::from(drive.address)));
@@ -438,6 +452,44 @@ mod tests {
         assert!(n2.applied_to(n2.line().unwrap()).boards.leading_byte);
         assert_eq!(line.rules.wire, Wire::Instant);
         assert!(line.drives.iter().all(|drive| drive.autopilot.is_some()));
+    }
+
+    #[test]
+    fn boards_that_count_from_one() {
+        let offset = |words: &str| {
+            let args = parse(words).unwrap();
+            let line = args.applied_to(args.line().unwrap());
+            line.drives
+                .iter()
+                .map(|drive| match &drive.model {
+                    ModelOptions::Cx(cx) => cx.offset,
+                    other => panic!("{other:?}"),
+                })
+                .collect::<Vec<_>>()
+        };
+        let none = AddressOffset::default();
+        assert_eq!(offset("--profile vacon-cx"), [none]);
+        let wanted = AddressOffset {
+            discrete_input: 1,
+            holding: 1,
+            ..none
+        };
+        let words = "--profile vacon-cx --addresses 1-2 --cx-address-offset holding=1,discrete-input=1,coil=0";
+        assert_eq!(offset(words), [wanted; 2]);
+        let all = AddressOffset {
+            coil: 1,
+            discrete_input: 1,
+            input: 1,
+            holding: 1,
+        };
+        assert_eq!("coil=1, input=1,holding=1,discrete-input=1".parse(), Ok(all));
+        for bad in ["", "holding", "holding=2", "holding=-1", "hold=1", "holding=1,"] {
+            assert!(bad.parse::<AddressOffset>().is_err(), "{bad}");
+        }
+        let error = parse("--profile vacon-cx --cx-address-offset coils=1").unwrap_err();
+        assert!(error.contains("names no table; write coil, "), "{error}");
+        let error = parse("--cx-address-offset coil=1").unwrap().line().unwrap_err();
+        assert!(error.contains("`vacon-nx` have no address offset"), "{error}");
     }
 
     #[test]

@@ -3,10 +3,11 @@
 use std::process::ExitCode;
 
 use super::oneshot::alone::Alone;
-use super::oneshot::remote::Remote;
-use super::oneshot::{Target, shown, target};
+use super::oneshot::remote::{Failure, Remote, refusal};
+use super::oneshot::{Target, reason, shown, target};
 use super::read::{listens, quiet, runtime};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
+use crate::codec::Exception;
 use crate::drive::model::Kind;
 use crate::drive::{Point, Value};
 
@@ -86,11 +87,14 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
 fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, String> {
     let what = described(target, &values);
     if let Some(mut remote) = Remote::find(&listens(target), &target.spec)? {
-        remote.write(&target.spec, &values)?;
-        return Ok(format!(
-            "{what}: acknowledged, through the gateway at {}\n",
-            remote.address()
-        ));
+        return match remote.write(&target.spec, &values) {
+            Ok(()) => Ok(format!(
+                "{what}: acknowledged, through the gateway at {}\n",
+                remote.address()
+            )),
+            Err(Failure::Told(why)) => Err(why),
+            Err(Failure::Refused { code, partly }) => Err(refused(target, &remote, &what, code, partly)),
+        };
     }
     quiet();
     runtime()?.block_on(async {
@@ -107,6 +111,18 @@ fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, Strin
         let latency = answer.latency.as_secs_f64() * 1000.0;
         Ok(format!("{what}: acknowledged within {latency:.0} ms, {seen}\n"))
     })
+}
+
+/// What to tell of a command that the gateway has refused: its own words where they can be had, else what the exception
+/// mostly means.
+fn refused(target: &Target, remote: &Remote, what: &str, code: Exception, partly: bool) -> String {
+    let why = reason::exact(target, remote).unwrap_or_else(|| format!("the gateway refused it with {}", refusal(code)));
+    let rest = if partly {
+        "; other values of this command were written before"
+    } else {
+        ""
+    };
+    format!("{what}: {why}; through the gateway at {}{rest}", remote.address())
 }
 
 fn described(target: &Target, values: &[(usize, Value)]) -> String {

@@ -6,6 +6,8 @@ use super::{Decoded, Request};
 
 /// Characters that a frame adds to its PDU: address and two of CRC.
 pub const OVERHEAD: usize = 3;
+/// Characters of the longest frame (MODBUS over Serial Line 1.02, 2.5.1).
+pub const LONGEST: usize = MAX_PDU + OVERHEAD;
 
 /// Appends `address`, `pdu` and CRC to `out` as one frame.
 pub fn encode_frame(address: u8, pdu: &[u8], out: &mut Vec<u8>) {
@@ -38,24 +40,19 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
 /// The end of a reply is known from its own first bytes, so no silence has to be waited for: the
 /// regular reply has a fixed length, an exception five characters, 43/14 counts its objects.
 /// Bytes that begin another drive's or another function's frame are measured the same way and
-/// dropped when their CRC is right.
+/// dropped when their CRC is right. A length that no frame has is refused as soon as it is announced.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     let Some(len) = frame_len(request, bytes) else {
-        return if bytes.len() >= MAX_PDU + OVERHEAD {
-            Decoded::Corrupt("no frame in 256 characters")
-        } else {
-            Decoded::Incomplete
-        };
+        return Decoded::Incomplete;
     };
+    if len > LONGEST {
+        return foreign_or(bytes, "the reply announces more than 256 characters");
+    }
     let Some(frame) = bytes.get(..len) else {
         return Decoded::Incomplete;
     };
     let Some((address, pdu)) = open_frame(frame) else {
-        // A frame of a length that its function does not have is nobody's answer, yet sound.
-        return match open_frame(bytes) {
-            Some(_) => Decoded::Foreign { used: bytes.len() },
-            None => Decoded::Corrupt("check code is wrong"),
-        };
+        return foreign_or(bytes, "check code is wrong");
     };
     if address != request.address {
         return Decoded::Foreign { used: len };
@@ -66,7 +63,15 @@ pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
     }
 }
 
-/// Length of the frame that starts `bytes`, once its first bytes tell it.
+/// A frame of a length that its function does not have is nobody's answer, yet sound.
+fn foreign_or(bytes: &[u8], why: &'static str) -> Decoded {
+    match open_frame(bytes) {
+        Some(_) => Decoded::Foreign { used: bytes.len() },
+        None => Decoded::Corrupt(why),
+    }
+}
+
+/// Length of the frame that starts `bytes`, once its first bytes tell it; more than [`LONGEST`] when it cannot be one.
 fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
     let function = *bytes.get(1)?;
     let own = function == request.pdu.function();
@@ -85,9 +90,14 @@ fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
 
 /// 43/14 replies list objects of id, length and text behind a header of seven bytes.
 fn device_identification_len(bytes: &[u8]) -> Option<usize> {
-    let objects = *bytes.get(7)?;
+    let objects = usize::from(*bytes.get(7)?);
     let mut at = 8;
-    for _ in 0..objects {
+    for missing in (1..=objects).rev() {
+        // Each that is missing takes two bytes at least.
+        let least = at + 2 * missing + 2;
+        if least > LONGEST {
+            return Some(least);
+        }
         at += 2 + usize::from(*bytes.get(at + 1)?);
     }
     Some(at + 2)
@@ -354,6 +364,42 @@ mod tests {
         assert_eq!(decode_reply(&set(2000, 2), &echo), Decoded::Foreign { used: 8 });
     }
 
+    #[test]
+    fn a_length_that_no_frame_has_is_refused_at_once() {
+        let too_long = Decoded::Corrupt("the reply announces more than 256 characters");
+        let request = read(Table::Holding, 2100, 1);
+        for function in [1, 2, 3, 4, 23] {
+            assert_eq!(decode_reply(&request, &[1, function]), Decoded::Incomplete);
+            // 251 bytes of data make a frame of 256 characters; nobody sends it, as registers have two bytes.
+            assert_eq!(decode_reply(&request, &[1, function, 251]), Decoded::Incomplete);
+            for count in [252, 255] {
+                assert_eq!(decode_reply(&request, &[1, function, count]), too_long, "{function}");
+                let mut bytes = vec![1, function, count, 7];
+                assert_eq!(decode_reply(&request, &bytes), too_long);
+                bytes.resize(LONGEST + 4, 0);
+                assert_eq!(decode_reply(&request, &bytes), too_long);
+                // A short frame whose third byte counts something else is somebody's.
+                let mut other = Vec::new();
+                encode_frame(2, &[function, count, 7], &mut other);
+                assert_eq!(decode_reply(&request, &other), Decoded::Foreign { used: 6 });
+            }
+        }
+        let identify = Request::new(1, RequestPdu::DeviceIdentification { code: 1, object: 0 });
+        let header = |objects| [1, 43, 14, 1, 1, 0, 0, objects];
+        assert_eq!(decode_reply(&identify, &header(123)), Decoded::Incomplete);
+        assert_eq!(decode_reply(&identify, &header(124)), too_long);
+        // One object may have 244 characters, which makes 256 with header, id, length and CRC.
+        for (length, decoded) in [(244, Decoded::Incomplete), (245, too_long.clone())] {
+            let bytes = [&header(1)[..], &[0, length]].concat();
+            assert_eq!(decode_reply(&identify, &bytes), decoded, "{length}");
+        }
+        let text = [b'x'; 200];
+        let bytes = [&header(2)[..], &[0, 200], &text, &[1, 43]].concat();
+        assert_eq!(decode_reply(&identify, &bytes), too_long);
+        let bytes = [&header(2)[..], &[0, 200], &text, &[1, 42]].concat();
+        assert_eq!(decode_reply(&identify, &bytes), Decoded::Incomplete);
+    }
+
     proptest! {
         #[test]
         fn no_bytes_panic_and_only_sound_frames_are_believed(
@@ -362,8 +408,10 @@ mod tests {
             count in 1u16..=125,
         ) {
             let request = read(Table::Holding, start, count);
-            if let Decoded::Reply { used, .. } = decode_reply(&request, &bytes) {
-                prop_assert!(open_frame(&bytes[..used]).is_some());
+            match decode_reply(&request, &bytes) {
+                Decoded::Reply { used, .. } => prop_assert!(open_frame(&bytes[..used]).is_some()),
+                Decoded::Incomplete => prop_assert!(bytes.len() < LONGEST),
+                _ => {}
             }
             let _ = request_len(&bytes);
             let _ = decode_request(&bytes);

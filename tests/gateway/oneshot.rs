@@ -168,6 +168,60 @@ fn alone_and_through_the_gateway() {
     drop(gateway);
 }
 
+/// An exception tells the kind of reason only; a gateway with [http] is asked for the words in its audit.
+#[test]
+fn a_refusal_is_told_in_the_words_of_the_gateway() {
+    let line = Line::start();
+    let refused = |arguments: &[&str]| {
+        let ran = line.command("write", arguments);
+        assert_eq!(ran.code, 1, "{arguments:?}: {}", ran.err);
+        ran.err
+    };
+    let through = format!("through the gateway at 127.0.0.1:{}", line.modbus);
+    let start = || {
+        let gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+        gateway.until_printed("drivegate runs");
+        until("both drives", || {
+            let read = |drive| line.command("read", &[drive, "run"]).code == 0;
+            (read("pump-1") && read("pump-5")).then_some(())
+        });
+        gateway
+    };
+    let without = start();
+    let told = refused(&["pump-5", "run=true"]);
+    assert!(told.contains("exception 01 (not allowed: "), "{told}");
+    // A configuration that names an HTTP server which does not run yet changes nothing.
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    std::fs::write(
+        line.config(),
+        format!("{text}[http]\nlisten = \"127.0.0.1:{}\"\n", free_port()),
+    )
+    .unwrap();
+    assert!(refused(&["pump-5", "run=true"]).contains("exception 01 (not allowed: "));
+    drop(without);
+    let _with = start();
+    for (arguments, wanted) in [
+        (
+            &["pump-5", "run=true"][..],
+            "pump-5 run=true: drive `pump-5` is only monitored; set access = \"control\" for it (not_allowed); ",
+        ),
+        (
+            &["pump-1", "speed_reference=81"],
+            "pump-1 speed_reference=81 %: `speed_reference` = 81 % is outside the limits 0 to 80 %; nothing was written \
+             (bad_value); ",
+        ),
+    ] {
+        let told = refused(arguments);
+        assert_eq!(told.trim_end(), format!("error: {wanted}{through}"), "{arguments:?}");
+        let told = refused(&["pump-1", "speed_reference=20", "fieldbus_fault_response=4"]);
+        assert!(told.contains("(bad_value); through"), "{told}");
+        assert!(
+            told.contains("; other values of this command were written before"),
+            "{told}"
+        );
+    }
+}
+
 #[test]
 fn what_a_search_prints_passes_check() {
     let line = Line::start();
@@ -257,6 +311,50 @@ fn every_family_is_found_by_reading() {
         let read = drivegate(&["read", "--config", config, "drive-1", "ready", "output_frequency"]);
         assert_eq!(read.code, 0, "{profile}: {}{}", read.out, read.err);
     }
+}
+
+/// The way of docs/commissioning.md to a CX board that counts from 1.
+#[test]
+fn a_board_that_counts_from_one_shows_by_reading() {
+    let directory = TempDir::new().unwrap();
+    let link = directory.path().join("line1");
+    let _drive = Running::drivegate(&[
+        "simulate",
+        "--profile",
+        "vacon-cx",
+        "--cx-address-offset",
+        "holding=1,discrete-input=1",
+        "--link",
+        link.to_str().unwrap(),
+    ]);
+    until("the line", || link.exists().then_some(()));
+    let profiles = directory.path().join("profiles");
+    std::fs::create_dir(&profiles).unwrap();
+    let shifted = "name = \"cx-from-one\"\nbase = \"vacon-cx\"\naddress_offset = { holding = 1, discrete-input = 1 }\n";
+    std::fs::write(profiles.join("cx-from-one.toml"), shifted).unwrap();
+    let config = directory.path().join("drivegate.toml");
+    let read = |profile: &str| {
+        let text = format!(
+            "[gateway]\nname = \"plant\"\nprofile_dirs = [\"profiles\"]\n[[bus]]\nname = \"line1\"\nport = \"line1\"\n\
+             baud = 19200\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
+        );
+        std::fs::write(&config, text).unwrap();
+        let config = config.to_str().unwrap();
+        let points = ["ready", "minimum_frequency", "maximum_frequency", "frequency_reference"];
+        drivegate(&[&["read", "--config", config, "--json", "fan-1"][..], &points].concat())
+    };
+    let values = |ran: &Ran| -> Vec<serde_json::Value> {
+        let rows: Vec<serde_json::Value> = serde_json::from_str(&ran.out).unwrap();
+        rows.into_iter().map(|row| row["value"].clone()).collect()
+    };
+    let from_one = read("cx-from-one");
+    assert_eq!(from_one.code, 0, "{}{}", from_one.out, from_one.err);
+    let truth = values(&from_one);
+    assert_eq!(truth[0], true);
+    assert_eq!(truth[2], 50.0);
+    let from_zero = read("vacon-cx");
+    assert_eq!(from_zero.code, 1, "{}{}", from_zero.out, from_zero.err);
+    assert_ne!(values(&from_zero)[1..], truth[1..]);
 }
 
 #[test]

@@ -48,6 +48,26 @@ async fn no_more_than_max_connections() {
     rig.end().await;
 }
 
+/// A client that vanished without a word is found out: the kernel asks for it once it is silent for a minute.
+#[tokio::test]
+async fn connections_are_kept_alive() {
+    let rig = Rig::new().await;
+    let mut client = rig.client().await;
+    client.ask(1, &words(3, &[2102, 1])).await;
+    let ends = [rig.address(), client.stream.local_addr().unwrap()].map(|end| format!(":{:04X}", end.port()));
+    // The timer of the server's side as proc(5) has it: which (02 is keepalive), and its rest in 1/100 s.
+    let timer = || {
+        let table = std::fs::read_to_string("/proc/net/tcp").unwrap();
+        let mut rows = table.lines().map(|line| line.split_whitespace().collect::<Vec<_>>());
+        let row = rows.find(|row| row[1].ends_with(&ends[0]) && row[2].ends_with(&ends[1]));
+        // Other connections that come and go can hide a row, and for a moment the timer can be that of an acknowledgement.
+        let rest = row.and_then(|row| u64::from_str_radix(row[5].strip_prefix("02:")?, 16).ok());
+        rest.filter(|rest| (1..=6000).contains(rest))
+    };
+    until("the connection is kept alive", || timer().is_some()).await;
+    rig.end().await;
+}
+
 #[tokio::test]
 async fn several_listeners_share_one_server() {
     let mut options = options();

@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, LazyLock};
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use drivegate::command::SourceKind;
 use drivegate::north::Turned;
@@ -146,12 +146,23 @@ impl TlsClient {
 }
 
 fn refused(rig: &Rig) -> u64 {
+    refused_for(rig, Turned::Tls)
+}
+
+fn refused_for(rig: &Rig, reason: Turned) -> u64 {
     rig.stats
         .modbus_tcp
         .refused()
-        .find(|(why, _)| *why == Turned::Tls)
+        .find(|(why, _)| *why == reason)
         .unwrap()
         .1
+}
+
+/// The server's clock jumps ahead; then it goes on as before.
+async fn later(seconds: f32) {
+    tokio::time::pause();
+    tokio::time::advance(Duration::from_secs_f32(seconds)).await;
+    tokio::time::resume();
 }
 
 #[tokio::test]
@@ -246,6 +257,40 @@ async fn who_is_not_known_is_refused() {
         "only who is known counts as connected"
     );
     drop(silent);
+    rig.end().await;
+}
+
+/// Ten seconds for the whole handshake, however lively it is kept; then the place is another's.
+#[tokio::test]
+async fn who_never_ends_the_handshake_is_closed() {
+    let rig = Rig::with(Options {
+        max_connections: 1,
+        ..tls_options()
+    })
+    .await;
+    let address = rig.server.tls_addresses()[0];
+    // A handshake record of 512 bytes, of which no more than these ever come.
+    for (round, begun) in [&[][..], &[0x16, 3, 1, 2, 0, 1, 0, 1, 0xFC]].into_iter().enumerate() {
+        let (round, full) = (round as u64, refused_for(&rig, Turned::Full));
+        let mut slow = Client::connect(address).await;
+        assert!(Client::connect(address).await.is_closed().await, "the place is taken");
+        for bytes in begun.chunks(3) {
+            slow.send(bytes).await;
+            later(1.5).await;
+        }
+        later(5.0 - 1.5 * begun.len().div_ceil(3) as f32).await;
+        assert!(Client::connect(address).await.is_closed().await, "it still is");
+        assert_eq!(refused_for(&rig, Turned::Full), full + 2);
+        assert_eq!(refused(&rig), round);
+        later(5.1).await;
+        assert!(slow.is_closed().await);
+        until("it is counted", || refused(&rig) == round + 1).await;
+    }
+    let mut next = TlsClient::connect(address, WORKS.client(Some("own/hmi"), &TLS13))
+        .await
+        .unwrap();
+    let answer = next.ask(1, &words(3, &[2102, 1])).await.unwrap();
+    assert_eq!(answer, registers(3, &[5000]));
     rig.end().await;
 }
 

@@ -2,7 +2,7 @@
 
 use std::io::{Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::Row;
 use crate::cache::DriveSpec;
@@ -28,8 +28,29 @@ const FAULT_RESET: u16 = 1 << 2;
 pub(in crate::cli) struct Remote {
     stream: TcpStream,
     address: SocketAddr,
+    since: SystemTime,
     unit: u8,
     transaction: u16,
+}
+
+/// Why a write was not done.
+#[derive(Debug)]
+pub(in crate::cli) enum Failure {
+    /// What to tell.
+    Told(String),
+    /// The gateway answered with an exception, which tells the kind of reason only.
+    Refused {
+        /// The exception.
+        code: Exception,
+        /// Some of the values were written before.
+        partly: bool,
+    },
+}
+
+impl From<String> for Failure {
+    fn from(told: String) -> Failure {
+        Failure::Told(told)
+    }
 }
 
 impl Remote {
@@ -52,6 +73,7 @@ impl Remote {
             let mut remote = Remote {
                 stream,
                 address,
+                since: SystemTime::now(),
                 unit: spec.unit,
                 transaction: 0,
             };
@@ -183,7 +205,7 @@ impl Remote {
 
     /// Writes the points: commands of the common model as one command where the command block can hold them, other
     /// points behind them one by one. Ends at the first that is refused.
-    pub(in crate::cli) fn write(&mut self, spec: &DriveSpec, values: &[(usize, Value)]) -> Result<(), String> {
+    pub(in crate::cli) fn write(&mut self, spec: &DriveSpec, values: &[(usize, Value)]) -> Result<(), Failure> {
         let mut others = Vec::new();
         let mut block = Block::default();
         for &(index, value) in values {
@@ -199,8 +221,9 @@ impl Remote {
                 _ => others.push((point, value)),
             }
         }
+        let mut written = false;
         for pdu in self.block_writes(spec, &block)? {
-            self.set(&pdu)?;
+            self.set(&pdu, &mut written)?;
         }
         for (point, value) in others {
             let raw = point.raw().filter(|_| point.write).ok_or_else(|| {
@@ -211,18 +234,15 @@ impl Remote {
             })?;
             let pdu = write_of(raw, value)
                 .map_err(|why| format!("`{}`: {why}; command line; nothing was written", point.name))?;
-            self.set(&pdu)?;
+            self.set(&pdu, &mut written)?;
         }
         Ok(())
     }
 
-    fn set(&mut self, pdu: &RequestPdu) -> Result<(), String> {
+    fn set(&mut self, pdu: &RequestPdu, written: &mut bool) -> Result<(), Failure> {
+        let partly = std::mem::replace(written, true);
         match self.ask(pdu)? {
-            Reply::Exception(code) => Err(format!(
-                "the gateway refused it with {}; {}",
-                refusal(code),
-                self.address
-            )),
+            Reply::Exception(code) => Err(Failure::Refused { code, partly }),
             _ => Ok(()),
         }
     }
@@ -312,6 +332,16 @@ impl Remote {
     pub(in crate::cli) fn address(&self) -> SocketAddr {
         self.address
     }
+
+    /// As whom the gateway knows this connection, unless something translates addresses between them.
+    pub(super) fn client(&self) -> Option<SocketAddr> {
+        self.stream.local_addr().ok()
+    }
+
+    /// When it was opened.
+    pub(super) fn since(&self) -> SystemTime {
+        self.since
+    }
 }
 
 /// What goes into the command block.
@@ -378,7 +408,7 @@ fn write_of(raw: &Raw, value: Value) -> Result<RequestPdu, String> {
 }
 
 /// A server that listens everywhere is reached on loopback.
-fn reachable(address: SocketAddr) -> SocketAddr {
+pub(super) fn reachable(address: SocketAddr) -> SocketAddr {
     let ip = match address.ip() {
         IpAddr::V4(ip) if ip.is_unspecified() => IpAddr::V4(Ipv4Addr::LOCALHOST),
         IpAddr::V6(ip) if ip.is_unspecified() => IpAddr::V6(Ipv6Addr::LOCALHOST),
@@ -388,7 +418,7 @@ fn reachable(address: SocketAddr) -> SocketAddr {
 }
 
 /// An exception with what it mostly means behind a gateway (`docs/modbus-tcp.md`).
-fn refusal(code: Exception) -> String {
+pub(in crate::cli) fn refusal(code: Exception) -> String {
     let meaning = match code {
         Exception::FUNCTION => "not allowed: the drive is only monitored, or this host is not in `write`",
         Exception::ADDRESS => "the address is read-only or the drive does not have it",

@@ -186,6 +186,22 @@ fn prepare(stream: &TcpStream) {
 mod tests {
     use super::*;
 
+    #[tokio::test]
+    async fn a_vanished_client_is_found_out() {
+        use rustix::net::sockopt;
+        let listener = TcpListener::bind("127.0.0.1:0").await.unwrap();
+        let client = TcpStream::connect(listener.local_addr().unwrap()).await.unwrap();
+        let (accepted, _) = listener.accept().await.unwrap();
+        assert!(!sockopt::socket_keepalive(&accepted).unwrap(), "nobody sets it unasked");
+        prepare(&accepted);
+        assert!(accepted.nodelay().unwrap());
+        assert!(sockopt::socket_keepalive(&accepted).unwrap());
+        assert_eq!(sockopt::tcp_keepidle(&accepted).unwrap(), Duration::from_secs(60));
+        assert_eq!(sockopt::tcp_keepintvl(&accepted).unwrap(), Duration::from_secs(10));
+        assert_eq!(sockopt::tcp_keepcnt(&accepted).unwrap(), 3);
+        drop(client);
+    }
+
     #[test]
     fn networks() {
         let networks = ["127.0.0.0/8".parse().unwrap(), "fd00::/8".parse().unwrap()];

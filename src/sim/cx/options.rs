@@ -2,6 +2,8 @@
 
 use super::super::model::Beyond;
 use super::super::motor::Load;
+use crate::codec::Table;
+use std::str::FromStr;
 
 /// Items per message; the manual states no limits and shows one item everywhere (drives.md 9.7).
 #[derive(Debug, Clone, Copy)]
@@ -36,6 +38,44 @@ pub struct AddressOffset {
     pub input: u16,
     /// Holding registers.
     pub holding: u16,
+}
+
+impl AddressOffset {
+    /// The offset of that table.
+    pub fn of(&self, table: Table) -> u16 {
+        match table {
+            Table::Coil => self.coil,
+            Table::DiscreteInput => self.discrete_input,
+            Table::Input => self.input,
+            Table::Holding => self.holding,
+        }
+    }
+}
+
+/// `holding=1,discrete-input=1`; tables that are not named have none.
+impl FromStr for AddressOffset {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<AddressOffset, String> {
+        let mut offset = AddressOffset::default();
+        for part in text.split(',') {
+            let (table, value) = part.split_once('=').unwrap_or((part, ""));
+            let table = Table::from_name(table.trim())
+                .ok_or_else(|| format!("`{part}` names no table; write coil, discrete-input, input or holding"))?;
+            let value = match value.trim() {
+                "0" => 0,
+                "1" => 1,
+                _ => return Err(format!("`{part}` is no offset; write 0 or 1, such as {table}=1")),
+            };
+            match table {
+                Table::Coil => offset.coil = value,
+                Table::DiscreteInput => offset.discrete_input = value,
+                Table::Input => offset.input = value,
+                Table::Holding => offset.holding = value,
+            }
+        }
+        Ok(offset)
+    }
 }
 
 /// What a frequency reference outside Par 1.1 to Par 1.2 does.

@@ -68,13 +68,7 @@ impl CxDrive {
 
     /// The item of the manual's tables behind an address, see [`AddressOffset`](super::AddressOffset).
     fn item(&self, table: Table, address: u16) -> Result<u16, Exception> {
-        let offset = &self.options.offset;
-        let offset = match table {
-            Table::Coil => offset.coil,
-            Table::DiscreteInput => offset.discrete_input,
-            Table::Input => offset.input,
-            Table::Holding => offset.holding,
-        };
+        let offset = self.options.offset.of(table);
         address.checked_sub(offset).ok_or(Exception::ADDRESS)
     }
 
