@@ -81,6 +81,9 @@ pub(super) struct Args {
     /// Add 1 to the addresses of tables of each Vacon CX, as boards may that count from 1: holding=1,discrete-input=1
     #[arg(long, value_name = "LIST")]
     pub cx_address_offset: Option<AddressOffset>,
+    /// Let each TECO 7300PA answer a request with a wrong check code by error 00H, as its error table says, not by silence
+    #[arg(long)]
+    pub teco_answer_check_error: bool,
     /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
@@ -327,8 +330,10 @@ impl Args {
             line.rules.wire = Wire::Instant;
         }
         for drive in &mut line.drives {
-            if let (ModelOptions::Cx(cx), Some(offset)) = (&mut drive.model, self.cx_address_offset) {
-                cx.offset = offset;
+            match (&mut drive.model, self.cx_address_offset) {
+                (ModelOptions::Cx(cx), Some(offset)) => cx.offset = offset,
+                (ModelOptions::Teco(teco), _) => teco.answer_check_error = self.teco_answer_check_error,
+                _ => {}
             }
             drive.model.set_trip_register(true);
             if self.autopilot {
@@ -544,6 +549,9 @@ mod tests {
         let teco = line("--profile teco-7300pa");
         assert_eq!(teco.rules.format.to_string(), "19200 7N2");
         assert_eq!(teco.drives[0].model.turnaround(), Some(Duration::from_millis(15)));
+        let answers = |line: SimulatedBusOptions| matches!(&line.drives[0].model, ModelOptions::Teco(teco) if teco.answer_check_error);
+        assert!(!answers(teco));
+        assert!(answers(line("--profile teco-7300pa --teco-answer-check-error")));
         let teco = line("--profile teco-7300pa --turnaround 3ms");
         assert_eq!(teco.drives[0].model.turnaround(), None);
         assert_eq!(teco.rules.turnaround, Duration::from_millis(3));

@@ -14,6 +14,8 @@ pub const LONGEST: usize = chars(MAX_PDU);
 const BEGIN: u8 = b':';
 const END: u8 = b'\n';
 
+const TOO_SHORT: &str = "it is shorter than any frame";
+
 /// Characters of the frame around a PDU of that length.
 pub const fn chars(pdu: usize) -> usize {
     1 + 2 * (1 + pdu + 1) + 2
@@ -92,6 +94,16 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
     parse(frame.get(noise(frame)..)?).ok()
 }
 
+/// The address and PDU of a frame that is whole but for its LRC, as far as they can be believed.
+pub fn damaged_frame(frame: &[u8]) -> Option<(u8, Vec<u8>)> {
+    let body = body(frame.get(noise(frame)..)?).ok()?;
+    check(&body).err()?;
+    match body.as_slice() {
+        [address, pdu @ .., _] => Some((*address, pdu.to_vec())),
+        _ => None,
+    }
+}
+
 /// The request in a whole frame, as a slave reads it; `None` when the frame or its LRC is wrong (a slave stays silent).
 pub fn decode_request(frame: &[u8]) -> Option<(u8, super::rtu::ReceivedPdu)> {
     let (address, pdu) = open_frame(frame)?;
@@ -110,6 +122,16 @@ fn unfinished(frame: &[u8]) -> Result<(), &'static str> {
 
 /// Address and PDU of a frame from its colon to its line feed, or why it is none.
 fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
+    let body = body(frame)?;
+    check(&body)?;
+    match body.as_slice() {
+        [address, pdu @ .., _] => Ok((*address, pdu.to_vec())),
+        _ => Err(TOO_SHORT),
+    }
+}
+
+/// Address, PDU and LRC between the colon of a frame and its line feed, or why there are none.
+fn body(frame: &[u8]) -> Result<Vec<u8>, &'static str> {
     let line = frame.strip_prefix(b":").ok_or("it does not begin with a colon")?;
     let line = line.strip_suffix(b"\n").ok_or("it does not end with a line feed")?;
     let digits = line
@@ -127,16 +149,13 @@ fn parse(frame: &[u8]) -> Result<(u8, Vec<u8>), &'static str> {
         return Err("an odd number of hexadecimal digits");
     }
     let body: Vec<u8> = pairs.iter().map(|[high, low]| high << 4 | low).collect();
-    match body.as_slice() {
-        [address, pdu @ .., check] if !pdu.is_empty() => {
-            let sum = lrc(body.split_last().map_or(&[], |(_, rest)| rest));
-            if sum == *check {
-                Ok((*address, pdu.to_vec()))
-            } else {
-                Err("check code (LRC) is wrong")
-            }
-        }
-        _ => Err("it is shorter than any frame"),
+    if body.len() < 3 { Err(TOO_SHORT) } else { Ok(body) }
+}
+
+fn check(body: &[u8]) -> Result<(), &'static str> {
+    match body.split_last() {
+        Some((check, rest)) if lrc(rest) == *check => Ok(()),
+        _ => Err("check code (LRC) is wrong"),
     }
 }
 

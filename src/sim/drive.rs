@@ -215,6 +215,11 @@ impl SimulatedDrive {
         self.model.get_mut().malformed(pdu, exception, now)
     }
 
+    /// The answer to a frame to it whose check code is wrong; `None` when the drive stays silent.
+    pub fn check_error(&self) -> Option<Exception> {
+        self.model.get().check_error()
+    }
+
     /// A request to all drives. Nobody answers it; a write takes the drive from its autopilot for good.
     pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);

@@ -64,6 +64,18 @@ pub fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
     }
 }
 
+/// Address and function of a frame that is whole but for its check code. A Modbus RTU frame has nothing else by which it
+/// could be whole.
+pub fn damaged(protocol: Protocol, frame: &[u8]) -> Option<(u8, u8)> {
+    match protocol {
+        Protocol::ModbusAscii => {
+            let (address, pdu) = ascii::damaged_frame(frame)?;
+            Some((address, *pdu.first()?))
+        }
+        Protocol::ModbusRtu | Protocol::N2 => None,
+    }
+}
+
 /// Appends the frame of a Modbus PDU to `out`.
 pub fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     match protocol {

@@ -358,6 +358,12 @@ impl HalfDuplex {
             Heard::Nobody(_) => self.statistics.unanswered += 1,
             Heard::Broadcast => self.statistics.broadcasts += 1,
             Heard::Request(asked) => self.reply(frame, &asked, now),
+            Heard::Damaged(asked, exception) => {
+                self.statistics.bad_crc += 1;
+                let mut reply = Vec::new();
+                refuse(&asked, exception, &mut reply);
+                self.respond(frame, &asked, None, reply, now);
+            }
         }
     }
 
@@ -377,6 +383,11 @@ impl HalfDuplex {
                 }
             }
         }
+        self.respond(frame, asked, fault, reply, now);
+    }
+
+    /// Puts a reply onto the wire, with what a fault makes of it.
+    fn respond(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, reply: Vec<u8>, now: SimTime) {
         let gap = match self.rules.wire {
             Wire::Instant => Duration::ZERO,
             _ => self.rules.format.silence_chars(),

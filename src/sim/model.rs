@@ -71,6 +71,11 @@ pub trait Model: fmt::Debug {
     /// A frame with a wrong check code was on the line.
     fn bus_error(&mut self) {}
 
+    /// The answer to a frame to this drive whose check code is wrong; `None` for silence.
+    fn check_error(&self) -> Option<Exception> {
+        None
+    }
+
     /// Whether the drive has supply; without it, it answers nothing.
     fn powered(&self) -> bool;
 

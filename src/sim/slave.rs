@@ -1,6 +1,6 @@
 //! The drives of one line: whole frames in, replies out.
 //!
-//! A frame with a wrong check code and a frame for somebody else get silence; a broadcast acts on all and gets silence
+//! A frame with a wrong check code and a frame for somebody else get silence, unless a drive answers the former; a broadcast acts on all and gets silence
 //! (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
 
 use super::SimTime;
@@ -26,6 +26,8 @@ pub enum Heard {
     Broadcast,
     /// A request to this drive.
     Request(Asked),
+    /// The check code is wrong, and the drive whose address was received answers that by this exception.
+    Damaged(Asked, Exception),
 }
 
 /// A request that a drive of the line has to answer.
@@ -115,7 +117,7 @@ impl Slaves {
         }
         let Some((address, decoded)) = framing::open(protocol, frame) else {
             self.drives.values_mut().for_each(SimulatedDrive::bus_error);
-            return Heard::BadFrame;
+            return self.hear_damaged(protocol, frame).unwrap_or(Heard::BadFrame);
         };
         self.drives.values_mut().for_each(SimulatedDrive::bus_message);
         if address == BROADCAST {
@@ -140,6 +142,23 @@ impl Slaves {
             request: decoded.map_err(|(_, exception)| exception),
             command: None,
         })
+    }
+
+    /// No manual says whom such an answer names: it has the address and function that were received, and what looks like
+    /// a broadcast gets none.
+    fn hear_damaged(&self, protocol: Protocol, frame: &[u8]) -> Option<Heard> {
+        let (address, function) = framing::damaged(protocol, frame)?;
+        let drive = self.drives.get(&address).filter(|drive| drive.answers())?;
+        let exception = drive.check_error()?;
+        let asked = Asked {
+            protocol,
+            address,
+            function,
+            malformed: Vec::new(),
+            request: Err(exception),
+            command: None,
+        };
+        Some(Heard::Damaged(asked, exception))
     }
 
     fn hear_n2(&self, frame: &[u8]) -> Heard {
@@ -212,8 +231,9 @@ pub fn refuse(asked: &Asked, exception: Exception, out: &mut Vec<u8>) {
 mod tests {
     use super::super::drive::ModelOptions;
     use super::super::nx::{NxOptions, StatusBits};
+    use super::super::teco::TecoOptions;
     use super::*;
-    use crate::codec::rtu;
+    use crate::codec::{ascii, rtu};
     use std::time::Duration;
 
     const RTU: Protocol = Protocol::ModbusRtu;
@@ -352,6 +372,54 @@ mod tests {
             (second.slave_messages, second.no_responses, second.exceptions),
             (2, 1, 1)
         );
+    }
+
+    /// drives.md 9.8: silence, or error 00H where a drive is made so.
+    #[test]
+    fn a_wrong_check_code_is_answered_by_none_but_a_teco_made_so() {
+        let teco = |address, answer_check_error| {
+            let options = TecoOptions {
+                answer_check_error,
+                ..TecoOptions::default()
+            };
+            DriveOptions::new(address, ModelOptions::Teco(options))
+        };
+        let cx = DriveOptions::new(3, ModelOptions::by_name("cx").unwrap());
+        let mut line = Slaves::new([teco(1, true), teco(2, false), cx], SimTime::ZERO);
+        let damaged = |protocol, address, pdu: &[u8]| {
+            let mut frame = framed(protocol, address, pdu);
+            let check = if protocol == RTU {
+                frame.len() - 1
+            } else {
+                frame.len() - 3
+            };
+            frame[check] = if frame[check] == b'0' { b'1' } else { b'0' };
+            frame
+        };
+        let ascii = Protocol::ModbusAscii;
+        let read = [0x03, 0, 0x20, 0, 1];
+        let Heard::Damaged(asked, exception) = line.hear(ascii, &damaged(ascii, 1, &read), SimTime::ZERO) else {
+            panic!("silence")
+        };
+        let mut out = Vec::new();
+        refuse(&asked, exception, &mut out);
+        assert_eq!(ascii::open_frame(&out), Some((1, vec![0x83, 0x00])));
+        // Sound frames are answered as ever.
+        assert_eq!(ask(&mut line, ascii, 1, &[0x03, 0, 0x40, 0, 1]), [3, 2, 0, 10]);
+        for (protocol, address) in [(ascii, 2), (ascii, 3), (ascii, 4), (ascii, 0), (RTU, 1)] {
+            let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
+            assert_eq!(heard, Heard::BadFrame, "{protocol:?} {address}");
+        }
+        // The check code is looked at first (drives.md 5.6): a message that lacks a byte fails there. What is no frame is
+        // nobody's.
+        let whole = damaged(ascii, 1, &read);
+        let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());
+        assert!(matches!(line.hear(ascii, &short, SimTime::ZERO), Heard::Damaged(..)));
+        for broken in [&odd[..], &whole[..whole.len() - 1], &whole[1..], b":01\r\n", b":\r\n"] {
+            assert_eq!(line.hear(ascii, broken, SimTime::ZERO), Heard::BadFrame, "{broken:?}");
+        }
+        line.drive(1).unwrap().set_alive(false);
+        assert_eq!(line.hear(ascii, &whole, SimTime::ZERO), Heard::BadFrame);
     }
 
     #[test]

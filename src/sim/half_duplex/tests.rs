@@ -1,6 +1,7 @@
 //! The wire in virtual time.
 
 use super::super::drive::{DriveOptions, ModelOptions};
+use super::super::teco::TecoOptions;
 use super::*;
 use proptest::prelude::*;
 
@@ -281,6 +282,28 @@ fn an_ascii_reply_begins_a_turnaround_after_the_line_feed() {
     assert_eq!(run(&mut line, us(2_000_000)).len(), 1);
     let s = line.statistics();
     assert_eq!((s.requests, s.silence_violations, s.bad_crc), (2, 0, 0));
+}
+
+/// A TECO that answers a wrong check code does so after its usual time; the request counts as a bad frame.
+#[test]
+fn an_answer_to_a_wrong_check_code_takes_its_time_too() {
+    let rules = ascii_rules();
+    let teco = TecoOptions {
+        answer_check_error: true,
+        ..TecoOptions::default()
+    };
+    let drives = [DriveOptions::new(1, ModelOptions::Teco(teco))];
+    let slaves = Slaves::new(drives, SimTime::ZERO);
+    let mut line = HalfDuplex::new(rules.clone(), slaves, FaultPlan::default(), Transcript::new(100));
+    line.on_bytes(b":010300200001DC\r\n", us(0));
+    let seen = run(&mut line, us(1_000_000));
+    let answer = b":0183007C\r\n".to_vec();
+    let due = rules.format.chars(17) + us(15_000) + rules.format.chars(answer.len());
+    assert_eq!(seen, [(due, answer)]);
+    line.on_bytes(b":010300200001DB\r\n", us(1_000_000));
+    assert!(run(&mut line, us(2_000_000))[0].1.starts_with(b":010302"));
+    let s = line.statistics();
+    assert_eq!((s.requests, s.replies, s.bad_crc), (1, 2, 1));
 }
 
 #[test]

@@ -279,6 +279,10 @@ impl Model for TecoDrive {
         registers::refusal(pdu, exception)
     }
 
+    fn check_error(&self) -> Option<Exception> {
+        self.options.answer_check_error.then_some(registers::CHECK_ERROR)
+    }
+
     fn broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
         if registers::allows_broadcast(request) {

@@ -85,6 +85,9 @@ pub struct TecoOptions {
     pub parameters: Vec<(u16, u16)>,
     /// Time between a message and its answer; `None` leaves it to the line.
     pub turnaround: Option<Duration>,
+    /// Whether a request with a wrong check code is answered by error 00H. Its error table has that code; what stands
+    /// beside it, and everything else about messages, says that there is no answer (drives.md 9.8).
+    pub answer_check_error: bool,
     /// Makes 09FFH a register of the simulator: writing a fault mask as 0021H shows it trips the drive. No real drive has
     /// it.
     pub trip_register: bool,
@@ -111,6 +114,7 @@ impl Default for TecoOptions {
             locked: Vec::new(),
             parameters: Vec::new(),
             turnaround: Some(TecoOptions::TURNAROUND),
+            answer_check_error: false,
             trip_register: false,
         }
     }

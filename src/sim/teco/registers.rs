@@ -9,6 +9,8 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 const FUNCTIONS: [u8; 4] = [0x03, 0x06, 0x08, 0x10];
 /// Registers per message.
 const MOST: u16 = 16;
+/// 00H: wrong check code.
+pub(super) const CHECK_ERROR: Exception = Exception(0x00);
 /// 21H: value out of range, or a parameter that may not be written over the bus.
 const DATA_ERROR: Exception = Exception(0x21);
 /// 22H: Sn, Cn or On written in DRIVE mode, or saving while the drive runs.
