@@ -1,0 +1,230 @@
+//! The tree of a document: values, each with its place, and how they come out of TOML or a variable.
+
+use toml::de::{DeTable, DeValue};
+
+/// One key of a table: the key, its line, the value.
+pub type Entry = (String, Option<usize>, Node);
+
+/// A value and its place.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Node {
+    /// The value.
+    pub value: Raw,
+    pub(super) line: Option<usize>,
+    pub(super) env: Option<String>,
+}
+
+impl Node {
+    /// The value of `key`, if this is a table that has it.
+    pub fn entry(&self, key: &str) -> Option<&Node> {
+        entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
+    }
+
+    /// Line of the file, from 1.
+    pub fn line(&self) -> Option<usize> {
+        self.line
+    }
+
+    /// Takes the place of another value, so that what is told of this one is told there.
+    pub fn stand_where(&mut self, other: &Node) {
+        self.line = other.line;
+        self.env = other.env.clone();
+    }
+
+    /// The same for a document of another file: what is told of it names `what` instead of a line.
+    pub fn told_as(&self, what: &str) -> Node {
+        let value = match &self.value {
+            Raw::Table(entries) => {
+                let told = entries
+                    .iter()
+                    .map(|(key, _, node)| (key.clone(), None, node.told_as(what)));
+                Raw::Table(told.collect())
+            }
+            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.told_as(what)).collect()),
+            other => other.clone(),
+        };
+        Node {
+            value,
+            line: None,
+            env: Some(what.to_string()),
+        }
+    }
+
+    /// A table without keys.
+    pub fn empty_table(env: Option<String>) -> Node {
+        Node {
+            value: Raw::Table(Vec::new()),
+            line: None,
+            env,
+        }
+    }
+}
+
+/// A TOML value.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Raw {
+    /// A string.
+    Text(String),
+    /// A 64-bit integer.
+    Integer(i64),
+    /// A float.
+    Float(f64),
+    /// A boolean.
+    Bool(bool),
+    /// An array.
+    Array(Vec<Node>),
+    /// A table: key, line of the key, value.
+    Table(Vec<Entry>),
+    /// Text of an environment variable, read as whatever type is wanted.
+    Env(String),
+    /// A date or an integer beyond 64 bits: no key takes one.
+    Other,
+}
+
+impl Raw {
+    /// What it is, for messages: `an integer`.
+    pub(super) fn kind(&self) -> &'static str {
+        match self {
+            Raw::Text(_) | Raw::Env(_) => "a string",
+            Raw::Integer(_) => "an integer",
+            Raw::Float(_) => "a number",
+            Raw::Bool(_) => "a boolean",
+            Raw::Array(_) => "an array",
+            Raw::Table(_) => "a table",
+            Raw::Other => "a date or an oversized number",
+        }
+    }
+}
+
+/// The keys of a table; none of any other value.
+pub(super) fn entries(node: &Node) -> &[Entry] {
+    match &node.value {
+        Raw::Table(entries) => entries,
+        _ => &[],
+    }
+}
+
+/// Parses `source` as far as it can be read; an error is its line and what is wrong.
+pub(super) fn parse(source: &str) -> (Node, Vec<(Option<usize>, String)>) {
+    let lines = Lines::of(source);
+    let (table, errors) = DeTable::parse_recoverable(source);
+    let root = Node {
+        value: table_of(table.into_inner(), &lines),
+        line: None,
+        env: None,
+    };
+    let errors = errors.iter().map(|error| {
+        let line = error.span().map(|s| lines.line(s.start));
+        (line, error.message().replace('\n', ", "))
+    });
+    (root, errors.collect())
+}
+
+/// Ends of the lines of a text.
+struct Lines(Vec<usize>);
+
+impl Lines {
+    fn of(source: &str) -> Lines {
+        Lines(
+            source
+                .bytes()
+                .enumerate()
+                .filter(|&(_, b)| b == b'\n')
+                .map(|(i, _)| i)
+                .collect(),
+        )
+    }
+
+    fn line(&self, offset: usize) -> usize {
+        self.0.partition_point(|&end| end < offset) + 1
+    }
+}
+
+fn table_of(table: DeTable<'_>, lines: &Lines) -> Raw {
+    let entries = table.into_iter().map(|(key, value)| {
+        let line = lines.line(key.span().start);
+        let span = value.span();
+        let node_line = if span.start == 0 && span.end == 0 {
+            line
+        } else {
+            lines.line(span.start)
+        };
+        let value = value_of(value.into_inner(), lines);
+        // A table's own place is its header or key, not the first of its values.
+        let node_line = if matches!(value, Raw::Table(_)) {
+            line
+        } else {
+            node_line
+        };
+        (
+            key.into_inner().into_owned(),
+            Some(line),
+            Node {
+                value,
+                line: Some(node_line),
+                env: None,
+            },
+        )
+    });
+    Raw::Table(entries.collect())
+}
+
+fn value_of(value: DeValue<'_>, lines: &Lines) -> Raw {
+    match value {
+        DeValue::String(text) => Raw::Text(text.into_owned()),
+        DeValue::Integer(integer) => {
+            i64::from_str_radix(integer.as_str(), integer.radix()).map_or(Raw::Other, Raw::Integer)
+        }
+        DeValue::Float(float) => float.as_str().parse().map_or(Raw::Other, Raw::Float),
+        DeValue::Boolean(value) => Raw::Bool(value),
+        DeValue::Datetime(_) => Raw::Other,
+        DeValue::Array(array) => Raw::Array(
+            array
+                .into_iter()
+                .map(|item| {
+                    let line = Some(lines.line(item.span().start));
+                    Node {
+                        value: value_of(item.into_inner(), lines),
+                        line,
+                        env: None,
+                    }
+                })
+                .collect(),
+        ),
+        DeValue::Table(table) => table_of(table, lines),
+    }
+}
+
+/// Puts the `text` of the variable `name` at `path` below `node`.
+///
+/// # Errors
+/// What is wrong with the path and what to do.
+pub(super) fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(), String> {
+    let Some((key, rest)) = path.split_first() else {
+        *node = Node {
+            value: Raw::Env(text),
+            line: None,
+            env: Some(name.to_string()),
+        };
+        return Ok(());
+    };
+    match &mut node.value {
+        Raw::Table(entries) => {
+            if let Some((_, _, child)) = entries.iter_mut().find(|(k, _, _)| k == key) {
+                return set(child, rest, name, text);
+            }
+            let mut child = Node::empty_table(Some(name.to_string()));
+            set(&mut child, rest, name, text)?;
+            entries.push((key.clone(), None, child));
+            Ok(())
+        }
+        Raw::Array(items) => {
+            let count = items.len();
+            match key.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
+                Some(item) => set(item, rest, name, text),
+                None => Err(format!("`{key}` is no element of an array of {count}; count from 0")),
+            }
+        }
+        _ => Err(format!("`{key}` lies below a plain value; override the value itself")),
+    }
+}

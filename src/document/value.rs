@@ -1,0 +1,217 @@
+//! The types that a value can be read as, and the texts of durations and sizes.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use super::{Node, Raw};
+
+/// A type that a value can be read as.
+pub trait FromNode: Sized {
+    /// What to write, for messages: `a string`.
+    const WANTED: &'static str;
+
+    /// Reads the value.
+    ///
+    /// # Errors
+    /// What is wrong and what to write instead.
+    fn from_node(node: &Node) -> Result<Self, String>;
+}
+
+fn wrong<T: FromNode>(node: &Node) -> String {
+    match &node.value {
+        Raw::Env(text) | Raw::Text(text) => format!("`{text}` is not {}; write {}", T::WANTED, T::WANTED),
+        other => format!("{} stands here; write {}", other.kind(), T::WANTED),
+    }
+}
+
+impl FromNode for String {
+    const WANTED: &'static str = "a string in quotes";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        match &node.value {
+            Raw::Text(text) | Raw::Env(text) => Ok(text.clone()),
+            _ => Err(wrong::<Self>(node)),
+        }
+    }
+}
+
+impl FromNode for PathBuf {
+    const WANTED: &'static str = "a path in quotes";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        String::from_node(node)
+            .map(PathBuf::from)
+            .map_err(|_| wrong::<Self>(node))
+    }
+}
+
+impl FromNode for bool {
+    const WANTED: &'static str = "true or false";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        match &node.value {
+            Raw::Bool(value) => Ok(*value),
+            Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
+            _ => Err(wrong::<Self>(node)),
+        }
+    }
+}
+
+impl FromNode for i64 {
+    const WANTED: &'static str = "a whole number";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        match &node.value {
+            Raw::Integer(value) => Ok(*value),
+            Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
+            _ => Err(wrong::<Self>(node)),
+        }
+    }
+}
+
+macro_rules! from_integer {
+    ($($type:ty: $wanted:literal),*) => {$(
+        impl FromNode for $type {
+            const WANTED: &'static str = $wanted;
+
+            fn from_node(node: &Node) -> Result<Self, String> {
+                let value = i64::from_node(node).map_err(|_| wrong::<Self>(node))?;
+                <$type>::try_from(value)
+                    .map_err(|_| format!("{value} is out of range; write {}", Self::WANTED))
+            }
+        }
+    )*};
+}
+
+from_integer!(u8: "a whole number from 0 to 255", u16: "a whole number from 0 to 65535",
+    u32: "a whole number from 0 to 4294967295", usize: "a whole number, not negative");
+
+impl FromNode for f64 {
+    const WANTED: &'static str = "a number";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        let value = match &node.value {
+            Raw::Float(value) => *value,
+            Raw::Integer(value) => *value as f64,
+            Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node))?,
+            _ => return Err(wrong::<Self>(node)),
+        };
+        if value.is_finite() {
+            Ok(value)
+        } else {
+            Err(format!("{value} is no finite number; write {}", Self::WANTED))
+        }
+    }
+}
+
+impl FromNode for Duration {
+    const WANTED: &'static str = "a duration in quotes, such as \"10ms\", \"1.5s\" or \"2min\"";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        match &node.value {
+            Raw::Text(text) | Raw::Env(text) => parse_duration(text),
+            _ => Err(wrong::<Self>(node)),
+        }
+    }
+}
+
+impl<T: FromNode> FromNode for Vec<T> {
+    const WANTED: &'static str = "a list in brackets";
+
+    fn from_node(node: &Node) -> Result<Self, String> {
+        match &node.value {
+            Raw::Array(items) => items.iter().map(T::from_node).collect(),
+            Raw::Env(text) => text
+                .split(',')
+                .map(|item| {
+                    let value = Raw::Env(item.trim().to_string());
+                    T::from_node(&Node {
+                        value,
+                        line: node.line,
+                        env: node.env.clone(),
+                    })
+                })
+                .collect(),
+            _ => Err(format!("{}, each {}", wrong::<Self>(node), T::WANTED)),
+        }
+    }
+}
+
+/// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min`, `h`.
+///
+/// # Errors
+/// What is wrong and what to write.
+pub fn parse_duration(text: &str) -> Result<Duration, String> {
+    let bad = || format!("`{text}` is no duration; write {}", Duration::WANTED);
+    let trimmed = text.trim();
+    let digits = trimmed
+        .find(|c: char| !c.is_ascii_digit() && c != '.')
+        .ok_or_else(bad)?;
+    let (number, unit) = trimmed.split_at(digits);
+    let number: f64 = number.parse().map_err(|_| bad())?;
+    let seconds = match unit.trim_start() {
+        "us" | "µs" => 1e-6,
+        "ms" => 1e-3,
+        "s" => 1.0,
+        "min" => 60.0,
+        "h" => 3600.0,
+        _ => return Err(bad()),
+    };
+    Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
+}
+
+/// The text that [`parse_duration`] reads as `time`, in the unit that makes it short.
+pub fn format_duration(time: Duration) -> String {
+    match (time.as_secs(), time.subsec_nanos()) {
+        (0, 0) => "0s".to_string(),
+        (seconds, 0) if seconds % 3600 == 0 => format!("{}h", seconds / 3600),
+        (seconds, 0) if seconds % 60 == 0 => format!("{}min", seconds / 60),
+        (0, nanos) if nanos < 1000 => format!("{}us", f64::from(nanos) / 1e3),
+        _ => format!("{time:?}"),
+    }
+}
+
+/// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
+///
+/// # Errors
+/// What is wrong and what to write.
+pub fn parse_size(text: &str) -> Result<u64, String> {
+    let bad = || format!("`{text}` is no size; write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"");
+    let trimmed = text.trim();
+    let digits = trimmed.find(|c: char| !c.is_ascii_digit()).ok_or_else(bad)?;
+    let (number, unit) = trimmed.split_at(digits);
+    let number: u64 = number.parse().map_err(|_| bad())?;
+    let shift = match unit.trim_start() {
+        "B" => 0,
+        "KiB" => 10,
+        "MiB" => 20,
+        "GiB" => 30,
+        _ => return Err(bad()),
+    };
+    number
+        .checked_shl(shift)
+        .filter(|v| v >> shift == number)
+        .ok_or_else(bad)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn durations_and_sizes() {
+        assert_eq!(parse_duration("0.5ms"), Ok(Duration::from_micros(500)));
+        assert_eq!(parse_duration("2min"), Ok(Duration::from_secs(120)));
+        assert_eq!(parse_duration("10 s"), Ok(Duration::from_secs(10)));
+        for bad in ["", "10", "ms", "-1s", "1d", "1.2.3s", "1e3s"] {
+            assert!(parse_duration(bad).is_err(), "{bad}");
+        }
+        for text in ["0s", "0.5us", "303.819µs", "10ms", "1.5s", "90s", "2min", "1h"] {
+            assert_eq!(format_duration(parse_duration(text).unwrap()), text);
+        }
+        assert_eq!(parse_size("64MiB"), Ok(64 << 20));
+        for bad in ["", "64", "64MB", "-1B", "99999999999999999GiB"] {
+            assert!(parse_size(bad).is_err(), "{bad}");
+        }
+    }
+}
