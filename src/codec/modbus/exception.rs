@@ -1,0 +1,69 @@
+//! Exception codes: those of Modbus, of one family, and those that stand for N2's errors.
+
+use std::fmt;
+
+/// A Modbus exception code.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Exception(pub u8);
+
+impl Exception {
+    /// 01: the function is not known or not allowed.
+    pub const FUNCTION: Exception = Exception(0x01);
+    /// 02: the address is not known or not allowed.
+    pub const ADDRESS: Exception = Exception(0x02);
+    /// 03: the value or the count is not allowed.
+    pub const VALUE: Exception = Exception(0x03);
+    /// 04: the device failed.
+    pub const DEVICE_FAILURE: Exception = Exception(0x04);
+    /// 06: the device is busy.
+    pub const BUSY: Exception = Exception(0x06);
+    /// 0x0A: the gateway has no way to that unit.
+    pub const GATEWAY_PATH: Exception = Exception(0x0A);
+    /// 0x0B: the device behind the gateway does not answer.
+    pub const GATEWAY_TARGET: Exception = Exception(0x0B);
+
+    /// N2 error 00: the drive has restarted and waits for Identify.
+    pub const N2_RESTARTED: Exception = Exception(0x80);
+
+    /// An N2 error code (two printed digits, read as hexadecimal), kept apart from the codes of Modbus.
+    pub fn n2(code: u8) -> Exception {
+        Exception(0x80 | code)
+    }
+
+    /// Whether the same request would be refused again: function, address or value, not the state of the drive.
+    pub fn is_about_request(self) -> bool {
+        matches!(self.0, 0x01..=0x03 | 0x21 | 0x81 | 0x85 | 0x90..=0x92)
+    }
+
+    /// What the code means, by the Modbus specification and the TECO list (drives.md 5.6).
+    pub fn meaning(self) -> &'static str {
+        match self.0 {
+            0x01 => "illegal function",
+            0x02 => "illegal data address",
+            0x03 => "illegal data value",
+            0x04 => "device failure",
+            0x05 => "acknowledge, still working",
+            0x06 => "device busy",
+            0x08 => "memory parity error",
+            0x0A => "gateway path unavailable",
+            0x0B => "device behind the gateway does not answer",
+            0x21 => "data value error (TECO)",
+            0x22 => "register write error: only in PRGM mode (TECO)",
+            0x80 => "N2 00: the drive has restarted and waits for Identify",
+            0x81 => "N2 01: command not understood",
+            0x82 => "N2 02: checksum error",
+            0x83 => "N2 03: message too long",
+            0x85 => "N2 05: field size wrong for the command",
+            0x90 => "N2 10: invalid data, out of the expected range",
+            0x91 => "N2 11: invalid command for the data type, or only in PRGM mode (TECO)",
+            0x92 => "N2 12: the value is read-only",
+            _ => "unknown exception",
+        }
+    }
+}
+
+impl fmt::Display for Exception {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "exception {:02X} ({})", self.0, self.meaning())
+    }
+}

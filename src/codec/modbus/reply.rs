@@ -1,0 +1,139 @@
+//! Replies to and from bytes, each against its request.
+
+use super::{Exception, RequestPdu, be, counted, pack, put, unpack, words};
+
+/// A reply of a slave.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Reply {
+    /// To functions 1 and 2, as many as were asked for.
+    Bits(Vec<bool>),
+    /// To functions 3, 4 and 23.
+    Registers(Vec<u16>),
+    /// To functions 5, 6, 15, 16 and 22: the echo fits the request.
+    Written,
+    /// To function 8: the data word.
+    Diagnostics(u16),
+    /// To function 43/14: the bytes after the MEI type.
+    DeviceIdentification(Vec<u8>),
+    /// To N2's Identify: the device type.
+    Identified(u8),
+    /// To a poll of N2: the digits of the report, none where nothing changed.
+    Changes(Vec<u8>),
+    /// Refused.
+    Exception(Exception),
+}
+
+impl Reply {
+    /// What was read: registers, or bits as 0 and 1.
+    pub fn words(&self) -> Option<Vec<u16>> {
+        match self {
+            Reply::Registers(words) => Some(words.clone()),
+            Reply::Bits(bits) => Some(bits.iter().map(|bit| u16::from(*bit)).collect()),
+            _ => None,
+        }
+    }
+
+    /// Appends the reply's PDU to `request` onto `out`.
+    pub fn encode(&self, request: &RequestPdu, out: &mut Vec<u8>) {
+        if let Reply::Exception(code) = self {
+            encode_exception(request.function(), *code, out);
+            return;
+        }
+        match self {
+            Reply::Bits(bits) => {
+                out.push(request.function());
+                out.push(bits.len().div_ceil(8) as u8);
+                pack(bits, out);
+            }
+            Reply::Registers(values) => {
+                out.push(request.function());
+                out.push((values.len() * 2) as u8);
+                values.iter().for_each(|&v| put(out, v));
+            }
+            Reply::Diagnostics(data) => {
+                if let RequestPdu::Diagnostics { subfunction, .. } = request {
+                    RequestPdu::Diagnostics {
+                        subfunction: *subfunction,
+                        data: *data,
+                    }
+                    .encode(out);
+                }
+            }
+            Reply::DeviceIdentification(body) => {
+                out.extend_from_slice(&[43, 14]);
+                out.extend_from_slice(body);
+            }
+            Reply::Identified(_) | Reply::Changes(_) => encode_exception(request.function(), Exception::FUNCTION, out),
+            Reply::Written | Reply::Exception(_) => encode_echo(request, out),
+        }
+    }
+
+    /// What the slave said in `pdu`, if it fits `request`.
+    ///
+    /// # Errors
+    /// [`Misfit`] when function, byte count or echo do not fit: the frame answers something else.
+    pub fn decode(request: &RequestPdu, pdu: &[u8]) -> Result<Reply, Misfit> {
+        let (&function, body) = pdu.split_first().ok_or(Misfit)?;
+        if function == request.function() | 0x80 {
+            return match body {
+                [code] => Ok(Reply::Exception(Exception(*code))),
+                _ => Err(Misfit),
+            };
+        }
+        if function != request.function() {
+            return Err(Misfit);
+        }
+        match request {
+            RequestPdu::Read { table, count, .. } if table.is_bits() => {
+                let data = counted(body, 0, usize::from(*count).div_ceil(8)).map_err(|_| Misfit)?;
+                Ok(Reply::Bits(unpack(data, usize::from(*count))))
+            }
+            RequestPdu::Read { count, .. } | RequestPdu::ReadWrite { read_count: count, .. } => {
+                let data = counted(body, 0, 2 * usize::from(*count)).map_err(|_| Misfit)?;
+                Ok(Reply::Registers(words(data)))
+            }
+            RequestPdu::Diagnostics { subfunction, .. } => {
+                if body.len() == 4 && be(body, 0) == Some(*subfunction) {
+                    be(body, 2).map(Reply::Diagnostics).ok_or(Misfit)
+                } else {
+                    Err(Misfit)
+                }
+            }
+            RequestPdu::DeviceIdentification { .. } => match body {
+                [14, rest @ ..] if rest.len() >= 5 => Ok(Reply::DeviceIdentification(rest.to_vec())),
+                _ => Err(Misfit),
+            },
+            _ => {
+                let mut echo = Vec::with_capacity(8);
+                encode_echo(request, &mut echo);
+                if echo == pdu { Ok(Reply::Written) } else { Err(Misfit) }
+            }
+        }
+    }
+}
+
+/// The frame is sound but no answer to the request: the bus drops it and waits on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Misfit;
+
+/// Appends an exception PDU.
+pub fn encode_exception(function: u8, code: Exception, out: &mut Vec<u8>) {
+    out.extend_from_slice(&[function | 0x80, code.0]);
+}
+
+/// Writes of one item are echoed whole, of several by their first five bytes.
+fn encode_echo(request: &RequestPdu, out: &mut Vec<u8>) {
+    match request {
+        RequestPdu::WriteCoils { start, bits } => {
+            out.push(15);
+            put(out, *start);
+            put(out, bits.len() as u16);
+        }
+        RequestPdu::WriteRegisters { start, values } => {
+            out.push(16);
+            put(out, *start);
+            put(out, values.len() as u16);
+        }
+        _ => request.encode(out),
+    }
+}

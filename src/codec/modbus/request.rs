@@ -1,0 +1,300 @@
+//! Requests to and from bytes.
+
+use super::super::n2::Session;
+use super::{Exception, Table, be, counted, pack, put, unpack, words};
+
+/// A request of a master.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum RequestPdu {
+    /// Functions 1 to 4.
+    Read {
+        /// Which table.
+        table: Table,
+        /// First PDU address.
+        start: u16,
+        /// Items, 1..=125 registers or 1..=2000 bits.
+        count: u16,
+    },
+    /// Function 5.
+    WriteCoil {
+        /// PDU address.
+        address: u16,
+        /// State to set.
+        on: bool,
+    },
+    /// Function 6.
+    WriteRegister {
+        /// PDU address.
+        address: u16,
+        /// Value.
+        value: u16,
+    },
+    /// Function 15.
+    WriteCoils {
+        /// First PDU address.
+        start: u16,
+        /// 1..=1968 states.
+        bits: Vec<bool>,
+    },
+    /// Function 16.
+    WriteRegisters {
+        /// First PDU address.
+        start: u16,
+        /// 1..=123 values.
+        values: Vec<u16>,
+    },
+    /// Function 22: `(old and and_mask) or (or_mask and not and_mask)`.
+    MaskWrite {
+        /// PDU address.
+        address: u16,
+        /// Bits to keep.
+        and_mask: u16,
+        /// Bits to set where not kept.
+        or_mask: u16,
+    },
+    /// Function 23: writes, then reads.
+    ReadWrite {
+        /// First PDU address to read.
+        read_start: u16,
+        /// Registers to read, 1..=125.
+        read_count: u16,
+        /// First PDU address to write.
+        write_start: u16,
+        /// 1..=121 values to write.
+        values: Vec<u16>,
+    },
+    /// Function 8.
+    Diagnostics {
+        /// Subfunction.
+        subfunction: u16,
+        /// Data word.
+        data: u16,
+    },
+    /// Function 43, MEI type 14.
+    DeviceIdentification {
+        /// Read device id code: 1 basic, 2 regular, 3 extended, 4 one object.
+        code: u8,
+        /// First object.
+        object: u8,
+    },
+    /// What only a bus of N2 says: no function of Modbus, never encoded as one.
+    N2(Session),
+}
+
+impl RequestPdu {
+    /// The function code; 0, which is none, for what is not of Modbus.
+    pub fn function(&self) -> u8 {
+        match self {
+            RequestPdu::Read { table, .. } => table.read_function(),
+            RequestPdu::WriteCoil { .. } => 5,
+            RequestPdu::WriteRegister { .. } => 6,
+            RequestPdu::Diagnostics { .. } => 8,
+            RequestPdu::WriteCoils { .. } => 15,
+            RequestPdu::WriteRegisters { .. } => 16,
+            RequestPdu::MaskWrite { .. } => 22,
+            RequestPdu::ReadWrite { .. } => 23,
+            RequestPdu::DeviceIdentification { .. } => 43,
+            RequestPdu::N2(_) => 0,
+        }
+    }
+
+    /// Whether the request changes something in the drive.
+    pub fn is_write(&self) -> bool {
+        matches!(
+            self,
+            RequestPdu::WriteCoil { .. }
+                | RequestPdu::WriteRegister { .. }
+                | RequestPdu::WriteCoils { .. }
+                | RequestPdu::WriteRegisters { .. }
+                | RequestPdu::MaskWrite { .. }
+                | RequestPdu::ReadWrite { .. }
+        )
+    }
+
+    /// Bytes of the encoded PDU.
+    pub fn encoded_len(&self) -> usize {
+        match self {
+            RequestPdu::Read { .. } | RequestPdu::WriteCoil { .. } | RequestPdu::WriteRegister { .. } => 5,
+            RequestPdu::Diagnostics { .. } => 5,
+            RequestPdu::WriteCoils { bits, .. } => 6 + bits.len().div_ceil(8),
+            RequestPdu::WriteRegisters { values, .. } => 6 + 2 * values.len(),
+            RequestPdu::MaskWrite { .. } => 7,
+            RequestPdu::ReadWrite { values, .. } => 10 + 2 * values.len(),
+            RequestPdu::DeviceIdentification { .. } => 4,
+            RequestPdu::N2(_) => 0,
+        }
+    }
+
+    /// Bytes of the regular reply's PDU; for 43/14, whose length the reply itself tells, its shortest.
+    pub fn reply_len(&self) -> usize {
+        match self {
+            RequestPdu::Read { table, count, .. } => {
+                2 + if table.is_bits() {
+                    usize::from(*count).div_ceil(8)
+                } else {
+                    2 * usize::from(*count)
+                }
+            }
+            RequestPdu::ReadWrite { read_count, .. } => 2 + 2 * usize::from(*read_count),
+            RequestPdu::MaskWrite { .. } => 7,
+            RequestPdu::DeviceIdentification { .. } => 7,
+            _ => 5,
+        }
+    }
+
+    /// Appends the PDU to `out`.
+    pub fn encode(&self, out: &mut Vec<u8>) {
+        if matches!(self, RequestPdu::N2(_)) {
+            return;
+        }
+        out.push(self.function());
+        match self {
+            RequestPdu::N2(_) => {}
+            RequestPdu::Read { start, count, .. } => {
+                put(out, *start);
+                put(out, *count);
+            }
+            RequestPdu::WriteCoil { address, on } => {
+                put(out, *address);
+                put(out, if *on { 0xFF00 } else { 0 });
+            }
+            RequestPdu::WriteRegister { address, value } => {
+                put(out, *address);
+                put(out, *value);
+            }
+            RequestPdu::Diagnostics { subfunction, data } => {
+                put(out, *subfunction);
+                put(out, *data);
+            }
+            RequestPdu::WriteCoils { start, bits } => {
+                put(out, *start);
+                put(out, bits.len() as u16);
+                out.push(bits.len().div_ceil(8) as u8);
+                pack(bits, out);
+            }
+            RequestPdu::WriteRegisters { start, values } => {
+                put(out, *start);
+                put(out, values.len() as u16);
+                out.push((values.len() * 2) as u8);
+                values.iter().for_each(|&v| put(out, v));
+            }
+            RequestPdu::MaskWrite {
+                address,
+                and_mask,
+                or_mask,
+            } => {
+                put(out, *address);
+                put(out, *and_mask);
+                put(out, *or_mask);
+            }
+            RequestPdu::ReadWrite {
+                read_start,
+                read_count,
+                write_start,
+                values,
+            } => {
+                put(out, *read_start);
+                put(out, *read_count);
+                put(out, *write_start);
+                put(out, values.len() as u16);
+                out.push((values.len() * 2) as u8);
+                values.iter().for_each(|&v| put(out, v));
+            }
+            RequestPdu::DeviceIdentification { code, object } => out.extend_from_slice(&[14, *code, *object]),
+        }
+    }
+
+    /// The request in `pdu`, as a slave reads it.
+    ///
+    /// # Errors
+    /// The exception that the slave answers: 01 for a function that is not known, 03 for a wrong
+    /// length, count or value.
+    pub fn decode(pdu: &[u8]) -> Result<RequestPdu, Exception> {
+        let (&function, body) = pdu.split_first().ok_or(Exception::FUNCTION)?;
+        match function {
+            1 => read(Table::Coil, body),
+            2 => read(Table::DiscreteInput, body),
+            3 => read(Table::Holding, body),
+            4 => read(Table::Input, body),
+            5 => match exact(body)? {
+                [address, 0xFF00] => Ok(RequestPdu::WriteCoil { address, on: true }),
+                [address, 0x0000] => Ok(RequestPdu::WriteCoil { address, on: false }),
+                _ => Err(Exception::VALUE),
+            },
+            6 => exact(body).map(|[address, value]| RequestPdu::WriteRegister { address, value }),
+            8 => exact(body).map(|[subfunction, data]| RequestPdu::Diagnostics { subfunction, data }),
+            15 => {
+                let [start, count] = head(body)?;
+                let data = counted(body, 4, usize::from(count).div_ceil(8))?;
+                check_span(start, count, 1968)?;
+                let bits = unpack(data, usize::from(count));
+                Ok(RequestPdu::WriteCoils { start, bits })
+            }
+            16 => {
+                let [start, count] = head(body)?;
+                let data = counted(body, 4, 2 * usize::from(count))?;
+                check_span(start, count, 123)?;
+                let values = words(data);
+                Ok(RequestPdu::WriteRegisters { start, values })
+            }
+            22 => exact(body).map(|[address, and_mask, or_mask]| RequestPdu::MaskWrite {
+                address,
+                and_mask,
+                or_mask,
+            }),
+            23 => {
+                let [read_start, read_count, write_start, count] = head(body)?;
+                let data = counted(body, 8, 2 * usize::from(count))?;
+                check_span(read_start, read_count, 125)?;
+                check_span(write_start, count, 121)?;
+                Ok(RequestPdu::ReadWrite {
+                    read_start,
+                    read_count,
+                    write_start,
+                    values: words(data),
+                })
+            }
+            43 => match *body {
+                [14, code, object] => Ok(RequestPdu::DeviceIdentification { code, object }),
+                [14, ..] => Err(Exception::VALUE),
+                _ => Err(Exception::FUNCTION),
+            },
+            _ => Err(Exception::FUNCTION),
+        }
+    }
+}
+
+fn read(table: Table, body: &[u8]) -> Result<RequestPdu, Exception> {
+    let [start, count] = exact(body)?;
+    check_span(start, count, table.max_read())?;
+    Ok(RequestPdu::Read { table, start, count })
+}
+
+/// The words at the beginning of `body`, if it is long enough.
+fn head<const N: usize>(body: &[u8]) -> Result<[u16; N], Exception> {
+    let mut head = [0; N];
+    for (i, word) in head.iter_mut().enumerate() {
+        *word = be(body, 2 * i).ok_or(Exception::VALUE)?;
+    }
+    Ok(head)
+}
+
+/// The words of `body`, if it is just as long.
+fn exact<const N: usize>(body: &[u8]) -> Result<[u16; N], Exception> {
+    if body.len() == 2 * N {
+        head(body)
+    } else {
+        Err(Exception::VALUE)
+    }
+}
+
+/// Count within 1..=max (else 03) and the span within the 65,536 addresses (else 02).
+fn check_span(start: u16, count: u16, max: u16) -> Result<(), Exception> {
+    if count == 0 || count > max {
+        return Err(Exception::VALUE);
+    }
+    if u32::from(start) + u32::from(count) > 0x1_0000 {
+        return Err(Exception::ADDRESS);
+    }
+    Ok(())
+}
