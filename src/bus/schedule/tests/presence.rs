@@ -1,0 +1,206 @@
+//! Drives that are away, refuse or cannot be understood.
+
+use super::*;
+
+#[test]
+fn dead_drives_cost_two_percent_each() {
+    let mut all = Bench::new(7, Duration::from_millis(10));
+    all.run(Duration::from_secs(60));
+    let mut some = Bench::new(10, Duration::from_millis(10));
+    some.dead = vec![2, 5, 9];
+    some.run(Duration::from_secs(60));
+    let total = |bench: &Bench| bench.polls(PollClass::Fast).values().sum::<usize>() as f64;
+    let ratio = total(&some) / total(&all);
+    assert!(ratio >= 0.94, "{ratio}");
+    assert_eq!(some.offline, [2, 5, 9], "told once each");
+    // It comes back within ten seconds, and its once class is read again.
+    some.dead.clear();
+    some.log.clear();
+    some.run(Duration::from_secs(14));
+    for drive in [2, 5, 9] {
+        assert!(
+            some.polls(PollClass::Fast).contains_key(&drive),
+            "{drive} is polled again"
+        );
+        assert_eq!(some.polls(PollClass::Once)[&drive], 1);
+    }
+}
+
+#[test]
+fn a_drive_that_dies_is_offline_after_the_retries() {
+    let mut bench = Bench::new(2, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.dead = vec![1];
+    let died = bench.now;
+    while bench.offline.is_empty() {
+        bench.step(None);
+    }
+    assert!(bench.now - died <= COST * 10 * 2 + COST * 3, "two tries");
+    assert!(!bench.schedule.is_online(1) && bench.schedule.is_online(0));
+}
+
+#[test]
+fn refused_blocks_are_split_joined_and_retried_slowly() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let bad = 2105;
+    let mut unavailable = Vec::new();
+    let mut asked = Vec::new();
+    let end = bench.now + Duration::from_secs(30);
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let refused = poll.read.covers(Table::Holding, bad);
+                let polled = if refused {
+                    Polled::Refused(Exception::ADDRESS)
+                } else {
+                    Polled::Ok
+                };
+                asked.push((poll.read.start, poll.read.count));
+                if let Change::Unavailable(read, _) = bench.schedule.poll_done(&poll, polled, COST, bench.now) {
+                    unavailable.push(read.start);
+                }
+            }
+        }
+    }
+    assert_eq!(unavailable, [bad]);
+    let tail: Vec<_> = asked
+        .iter()
+        .rev()
+        .take(20)
+        .filter(|(start, _)| *start >= 2100)
+        .collect();
+    assert!(
+        tail.iter().all(|read| **read == (2100, 5) || **read == (2106, 5)),
+        "{tail:?}"
+    );
+    assert!(bench.schedule.is_online(0));
+}
+
+#[test]
+fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let mut mute = 0;
+    let end = bench.now + Duration::from_secs(30);
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let silent = poll.read.class == PollClass::Once;
+                mute += usize::from(silent);
+                let polled = if silent { Polled::Failed } else { Polled::Ok };
+                assert_ne!(
+                    bench.schedule.poll_done(&poll, polled, COST, bench.now),
+                    Change::Offline
+                );
+            }
+        }
+    }
+    assert_eq!(mute, 5, "first try and one retry, then after 2, 4, 8 s");
+}
+
+#[test]
+fn many_dead_drives_at_start_do_not_keep_the_others_waiting() {
+    let mut bench = Bench::new(31, Duration::from_millis(10));
+    bench.dead = (3..31).collect();
+    bench.run(Duration::from_secs(10));
+    for drive in 0..3 {
+        let mut last = None;
+        let mut longest = Duration::ZERO;
+        for (at, decision) in &bench.log {
+            if matches!(decision, Decision::Poll(p) if p.drive == drive && p.read.class == PollClass::Fast) {
+                longest = longest.max(last.map_or(Duration::ZERO, |before| *at - before));
+                last = Some(*at);
+            }
+        }
+        // A round, one probe between two fast polls, and first reads.
+        assert!(longest < Duration::from_millis(700), "drive {drive}: {longest:?}");
+    }
+    assert_eq!(bench.offline.len(), 28);
+}
+
+#[test]
+fn a_block_refused_once_by_mistake_is_whole_again_after_a_minute() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    let mut refuse = 1;
+    let mut asked = Vec::new();
+    let end = bench.now + Duration::from_secs(70);
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let polled = if poll.read.count == 11 && refuse > 0 {
+                    refuse -= 1;
+                    Polled::Refused(Exception::ADDRESS)
+                } else {
+                    Polled::Ok
+                };
+                if poll.read.class == PollClass::Fast {
+                    asked.push((poll.read.start, poll.read.count));
+                }
+                bench.schedule.poll_done(&poll, polled, COST, bench.now);
+            }
+        }
+    }
+    assert!(asked.contains(&(2100, 5)) && asked.contains(&(2105, 6)));
+    assert!(asked[asked.len() - 100..].iter().all(|read| *read == (2100, 11)));
+}
+
+#[test]
+fn a_bad_point_that_is_sound_again_is_read_with_its_neighbours() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let healed = bench.now + Duration::from_secs(30);
+    let end = bench.now + Duration::from_secs(200);
+    let mut asked = Vec::new();
+    while bench.now < end {
+        match bench.schedule.next(bench.now, None) {
+            Decision::Idle(until) => bench.now = until,
+            Decision::Command(_) => unreachable!(),
+            Decision::Poll(poll) => {
+                bench.now += COST;
+                let bad = bench.now < healed && poll.read.covers(Table::Holding, 2105);
+                let polled = if bad {
+                    Polled::Refused(Exception::ADDRESS)
+                } else {
+                    Polled::Ok
+                };
+                if poll.read.class == PollClass::Fast {
+                    asked.push((poll.read.start, poll.read.count));
+                }
+                bench.schedule.poll_done(&poll, polled, COST, bench.now);
+            }
+        }
+    }
+    assert!(
+        asked[asked.len() - 100..].iter().all(|read| *read == (2100, 11)),
+        "{:?}",
+        &asked[asked.len() - 20..]
+    );
+}
+
+#[test]
+fn garbled_answers_do_not_take_a_drive_away_at_once_but_at_last() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    let mut garbled = 0;
+    loop {
+        let Decision::Poll(poll) = bench.schedule.next(bench.now, None) else {
+            bench.now += Duration::from_millis(1);
+            continue;
+        };
+        bench.now += COST;
+        garbled += 1;
+        if bench.schedule.poll_done(&poll, Polled::Garbled, COST, bench.now) == Change::Offline {
+            break;
+        }
+        assert!(garbled < 100);
+    }
+    assert!((8..=12).contains(&garbled), "{garbled}");
+}
