@@ -1,0 +1,184 @@
+//! Which poll is due: the grid of fast rounds, the credit of slow polls, probes.
+
+use std::time::{Duration, Instant};
+
+use super::drives::{DriveSchedule, Item, Presence};
+use super::{FIRST_SHARE, Poll, RoundStart, Schedule, Turn};
+use crate::drive::{PlannedRead, PollClass};
+
+impl Schedule {
+    /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
+    /// the line rests where none of them fits.
+    pub(super) fn earn(&mut self, now: Instant) {
+        let passed = now.saturating_duration_since(self.earned_until);
+        self.earned_until = now;
+        let first = self.drives.iter().any(DriveSchedule::has_unread);
+        let share = if first { FIRST_SHARE } else { self.slow_share };
+        self.slow_credit = (self.slow_credit + passed.mul_f64(share)).min(self.most_credit);
+    }
+
+    pub(super) fn start_round(&mut self, now: Instant) {
+        if !self.round.is_empty() || now < self.round_due {
+            return;
+        }
+        self.join_again(now);
+        // The first reads of all drives, then the second ones: a reply that comes twice meets another drive's request.
+        let mut reads: Vec<(usize, usize, PlannedRead)> = Vec::new();
+        for (index, drive) in self
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, d)| d.presence == Presence::Online)
+        {
+            let due = drive
+                .items
+                .iter()
+                .filter(|i| i.read.class == PollClass::Fast && i.due <= now);
+            reads.extend(due.enumerate().map(|(place, i)| (place, index, i.read)));
+        }
+        reads.sort_by_key(|(place, index, _)| (*place, *index));
+        self.round
+            .extend(reads.into_iter().map(|(_, index, read)| (index, read)));
+        if self.round.is_empty() {
+            self.round_due = now + self.cadence.fast;
+            self.round_started = None;
+            return;
+        }
+        let cycle = self.round_started.map(|before| now.saturating_duration_since(before));
+        self.round_started = Some(now);
+        self.new_round = Some(RoundStart { at: now, cycle });
+        // The grid is kept whatever delayed this round; rounds that were missed altogether are not caught up.
+        let next = self.round_due + self.cadence.fast;
+        let missed = now.saturating_duration_since(next).as_nanos() / self.cadence.fast.as_nanos().max(1);
+        self.round_due = next + self.cadence.fast * u32::try_from(missed).unwrap_or(0);
+    }
+
+    /// Parts of a block that was refused long ago, by mistake perhaps, are read as one again.
+    fn join_again(&mut self, now: Instant) {
+        for drive in &mut self.drives {
+            let due = |item: &&Item| item.whole_again.is_some_and(|at| at <= now);
+            while let Some(origin) = drive.items.iter().find(due).map(|item| item.origin) {
+                drive.join(origin, now);
+            }
+        }
+    }
+
+    pub(super) fn due_poll(&mut self, now: Instant) -> Option<Poll> {
+        self.turn = Turn::Due;
+        // Many drives that are away must not keep the others waiting: one probe in vain, then a fast poll.
+        let hold = self.probed && !self.round.is_empty();
+        if let Some(probe) = self.due_probe(now).filter(|_| !hold) {
+            return Some(probe);
+        }
+        let slow = self.due_slow(now);
+        // A whole round went by without room for it: the line is saturated.
+        let left_out = |due| now.saturating_duration_since(due) > self.cadence.fast;
+        let on_credit = |(due, _, cost): &(Instant, Poll, Duration)| self.slow_credit >= *cost && left_out(*due);
+        if let Some((_, poll, _)) = slow.filter(on_credit) {
+            self.turn = Turn::OnCredit;
+            return Some(poll);
+        }
+        if let Some(&(drive, read)) = self.round.front() {
+            return Some(Poll {
+                drive,
+                read,
+                probe: false,
+            });
+        }
+        // In the idle time of a round a slow poll must not delay the next one.
+        let fast_active = self.round_started.is_some();
+        slow.filter(|(_, _, cost)| !fast_active || now + *cost <= self.round_due)
+            .map(|(_, poll, _)| poll)
+    }
+
+    /// The drive that is asked whether it answers: the one waiting longest.
+    fn due_probe(&self, now: Instant) -> Option<Poll> {
+        let due = |drive: &DriveSchedule| match drive.presence {
+            Presence::Away(at, _) if at <= now => Some(at),
+            _ => None,
+        };
+        let mut waiting: Vec<(Instant, usize)> = self
+            .drives
+            .iter()
+            .enumerate()
+            .filter_map(|(i, d)| Some((due(d)?, i)))
+            .collect();
+        waiting.sort();
+        waiting.into_iter().find_map(|(_, index)| {
+            let read = self.drives.get(index)?.items.first()?.read;
+            Some(Poll {
+                drive: index,
+                read,
+                probe: true,
+            })
+        })
+    }
+
+    /// The read that a command asked for, waiting longest.
+    pub(super) fn due_asked(&self, now: Instant) -> Option<Poll> {
+        let online = self.drives.iter().enumerate();
+        let online = online.filter(|(_, d)| d.presence == Presence::Online);
+        let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
+        let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
+        let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;
+        Some(Poll {
+            drive,
+            read,
+            probe: false,
+        })
+    }
+
+    fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
+        // What is read once when a drive comes online goes first: commands in percent rest on its frequencies.
+        let rank = |item: &Item| {
+            let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
+            (!first, item.due)
+        };
+        let (mut least, mut best) = (None, None);
+        for (index, drive) in self
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, d)| d.presence == Presence::Online)
+        {
+            for item in drive.items.iter().filter(|i| i.is_slow() && i.due <= now) {
+                if least.is_none_or(|least| rank(item) < least) {
+                    let poll = Poll {
+                        drive: index,
+                        read: item.read,
+                        probe: false,
+                    };
+                    least = Some(rank(item));
+                    best = Some((item.due, poll, item.cost));
+                }
+            }
+        }
+        best
+    }
+
+    /// When something is due; a slow poll that is due but does not fit before the round waits for the round.
+    pub(super) fn next_due(&self, now: Instant) -> Instant {
+        let mut next = self.round_due;
+        for drive in &self.drives {
+            let due = match drive.presence {
+                Presence::Away(at, _) => Some(at),
+                Presence::Online => {
+                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| i.due);
+                    let asked = drive.items.iter().filter_map(|i| i.asked);
+                    slow.chain(asked).filter(|due| *due > now).min()
+                }
+            };
+            next = due.map_or(next, |due| next.min(due));
+        }
+        next
+    }
+
+    pub(super) fn note_slow(&mut self, now: Instant) {
+        let started = self.slow_started;
+        if started.is_none_or(|at| now.saturating_duration_since(at) >= self.cadence.slow.mul_f64(0.5)) {
+            let cycle = started.map(|before| now.saturating_duration_since(before));
+            self.new_slow = Some(RoundStart { at: now, cycle });
+            self.slow_started = Some(now);
+        }
+    }
+}
