@@ -5,10 +5,9 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::confirm::NotConfirmed;
 use super::tap::{self, Tap};
-use super::task::counted;
 use super::transaction::{Ended, Transaction};
 use super::watchdog::{OwnResponse, own_response};
-use crate::cache::{Access, BusImage, Link, PollCycle};
+use crate::cache::{Access, BusImage, Link, Outcome as Counted, PollCycle};
 use crate::codec::{Exception, Reply, Request};
 use crate::drive::{ModelPoint, PlannedRead, Value};
 use crate::event::{Event, EventKind, Events};
@@ -343,5 +342,15 @@ impl Report {
         self.image.update_health(|h| h.load = load);
         self.window = now;
         self.busy = Duration::ZERO;
+    }
+}
+
+/// What the counters call an exchange that ended so.
+fn counted(ended: &Ended) -> Counted {
+    match ended {
+        Ended::Reply(Reply::Exception(_)) => Counted::Exception,
+        Ended::Reply(_) => Counted::Ok,
+        Ended::Silent => Counted::Timeout,
+        Ended::Corrupt(_) => Counted::Corrupt,
     }
 }
