@@ -1,0 +1,215 @@
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::*;
+use crate::cache::{DriveImage, DriveSpec, Link};
+use crate::codec::Exception;
+use crate::drive::profile::Profiles;
+
+fn drive(access: Access) -> DriveImage {
+    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let spec = DriveSpec {
+        access,
+        limits: BTreeMap::from([("speed_reference".to_string(), 0.0..=80.0)]),
+        turnaround: Duration::from_millis(2),
+        ..DriveSpec::new("pump-1", "line1", 1, Arc::clone(&profile))
+    };
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    image.update(|s| {
+        s.link = Link::Online(std::time::SystemTime::now());
+        s.store(Table::Holding, 100, &[1000, 5000], Instant::now());
+    });
+    image
+}
+
+fn try_order(order: Order) -> Result<Admitted, Refusal> {
+    let image = drive(Access::Control);
+    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+}
+
+fn point(name: &str) -> usize {
+    Profiles::built_in().get("vacon-nx").unwrap().point_index(name).unwrap()
+}
+
+fn set(points: &[(&str, f64)]) -> Result<Admitted, Refusal> {
+    try_order(Order::Points(
+        points.iter().map(|(n, v)| (point(n), Value::Number(*v))).collect(),
+    ))
+}
+
+fn write(address: u16, value: u16) -> Order {
+    Order::Write(RequestPdu::WriteRegister { address, value })
+}
+
+#[test]
+fn authority_comes_first() {
+    let image = drive(Access::Monitor);
+    let reading = image.reading(Instant::now(), Duration::from_secs(1));
+    for (order, may) in [(write(2000, 1), true), (write(9999, 1), true), (write(2000, 1), false)] {
+        assert_eq!(
+            admit(order, &reading, may).unwrap_err().exception(),
+            Exception::FUNCTION
+        );
+    }
+    assert!(
+        admit(
+            Order::Read(RequestPdu::Read {
+                table: Table::Holding,
+                start: 0,
+                count: 1
+            }),
+            &reading,
+            false
+        )
+        .is_ok()
+    );
+}
+
+#[test]
+fn limits_are_told_never_clamped() {
+    let refusal = set(&[("speed_reference", 80.5)]).unwrap_err();
+    assert_eq!(refusal.exception(), Exception::VALUE);
+    assert_eq!(
+        refusal.to_string(),
+        "`speed_reference` = 80.5 % is outside the limits 0 to 80 %; nothing was written"
+    );
+    assert!(set(&[("speed_reference", 80.0)]).is_ok());
+    assert!(set(&[("speed_reference", f64::NAN)]).is_err());
+    assert!(set(&[("run", 0.5)]).is_err());
+    assert!(try_order(write(2002, 8001)).is_err(), "raw writes obey the limits too");
+    assert!(try_order(write(2002, 8000)).is_ok());
+}
+
+#[test]
+fn frequency_becomes_percent_of_the_band() {
+    let admitted = set(&[("frequency_reference", 30.0)]).unwrap();
+    assert_eq!(
+        admitted.order,
+        Order::Points(vec![(point("speed_reference"), Value::Number(50.0))])
+    );
+    assert!(admitted.reference_only);
+    assert!(
+        set(&[("frequency_reference", 49.0)]).is_err(),
+        "97.5 % is beyond the limit of the percentage"
+    );
+    let twice = set(&[("frequency_reference", 30.0), ("speed_reference", 50.0)]).unwrap_err();
+    assert!(twice.to_string().contains("twice"), "{twice}");
+}
+
+#[test]
+fn stops_are_known_as_such() {
+    assert_eq!(
+        set(&[("run", 0.0), ("speed_reference", 0.0)]).unwrap().urgency,
+        Urgency::Stop
+    );
+    assert_eq!(set(&[("run", 1.0)]).unwrap().urgency, Urgency::Command);
+    assert_eq!(try_order(write(2000, 2)).unwrap().urgency, Urgency::Stop);
+    assert_eq!(try_order(write(2000, 1)).unwrap().urgency, Urgency::Command);
+    assert_eq!(try_order(write(2002, 0)).unwrap().urgency, Urgency::Command);
+}
+
+#[test]
+fn addresses_and_counts() {
+    let many = |start, count| {
+        Order::Write(RequestPdu::WriteRegisters {
+            start,
+            values: vec![0; count],
+        })
+    };
+    assert_eq!(
+        try_order(write(2100, 1)).unwrap_err().exception(),
+        Exception::ADDRESS,
+        "status word"
+    );
+    assert_eq!(
+        try_order(write(7000, 1)).unwrap_err().exception(),
+        Exception::ADDRESS,
+        "unknown"
+    );
+    assert_eq!(
+        try_order(many(2000, 12)).unwrap_err().exception(),
+        Exception::ADDRESS,
+        "past the range"
+    );
+    assert_eq!(
+        try_order(many(200, 2)).unwrap_err().exception(),
+        Exception::VALUE,
+        "one parameter a message"
+    );
+    assert!(try_order(many(2000, 3)).is_ok());
+    assert_eq!(
+        try_order(Order::Write(RequestPdu::WriteCoil { address: 0, on: true }))
+            .unwrap_err()
+            .exception(),
+        Exception::ADDRESS
+    );
+    assert_eq!(set(&[("ready", 1.0)]).unwrap_err().exception(), Exception::ADDRESS);
+    let mask = RequestPdu::MaskWrite {
+        address: 2000,
+        and_mask: 0,
+        or_mask: 0,
+    };
+    assert_eq!(
+        try_order(Order::Write(mask)).unwrap_err().exception(),
+        Exception::FUNCTION
+    );
+}
+
+/// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
+fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Order) -> Result<Admitted, Refusal> {
+    let profile = Profiles::built_in().get("teco-7300pa").unwrap().clone();
+    let mut spec = drive(Access::Control).spec;
+    spec.profile = Arc::clone(&profile);
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    image.update(|s| {
+        s.link = Link::Online(std::time::SystemTime::now());
+        if let Some(maximum) = maximum {
+            s.store(Table::Holding, 0x0201, &[maximum], Instant::now());
+        }
+    });
+    let order = order(&|name| profile.point_index(name).unwrap());
+    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+}
+
+#[test]
+fn a_command_goes_where_the_drive_takes_it_within_the_limits_of_the_other_unit() {
+    let set = |maximum, name: &str, value: f64| {
+        in_hertz(maximum, |point| {
+            Order::Points(vec![(point(name), Value::Number(value))])
+        })
+    };
+    let command = Profiles::built_in()
+        .get("teco-7300pa")
+        .unwrap()
+        .point_index("frequency_command")
+        .unwrap();
+    for (name, value) in [
+        ("speed_reference", 50.0),
+        ("frequency_reference", 30.0),
+        ("frequency_command", 30.0),
+    ] {
+        let admitted = set(Some(600), name, value).unwrap();
+        assert_eq!(
+            admitted.order,
+            Order::Points(vec![(command, Value::Number(30.0))]),
+            "{name}"
+        );
+    }
+    // 80 % of 60 Hz is 48 Hz.
+    for (name, value) in [
+        ("speed_reference", 81.0),
+        ("frequency_reference", 49.0),
+        ("frequency_command", 49.0),
+    ] {
+        assert_eq!(
+            set(Some(600), name, value).unwrap_err().exception(),
+            Exception::VALUE,
+            "{name}"
+        );
+        assert!(set(None, name, value).is_err(), "{name}: what 80 % are is not known");
+    }
+    let raw = |value| in_hertz(Some(600), |_| write(0x0002, value));
+    assert!(raw(4800).is_ok());
+    assert_eq!(raw(4801).unwrap_err().exception(), Exception::VALUE);
+}
