@@ -4,7 +4,8 @@ use std::fmt::Write as _;
 
 use serde_json::{Map as Object, Value, json};
 
-use super::{COLUMNS, Map, Row, drive_rows};
+use super::Map;
+use super::rows::{COLUMNS, Row, drive_rows};
 use crate::cache::Access;
 use crate::north::register_map::GATEWAY_UNIT;
 

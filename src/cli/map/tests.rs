@@ -2,7 +2,7 @@ use std::time::Duration;
 
 use super::export::quoted;
 use super::*;
-use crate::cache::BusSpec;
+use crate::cache::{Access, BusSpec};
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::profile::Profiles;
 

@@ -1,0 +1,123 @@
+//! The map as text: tables for people.
+
+use std::fmt::Write as _;
+
+use comfy_table::{Table as TextTable, presets};
+
+use super::Map;
+use super::rows::{COLUMNS, Row, drive_rows};
+use crate::cache::{Access, DriveSpec};
+use crate::codec::Table;
+use crate::drive::Profile;
+use crate::north::register_map::GATEWAY_UNIT;
+
+/// The whole map as tables.
+pub(super) fn render(map: &Map<'_>) -> String {
+    let (plant, drives) = (map.plant, &map.drives);
+    let specs: Vec<&DriveSpec> = drives.iter().map(|d| &d.image.spec).collect();
+    let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", plant.gateway);
+    let units = specs.iter().map(|s| {
+        let access = match s.access {
+            Access::Monitor => "monitor: every write is refused",
+            Access::Control => "control",
+        };
+        let address = s.address.to_string();
+        vec![
+            s.unit.to_string(),
+            s.name.clone(),
+            s.bus.clone(),
+            address,
+            s.profile.name.clone(),
+            access.to_string(),
+        ]
+    });
+    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
+    out += &table(
+        &["unit", "drive", "bus", "address", "profile", "access"],
+        units.chain([gateway]),
+    );
+    if map.listeners.len() > 1 {
+        out += "\nListeners\n";
+        let cells = map.listeners.iter().map(|listener| {
+            let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
+            let buses = listener
+                .buses
+                .as_ref()
+                .map_or_else(|| "all".to_string(), |names| names.join(", "));
+            let tls = if listener.tls { "yes" } else { "no" };
+            vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
+        });
+        out += &table(&["address", "TLS", "buses", "who may write"], cells);
+    }
+    out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
+            32-bit values lie high word first; age and state tell why a value is not available.\n";
+    let mut seen: Vec<&str> = Vec::new();
+    for drive in drives {
+        let profile = &drive.image.spec.profile;
+        if seen.contains(&profile.name.as_str()) {
+            continue;
+        }
+        seen.push(&profile.name);
+        let units: Vec<String> = specs
+            .iter()
+            .filter(|s| s.profile.name == profile.name)
+            .map(|s| s.unit.to_string())
+            .collect();
+        let _ = write!(
+            out,
+            "\nProfile {} ({}), units {}\n",
+            profile.name,
+            profile.title,
+            units.join(", ")
+        );
+        // What a unit of this profile can have; the table above tells which units take writes.
+        out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
+        let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
+        out += &ranges(profile);
+    }
+    out += "\nThe gateway itself, unit 255\n";
+    out += &rows(&map.gateway);
+    out
+}
+
+fn rows(rows: &[Row]) -> String {
+    table(&COLUMNS, rows.iter().map(|r| r.cells().to_vec()))
+}
+
+fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
+    let mut table = TextTable::new();
+    table
+        .load_preset(presets::NOTHING)
+        .set_header(header.iter().map(|h| h.replace('_', " ")));
+    table.add_rows(rows);
+    let mut out: String = table.trim_fmt();
+    out.push('\n');
+    out
+}
+
+/// What the raw view reaches beside the points.
+fn ranges(profile: &Profile) -> String {
+    let header = ["table", "first", "last", "read at once", "written at once", "note"];
+    let rows = profile.ranges.iter().map(|range| {
+        let table = match range.table {
+            Table::Holding if profile.input_is_holding => "holding, input",
+            table => table.name(),
+        };
+        let written = if range.write == 0 {
+            "read only".to_string()
+        } else {
+            range.write.to_string()
+        };
+        let (first, last) = range.addresses.clone().into_inner();
+        let note = range.note.clone();
+        vec![
+            table.to_string(),
+            first.to_string(),
+            last.to_string(),
+            range.read.to_string(),
+            written,
+            note,
+        ]
+    });
+    table(&header, rows)
+}
