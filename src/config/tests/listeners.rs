@@ -1,0 +1,212 @@
+//! Listeners and certificates.
+
+use std::path::Path;
+use std::sync::LazyLock;
+
+use super::{FORM, FULL, load, settings};
+use crate::config::modbus_tcp;
+
+/// Directory of a CA and a server certificate, made by the script of the documentation.
+pub(super) fn certificates() -> &'static Path {
+    static DIR: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
+        let dir = tempfile::tempdir().unwrap();
+        for arguments in [&["ca"][..], &["server", "gateway"], &["server", "other"]] {
+            certificate(dir.path(), arguments, "30");
+        }
+        certificate(dir.path(), &["server", "expired"], "-1");
+        dir
+    });
+    DIR.path()
+}
+
+fn certificate(dir: &Path, arguments: &[&str], days: &str) {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus-tls-ca.sh");
+    let output = std::process::Command::new(script)
+        .arg(dir)
+        .args(arguments)
+        .env("DAYS", days)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
+#[test]
+fn units_are_unique_where_modbus_tcp_serves_them() {
+    let mut source = "[gateway]\nname = \"g\"\n".to_string();
+    for bus in 1..=32 {
+        source += &format!("[[bus]]\nname = \"b{bus}\"\nport = \"/dev/tty{bus}\"\n");
+        for address in 1..=31 {
+            source +=
+                &format!("[[bus.drive]]\nname = \"d{bus}-{address}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
+        }
+    }
+    assert_eq!(
+        settings(&source).buses.iter().map(|b| b.drives.len()).sum::<usize>(),
+        992
+    );
+    let (served, _) = load(&(source + "[modbus_tcp]\n"));
+    assert_eq!(served.errors.len(), 961);
+    assert!(
+        served.errors[0].message.contains("unit 1 belongs to"),
+        "{:?}",
+        served.errors[0]
+    );
+}
+
+/// Two lines with the same addresses, and what stands in `[modbus_tcp]`.
+fn two_lines(modbus_tcp: &str) -> String {
+    let mut source = "[gateway]\nname = \"g\"\n".to_string();
+    for bus in ["line1", "line2"] {
+        source += &format!("[[bus]]\nname = \"{bus}\"\nport = \"/dev/{bus}\"\n");
+        for address in [1, 2] {
+            source +=
+                &format!("[[bus.drive]]\nname = \"{bus}-{address}\"\naddress = {address}\nprofile = \"vacon-nx\"\n");
+        }
+    }
+    source + modbus_tcp
+}
+
+#[test]
+fn a_listener_for_each_line() {
+    let split = two_lines(
+        "[modbus_tcp]\nallow = [\"10.0.0.0/8\"]\nwrite = [\"10.0.0.1\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1503\"]\nbuses = [\"line1\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1504\"]\nbuses = [\"line2\"]\nwrite = []\nallow = [\"10.2.0.0/16\"]\n",
+    );
+    let options = settings(&split).modbus_tcp.unwrap();
+    assert_eq!(
+        options.listeners.len(),
+        2,
+        "the short form is not there unless it is written"
+    );
+    let [one, two] = [&options.listeners[0], &options.listeners[1]];
+    assert_eq!(one.buses.as_deref(), Some(&["line1".to_string()][..]));
+    assert_eq!(
+        (one.allow[0].to_string(), one.write[0].to_string()),
+        ("10.0.0.0/8".into(), "10.0.0.1/32".into())
+    );
+    assert_eq!((two.allow[0].to_string(), two.write.len()), ("10.2.0.0/16".into(), 0));
+    assert_eq!(options.idle_timeout, Some(modbus_tcp::DEFAULT_IDLE));
+    let off = settings(&split.replace("[modbus_tcp]", "[modbus_tcp]\nidle_timeout = \"off\""))
+        .modbus_tcp
+        .unwrap();
+    assert_eq!(off.idle_timeout, None);
+    // Together they would share their units.
+    let (both, _) = load(&split.replace("buses = [\"line2\"]", "buses = [\"line1\", \"line2\"]"));
+    assert_eq!(both.errors.len(), 2, "{:?}", both.errors);
+    assert!(
+        both.errors[0].message.contains("unit 1 belongs to drive `line1-1`"),
+        "{:?}",
+        both.errors[0]
+    );
+    // Shown twice, told once.
+    let (all, _) = load(&(split + "[modbus_tcp.tls]\ncertificate = \"a\"\n"));
+    assert_eq!(
+        all.errors
+            .iter()
+            .filter(|e| e.message.contains("belongs to drive"))
+            .count(),
+        2
+    );
+}
+
+#[test]
+fn faults_of_listeners() {
+    let (loaded, _) = load(&two_lines(
+        "[modbus_tcp]\nlisten = [\"127.0.0.1:1502\"]\nmax_connections_per_address = 0\nidle_timeout = \"0s\"\n\
+         [[modbus_tcp.listener]]\nbuses = [\"lime1\", \"hall\"]\n\
+         [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1502\"]\nbuses = []\n",
+    ));
+    let told: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
+    for wanted in [
+        "there is no bus `lime1`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; did you mean `line1`?",
+        "there is no bus `hall`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; write one of line1, line2",
+        "`listen` is missing; /etc/drivegate/t.toml:29, modbus_tcp.listener[0].listen; write for example [\"127.0.0.1:1502\"]",
+        "the list is empty; /etc/drivegate/t.toml:33, modbus_tcp.listener[1].buses; name a bus, or leave the key out for all",
+        "127.0.0.1:1502 collides with 127.0.0.1:1502 of modbus_tcp.listen (line 26); /etc/drivegate/t.toml:32, \
+         modbus_tcp.listener[1].listen; give each server a port of its own",
+        "0 is out of range; /etc/drivegate/t.toml:27, modbus_tcp.max_connections_per_address; write 1 to 10000",
+        "0s is out of range; /etc/drivegate/t.toml:28, modbus_tcp.idle_timeout; write \"1s\" to \"168h\"",
+    ] {
+        assert!(
+            told.iter().any(|t| t == wanted),
+            "{wanted}\nis missing in\n{}",
+            told.join("\n")
+        );
+    }
+}
+
+#[test]
+fn faults_of_certificates_are_told_with_file_and_key() {
+    let dir = certificates();
+    let shown = dir.display();
+    let of = |from: &str, to: &str| {
+        let (loaded, _) = load(&FULL.replace(&format!("{shown}/{from}\""), &format!("{to}\"")));
+        assert!(loaded.settings.is_none());
+        loaded
+            .errors
+            .iter()
+            .map(ToString::to_string)
+            .collect::<Vec<_>>()
+            .join("\n")
+    };
+    let file = |name: &str| dir.join(name).display().to_string();
+    for (from, to, wanted) in [
+        (
+            "gateway.crt",
+            file("nowhere.crt"),
+            "nowhere.crt: No such file or directory (os error 2); /etc/drivegate/t.toml:18, \
+          modbus_tcp.tls.certificate; check the path and its permissions",
+        ),
+        (
+            "gateway.crt",
+            file("gateway.key"),
+            "gateway.key holds no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; give a PEM file",
+        ),
+        (
+            "gateway.crt",
+            file("other.crt"),
+            "the key does not belong to the certificate; /etc/drivegate/t.toml:19, \
+          modbus_tcp.tls.key; give the key that the certificate was made for",
+        ),
+        ("gateway.key", file("gateway.crt"), "gateway.crt holds no private key: "),
+        ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
+        ("gateway.crt", file("expired.crt"), "has expired on "),
+    ] {
+        let told = of(from, &to);
+        assert!(told.contains(wanted), "{wanted}\nis not in\n{told}");
+        assert_eq!(told.lines().count(), 1, "{told}");
+    }
+}
+
+#[test]
+fn new_certificates_in_the_same_files_are_seen() {
+    let dir = tempfile::tempdir().unwrap();
+    certificate(dir.path(), &["ca"], "30");
+    let source = FORM.replace("DIR", &dir.path().display().to_string());
+    let renewed = || {
+        let _ = std::fs::remove_file(dir.path().join("gateway.key"));
+        let _ = std::fs::remove_file(dir.path().join("gateway.crt"));
+        certificate(dir.path(), &["server", "gateway"], "400");
+        settings(&source).modbus_tcp.unwrap()
+    };
+    let (one, two) = (renewed(), renewed());
+    assert!(two.differs_in_certificates_only(&one));
+    assert!(!one.differs_in_certificates_only(&one.clone()));
+    let mut other = two.clone();
+    other.max_connections += 1;
+    assert!(!other.differs_in_certificates_only(&one));
+    let debug = format!("{one:?}");
+    let key = std::fs::read_to_string(dir.path().join("gateway.key")).unwrap();
+    assert!(
+        debug.contains("elided") && !debug.contains(key.lines().nth(1).unwrap()),
+        "{debug}"
+    );
+    // Thirty days before its end a certificate is worth a word.
+    let (loaded, _) = load(&FULL);
+    assert!(
+        loaded.warnings.iter().any(|w| w.message.contains("expires on")),
+        "{:?}",
+        loaded.warnings
+    );
+}
