@@ -318,5 +318,4 @@ fn is_linked(session: &Session, link: u64) -> bool {
 }
 
 #[cfg(test)]
-#[path = "state_tests.rs"]
 mod tests;
