@@ -424,5 +424,4 @@ impl fmt::Display for Remedy {
 }
 
 #[cfg(test)]
-#[path = "predict_tests.rs"]
 mod tests;

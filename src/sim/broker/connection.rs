@@ -408,5 +408,4 @@ async fn sleep_until(deadline: Option<Instant>) {
 }
 
 #[cfg(test)]
-#[path = "connection_tests.rs"]
 mod tests;

@@ -334,5 +334,4 @@ fn variable_integer(bytes: &[u8]) -> Option<(usize, usize)> {
 }
 
 #[cfg(test)]
-#[path = "wire_tests.rs"]
 mod tests;
