@@ -7,15 +7,16 @@
 //!
 //! The values themselves are in `tree`, the types that they can be read as in `value`.
 
+mod file;
+mod reader;
+mod tree;
+mod value;
+
 use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::fmt;
 
 use serde::Serialize;
-mod file;
-mod reader;
-mod tree;
-mod value;
 
 use tree::entries;
 
