@@ -12,11 +12,7 @@ fn request() -> (Request, Vec<u8>) {
         start: 732,
         count: 1,
     };
-    let request = Request {
-        address: 1,
-        pdu,
-        n2: Default::default(),
-    };
+    let request = Request::new(1, pdu);
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
     (request, frame)
@@ -109,14 +105,13 @@ fn echo_is_dropped_even_where_it_looks_like_a_reply() {
 
 #[test]
 fn a_known_echo_does_not_acknowledge_a_write() {
-    let request = Request {
-        address: 1,
-        pdu: RequestPdu::WriteRegister {
+    let request = Request::new(
+        1,
+        RequestPdu::WriteRegister {
             address: 2000,
             value: 1,
         },
-        n2: Default::default(),
-    };
+    );
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
     let now = Instant::now();
@@ -185,11 +180,7 @@ fn a_reply_behind_noise_is_found_but_no_exception_and_no_echo() {
         address: 2000,
         value: 1,
     };
-    let write = Request {
-        address: 1,
-        pdu,
-        n2: Default::default(),
-    };
+    let write = Request::new(1, pdu);
     let mut bytes = vec![0x37];
     rtu::encode_request(&write, &mut bytes);
     let (ms, protocol) = (Duration::from_millis, Protocol::ModbusRtu);

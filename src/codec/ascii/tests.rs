@@ -9,11 +9,7 @@ fn line(text: &str) -> Vec<u8> {
 }
 
 fn to(address: u8, pdu: RequestPdu) -> Request {
-    Request {
-        address,
-        pdu,
-        n2: Default::default(),
-    }
+    Request::new(address, pdu)
 }
 
 fn read(start: u16, count: u16) -> Request {

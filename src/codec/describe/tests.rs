@@ -12,11 +12,7 @@ fn hex(text: &str) -> Vec<u8> {
 
 fn asked(frame: &str) -> Request {
     let (address, pdu) = rtu::decode_request(&hex(frame)).unwrap();
-    Request {
-        address,
-        pdu: pdu.unwrap(),
-        n2: Default::default(),
-    }
+    Request::new(address, pdu.unwrap())
 }
 
 fn framed(address: u8, pdu: &str) -> Vec<u8> {
@@ -124,11 +120,7 @@ fn replies() {
         ),
     ] {
         let (address, decoded) = rtu::decode_request(&framed(1, asked_for)).unwrap();
-        let asked = Request {
-            address,
-            pdu: decoded.unwrap(),
-            n2: Default::default(),
-        };
+        let asked = Request::new(address, decoded.unwrap());
         assert_eq!(reply(RTU, &asked, &framed(1, pdu)), text);
     }
 }
@@ -238,11 +230,7 @@ fn in_ascii(asked: &Request, bytes: &[u8], answered: bool) -> Vec<(Kind, usize)>
 fn ascii_exchanges_in_their_parts_and_words() {
     let ask = |text: &[u8]| {
         let (address, pdu) = ascii::decode_request(text).unwrap();
-        Request {
-            address,
-            pdu: pdu.unwrap(),
-            n2: Default::default(),
-        }
+        Request::new(address, pdu.unwrap())
     };
     let echo = b":010300200002DA\r\n";
     let read = ask(echo);

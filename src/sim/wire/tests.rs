@@ -239,14 +239,15 @@ fn the_measuring_rod_keeps_the_silence() {
     let format = options.rules.format;
     let bus = SimulatedBus::start(options).unwrap();
     let requests: Vec<Request> = (1..=2)
-        .map(|address| Request {
-            address,
-            pdu: RequestPdu::Read {
-                table: Table::Holding,
-                start: 2100,
-                count: 11,
-            },
-            n2: Default::default(),
+        .map(|address| {
+            Request::new(
+                address,
+                RequestPdu::Read {
+                    table: Table::Holding,
+                    start: 2100,
+                    count: 11,
+                },
+            )
         })
         .collect();
     let master = BareOptions {

@@ -9,11 +9,7 @@ pub(super) fn in_ascii() -> (Request, Vec<u8>, &'static [u8]) {
         start: 0x20,
         count: 2,
     };
-    let request = Request {
-        address: 1,
-        pdu,
-        n2: Default::default(),
-    };
+    let request = Request::new(1, pdu);
     let mut frame = Vec::new();
     Protocol::ModbusAscii.encode(&request, &mut frame);
     (request, frame, b":01030400050000F3\r\n")
@@ -105,11 +101,7 @@ fn an_ascii_echo_is_dropped_behind_noise_too() {
         assert_eq!(transaction.on_bytes(now, &bytes), Step::Done(answered.clone()));
         assert_eq!((transaction.echoes(&answered), transaction.foreign()), (Some(true), 0));
     }
-    let write = Request {
-        address: 1,
-        pdu: RequestPdu::WriteRegister { address: 1, value: 1 },
-        n2: Default::default(),
-    };
+    let write = Request::new(1, RequestPdu::WriteRegister { address: 1, value: 1 });
     let mut frame = Vec::new();
     Protocol::ModbusAscii.encode(&write, &mut frame);
     let mut transaction = start_ascii(&write, &frame, now, true);
