@@ -4,8 +4,8 @@ use std::fmt::Write as _;
 
 use comfy_table::{Table as TextTable, presets};
 
-use super::Map;
 use super::rows::{COLUMNS, Row, drive_rows};
+use super::{Listener, Map};
 use crate::cache::{Access, DriveSpec};
 use crate::codec::Table;
 use crate::drive::Profile;
@@ -13,46 +13,17 @@ use crate::north::register_map::GATEWAY_UNIT;
 
 /// The whole map as tables.
 pub(super) fn render(map: &Map<'_>) -> String {
-    let (plant, drives) = (map.plant, &map.drives);
-    let specs: Vec<&DriveSpec> = drives.iter().map(|d| &d.image.spec).collect();
-    let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", plant.gateway);
-    let units = specs.iter().map(|s| {
-        let access = match s.access {
-            Access::Monitor => "monitor: every write is refused",
-            Access::Control => "control",
-        };
-        let address = s.address.to_string();
-        vec![
-            s.unit.to_string(),
-            s.name.clone(),
-            s.bus.clone(),
-            address,
-            s.profile.name.clone(),
-            access.to_string(),
-        ]
-    });
-    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
-    out += &table(
-        &["unit", "drive", "bus", "address", "profile", "access"],
-        units.chain([gateway]),
-    );
+    let specs: Vec<&DriveSpec> = map.drives.iter().map(|d| &d.image.spec).collect();
+    let mut out = format!("Modbus TCP register map of {}\n\nUnits\n", map.plant.gateway);
+    out += &units(&specs);
     if map.listeners.len() > 1 {
         out += "\nListeners\n";
-        let cells = map.listeners.iter().map(|listener| {
-            let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
-            let buses = listener
-                .buses
-                .as_ref()
-                .map_or_else(|| "all".to_string(), |names| names.join(", "));
-            let tls = if listener.tls { "yes" } else { "no" };
-            vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
-        });
-        out += &table(&["address", "TLS", "buses", "who may write"], cells);
+        out += &listeners(map.listeners);
     }
     out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
             32-bit values lie high word first; age and state tell why a value is not available.\n";
     let mut seen: Vec<&str> = Vec::new();
-    for drive in drives {
+    for drive in &map.drives {
         let profile = &drive.image.spec.profile;
         if seen.contains(&profile.name.as_str()) {
             continue;
@@ -78,6 +49,42 @@ pub(super) fn render(map: &Map<'_>) -> String {
     out += "\nThe gateway itself, unit 255\n";
     out += &rows(&map.gateway);
     out
+}
+
+fn units(specs: &[&DriveSpec]) -> String {
+    let units = specs.iter().map(|s| {
+        let access = match s.access {
+            Access::Monitor => "monitor: every write is refused",
+            Access::Control => "control",
+        };
+        let address = s.address.to_string();
+        vec![
+            s.unit.to_string(),
+            s.name.clone(),
+            s.bus.clone(),
+            address,
+            s.profile.name.clone(),
+            access.to_string(),
+        ]
+    });
+    let gateway = vec![GATEWAY_UNIT.to_string(), "the gateway itself".to_string()];
+    table(
+        &["unit", "drive", "bus", "address", "profile", "access"],
+        units.chain([gateway]),
+    )
+}
+
+fn listeners(listeners: &[Listener]) -> String {
+    let cells = listeners.iter().map(|listener| {
+        let addresses: Vec<String> = listener.addresses.iter().map(ToString::to_string).collect();
+        let buses = listener
+            .buses
+            .as_ref()
+            .map_or_else(|| "all".to_string(), |names| names.join(", "));
+        let tls = if listener.tls { "yes" } else { "no" };
+        vec![addresses.join(", "), tls.to_string(), buses, listener.writers.clone()]
+    });
+    table(&["address", "TLS", "buses", "who may write"], cells)
 }
 
 fn rows(rows: &[Row]) -> String {
