@@ -1,5 +1,7 @@
 //! Buses of chance: nothing starves, and everybody has his share.
 
+use std::collections::VecDeque;
+
 use proptest::prelude::*;
 
 use super::*;
@@ -67,6 +69,88 @@ struct Seen {
     elapsed: Duration,
 }
 
+impl Seen {
+    /// A poll of a drive that is alive, `gap` after the one before.
+    fn read(&mut self, poll: &Poll, took: Duration, gap: Duration) {
+        let key = (poll.drive, poll.read.start);
+        match poll.read.class {
+            PollClass::Fast => {
+                *self.fast_counts.entry(key).or_default() += 1;
+                self.longest(key, PollClass::Fast, gap);
+            }
+            PollClass::Slow => {
+                self.slow_time += took;
+                self.longest(key, PollClass::Slow, gap);
+            }
+            // On a line that is full of commands the start takes long.
+            _ => self.slow_time += took,
+        }
+    }
+
+    fn longest(&mut self, key: (usize, u16), class: PollClass, gap: Duration) {
+        let of = match class {
+            PollClass::Fast => &mut self.longest,
+            PollClass::Slow => &mut self.slow_longest,
+            _ => return,
+        };
+        let longest = of.entry(key).or_default();
+        *longest = gap.max(*longest);
+    }
+}
+
+/// Commands that arrive at a steady pace, each of a rank by chance.
+struct Commands {
+    every: Option<Duration>,
+    next: Instant,
+    dice: u64,
+    waiting: VecDeque<Urgency>,
+}
+
+impl Commands {
+    fn new(case: &Case, start: Instant) -> Commands {
+        Commands {
+            every: case.every_ms.map(Duration::from_millis),
+            next: start,
+            dice: case.seed | 1,
+            waiting: VecDeque::new(),
+        }
+    }
+
+    fn arrive(&mut self, now: Instant) {
+        let Some(every) = self.every else { return };
+        while self.next <= now {
+            self.dice = self
+                .dice
+                .wrapping_mul(6_364_136_223_846_793_005)
+                .wrapping_add(1_442_695_040_888_963_407);
+            let urgency = match (self.dice >> 33) % 20 {
+                0 => Urgency::Stop,
+                1..=14 => Urgency::Command,
+                _ => Urgency::Read,
+            };
+            // The queue is bounded.
+            if self.waiting.len() < 64 {
+                self.waiting.push_back(urgency);
+            }
+            self.next += every;
+        }
+    }
+
+    fn best(&self) -> Option<Urgency> {
+        self.waiting.iter().min().copied()
+    }
+
+    /// When the next one arrives, if any does.
+    fn next(&self) -> Option<Instant> {
+        self.every.map(|_| self.next)
+    }
+
+    fn take(&mut self, urgency: Urgency) {
+        let at = self.waiting.iter().position(|u| *u == urgency).unwrap();
+        self.waiting.remove(at);
+    }
+}
+
 fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
     let plans: Vec<Plan> = case.plans.iter().map(|reads| plan_of(reads)).collect();
     let plan_refs: Vec<&Plan> = plans.iter().collect();
@@ -82,29 +166,13 @@ fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
     let (settled, end) = (start + Duration::from_secs(15), start + Duration::from_secs(75));
     let mut seen = Seen::default();
     let mut last: BTreeMap<(usize, PlannedRead), Instant> = BTreeMap::new();
-    let (mut now, mut next_command, mut dice) = (start, start, case.seed | 1);
-    let mut waiting: std::collections::VecDeque<Urgency> = std::collections::VecDeque::new();
+    let mut now = start;
+    let mut commands = Commands::new(case, start);
     let mut passed = 0;
     let (mut row, mut stops) = (0, 0);
     while now < end {
-        if let Some(every) = case.every_ms {
-            while next_command <= now {
-                dice = dice
-                    .wrapping_mul(6_364_136_223_846_793_005)
-                    .wrapping_add(1_442_695_040_888_963_407);
-                let urgency = match (dice >> 33) % 20 {
-                    0 => Urgency::Stop,
-                    1..=14 => Urgency::Command,
-                    _ => Urgency::Read,
-                };
-                // The queue is bounded.
-                if waiting.len() < 64 {
-                    waiting.push_back(urgency);
-                }
-                next_command += Duration::from_millis(every);
-            }
-        }
-        let best = waiting.iter().min().copied();
+        commands.arrive(now);
+        let best = commands.best();
         let due = matches!(schedule.next(now, None), Decision::Poll(_));
         let decision = schedule.next(now, best);
         if let (true, Decision::Command(urgency)) = (due, decision) {
@@ -120,16 +188,11 @@ fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
             Decision::Idle(until) => {
                 prop_assert!(until > now, "idle into the past");
                 prop_assert!(best.is_none(), "idle while a command waits");
-                now = if case.every_ms.is_some() {
-                    until.min(next_command)
-                } else {
-                    until
-                };
+                now = commands.next().map_or(until, |next| until.min(next));
             }
             Decision::Command(urgency) => {
                 prop_assert_eq!(Some(urgency), best);
-                let at = waiting.iter().position(|u| *u == urgency).unwrap();
-                waiting.remove(at);
+                commands.take(urgency);
                 let took = Duration::from_millis(case.cost_ms);
                 now += took;
                 schedule.command_done(urgency, COST);
@@ -143,29 +206,11 @@ fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
                 now += took;
                 schedule.poll_done(&poll, if dead { Polled::Failed } else { Polled::Ok }, took, now);
                 (row, stops) = (0, 0);
-                if !counted {
-                    last.insert((poll.drive, poll.read), now);
-                    continue;
-                }
-                if dead {
-                    *seen.dead_time.entry(poll.drive).or_default() += took;
-                    continue;
-                }
-                let key = (poll.drive, poll.read.start);
-                let gap = now - last.insert((poll.drive, poll.read), now).unwrap_or(settled);
-                match poll.read.class {
-                    PollClass::Fast => {
-                        *seen.fast_counts.entry(key).or_default() += 1;
-                        let longest = seen.longest.entry(key).or_default();
-                        *longest = gap.max(*longest);
-                    }
-                    PollClass::Slow => {
-                        seen.slow_time += took;
-                        let longest = seen.slow_longest.entry(key).or_default();
-                        *longest = gap.max(*longest);
-                    }
-                    // On a line that is full of commands the start takes long.
-                    _ => seen.slow_time += took,
+                let before = last.insert((poll.drive, poll.read), now);
+                match (counted, dead) {
+                    (false, _) => {}
+                    (true, true) => *seen.dead_time.entry(poll.drive).or_default() += took,
+                    (true, false) => seen.read(&poll, took, now - before.unwrap_or(settled)),
                 }
             }
         }
@@ -174,13 +219,7 @@ fn simulate(case: &Case) -> Result<Seen, TestCaseError> {
         if case.dead[drive] {
             continue;
         }
-        let of = match read.class {
-            PollClass::Fast => &mut seen.longest,
-            PollClass::Slow => &mut seen.slow_longest,
-            _ => continue,
-        };
-        let longest = of.entry((drive, read.start)).or_default();
-        *longest = (*longest).max(now - at);
+        seen.longest((drive, read.start), read.class, now - at);
     }
     seen.elapsed = now - settled;
     Ok(seen)
