@@ -11,7 +11,8 @@ pub(super) fn certificates() -> &'static Path {
     static DIR: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
         let dir = tempfile::tempdir().unwrap();
         for arguments in [&["ca"][..], &["server", "gateway"], &["server", "other"]] {
-            certificate(dir.path(), arguments, "30");
+            // A day under the thirty from which on the end is told, whatever second it is looked at.
+            certificate(dir.path(), arguments, "29");
         }
         certificate(dir.path(), &["server", "expired"], "-1");
         dir
