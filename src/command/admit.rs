@@ -128,9 +128,12 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
     }
     if let Some(limits) = drive.spec.limits_of(index).filter(|l| !l.contains(&number)) {
         let (low, high) = limits.into_inner();
-        let unit = &point.unit;
+        let unit = match point.unit.as_str() {
+            "" => String::new(),
+            unit => format!(" {unit}"),
+        };
         let text =
-            format!("`{name}` = {number} {unit} is outside the limits {low} to {high} {unit}; nothing was written");
+            format!("`{name}` = {number}{unit} is outside the limits {low} to {high}{unit}; nothing was written");
         return Err(Refusal::BadValue(text));
     }
     Ok(Value::Number(number))

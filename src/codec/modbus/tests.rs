@@ -39,6 +39,17 @@ fn refused_requests() {
     assert_eq!(RequestPdu::decode(&[43, 13, 1, 0]), Err(Exception::FUNCTION));
 }
 
+#[test]
+fn a_refusal_with_00_is_the_lines_and_no_answer() {
+    let read = RequestPdu::Read {
+        table: Table::Holding,
+        start: 0x20,
+        count: 1,
+    };
+    assert_eq!(Reply::decode(&read, &[0x83, 0]), Err(Misfit));
+    assert_eq!(Reply::decode(&read, &[0x83, 1]), Ok(Reply::Exception(Exception(1))));
+}
+
 fn any_request() -> impl Strategy<Value = RequestPdu> {
     let table = prop_oneof![
         Just(Table::Coil),
