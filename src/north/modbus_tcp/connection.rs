@@ -54,13 +54,15 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     cancel: CancellationToken,
 ) {
     tracing::debug!(client = session.who(), "Modbus TCP: connected");
+    let now = Instant::now();
     let mut connection = Connection {
+        now,
         turns: session.turns(),
         stream,
         dialogue: Dialogue::new(session),
         since_yield: 0,
-        idle: idle_timeout.map(Idle::new),
-        lookout: Lookout::new(std::time::Instant::now()),
+        idle: idle_timeout.map(|timeout| Idle::new(timeout, now)),
+        lookout: Lookout::new(now.into_std()),
     };
     let end = match connection.run(&cancel).await {
         Ok(never) => match never {},
@@ -79,6 +81,8 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
 struct Connection<S> {
     stream: S,
     dialogue: Dialogue,
+    /// The time, as of the last wait: read once a request.
+    now: Instant,
     /// Requests since others had their turn.
     since_yield: usize,
     idle: Option<Idle>,
@@ -93,7 +97,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         // One future for all turns: it enters the token's list once, not with every request.
         let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
-            let worked = self.dialogue.work(std::time::Instant::now());
+            let worked = self.dialogue.work(self.now.into_std());
             self.dialogue.collect();
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
@@ -101,6 +105,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                     () = &mut cancelled => return Err(End::Cancelled),
                     flushed = flush(&mut self.stream, &mut self.dialogue) => flushed?,
                 }
+                self.now = Instant::now();
             }
             let taken = worked?;
             if taken.frames > 0 {
@@ -113,6 +118,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             }
             let full = self.dialogue.is_full();
             if !full && self.dialogue.has_more() {
+                self.now = Instant::now();
                 continue;
             }
             if client_done && !self.dialogue.is_waiting() {
@@ -127,13 +133,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 event = self.next(reads, half_frame_since) => event?,
                 () = &mut cancelled => return Err(End::Cancelled),
             };
+            self.now = Instant::now();
             match event {
                 Event::Answer(finished) => {
                     self.dialogue.finish(&finished);
                     self.touch();
                 }
-                Event::Input(0) => client_done = true,
-                Event::Input(count) => self.dialogue.received(count),
+                Event::Input(0, _) => client_done = true,
+                Event::Input(count, looked) => {
+                    self.lookout.served(self.turns.next(), self.now.into_std(), looked);
+                    self.dialogue.received(count);
+                }
             }
         }
     }
@@ -142,7 +152,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn next(&mut self, reads: bool, half_frame_since: Option<Instant>) -> Result<Event, End> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
-        let began = std::time::Instant::now();
         let (mut read, mut looked) = (None, false);
         if reads {
             read = self.stream.read(space).now_or_never();
@@ -153,7 +162,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             self.since_yield = 0;
             if reads
                 && !waits
-                && let Some(patience) = self.lookout.patience(began)
+                && let Some(patience) = self.lookout.patience()
             {
                 looked = true;
                 read = look_out(&mut self.stream, space, &mut self.lookout, &self.turns, patience).await;
@@ -162,21 +171,20 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         let count = match read {
             Some(count) => count?,
             None => tokio::select! {
+                biased;
                 Some(finished) = waiting.next() => return Ok(Event::Answer(finished)),
                 count = self.stream.read(space), if reads => count?,
                 () = expired(half_frame_since) => return Err(End::HalfFrame),
                 timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
             },
         };
-        self.lookout
-            .served(self.turns.next(), began, std::time::Instant::now(), looked);
-        Ok(Event::Input(count))
+        Ok(Event::Input(count, looked))
     }
 
     /// The client uses its connection.
     fn touch(&mut self) {
         if let Some(idle) = &mut self.idle {
-            idle.since = Instant::now();
+            idle.since = self.now;
         }
     }
 
@@ -208,8 +216,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 enum Event {
     /// An answer from the bus.
     Answer(Finished),
-    /// So many bytes from the client; 0 at its end.
-    Input(usize),
+    /// So many bytes from the client, 0 at its end; whether they were looked out for.
+    Input(usize, bool),
 }
 
 /// How long the client has been silent. The timer is set anew only when it runs out, not with each request.
@@ -220,10 +228,10 @@ struct Idle {
 }
 
 impl Idle {
-    fn new(timeout: Duration) -> Idle {
+    fn new(timeout: Duration, now: Instant) -> Idle {
         Idle {
             timeout,
-            since: Instant::now(),
+            since: now,
             timer: Box::pin(tokio::time::sleep(timeout)),
         }
     }

@@ -10,7 +10,7 @@ use std::time::{Duration, Instant};
 
 /// Longest look-out for one request.
 const PATIENCE: Duration = Duration::from_micros(50);
-/// A client that asks within that time, seen by who has slept, will ask within [`PATIENCE`] when seen at once.
+/// A client whose requests come so quickly to who has slept will ask within [`PATIENCE`] when seen at once.
 const QUICK: Duration = Duration::from_micros(100);
 /// So many such requests in a row show what the client is like.
 const STREAK: u32 = 8;
@@ -48,7 +48,6 @@ pub(super) struct Lookout {
     turn: u64,
     at: Instant,
     credit: Duration,
-    credited: Instant,
     /// From request to request, on average, when it was slept in between and when it was looked out.
     slept: Duration,
     looked: Duration,
@@ -61,25 +60,24 @@ impl Lookout {
             turn: 0,
             at: now,
             credit: Duration::ZERO,
-            credited: now,
             slept: LONGEST,
             looked: Duration::ZERO,
         }
     }
 
-    /// Input has come at `now`, after it was waited for since `began` and `looked` out for; `turn` counts what came to
-    /// any connection.
-    pub(super) fn served(&mut self, turn: u64, began: Instant, now: Instant, looked: bool) {
+    /// Input has come at `now`, and was `looked` out for or not; `turn` counts what came to any connection.
+    pub(super) fn served(&mut self, turn: u64, now: Instant, looked: bool) {
         let alone = turn.wrapping_sub(self.turn) == 1;
-        let period = now.saturating_duration_since(self.at).min(LONGEST);
-        let waited = now.saturating_duration_since(began);
+        let period = now.saturating_duration_since(self.at);
         (self.turn, self.at) = (turn, now);
+        let earned = period / if self.pays() { SHARE } else { TRIAL };
+        self.credit = (self.credit + earned).min(MOST);
         if looked {
-            self.looked = (self.looked * 7 + period) / 8;
+            self.looked = (self.looked * 7 + period.min(LONGEST)) / 8;
         } else if self.streak > 0 {
-            self.slept = (self.slept * 7 + period) / 8;
+            self.slept = (self.slept * 7 + period.min(LONGEST)) / 8;
         }
-        self.streak = if alone && waited <= QUICK {
+        self.streak = if alone && period <= QUICK {
             self.streak.saturating_add(1)
         } else {
             0
@@ -92,14 +90,8 @@ impl Lookout {
     }
 
     /// How long to look out for the next request; `None` to go to sleep.
-    pub(super) fn patience(&mut self, now: Instant) -> Option<Duration> {
-        if self.streak < STREAK {
-            return None;
-        }
-        let earned = now.saturating_duration_since(self.credited) / if self.pays() { SHARE } else { TRIAL };
-        self.credited = now;
-        self.credit = (self.credit + earned).min(MOST);
-        (self.credit >= PATIENCE).then_some(PATIENCE)
+    pub(super) fn patience(&self) -> Option<Duration> {
+        (self.streak >= STREAK && self.credit >= PATIENCE).then_some(PATIENCE)
     }
 
     /// Whether to give up because `turn` shows that others are served.
@@ -140,7 +132,7 @@ mod tests {
 
         /// A request after `time`; whether it was looked out for.
         fn ask(&mut self, slept: Duration, looked: Duration) -> bool {
-            let (began, patience) = (self.now, self.lookout.patience(self.now));
+            let patience = self.lookout.patience();
             self.turn += 1;
             let time = patience.map_or(slept, |_| looked);
             if let Some(patience) = patience {
@@ -148,7 +140,7 @@ mod tests {
                 self.spent += time.min(patience);
             }
             self.now += time;
-            self.lookout.served(self.turn, began, self.now, patience.is_some());
+            self.lookout.served(self.turn, self.now, patience.is_some());
             patience.is_some()
         }
 
@@ -171,8 +163,8 @@ mod tests {
         let mut client = Client::new();
         client.now += Duration::from_secs(1);
         let quick = |client: &mut Client| client.ask(40 * US, 20 * US);
-        for turn in 0..STREAK {
-            assert!(!quick(&mut client), "after {turn}");
+        for turn in 0..=STREAK {
+            assert!(!quick(&mut client), "after {turn}; the first one came late");
         }
         assert!(quick(&mut client));
         assert!(!client.lookout.is_disturbed(client.turn) && client.lookout.is_disturbed(client.turn + 1));
@@ -184,7 +176,6 @@ mod tests {
             quick(&mut client);
         }
         assert!(quick(&mut client));
-        client.now += Duration::from_secs(1);
         client.ask(QUICK + US, QUICK + US);
         assert!(!quick(&mut client), "after a slow request");
     }
@@ -211,13 +202,12 @@ mod tests {
     #[test]
     fn a_pause_saves_up_little() {
         let mut client = Client::new();
-        for _ in 0..STREAK {
+        client.now += Duration::from_secs(3600);
+        for _ in 0..=STREAK {
             client.ask(40 * US, 20 * US);
         }
-        client.lookout.credited = client.now;
-        let later = client.now + Duration::from_secs(3600);
         let mut looked = 0;
-        while client.lookout.patience(later).is_some() {
+        while client.lookout.patience().is_some() {
             client.lookout.spent(PATIENCE);
             looked += 1;
         }
