@@ -205,6 +205,10 @@ impl DriveHandle {
         let mut ticket = ticket.with_changes(changes(&reading, &order));
         let confirmation = ticket.confirmation();
         match command::admit(order, &reading, may_write) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, accepted),
+            Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => {
+                ticket.answer(Outcome::Offline, accepted)
+            }
             Err(refusal) => {
                 self.tell_refusal(&what, &refusal.to_string(), ticket.origin());
                 ticket.answer(Outcome::Refused(refusal), accepted);

@@ -164,7 +164,7 @@ fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<
             Source::Raw(_) => continue,
         };
         let Some(figure) = figure.map(Value::as_f64) else {
-            return Err(Refusal::NotWritable(format!(
+            return Err(Refusal::NotKnown(format!(
                 "the limits of `{}` cannot be kept while the drive's frequency range is not known; set frequency_range \
                  for the drive",
                 point.name
@@ -204,7 +204,7 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                 )));
             };
             let band = drive.band(minimum, maximum).ok_or_else(|| {
-                Refusal::NotWritable(format!(
+                Refusal::NotKnown(format!(
                     "`{name}` needs the drive's frequency range, which is not known; set frequency_range for the drive"
                 ))
             })?;

@@ -205,6 +205,10 @@ pub enum Refusal {
     /// The point or address cannot be written, or does not exist.
     #[error("{0}")]
     NotWritable(String),
+    /// It rests on something that the drive tells and has not told so far. Of a drive that does not answer it says
+    /// nothing: that is why.
+    #[error("{0}")]
+    NotKnown(String),
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
     #[error("{0}")]
     BadValue(String),
@@ -215,7 +219,7 @@ impl Refusal {
     pub fn code(&self) -> &'static str {
         match self {
             Refusal::NotAllowed(_) => "not_allowed",
-            Refusal::NotWritable(_) => "not_writable",
+            Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
         }
     }
@@ -224,7 +228,7 @@ impl Refusal {
     pub fn exception(&self) -> Exception {
         match self {
             Refusal::NotAllowed(_) => Exception::FUNCTION,
-            Refusal::NotWritable(_) => Exception::ADDRESS,
+            Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
         }
     }

@@ -8,7 +8,7 @@
 mod command;
 mod gateway;
 
-pub use command::{CommandWrite, command, is_reset, without_reset};
+pub use command::{Before, CommandWrite, command, without_reset};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, BusRegister, gateway};
 
 use crate::cache::Reading;

@@ -4,6 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use drivegate::codec::Table;
 use drivegate::command::{CAPACITY, Order, Outcome, SourceKind};
 use drivegate::drive::Value;
 use drivegate::event::EventKind;
@@ -59,6 +60,23 @@ async fn fault_reset_is_an_edge_shared_by_all_clients() {
         orders(&rig),
         [reset, plain, plain, "run=true reverse=false fault_reset=true"]
     );
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn every_fault_can_be_reset_by_the_same_word() {
+    let rig = Rig::new().await;
+    let mut client = rig.client().await;
+    for _ in 0..2 {
+        rig.drive("pump-1")
+            .update(|s| s.store(Table::Holding, 2100, &[0x0008], Instant::now()));
+        client.ask(1, &words(6, &[0x8100, 4])).await;
+        rig.drive("pump-1")
+            .update(|s| s.store(Table::Holding, 2100, &[0x0001], Instant::now()));
+    }
+    client.ask(1, &words(6, &[0x8100, 4])).await;
+    let (reset, plain) = ("run=false reverse=false fault_reset=true", "run=false reverse=false");
+    assert_eq!(orders(&rig), [reset, reset, plain]);
     rig.end().await;
 }
 

@@ -75,6 +75,11 @@ async fn offline_drives_and_closed_buses() {
     assert_eq!(client.ask(3, &words(3, &[500, 1])).await, [0x83, 0x0B]);
     assert_eq!(client.ask(3, &words(6, &[0x8100, 1])).await, [0x86, 0x0B]);
     assert_eq!(
+        client.ask(3, &words(6, &[0x8102, 2500])).await,
+        [0x86, 0x0B],
+        "its range is not known since it does not answer"
+    );
+    assert_eq!(
         client.ask(3, &words(3, &[0x8000, 5])).await,
         registers(3, &[0x4000, 0, 0xFFFF, 0xFFFF, 0x8000])
     );
@@ -101,6 +106,7 @@ async fn offline_drives_and_closed_buses() {
         );
     }
     assert_eq!(client.ask(1, &words(6, &[0x8100, 1])).await, [0x86, 0x0A]);
+    assert_eq!(client.ask(3, &words(6, &[0x8102, 2500])).await, [0x86, 0x0A]);
     assert_eq!(
         client.ask(1, &words(6, &[2100, 1])).await,
         [0x86, 2],

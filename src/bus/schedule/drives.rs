@@ -49,14 +49,14 @@ pub(super) struct DriveSchedule {
     pub(super) items: Vec<Item>,
 }
 
-/// The next probe: the pause doubles, and the probe's cost stays within its share of the line.
+/// The next probe: the pause doubles, and the probe's cost stays within its share of the line. The first one comes without
+/// delay: a drive that was silent for a moment must not be without its stop for seconds.
 pub(super) fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
     let (first, longest) = PROBE_PAUSE;
-    let doubled = if pause.is_zero() {
-        first
-    } else {
-        (pause * 2).min(longest)
-    };
+    if pause.is_zero() {
+        return Presence::Away(now + first, first);
+    }
+    let doubled = (pause * 2).min(longest);
     let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
     Presence::Away(now + doubled.max(affordable), doubled)
 }

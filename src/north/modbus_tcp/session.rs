@@ -15,7 +15,7 @@ use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Order, Outcome};
-use crate::drive::Profile;
+use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
 use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
 use crate::plant::{BusHandle, DriveHandle};
@@ -276,9 +276,11 @@ impl Session {
     /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
     fn command(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
         let spec = &drive.image.spec;
+        let fault = drive.reading(now).state() == State::Fault;
         let write = self.shared.with_command_word(&spec.name, |last| {
-            let write = register_map::command(&spec.profile, start, values, *last)?;
-            let resets = write.word.is_some_and(|word| register_map::is_reset(word, *last));
+            let before = register_map::Before { word: *last, fault };
+            let write = register_map::command(&spec.profile, start, values, before)?;
+            let resets = write.word.is_some_and(|word| before.resets(word));
             *last = write.word.unwrap_or(*last);
             Ok((write, resets))
         });

@@ -18,14 +18,32 @@ pub struct CommandWrite {
     pub heartbeat: bool,
 }
 
-/// What writing `values` from `start` on means to a drive of that family. `last` is the word written at
-/// 0x8100 before: a fault reset is the change of bit 2 from 0 to 1.
+/// What stands before a write of 0x8100.
+#[derive(Debug, Clone, Copy, Default, PartialEq)]
+pub struct Before {
+    /// The word that was written there last.
+    pub word: u16,
+    /// The drive tells of a fault.
+    pub fault: bool,
+}
+
+impl Before {
+    /// Whether `word` asks for a fault reset: bit 2 changes from 0 to 1, or it comes without run while the drive has a
+    /// fault, whatever was written before: no client has to take back a bit that reads as 0. With run only the change
+    /// counts, so a client that repeats its word does not start a motor again after each fault.
+    pub fn resets(self, word: u16) -> bool {
+        let changes = !self.word & FAULT_RESET != 0;
+        word & FAULT_RESET != 0 && (changes || (self.fault && word & RUN == 0))
+    }
+}
+
+/// What writing `values` from `start` on means to a drive of that family.
 ///
 /// Where one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is left alone.
 ///
 /// # Errors
 /// An address that takes no command or that the family lacks, then a value that is none.
-pub fn command(profile: &Profile, start: u16, values: &[u16], last: u16) -> Result<CommandWrite, Refusal> {
+pub fn command(profile: &Profile, start: u16, values: &[u16], before: Before) -> Result<CommandWrite, Refusal> {
     let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
@@ -40,7 +58,7 @@ pub fn command(profile: &Profile, start: u16, values: &[u16], last: u16) -> Resu
         match address as u16 {
             COMMAND_WORD => {
                 write.word = Some(value);
-                bad = bad.or(command_word(profile, value, last, &mut write.points)?);
+                bad = bad.or(command_word(profile, value, before, &mut write.points)?);
             }
             SPEED_REFERENCE if !(both && value == NO_I16) => {
                 write.points.push((
@@ -100,7 +118,7 @@ fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
 fn command_word(
     profile: &Profile,
     word: u16,
-    last: u16,
+    before: Before,
     points: &mut Vec<(usize, Value)>,
 ) -> Result<Option<Refusal>, Refusal> {
     points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));
@@ -117,7 +135,7 @@ fn command_word(
         Err(refusal) if reverse => return lacks(refusal),
         Err(_) => {}
     }
-    if is_reset(word, last) {
+    if before.resets(word) {
         match writable(profile, ModelPoint::FaultReset) {
             Ok(index) => points.push((index, Value::Bool(true))),
             Err(refusal) => return lacks(refusal),
@@ -129,9 +147,4 @@ fn command_word(
 /// The word at 0x8100 after its fault reset did not reach the drive: the next write with bit 2 resets again.
 pub fn without_reset(word: u16) -> u16 {
     word & !FAULT_RESET
-}
-
-/// Whether the word at 0x8100 asks for a fault reset after `last` stood there.
-pub fn is_reset(word: u16, last: u16) -> bool {
-    word & !last & FAULT_RESET != 0
 }

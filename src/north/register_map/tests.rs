@@ -283,11 +283,37 @@ fn command_writes() {
         (0x8103, &[0], 0, ""),
     ];
     for (start, values, last, wanted) in table {
-        let write = command(&profile, *start, values, *last).unwrap();
+        let write = command(&profile, *start, values, before(*last, false)).unwrap();
         assert_eq!(named(&profile, &write).join(" "), *wanted, "{start:04X} {values:04X?}");
         let covers = |a: u16| *start <= a && usize::from(a - start) < values.len();
         assert_eq!(write.heartbeat, covers(0x8103), "{start:04X} {values:04X?}");
         assert_eq!(write.word, covers(0x8100).then(|| values[0]));
+    }
+}
+
+fn before(word: u16, fault: bool) -> Before {
+    Before { word, fault }
+}
+
+#[test]
+fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
+    for (word, last, fault, resets) in [
+        (4, 0, false, true),
+        (4, 0, true, true),
+        (4, 4, false, false),
+        (4, 4, true, true),
+        (6, 4, true, true),
+        (5, 1, true, true),
+        (5, 4, true, false),
+        (5, 5, true, false),
+        (0, 0, true, false),
+        (1, 4, true, false),
+    ] {
+        assert_eq!(
+            before(last, fault).resets(word),
+            resets,
+            "{last} then {word}, fault {fault}"
+        );
     }
 }
 
@@ -326,10 +352,10 @@ fn refused_command_writes() {
         (&lacking, 0x8100, &[8, 100, 2500], address),
     ];
     for (profile, start, values, wanted) in table {
-        let refusal = command(profile, *start, values, 0).unwrap_err();
+        let refusal = command(profile, *start, values, Before::default()).unwrap_err();
         assert_eq!(refusal.exception(), *wanted, "{start:04X} {values:04X?}: {refusal}");
     }
-    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], 0).unwrap();
+    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], Before::default()).unwrap();
     assert_eq!(named(&lacking, &word), ["run=true", "speed_reference=50"]);
 }
 

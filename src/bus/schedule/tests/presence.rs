@@ -40,6 +40,26 @@ fn a_drive_that_dies_is_offline_after_the_retries() {
 }
 
 #[test]
+fn a_drive_that_was_silent_for_a_moment_is_back_after_half_a_second() {
+    let mut bench = Bench::new(2, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.dead = vec![1];
+    while bench.offline.is_empty() {
+        bench.step(None);
+    }
+    let away = bench.now;
+    bench.dead.clear();
+    while !bench.schedule.is_online(1) {
+        bench.step(None);
+    }
+    assert!(
+        bench.now - away <= Duration::from_millis(500) + COST * 3,
+        "{:?}",
+        bench.now - away
+    );
+}
+
+#[test]
 fn refused_blocks_are_split_joined_and_retried_slowly() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     let bad = 2105;
