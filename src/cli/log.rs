@@ -4,6 +4,7 @@ use std::fmt;
 use std::io::IsTerminal;
 
 use tracing::{Event, Level, Subscriber};
+use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::fmt::format::Writer;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::layer::SubscriberExt;
@@ -13,6 +14,10 @@ use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
 use crate::config::{LogFormat, LogSettings};
 
+/// Where commands are logged (`command::AuditRecord`), and the level of their lines.
+const AUDIT: &str = "audit";
+const AUDIT_LINES: Level = Level::INFO;
+
 /// Changes the level of a running program.
 #[derive(Debug, Clone)]
 pub(super) struct LogHandle(reload::Handle<EnvFilter, Registry>);
@@ -20,7 +25,7 @@ pub(super) struct LogHandle(reload::Handle<EnvFilter, Registry>);
 impl LogHandle {
     /// Takes a new level; a format change needs a restart.
     pub(super) fn set_level(&self, level: &str) {
-        if let Err(error) = self.0.reload(EnvFilter::new(level)) {
+        if let Err(error) = self.0.reload(filter(level)) {
             tracing::error!("the log level stays as it is: {error}");
         }
     }
@@ -28,7 +33,7 @@ impl LogHandle {
 
 /// Starts logging to standard error.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
-    let (filter, handle) = reload::Layer::new(EnvFilter::new(&settings.level));
+    let (filter, handle) = reload::Layer::new(filter(&settings.level));
     let terminal = std::io::stderr().is_terminal();
     let format = match settings.format {
         LogFormat::Auto if std::env::var_os("JOURNAL_STREAM").is_some() => LogFormat::Journal,
@@ -54,6 +59,26 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
     LogHandle(handle)
 }
 
+/// What a checked `level` lets through. Whoever wants less to read still has a record of every command: only `off`, of
+/// everything or of the audit itself, ends that.
+fn filter(level: &str) -> EnvFilter {
+    // The last of its kind counts, as in the filter itself.
+    let last = |wanted: Option<&str>| {
+        let mut parts = level.split(',').map(|part| match part.split_once('=') {
+            Some((target, level)) => (Some(target), level),
+            None => (None, part),
+        });
+        let (_, found) = parts.rfind(|(target, _)| *target == wanted)?;
+        found.parse::<LevelFilter>().ok()
+    };
+    let own = last(Some(AUDIT));
+    let silent = own.or(last(None)) == Some(LevelFilter::OFF);
+    if silent || own.is_some_and(|own| own >= AUDIT_LINES) {
+        return EnvFilter::new(level);
+    }
+    EnvFilter::new(format!("{level},{AUDIT}={AUDIT_LINES}"))
+}
+
 /// A line with its priority in front, as systemd reads it; the journal adds the time.
 struct JournalLine;
 
@@ -72,5 +97,40 @@ where
         write!(writer, "<{priority}>{}: ", event.metadata().target())?;
         context.format_fields(writer.by_ref(), event)?;
         writeln!(writer)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn commands_are_logged_at_any_level_that_says_anything() {
+        for (level, commands, others) in [
+            ("info", true, true),
+            ("warn", true, false),
+            ("error", true, false),
+            ("debug", true, true),
+            ("off", false, false),
+            ("warn,drivegate::bus=debug", true, false),
+            ("drivegate::bus=debug", true, false),
+            ("warn,aud=off", true, false),
+            ("warn,audit=warn", true, false),
+            ("audit=debug,warn", true, false),
+            ("info,audit=off", false, true),
+            ("audit=off,audit=info,off", true, false),
+            ("off,audit=info", true, false),
+            ("off,drivegate=warn", false, false),
+            ("off,warn", true, false),
+        ] {
+            let log = Registry::default().with(filter(level));
+            let seen = tracing::subscriber::with_default(log, || {
+                (
+                    tracing::enabled!(target: "audit", Level::INFO),
+                    tracing::enabled!(target: "drivegate::plant", Level::INFO),
+                )
+            });
+            assert_eq!(seen, (commands, others), "{level}");
+        }
     }
 }

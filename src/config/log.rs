@@ -20,7 +20,7 @@ pub enum LogFormat {
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogSettings {
     /// Level, also for each target: `info,drivegate::bus=debug`. Checked: every part is a level or
-    /// `target=level`.
+    /// `target=level`. Commands (target `audit`) are logged at any level but `off`.
     pub level: String,
     /// How lines look.
     pub format: LogFormat,
