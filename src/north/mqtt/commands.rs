@@ -74,7 +74,8 @@ impl Commands {
         let Some(drive) = plant.drive(target.drive) else {
             let text = unknown_drive(target.drive, plant);
             tracing::warn!(topic = %incoming.topic, "command refused: {text}");
-            return Some(reply.message(None, "unknown_drive", Some(text), Duration::ZERO));
+            let id = request::id(&incoming, target.point);
+            return Some(reply.message(id, "unknown_drive", Some(text), Duration::ZERO));
         };
         let origin = Origin {
             kind: SourceKind::Mqtt,
@@ -380,8 +381,11 @@ mod tests {
         }
         assert_eq!(bench.queued(), 0);
         assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
-        let result = json(&bench.take(set("p11/set", "{}")).unwrap());
-        assert_eq!(result["error"]["code"], "unknown_drive");
+        let result = json(&bench.take(set("p11/set", r#"{"id": 21, "run": true}"#)).unwrap());
+        assert_eq!(
+            (&result["error"]["code"], &result["id"]),
+            (&"unknown_drive".into(), &21.into())
+        );
         assert!(
             result["error"]["message"]
                 .as_str()

@@ -1,10 +1,11 @@
 //! What a message on a set topic asks for. Pure.
 
+use std::borrow::Cow;
 use std::collections::BTreeSet;
 use std::fmt;
 use std::time::Duration;
 
-use serde::de::{Deserialize, Deserializer, MapAccess, Visitor};
+use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 
 use crate::command::{DEFAULT_EXPIRY, Refusal};
@@ -65,67 +66,65 @@ type Points = Vec<(usize, Value)>;
 
 /// Reads a message on a set topic; `point` is given for a bare value.
 pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Request {
-    let refused = |refusal| Request {
-        id: None,
-        order: Err(refusal),
-    };
+    Request {
+        id: id(incoming, point),
+        order: order(incoming, point, profile),
+    }
+}
+
+/// The `id` of a message, before anything of it is judged: whatever else is wrong, the client finds its request in the
+/// result. None where the text is no JSON, or where nobody knows which `id` is meant.
+pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Json> {
+    if point.is_some() {
+        return None;
+    }
+    let Id(id) = serde_json::from_slice(&incoming.payload).ok()?;
+    id.filter(is_id)
+}
+
+fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<(Points, Duration), Refusal> {
     if incoming.retain {
-        return refused(Refusal::NotAllowed(
+        return Err(Refusal::NotAllowed(
             "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
         ));
     }
     if incoming.payload.len() > MAX_PAYLOAD {
-        let text = format!(
+        return Err(Refusal::BadValue(format!(
             "the payload has {} bytes, {MAX_PAYLOAD} are allowed",
             incoming.payload.len()
-        );
-        return refused(Refusal::BadValue(text));
+        )));
     }
+    let (points, expiry) = match point {
+        Some(name) => (vec![resolve(profile, name, &bare(&incoming.payload)?)?], DEFAULT_EXPIRY),
+        None => points_of(object(&incoming.payload)?, profile)?,
+    };
     let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
-    let within_life = |expiry: Duration| life.map_or(expiry, |life| life.min(expiry));
-    if let Some(name) = point {
-        let order = bare(&incoming.payload).and_then(|value| Ok(vec![resolve(profile, name, &value)?]));
-        return Request {
-            id: None,
-            order: order.map(|points| (points, within_life(DEFAULT_EXPIRY))),
-        };
-    }
-    match object(&incoming.payload) {
-        Err(refusal) => refused(refusal),
-        Ok(fields) => {
-            let (id, order) = fields_of(fields, profile);
-            Request {
-                id,
-                order: order.map(|(points, expiry)| (points, within_life(expiry))),
+    Ok((points, life.map_or(expiry, |life| life.min(expiry))))
+}
+
+fn points_of(fields: Fields, profile: &Profile) -> Result<(Points, Duration), Refusal> {
+    let mut expiry = DEFAULT_EXPIRY;
+    let mut points = Vec::new();
+    for (name, value) in fields.0 {
+        match name.as_str() {
+            "id" if is_id(&value) => {}
+            "id" => {
+                return Err(Refusal::BadValue(format!(
+                    "`id` is a number or a string of at most {MAX_ID} bytes"
+                )));
             }
+            "expires_ms" => expiry = request_expiry(&value)?,
+            name => points.push(resolve(profile, name, &value)?),
         }
     }
+    Ok((points, expiry))
 }
 
-fn fields_of(fields: Fields, profile: &Profile) -> (Option<Json>, Result<(Points, Duration), Refusal>) {
-    let (mut id, mut expiry) = (None, DEFAULT_EXPIRY);
-    let mut points = Vec::new();
-    let mut refusal = None;
-    for (name, value) in fields.0 {
-        let result = match name.as_str() {
-            "id" => request_id(value).map(|value| id = Some(value)),
-            "expires_ms" => request_expiry(&value).map(|time| expiry = time),
-            // The first thing wrong is told; the rest is only read on for the id.
-            _ if refusal.is_some() => Ok(()),
-            name => resolve(profile, name, &value).map(|point| points.push(point)),
-        };
-        refusal = refusal.or(result.err());
-    }
-    (id, refusal.map_or(Ok((points, expiry)), Err))
-}
-
-fn request_id(value: Json) -> Result<Json, Refusal> {
-    match &value {
-        Json::Number(_) => Ok(value),
-        Json::String(text) if text.len() <= MAX_ID => Ok(value),
-        _ => Err(Refusal::BadValue(format!(
-            "`id` is a number or a string of at most {MAX_ID} bytes"
-        ))),
+fn is_id(value: &Json) -> bool {
+    match value {
+        Json::Number(_) => true,
+        Json::String(text) => text.len() <= MAX_ID,
+        _ => false,
     }
 }
 
@@ -240,6 +239,37 @@ impl<'de> Visitor<'de> for FieldsVisitor {
     }
 }
 
+/// The `id` of an object, if it has exactly one. What the other fields hold does not matter.
+struct Id(Option<Json>);
+
+impl<'de> Deserialize<'de> for Id {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Id, D::Error> {
+        deserializer.deserialize_map(IdVisitor)
+    }
+}
+
+struct IdVisitor;
+
+impl<'de> Visitor<'de> for IdVisitor {
+    type Value = Id;
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a JSON object")
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Id, A::Error> {
+        let mut found = Vec::new();
+        while let Some(name) = map.next_key::<Cow<'de, str>>()? {
+            if name == "id" && found.len() < 2 {
+                found.push(map.next_value()?);
+            } else {
+                map.next_value::<IgnoredAny>()?;
+            }
+        }
+        Ok(Id(found.pop().filter(|_| found.is_empty())))
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use std::sync::Arc;
@@ -333,10 +363,33 @@ mod tests {
     }
 
     #[test]
-    fn a_refusal_carries_the_id_wherever_it_stands() {
-        let request = set(r#"{"sped": 5, "run": true, "id": 12}"#);
-        assert_eq!(request.id, Some(12.into()));
-        assert!(request.order.is_err());
+    fn a_refusal_carries_the_id_wherever_it_stands_and_whatever_is_wrong() {
+        for (payload, id) in [
+            (r#"{"sped": 5, "run": true, "id": 12}"#, 12.into()),
+            (r#"{"id": 11, "run": false, "run": true}"#, 11.into()),
+            (r#"{"run": false, "run": true, "id": "a"}"#, "a".into()),
+            (r#"{"speed_reference": 1e999, "\u0069d": 3}"#, 3.into()),
+            (r#"{"id": 4, "expires_ms": 0}"#, 4.into()),
+            // Not to be known, or no `id`.
+            (r#"{"id": 1, "id": 2}"#, Json::Null),
+            (r#"{"id": [1], "run": 2}"#, Json::Null),
+            (r#"{"id": null, "run": 2}"#, Json::Null),
+            (r#"{"id": 1e999}"#, Json::Null),
+            (r#"{"id": 1, "run": NaN}"#, Json::Null),
+            (r#"{"id": 1, "run": 2"#, Json::Null),
+            (r#"{"id": 1, "run": 2} {}"#, Json::Null),
+            (r#"{"run": 2, "ready": {"id": 1}}"#, Json::Null),
+            (r#"[{"id": 1}]"#, Json::Null),
+            (r#""id""#, Json::Null),
+        ] {
+            let request = set(payload);
+            assert_eq!(request.id.unwrap_or_default(), id, "{payload}");
+            assert!(request.order.is_err(), "{payload}");
+        }
+        let long = |n| set(&format!(r#"{{"id": "{}", "sped": 1}}"#, "x".repeat(n))).id;
+        assert!(long(MAX_ID).is_some() && long(MAX_ID + 1).is_none());
+        let bare = message(r#"{"id": 1}"#);
+        assert_eq!(read(&bare, Some("run"), &profile()).id, None);
     }
 
     #[test]
@@ -370,9 +423,11 @@ mod tests {
     fn retained_and_oversized_messages_are_refused() {
         let retained = Incoming {
             retain: true,
-            ..message(r#"{"run": true}"#)
+            ..message(r#"{"run": true, "id": 40}"#)
         };
-        let (code_retained, text) = code(read(&retained, None, &profile()));
+        let refused = read(&retained, None, &profile());
+        assert_eq!(refused.id, Some(40.into()));
+        let (code_retained, text) = code(refused);
         assert_eq!(code_retained, "not_allowed");
         assert!(text.contains("retained"), "{text}");
         assert!(
@@ -389,6 +444,8 @@ mod tests {
         );
         let big = format!(r#"{{"id": "{}"}}"#, "x".repeat(MAX_PAYLOAD));
         assert!(code(set(&big)).1.contains("65536 are allowed"));
+        let padded = format!(r#"{{"pad": "{}", "id": 41}}"#, "x".repeat(MAX_PAYLOAD));
+        assert_eq!(set(&padded).id, Some(41.into()));
     }
 
     #[test]
