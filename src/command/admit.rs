@@ -2,7 +2,8 @@
 
 use super::{Order, Refusal, Urgency};
 use crate::cache::{Access, Reading};
-use crate::codec::{RequestPdu, Table};
+use crate::codec::n2::Object;
+use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, Source, Value};
 
@@ -269,6 +270,9 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
             drive.spec.name
         )));
     }
+    if profile.protocols.contains(&Protocol::N2) {
+        one_object(table, *first, items.len())?;
+    }
     if items.len() > usize::from(range.write) {
         let (count, most) = (items.len(), range.write);
         return Err(Refusal::BadValue(format!(
@@ -276,6 +280,20 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
         )));
     }
     raw_values(drive, table, &items)
+}
+
+/// On N2 a write goes to one object and sets all of it: an address at which none begins is no address, another length
+/// no value.
+fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
+    let object = Object::at(table, first)
+        .ok_or_else(|| Refusal::NotWritable(format!("no object begins at {table} {first}; nothing was written")))?;
+    let items = object.items();
+    if count != usize::from(items) {
+        return Err(Refusal::BadValue(format!(
+            "{object} takes {items} items in one write, no more and no less; nothing was written"
+        )));
+    }
+    Ok(())
 }
 
 /// The points that a raw write of `items` sets: each whole, and within its limits.

@@ -213,3 +213,48 @@ fn a_command_goes_where_the_drive_takes_it_within_the_limits_of_the_other_unit()
     assert!(raw(4800).is_ok());
     assert_eq!(raw(4801).unwrap_err().exception(), Exception::VALUE);
 }
+
+#[test]
+fn a_write_on_n2_is_one_whole_object() {
+    let profile = Profiles::built_in().get("eaton-hvx-n2").unwrap().clone();
+    let spec = DriveSpec {
+        access: Access::Control,
+        ..DriveSpec::new("ahu-1", "line4", 1, profile)
+    };
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    image.update(|s| s.link = Link::Online(std::time::SystemTime::now()));
+    let reading = image.reading(Instant::now(), Duration::from_secs(1));
+    let (float, ao1_ao2) = ([0x41C8, 0], [0x41C8, 0, 0x41C8, 0]);
+    let registers = |start, values: &[u16]| RequestPdu::WriteRegisters {
+        start,
+        values: values.to_vec(),
+    };
+    let coils = |start, bits: &[bool]| RequestPdu::WriteCoils {
+        start,
+        bits: bits.to_vec(),
+    };
+    let (address, value) = (Some(Exception::ADDRESS), Some(Exception::VALUE));
+    // AO 1 and 2 are points, AO 8 has no name; the raw range ends behind it, and BO 9 and 10 do not exist.
+    for (pdu, wanted) in [
+        (registers(0, &float), None),
+        (registers(14, &float), None),
+        (registers(0, &float[..1]), value),
+        (registers(14, &float[..1]), value),
+        (RequestPdu::WriteRegister { address: 14, value: 1 }, value),
+        (registers(0, &ao1_ao2), value),
+        (registers(12, &ao1_ao2), value),
+        (registers(1, &float), address),
+        (registers(13, &float), address),
+        (registers(1, &float[..1]), address),
+        (RequestPdu::WriteRegister { address: 15, value: 1 }, address),
+        (registers(13, &ao1_ao2[..3]), address),
+        (registers(14, &ao1_ao2), address),
+        (registers(16, &float), address),
+        (coils(1, &[true]), None),
+        (coils(1, &[true, true]), value),
+        (coils(8, &[true]), address),
+    ] {
+        let refused = admit(Order::Write(pdu.clone()), &reading, true).err();
+        assert_eq!(refused.map(|refusal| refusal.exception()), wanted, "{pdu:?}");
+    }
+}
