@@ -39,6 +39,9 @@ pub(super) struct Found {
     pub(super) address: Option<(u8, Place)>,
     pub(super) unit: Option<(u8, Place)>,
     pub(super) access: (Access, Place),
+    /// Where `supervision` and a stop `on_shutdown` are written.
+    pub(super) lease: Option<Place>,
+    pub(super) shutdown_stop: Option<Place>,
     pub(super) spec: Option<DriveSpec>,
 }
 
@@ -86,6 +89,8 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         address: address.map(|a| (a, reader.place_of("address"))),
         unit: unit.map(|u| (u, reader.place_of("unit"))),
         access: (access, reader.place_of("access")),
+        lease: reader.has("supervision").then(|| reader.place_of("supervision")),
+        shutdown_stop: (on_shutdown == OnShutdown::Stop).then(|| reader.place_of("on_shutdown")),
         spec,
     }
 }

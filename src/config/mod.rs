@@ -241,6 +241,7 @@ fn judge(
     }
     if reader.document().is_sound() {
         // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
+        warn_of_idle_stops(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
         warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
     }
@@ -326,6 +327,30 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
                 "process data of bus `{}` is renewed every {cycle:.0} ms and stale after {limit:.0} ms; raise \
                  stale_after, leave it out, or lighten the bus",
                 settings.spec.name
+            );
+            reader.document().warning(place, text);
+        }
+    }
+}
+
+/// What is to be written to drives to which nothing is written.
+fn warn_of_idle_stops(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for drive in buses.iter().flat_map(|bus| &bus.drives) {
+        let (Some((name, _)), Access::Monitor) = (&drive.name, drive.access.0) else {
+            continue;
+        };
+        let idle = "is only monitored, so nothing is ever written to it";
+        if let Some(place) = &drive.lease {
+            let text = format!(
+                "drive `{name}` {idle}, and it has no lease that could run out; set access = \"control\", or leave \
+                 supervision out"
+            );
+            reader.document().warning(place, text);
+        }
+        if let Some(place) = &drive.shutdown_stop {
+            let text = format!(
+                "drive `{name}` {idle}, and it is not stopped with the gateway; set access = \"control\", or leave \
+                 on_shutdown out"
             );
             reader.document().warning(place, text);
         }
