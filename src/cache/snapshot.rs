@@ -224,8 +224,21 @@ impl Reading<'_> {
             Source::Raw(raw) => self.raw_sample(raw, point.kind()),
             Source::Derived(derived) => {
                 let sources: Vec<Sample> = derived.sources().into_iter().map(|i| self.sample(i)).collect();
-                let band = derived.band().and_then(|(_, low, high)| self.band(low, high));
-                derived.sample(&sources, band)
+                let Some((_, low, high)) = derived.band() else {
+                    return derived.sample(&sources, None);
+                };
+                if let Some(band) = self.band(low, high) {
+                    return derived.sample(&sources, Some(band));
+                }
+                // What the ends were last makes a value of what the source was last, which is as good as they are.
+                let Some((band, quality)) = self.last_band(low, high) else {
+                    return Sample::NONE;
+                };
+                let sample = derived.sample(&sources, Some(band));
+                Sample {
+                    quality: sample.quality.worse(quality),
+                    ..sample
+                }
             }
         }
     }
@@ -272,6 +285,20 @@ impl Reading<'_> {
                 }
             }
         }
+    }
+
+    /// The ends of a band as the drive told them last, and the worse quality of the two. No command is made of them.
+    fn last_band(&self, minimum: Bound, maximum: Bound) -> Option<((f64, f64), Quality)> {
+        let end = |bound: Bound| match bound {
+            Bound::Point(point) => {
+                let sample = self.sample(point);
+                let value = sample.value.filter(|_| sample.quality != Quality::Bad)?;
+                Some((value.as_f64(), sample.quality))
+            }
+            Bound::Fixed(figure) => Some((figure, Quality::Good)),
+        };
+        let ((low, of_low), (high, of_high)) = (end(minimum)?, end(maximum)?);
+        (high > low).then_some(((low, high), of_low.worse(of_high)))
     }
 
     /// The sample of a model point; a point that the family lacks is bad.
@@ -329,5 +356,42 @@ impl Reading<'_> {
         } else {
             Quality::Good
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::cache::DriveImage;
+    use crate::drive::profile::Profiles;
+
+    /// What rests on the drive's frequency range is no worse than the figures that it rests on.
+    #[test]
+    fn a_value_within_a_band_is_as_good_as_the_band() {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let index = |name: &str| profile.point_index(name).unwrap();
+        let reference = index("frequency_reference");
+        let image = DriveImage::new(
+            DriveSpec::new("pump-1", "line1", 1, profile.clone()),
+            Duration::from_secs(1),
+        );
+        let now = Instant::now();
+        let sample = || image.reading(now, Duration::from_secs(1)).sample(reference);
+        let store = |name: &str, value: f64| {
+            let raw = profile.points[index(name)].raw().unwrap().clone();
+            let words = raw.encode(Value::Number(value), 0).unwrap();
+            image.update(|s| s.store(raw.table, raw.address, &words, now));
+        };
+        image.update(|s| s.link = Link::Online(SystemTime::now()));
+        store("speed_reference", 50.0);
+        assert_eq!(sample(), Sample::NONE, "no range is known");
+        store("minimum_frequency", 10.0);
+        store("maximum_frequency", 50.0);
+        let expected = |quality| (Some(Value::Number(30.0)), quality);
+        assert_eq!((sample().value, sample().quality), expected(Quality::Good));
+        image.update(|s| s.link = Link::Offline(SystemTime::now()));
+        assert_eq!((sample().value, sample().quality), expected(Quality::Stale));
+        store("maximum_frequency", 10.0);
+        assert_eq!(sample(), Sample::NONE, "an empty range");
     }
 }
