@@ -5,7 +5,8 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use crate::process::{Running, free_port, until};
+use crate::process::{Running, api, free_port, until, until_ready};
+use crate::restart::line_of;
 use crate::tools::tool;
 
 /// How a command ended, what it printed and what it complained of.
@@ -220,6 +221,55 @@ fn a_refusal_is_told_in_the_words_of_the_gateway() {
             "{told}"
         );
     }
+}
+
+/// What is known of a drive that is away is stale, what never was is bad: by `read` as over HTTP.
+#[test]
+fn a_drive_that_is_away_has_the_quality_that_http_tells() {
+    let folder = TempDir::new().unwrap();
+    let line = line_of(&folder.path().join("line1"), &[1]);
+    let (modbus, http) = (free_port(), free_port());
+    let drives = [("pump-1", 1), ("pump-2", 2)].map(|(name, address)| {
+        format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n")
+    });
+    let text = format!(
+        "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\n{}\
+         [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\n[http]\nlisten = \"127.0.0.1:{http}\"\n",
+        drives.concat()
+    );
+    let config = folder.path().join("drivegate.toml");
+    std::fs::write(&config, text).unwrap();
+    let config = config.display().to_string();
+    let _gateway = Running::drivegate(&["run", "--config", &config]);
+    until_ready(http);
+    until("all that is known of pump-1", || {
+        let known = |name| api(http, "pump-1")["points"][name]["quality"] == "good";
+        (known("frequency_reference") && known("fieldbus_fault_response")).then_some(())
+    });
+    line.set_alive(1, false);
+    for (drive, wanted) in [("pump-1", "stale"), ("pump-2", "bad")] {
+        let told = until("a drive that is away", || {
+            let told = api(http, drive);
+            (told["state"] == "offline").then_some(told)
+        });
+        let ran = drivegate(&["read", "--json", "--config", &config, drive]);
+        assert_eq!(ran.code, 1, "{}", ran.err);
+        let rows: serde_json::Value = serde_json::from_str(&ran.out).unwrap();
+        let rows = rows.as_array().unwrap();
+        assert!(rows.len() > 20, "{rows:?}");
+        let mut others = Vec::new();
+        for row in rows {
+            let point = row["point"].as_str().unwrap();
+            let over_http = &told["points"][point]["quality"];
+            if row["quality"] != wanted || over_http != wanted || !row["value"].is_null() {
+                others.push(format!("{drive}: {over_http} over HTTP: {row}"));
+            }
+        }
+        assert!(others.is_empty(), "{others:#?}");
+    }
+    // Nobody ever asked for this one, so nothing of it can be old.
+    let ran = drivegate(&["read", "--json", "--config", &config, "pump-1", "fault_code_id99"]);
+    assert!(ran.out.contains("\"bad\""), "{}{}", ran.out, ran.err);
 }
 
 #[test]

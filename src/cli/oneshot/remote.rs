@@ -8,13 +8,16 @@ use super::Row;
 use crate::cache::DriveSpec;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::profile::Form;
-use crate::drive::{Bound, ModelPoint, Point, Quality, Raw, Sample, Source, Value};
+use crate::drive::{Bound, ModelPoint, Point, PollClass, Quality, Raw, Sample, Source, Value};
 use crate::north::modbus_tcp::frame::{self, Header};
 
 /// Time to connect.
 const CONNECT: Duration = Duration::from_millis(500);
 /// Time for an answer: a command may wait for its turn, a forwarded read for a slow line.
 const ANSWER: Duration = Duration::from_secs(10);
+/// Age of the process data, and what it is before any was read.
+const AGE: u16 = 0x8002;
+const NEVER: u16 = 0xFFFF;
 /// The command block (`docs/modbus-tcp.md`).
 const COMMAND: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
@@ -31,6 +34,8 @@ pub(in crate::cli) struct Remote {
     since: SystemTime,
     unit: u8,
     transaction: u16,
+    /// Once it was asked for.
+    was_read: Option<bool>,
 }
 
 /// Why a write was not done.
@@ -76,6 +81,7 @@ impl Remote {
                 since: SystemTime::now(),
                 unit: spec.unit,
                 transaction: 0,
+                was_read: None,
             };
             match (remote.identity(0), remote.identity(5)) {
                 (Some(vendor), Some(name)) if vendor == "drivegate" && name == spec.name => return Ok(Some(remote)),
@@ -160,24 +166,39 @@ impl Remote {
                     why = why.or(reason);
                     sources.push(sample);
                 }
-                let band = match derived.band() {
-                    Some((_, low, high)) => self.bound(spec, low)?.zip(self.bound(spec, high)?),
-                    None => None,
+                let ends = match derived.band() {
+                    Some((_, low, high)) => vec![self.bound(spec, low)?, self.bound(spec, high)?],
+                    None => Vec::new(),
                 };
-                Ok((
-                    derived.sample(&sources, band),
-                    why.or(Some("its range is not known".to_string())),
-                ))
+                let band = match ends.as_slice() {
+                    [low, high] => low.good().zip(high.good()).map(|(l, h)| (l.as_f64(), h.as_f64())),
+                    _ => None,
+                };
+                let qualities = sources.iter().chain(&ends).map(|sample| sample.quality);
+                let sample = match qualities.fold(Quality::Good, Quality::worse) {
+                    // An exception carries no value: of what is stale nothing else is known.
+                    Quality::Stale => Sample {
+                        quality: Quality::Stale,
+                        ..Sample::NONE
+                    },
+                    _ => derived.sample(&sources, band),
+                };
+                Ok((sample, why.or(Some("its range is not known".to_string()))))
             }
         }
     }
 
-    fn bound(&mut self, spec: &DriveSpec, bound: Bound) -> Result<Option<f64>, String> {
+    fn bound(&mut self, spec: &DriveSpec, bound: Bound) -> Result<Sample, String> {
+        let fixed = |figure| Sample {
+            value: Some(Value::Number(figure)),
+            quality: Quality::Good,
+            at: None,
+        };
         match bound {
-            Bound::Fixed(figure) => Ok(Some(figure)),
+            Bound::Fixed(figure) => Ok(fixed(figure)),
             Bound::Point(index) => match spec.profile.points.get(index) {
-                Some(point) => Ok(self.sample(spec, point)?.0.good().map(Value::as_f64)),
-                None => Ok(None),
+                Some(point) => Ok(self.sample(spec, point)?.0),
+                None => Ok(Sample::NONE),
             },
         }
     }
@@ -191,7 +212,16 @@ impl Remote {
         let words = match reply {
             Reply::Registers(words) => words,
             Reply::Bits(bits) => bits.iter().map(|b| u16::from(*b)).collect(),
-            Reply::Exception(code) => return Ok((Sample::NONE, Some(refusal(code)))),
+            Reply::Exception(code) => {
+                let lost = [Exception::GATEWAY_PATH, Exception::GATEWAY_TARGET].contains(&code);
+                let stale = lost && point.class != PollClass::Never && self.was_read()?;
+                let quality = if stale { Quality::Stale } else { Quality::Bad };
+                let sample = Sample {
+                    quality,
+                    ..Sample::NONE
+                };
+                return Ok((sample, Some(refusal(code))));
+            }
             _ => return Ok((Sample::NONE, Some("the reply does not fit the request".to_string()))),
         };
         let value = raw.decode(&words, point.kind());
@@ -201,6 +231,19 @@ impl Remote {
             at: None,
         };
         Ok((sample, Some("it is no number".to_string())))
+    }
+
+    /// Whether the gateway has values of the drive, however old: what never was read is bad and not stale.
+    fn was_read(&mut self) -> Result<bool, String> {
+        if self.was_read.is_none() {
+            let reply = self.ask(&RequestPdu::Read {
+                table: Table::Input,
+                start: AGE,
+                count: 1,
+            })?;
+            self.was_read = Some(matches!(reply, Reply::Registers(age) if age != [NEVER]));
+        }
+        Ok(self.was_read.unwrap_or_default())
     }
 
     /// Writes the points: commands of the common model as one command where the command block can hold them, other
