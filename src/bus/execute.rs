@@ -11,10 +11,9 @@ pub use self::shadow::Shadow;
 use self::actions::{Action, Check, actions, request, sets_all_bits, sparing};
 use self::shadow::{learn, note_write};
 use super::confirm::{self, Effect};
-use crate::cache::Reading;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency};
-use crate::drive::{Point, PollClass, Profile};
+use crate::drive::Profile;
 
 /// What a command needs next.
 #[derive(Debug, Clone, PartialEq)]
@@ -53,8 +52,6 @@ pub struct Execution {
     running: bool,
     /// Whether the drive was asked for what it has before it is written.
     check: Check,
-    /// What is known of the words of the next step is as good as read just now.
-    fresh: bool,
     /// The drive does not tell its own word: bits that the command does not set are written as 0.
     blind: bool,
 }
@@ -97,24 +94,8 @@ impl Execution {
             whole,
             running: true,
             check: Check::NotYet,
-            fresh: false,
             blind: false,
         }
-    }
-
-    /// Looks at how good the knowledge of the words is that the next step would write: read often enough, and good.
-    pub fn look(&mut self, reading: &Reading<'_>) {
-        let (table, addresses): (Table, Vec<u16>) = match self.actions.front() {
-            Some(Action::Change { table, items, .. }) => (*table, items.iter().map(|(a, _)| *a).collect()),
-            _ => return,
-        };
-        let points = &reading.spec.profile.points;
-        let is_read = |p: &Point| p.on_change && matches!(p.class, PollClass::Fast | PollClass::Slow);
-        self.fresh = addresses.iter().all(|address| {
-            let covers = |p: &Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, *address));
-            let mut those = points.iter().enumerate().filter(|(_, p)| covers(p)).peekable();
-            those.peek().is_some() && those.all(|(index, p)| is_read(p) && reading.sample(index).good().is_some())
-        });
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -145,7 +126,7 @@ impl Execution {
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
-            let known = (self.check, self.fresh, self.blind);
+            let known = (self.check, self.blind);
             match request(action, self.drive, shadow, profile, running, known) {
                 Some(pdu) => return Next::Send(pdu),
                 // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
@@ -163,7 +144,6 @@ impl Execution {
     fn pop(&mut self) {
         self.actions.pop_front();
         self.check = Check::NotYet;
-        self.fresh = false;
     }
 
     /// Its time ran out, and what is left of it was not cut off yet.

@@ -14,7 +14,7 @@ use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
 pub(super) enum Action {
     /// A raw request, or a register of its own.
     Send(RequestPdu),
-    /// A write of what the drive keeps: left out where it is known to have it already.
+    /// A write of what the drive keeps: left out where the drive, asked for it, says that it has it already.
     Change {
         pdu: RequestPdu,
         table: Table,
@@ -151,17 +151,16 @@ pub(super) fn request(
     shadow: &Shadow,
     profile: &Profile,
     running: bool,
-    (check, fresh, blind): (Check, bool, bool),
+    (check, blind): (Check, bool),
 ) -> Option<RequestPdu> {
     let (raw, changes) = match action {
         Action::Send(pdu) | Action::Release(pdu) => return Some(pdu.clone()),
         Action::Change { pdu, table, items } => {
-            let has = shadow.has(drive, *table, items);
             return match check {
-                Check::NotYet if fresh && has => None,
-                Check::NotYet if fresh => Some(pdu.clone()),
+                // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.
+                Check::NotYet if shadow.differs(drive, *table, items) => Some(pdu.clone()),
                 Check::NotYet => read_of(*table, items).or_else(|| Some(pdu.clone())),
-                Check::Read => (!has).then(|| pdu.clone()),
+                Check::Read => (!shadow.has(drive, *table, items)).then(|| pdu.clone()),
                 Check::InVain => Some(pdu.clone()),
             };
         }
@@ -213,8 +212,8 @@ fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
     }
 }
 
-/// A write that spares the drive's memory, where its words are such that wear: left out when the drive has them, and
-/// what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
+/// A write that spares the drive's memory, where its words are such that wear: left out when the drive says that it has
+/// them, and what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
 pub(super) fn sparing(action: Action, profile: &Profile) -> Vec<Action> {
     let written = match &action {
         Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),
