@@ -10,6 +10,7 @@ use crate::command::{Answer, Origin, SourceKind, WriteStats};
 use crate::drive::Value;
 use crate::drive::profile::Profiles;
 
+mod elsewhere;
 mod on_change;
 
 struct Bench {
