@@ -162,6 +162,34 @@ async fn a_fault_is_told_and_reset() {
 }
 
 #[tokio::test]
+async fn a_motor_that_was_stopped_elsewhere_is_not_started_by_a_command_that_does_not_name_run() {
+    let rig = Rig::start(&[1], 38_400).await;
+    rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
+    let word = |pdu: RequestPdu| match rig.line.with_drive(1, |drive, now| drive.answer(&pdu, now)) {
+        Some(Some(Reply::Registers(words))) => words.first().copied(),
+        _ => None,
+    };
+    let address = 2000;
+    for (points, left) in [(("reverse", 1.0), 2), (("fault_reset", 1.0), 0), (("reverse", 1.0), 2)] {
+        assert!(rig.set(1, &[("run", 1.0), ("reverse", 0.0)]).await.is_ok());
+        rig.until("it runs", |r| r.state(1) == State::Running).await;
+        // The gateway cannot have read it by the time of the command.
+        word(RequestPdu::WriteRegister { address, value: 0 });
+        rig.line.record(1_000);
+        assert!(rig.set(1, &[points]).await.is_ok());
+        let has = word(RequestPdu::Read {
+            table: Table::Holding,
+            start: address,
+            count: 1,
+        });
+        assert_eq!(has, Some(left), "{points:?}");
+        let written = hex(&rig.line.transcript(), Direction::ToDrives);
+        let runs = |frame: &&String| frame.starts_with("01 06 07 D0 00 0") && "1357".contains(&frame[16..17]);
+        assert_eq!(written.iter().find(runs), None, "{points:?}");
+    }
+}
+
+#[tokio::test]
 async fn a_dead_drive_is_stale_at_once_and_comes_back() {
     let rig = Rig::start(&[1, 2], 115_200).await;
     rig.until("both drives answer", |r| {

@@ -181,6 +181,29 @@ async fn what_the_drive_has_already_is_not_written_again() {
 }
 
 #[tokio::test]
+async fn what_was_changed_at_the_drive_is_written_again() {
+    let rig = Rig::of(setup("vacon-nx-n2", &[1]), |_| {});
+    rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
+    let at_the_drive = |address, value| {
+        let panel = RequestPdu::WriteRegister { address, value };
+        rig.line.with_drive(1, |drive, now| drive.answer(&panel, now));
+    };
+    assert!(rig.set(1, &[("speed_reference", 25.0)]).await.is_ok());
+    assert!(rig.set(1, &[("run", 1.0)]).await.is_ok());
+    for turn in 1..=3 {
+        is_good(&rig, ModelPoint::SpeedReference, Value::Number(25.0)).await;
+        is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
+        // The gateway cannot have read it by the time of the command.
+        at_the_drive(2002, 7700);
+        assert!(rig.set(1, &[("speed_reference", 25.0)]).await.is_ok());
+        assert_eq!(reference(&rig, 1), 2500, "turn {turn}");
+        at_the_drive(2000, 0);
+        assert!(rig.set(1, &[("run", 1.0)]).await.is_ok());
+        assert_eq!(count(&rig, ">0172040101"), 1 + turn, "override of BO 1");
+    }
+}
+
+#[tokio::test]
 async fn a_drive_that_starts_anew_in_mid_run() {
     let rig = Rig::of(setup("vacon-nx-n2", &[1]), |_| {});
     rig.until("the drive answers", |r| r.state(1) == State::Ready).await;

@@ -104,7 +104,6 @@ impl Desk {
             let reading = drive.reading(now, FRESH);
             // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
             let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
-            execution.look(&reading);
             match execution.next(&self.shadow, &drive.spec.profile, running, now) {
                 Next::Send(pdu) => {
                     // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.

@@ -8,13 +8,12 @@ use std::time::Instant;
 
 pub use self::shadow::Shadow;
 
-use self::actions::{Action, Check, actions, request, sets_all_bits, sparing};
+use self::actions::{Action, Check, Known, actions, names_run, request, sets_all_bits, sparing};
 use self::shadow::{learn, note_write};
 use super::confirm::{self, Effect};
-use crate::cache::Reading;
-use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Order, Outcome, Receipt, Ticket, Urgency};
-use crate::drive::{Point, PollClass, Profile};
+use crate::drive::Profile;
 
 /// What a command needs next.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,12 +48,12 @@ pub struct Execution {
     in_doubt: bool,
     /// It sets every bit that can be commanded, reset bits apart.
     whole: bool,
+    /// It says whether the motor is to run.
+    names_run: bool,
     /// What the drive last said of its motor.
     running: bool,
     /// Whether the drive was asked for what it has before it is written.
     check: Check,
-    /// What is known of the words of the next step is as good as read just now.
-    fresh: bool,
     /// The drive does not tell its own word: bits that the command does not set are written as 0.
     blind: bool,
 }
@@ -73,6 +72,7 @@ impl Execution {
         } = command;
         let effects = confirm::effects(profile, &order);
         let whole = matches!(&order, Order::Points(values) if sets_all_bits(profile, values));
+        let names_run = matches!(&order, Order::Points(values) if names_run(profile, values));
         let actions = match order {
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
@@ -95,26 +95,11 @@ impl Execution {
             failures: 0,
             in_doubt: false,
             whole,
+            names_run,
             running: true,
             check: Check::NotYet,
-            fresh: false,
             blind: false,
         }
-    }
-
-    /// Looks at how good the knowledge of the words is that the next step would write: read often enough, and good.
-    pub fn look(&mut self, reading: &Reading<'_>) {
-        let (table, addresses): (Table, Vec<u16>) = match self.actions.front() {
-            Some(Action::Change { table, items, .. }) => (*table, items.iter().map(|(a, _)| *a).collect()),
-            _ => return,
-        };
-        let points = &reading.spec.profile.points;
-        let is_read = |p: &Point| p.on_change && matches!(p.class, PollClass::Fast | PollClass::Slow);
-        self.fresh = addresses.iter().all(|address| {
-            let covers = |p: &Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, *address));
-            let mut those = points.iter().enumerate().filter(|(_, p)| covers(p)).peekable();
-            those.peek().is_some() && those.all(|(index, p)| is_read(p) && reading.sample(index).good().is_some())
-        });
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -145,8 +130,13 @@ impl Execution {
                 self.not_before = Some(until);
                 return Next::Wait(until);
             }
-            let known = (self.check, self.fresh, self.blind);
-            match request(action, self.drive, shadow, profile, running, known) {
+            let known = Known {
+                check: self.check,
+                blind: self.blind,
+                names_run: self.names_run,
+                running,
+            };
+            match request(action, self.drive, shadow, profile, known) {
                 Some(pdu) => return Next::Send(pdu),
                 // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
                 // overridden that would have to be released.
@@ -163,7 +153,6 @@ impl Execution {
     fn pop(&mut self) {
         self.actions.pop_front();
         self.check = Check::NotYet;
-        self.fresh = false;
     }
 
     /// Its time ran out, and what is left of it was not cut off yet.
@@ -173,7 +162,10 @@ impl Execution {
 
     /// The drive answered the request that [`Execution::next`] gave. The outcome, when the command is over.
     pub fn answered(&mut self, sent: &RequestPdu, reply: Reply, shadow: &mut Shadow) -> Option<Outcome> {
-        self.failures = 0;
+        // A read between the tries of a write does not make them more.
+        if !self.in_doubt || !self.reads_word(sent) {
+            self.failures = 0;
+        }
         // An exception tells nothing of an earlier try that was not answered.
         if sent.is_write() && !matches!(reply, Reply::Exception(_)) {
             self.in_doubt = false;
@@ -187,6 +179,9 @@ impl Execution {
         }
         if let Reply::Exception(code) = reply {
             let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
+            if self.reads_word(sent) && self.goes_on(kept_back && self.knows(sent, shadow)) {
+                return None;
+            }
             if self.reads_word(sent) && (kept_back || self.urgency == Urgency::Stop) {
                 return self.without_word(Outcome::Exception(code));
             }
@@ -196,11 +191,12 @@ impl Execution {
         if let RequestPdu::Read { table, start, .. } = sent
             && self.reads_word(sent)
         {
-            // The drive's own word, read because the shadow did not have it.
+            // The drive's own word, read because the shadow did not have it, or only as it was once.
             return match reply {
                 Reply::Registers(words) => {
                     let word = words.first().copied()?;
                     shadow.learn(self.drive, *table, *start, word);
+                    self.check = Check::Read;
                     None
                 }
                 _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
@@ -244,8 +240,15 @@ impl Execution {
         if self.checks(sent) {
             return over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut));
         }
+        if self.reads_word(sent) && self.goes_on(false) {
+            return None;
+        }
         if self.reads_word(sent) && (over || self.urgency == Urgency::Stop) {
             return self.without_word(Outcome::TimedOut);
+        }
+        if sent.is_write() && self.check == Check::Read {
+            // By the next try it may have changed again.
+            self.check = Check::NotYet;
         }
         over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
     }
@@ -260,7 +263,24 @@ impl Execution {
         self.in_doubt
     }
 
-    /// Whether that request reads the drive's own word, which the shadow did not have.
+    /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
+    /// tells it (`untold`), and at the end of a pulse, which no read stands in the way of.
+    fn goes_on(&mut self, untold: bool) -> bool {
+        let ends = matches!(self.actions.front(), Some(Action::PulseEnd { .. }));
+        let goes_on = self.check == Check::NotYet && (untold || ends);
+        if goes_on {
+            self.check = Check::InVain;
+            self.failures = 0;
+        }
+        goes_on
+    }
+
+    /// Whether the shadow has the word that the request reads.
+    fn knows(&self, sent: &RequestPdu, shadow: &Shadow) -> bool {
+        matches!(sent, RequestPdu::Read { start, .. } if shadow.get(self.drive, *start).is_some())
+    }
+
+    /// Whether that request reads the drive's own word, which the shadow did not have, or only as it was once.
     fn reads_word(&self, sent: &RequestPdu) -> bool {
         matches!(sent, RequestPdu::Read { .. }) && !matches!(self.actions.front(), Some(Action::Send(_)) | None)
     }
@@ -273,6 +293,7 @@ impl Execution {
             return Some(outcome);
         }
         self.blind = true;
+        self.check = Check::InVain;
         self.failures = 0;
         None
     }

@@ -14,7 +14,7 @@ use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
 pub(super) enum Action {
     /// A raw request, or a register of its own.
     Send(RequestPdu),
-    /// A write of what the drive keeps: left out where it is known to have it already.
+    /// A write of what the drive keeps: left out where the drive, asked for it, says that it has it already.
     Change {
         pdu: RequestPdu,
         table: Table,
@@ -45,6 +45,18 @@ pub(super) enum Check {
     InVain,
 }
 
+/// What the request of a step depends on besides the shadow.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Known {
+    pub(super) check: Check,
+    /// The word cannot be read.
+    pub(super) blind: bool,
+    /// The command says whether the motor is to run.
+    pub(super) names_run: bool,
+    /// What the drive last said of its motor.
+    pub(super) running: bool,
+}
+
 /// A word and the bits of it that change.
 type WordChange = (Raw, Vec<(u8, bool)>);
 
@@ -53,6 +65,20 @@ pub(super) fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> boo
     let level = |p: &Point| p.write && !p.pulse && p.raw().is_some_and(|r| matches!(r.form, Form::Bit { .. }));
     let mut bits = profile.points.iter().enumerate().filter(|(_, p)| level(p));
     bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
+}
+
+/// Whether a command says whether the motor is to run.
+pub(super) fn names_run(profile: &Profile, values: &[(usize, Value)]) -> bool {
+    let Some((run, bit, _)) = profile.run_bit() else {
+        return false;
+    };
+    let is_run = |raw: &Raw| match raw.form {
+        Form::Bit { bit: of, .. } => of == bit,
+        Form::Bits { first, count } => (first..first.saturating_add(count)).contains(&bit),
+        _ => true,
+    };
+    let raws = values.iter().filter_map(|(index, _)| profile.points.get(*index)?.raw());
+    raws.filter(|raw| raw.covers(run.table, run.address)).any(is_run)
 }
 
 pub(super) fn actions(profile: &Profile, values: &[(usize, Value)], stop: bool) -> VecDeque<Action> {
@@ -144,24 +170,25 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
 }
 
 /// The request of an action with the shadow as it is now; a read where the shadow does not know the word;
-/// `None` where there is nothing to do. `blind`: the word cannot be read.
+/// `None` where there is nothing to do.
 pub(super) fn request(
     action: &Action,
     drive: usize,
     shadow: &Shadow,
     profile: &Profile,
-    running: bool,
-    (check, fresh, blind): (Check, bool, bool),
+    known: Known,
 ) -> Option<RequestPdu> {
+    let Known {
+        check, blind, running, ..
+    } = known;
     let (raw, changes) = match action {
         Action::Send(pdu) | Action::Release(pdu) => return Some(pdu.clone()),
         Action::Change { pdu, table, items } => {
-            let has = shadow.has(drive, *table, items);
             return match check {
-                Check::NotYet if fresh && has => None,
-                Check::NotYet if fresh => Some(pdu.clone()),
+                // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.
+                Check::NotYet if shadow.differs(drive, *table, items) => Some(pdu.clone()),
                 Check::NotYet => read_of(*table, items).or_else(|| Some(pdu.clone())),
-                Check::Read => (!has).then(|| pdu.clone()),
+                Check::Read => (!shadow.has(drive, *table, items)).then(|| pdu.clone()),
                 Check::InVain => Some(pdu.clone()),
             };
         }
@@ -187,24 +214,35 @@ pub(super) fn request(
             on,
         });
     }
-    let Some(old) = shadow.get(drive, raw.address).or(blind.then_some(0)) else {
-        return Some(RequestPdu::Read {
-            table: raw.table,
-            start: raw.address,
-            count: 1,
-        });
+    let read = RequestPdu::Read {
+        table: raw.table,
+        start: raw.address,
+        count: 1,
     };
-    let value = changes.iter().fold(
-        old,
-        |word, (bit, on)| if *on { word | (1 << bit) } else { word & !(1 << bit) },
-    );
-    let idle = matches!(action, Action::PulseLow { .. } | Action::Disarm { .. }) && value == old;
-    (!idle).then_some(RequestPdu::WriteRegister {
+    let Some(old) = shadow.get(drive, raw.address).or(blind.then_some(0)) else {
+        return Some(read);
+    };
+    let set = |word: u16, (bit, on): (u8, bool)| if on { word | (1 << bit) } else { word & !(1 << bit) };
+    let value = changes.into_iter().fold(old, set);
+    if matches!(action, Action::PulseLow { .. } | Action::Disarm { .. }) && value == old {
+        return None;
+    }
+    // A run bit that the command does not name may have been taken away elsewhere since the word was read, and to write
+    // it would start the motor: the drive is asked, and where it does not tell, a motor that stands goes on standing.
+    let stands = standing_run_bit(profile, raw).map_or(value, |run| set(value, run));
+    let value = match check {
+        _ if known.names_run || value == stands => value,
+        Check::NotYet => return Some(read),
+        Check::InVain if !running => stands,
+        Check::Read | Check::InVain => value,
+    };
+    Some(RequestPdu::WriteRegister {
         address: raw.address,
         value,
     })
 }
 
+/// The run bit, if it is in the same word, as it is where the motor is to stand.
 fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
     let run = profile.model_point(ModelPoint::Run)?.raw()?;
     match run.form {
@@ -213,8 +251,8 @@ fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
     }
 }
 
-/// A write that spares the drive's memory, where its words are such that wear: left out when the drive has them, and
-/// what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
+/// A write that spares the drive's memory, where its words are such that wear: left out when the drive says that it has
+/// them, and what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
 pub(super) fn sparing(action: Action, profile: &Profile) -> Vec<Action> {
     let written = match &action {
         Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),

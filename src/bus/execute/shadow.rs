@@ -31,6 +31,14 @@ impl Shadow {
         items.iter().all(has)
     }
 
+    /// Whether the drive is known to have something else than that, by now or earlier.
+    pub(super) fn differs(&self, drive: usize, table: Table, items: &[(u16, u16)]) -> bool {
+        let known = |address: u16| self.0.get(&(drive, table, address));
+        items
+            .iter()
+            .any(|(address, word)| known(*address).is_some_and(|has| has != word))
+    }
+
     /// The drive may have started anew: its words are read again before a bit is changed.
     pub fn forget(&mut self, drive: usize) {
         self.0.retain(|(of, _, _), _| *of != drive);

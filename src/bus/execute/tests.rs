@@ -5,10 +5,12 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::*;
+use crate::codec::Table;
 use crate::command::{Answer, Origin, SourceKind, WriteStats};
 use crate::drive::Value;
 use crate::drive::profile::Profiles;
 
+mod elsewhere;
 mod on_change;
 
 struct Bench {

@@ -32,6 +32,12 @@ fn coil(address: u16, on: bool) -> RequestPdu {
     RequestPdu::WriteCoil { address, on }
 }
 
+/// AO 1 was something else when it was read last.
+fn changed(bench: &mut Bench) {
+    bench.shadow.learn(0, Table::Holding, 0, 0);
+    bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
+}
+
 fn reference(bench: &Bench) -> Execution {
     bench.begin(&[("speed_reference", 50.0)], Urgency::Command).0
 }
@@ -50,22 +56,20 @@ fn what_the_drive_has_is_read_and_not_written() {
 }
 
 #[test]
-fn what_was_read_just_now_is_not_read_again() {
-    for (known, next) in [(HALF[0], None), (0, Some(override_ao()))] {
-        let mut bench = bench();
-        bench.shadow.learn(0, Table::Holding, 0, known);
-        bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
-        let mut command = reference(&bench);
-        command.fresh = true;
-        let expected = next.map_or(Next::Done, Next::Send);
-        assert_eq!(command.next(&bench.shadow, &bench.profile, false, bench.now), expected);
-    }
-    // What is known from long ago is.
+fn what_was_read_earlier_lets_write_and_leaves_nothing_out() {
     let mut bench = bench();
+    changed(&mut bench);
+    assert_eq!(sends(&bench, &mut reference(&bench)), override_ao());
+    // It had the value when it was read last: it is asked, and may have another one by now.
     bench.shadow.learn(0, Table::Holding, 0, HALF[0]);
-    bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
-    let mut command = reference(&bench);
-    assert_eq!(sends(&bench, &mut command), read(Table::Holding, 2));
+    for (has, next) in [(HALF[0], Next::Done), (0x429A, Next::Send(override_ao()))] {
+        let mut command = reference(&bench);
+        let check = sends(&bench, &mut command);
+        assert_eq!(check, read(Table::Holding, 2));
+        let has = Reply::Registers(vec![has, HALF[1]]);
+        assert_eq!(command.answered(&check, has, &mut bench.shadow), None);
+        assert_eq!(command.next(&bench.shadow, &bench.profile, false, bench.now), next);
+    }
 }
 
 #[test]
@@ -83,8 +87,8 @@ fn a_release_is_behind_the_override_and_may_fail() {
     let refused = Reply::Exception(Exception::n2(0x11));
     for answer in [Some(Reply::Written), Some(refused), None] {
         let mut bench = bench();
+        changed(&mut bench);
         let mut command = reference(&bench);
-        command.fresh = true;
         assert_eq!(sends(&bench, &mut command), override_ao());
         assert_eq!(
             command.answered(&override_ao(), Reply::Written, &mut bench.shadow),
@@ -107,8 +111,8 @@ fn a_release_is_behind_the_override_and_may_fail() {
 #[test]
 fn an_override_that_is_refused_is_not_released() {
     let mut bench = bench();
+    changed(&mut bench);
     let mut command = reference(&bench);
-    command.fresh = true;
     assert_eq!(sends(&bench, &mut command), override_ao());
     let refused = Exception::n2(0x10);
     let ended = command.answered(&override_ao(), Reply::Exception(refused), &mut bench.shadow);
@@ -121,15 +125,17 @@ fn a_stop_is_never_left_out() {
     bench.shadow.learn(0, Table::Coil, 0, 0);
     for urgency in [Urgency::Stop, Urgency::Command] {
         let (mut stop, _answer) = bench.begin(&[("run", 0.0)], urgency);
-        stop.fresh = true;
         assert_eq!(sends(&bench, &mut stop), coil(0, false));
     }
-    // A start is.
-    bench.shadow.learn(0, Table::Coil, 0, 1);
-    let (mut start, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
-    start.fresh = true;
-    let next = start.next(&bench.shadow, &bench.profile, true, bench.now);
-    assert_eq!(next, Next::Done);
+    // A start is, where the drive says that it has it.
+    for (has, next) in [(true, Next::Done), (false, Next::Send(coil(0, true)))] {
+        bench.shadow.learn(0, Table::Coil, 0, 1);
+        let (mut start, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        let check = sends(&bench, &mut start);
+        assert_eq!(check, read(Table::Coil, 1));
+        assert_eq!(start.answered(&check, Reply::Bits(vec![has]), &mut bench.shadow), None);
+        assert_eq!(start.next(&bench.shadow, &bench.profile, true, bench.now), next);
+    }
 }
 
 #[test]
@@ -142,7 +148,6 @@ fn a_pulse_is_never_left_out() {
     let (mut reset, _answer) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     let mut sent = Vec::new();
     loop {
-        reset.fresh = true;
         match reset.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
             Next::Wait(until) => bench.now = until,
             Next::Done => break,
