@@ -327,7 +327,8 @@ async fn a_dead_drive_is_probed_by_identify_and_comes_back() {
             .count(),
         0
     );
-    assert_eq!(rig.state(1), State::Ready, "the other one is read on");
+    rig.until("the other one is read on", |r| r.state(1) == State::Ready)
+        .await;
     rig.line.set_alive(2, true);
     rig.until("it is back", |r| r.state(2) == State::Ready).await;
 }

@@ -49,12 +49,13 @@ pub(super) struct DriveSchedule {
     pub(super) items: Vec<Item>,
 }
 
-/// The next probe: the pause doubles, and the probe's cost stays within its share of the line. The first one comes without
-/// delay: a drive that was silent for a moment must not be without its stop for seconds.
+/// The next probe: the pause doubles, and the probe's cost stays within its share of the line. The first one comes sooner: a
+/// drive that was silent for a moment must not be without its stop for seconds. The others have been waiting for its
+/// tries; they get four times of what it takes first.
 pub(super) fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
     let (first, longest) = PROBE_PAUSE;
     if pause.is_zero() {
-        return Presence::Away(now + first, first);
+        return Presence::Away(now + first.max(took * 4), first);
     }
     let doubled = (pause * 2).min(longest);
     let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
