@@ -2,6 +2,32 @@
 
 use super::*;
 
+impl Bench {
+    /// Lets the schedule ask for `time`; every poll takes `COST` and is answered by `answer`. What changed.
+    fn answer(&mut self, time: Duration, mut answer: impl FnMut(&Poll, Instant) -> Polled) -> Vec<Change> {
+        let (end, mut changes) = (self.now + time, Vec::new());
+        while self.now < end {
+            match self.schedule.next(self.now, None) {
+                Decision::Idle(until) => self.now = until,
+                Decision::Command(_) => unreachable!(),
+                Decision::Poll(poll) => {
+                    self.now += COST;
+                    let polled = answer(&poll, self.now);
+                    changes.push(self.schedule.poll_done(&poll, polled, COST, self.now));
+                }
+            }
+        }
+        changes
+    }
+}
+
+fn refused_if(refused: bool) -> Polled {
+    match refused {
+        true => Polled::Refused(Exception::ADDRESS),
+        false => Polled::Ok,
+    }
+}
+
 #[test]
 fn dead_drives_cost_two_percent_each() {
     let mut all = Bench::new(7, Duration::from_millis(10));
@@ -63,28 +89,16 @@ fn a_drive_that_was_silent_for_a_moment_is_back_after_half_a_second() {
 fn refused_blocks_are_split_joined_and_retried_slowly() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     let bad = 2105;
-    let mut unavailable = Vec::new();
     let mut asked = Vec::new();
-    let end = bench.now + Duration::from_secs(30);
-    while bench.now < end {
-        match bench.schedule.next(bench.now, None) {
-            Decision::Idle(until) => bench.now = until,
-            Decision::Command(_) => unreachable!(),
-            Decision::Poll(poll) => {
-                bench.now += COST;
-                let refused = poll.read.covers(Table::Holding, bad);
-                let polled = if refused {
-                    Polled::Refused(Exception::ADDRESS)
-                } else {
-                    Polled::Ok
-                };
-                asked.push((poll.read.start, poll.read.count));
-                if let Change::Unavailable(read, _) = bench.schedule.poll_done(&poll, polled, COST, bench.now) {
-                    unavailable.push(read.start);
-                }
-            }
-        }
-    }
+    let changes = bench.answer(Duration::from_secs(30), |poll, _| {
+        asked.push((poll.read.start, poll.read.count));
+        refused_if(poll.read.covers(Table::Holding, bad))
+    });
+    let told = changes.into_iter().filter_map(|change| match change {
+        Change::Unavailable(read, _) => Some(read.start),
+        _ => None,
+    });
+    let unavailable: Vec<u16> = told.collect();
     assert_eq!(unavailable, [bad]);
     let tail: Vec<_> = asked
         .iter()
@@ -103,23 +117,12 @@ fn refused_blocks_are_split_joined_and_retried_slowly() {
 fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     let mut mute = 0;
-    let end = bench.now + Duration::from_secs(30);
-    while bench.now < end {
-        match bench.schedule.next(bench.now, None) {
-            Decision::Idle(until) => bench.now = until,
-            Decision::Command(_) => unreachable!(),
-            Decision::Poll(poll) => {
-                bench.now += COST;
-                let silent = poll.read.class == PollClass::Once;
-                mute += usize::from(silent);
-                let polled = if silent { Polled::Failed } else { Polled::Ok };
-                assert_ne!(
-                    bench.schedule.poll_done(&poll, polled, COST, bench.now),
-                    Change::Offline
-                );
-            }
-        }
-    }
+    let changes = bench.answer(Duration::from_secs(30), |poll, _| {
+        let silent = poll.read.class == PollClass::Once;
+        mute += usize::from(silent);
+        if silent { Polled::Failed } else { Polled::Ok }
+    });
+    assert!(!changes.contains(&Change::Offline));
     assert_eq!(mute, 5, "first try and one retry, then after 2, 4, 8 s");
 }
 
@@ -149,26 +152,14 @@ fn a_block_refused_once_by_mistake_is_whole_again_after_a_minute() {
     bench.run(Duration::from_secs(1));
     let mut refuse = 1;
     let mut asked = Vec::new();
-    let end = bench.now + Duration::from_secs(70);
-    while bench.now < end {
-        match bench.schedule.next(bench.now, None) {
-            Decision::Idle(until) => bench.now = until,
-            Decision::Command(_) => unreachable!(),
-            Decision::Poll(poll) => {
-                bench.now += COST;
-                let polled = if poll.read.count == 11 && refuse > 0 {
-                    refuse -= 1;
-                    Polled::Refused(Exception::ADDRESS)
-                } else {
-                    Polled::Ok
-                };
-                if poll.read.class == PollClass::Fast {
-                    asked.push((poll.read.start, poll.read.count));
-                }
-                bench.schedule.poll_done(&poll, polled, COST, bench.now);
-            }
+    bench.answer(Duration::from_secs(70), |poll, _| {
+        if poll.read.class == PollClass::Fast {
+            asked.push((poll.read.start, poll.read.count));
         }
-    }
+        let refused = poll.read.count == 11 && refuse > 0;
+        refuse -= i32::from(refused);
+        refused_if(refused)
+    });
     assert!(asked.contains(&(2100, 5)) && asked.contains(&(2105, 6)));
     assert!(asked[asked.len() - 100..].iter().all(|read| *read == (2100, 11)));
 }
@@ -177,27 +168,13 @@ fn a_block_refused_once_by_mistake_is_whole_again_after_a_minute() {
 fn a_bad_point_that_is_sound_again_is_read_with_its_neighbours() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     let healed = bench.now + Duration::from_secs(30);
-    let end = bench.now + Duration::from_secs(200);
     let mut asked = Vec::new();
-    while bench.now < end {
-        match bench.schedule.next(bench.now, None) {
-            Decision::Idle(until) => bench.now = until,
-            Decision::Command(_) => unreachable!(),
-            Decision::Poll(poll) => {
-                bench.now += COST;
-                let bad = bench.now < healed && poll.read.covers(Table::Holding, 2105);
-                let polled = if bad {
-                    Polled::Refused(Exception::ADDRESS)
-                } else {
-                    Polled::Ok
-                };
-                if poll.read.class == PollClass::Fast {
-                    asked.push((poll.read.start, poll.read.count));
-                }
-                bench.schedule.poll_done(&poll, polled, COST, bench.now);
-            }
+    bench.answer(Duration::from_secs(200), |poll, now| {
+        if poll.read.class == PollClass::Fast {
+            asked.push((poll.read.start, poll.read.count));
         }
-    }
+        refused_if(now < healed && poll.read.covers(Table::Holding, 2105))
+    });
     assert!(
         asked[asked.len() - 100..].iter().all(|read| *read == (2100, 11)),
         "{:?}",

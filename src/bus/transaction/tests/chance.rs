@@ -39,6 +39,36 @@ fn mutated() -> impl Strategy<Value = Vec<u8>> {
     ]
 }
 
+/// How it ends when the bytes come in pieces of `chunk`, `gap_us` apart.
+fn fed(
+    mut transaction: Transaction<'_>,
+    begun: Instant,
+    deadline: Instant,
+    bytes: &[u8],
+    (chunk, gap_us): (usize, u64),
+) -> Result<Ended, TestCaseError> {
+    let mut now = begun;
+    let mut step = transaction.on_time(now);
+    for piece in bytes.chunks(chunk) {
+        now += Duration::from_micros(gap_us);
+        let Step::Wait(until) = step else { break };
+        prop_assert!(until <= deadline);
+        step = if now >= until {
+            transaction.on_time(until)
+        } else {
+            transaction.on_bytes(now, piece)
+        };
+    }
+    if let Step::Wait(until) = step {
+        prop_assert!(until <= deadline);
+        step = transaction.on_time(until);
+    }
+    match step {
+        Step::Done(ended) => Ok(ended),
+        _ => Err(TestCaseError::fail("it waits beyond what it said")),
+    }
+}
+
 proptest! {
     #![proptest_config(ProptestConfig::with_cases(2000))]
 
@@ -51,23 +81,8 @@ proptest! {
         let (request, frame) = request();
         let begun = Instant::now();
         let deadline = begun + Duration::from_millis(105);
-        let mut transaction = start(&request, &frame, begun);
-        let bytes = pieces.concat();
-        let mut now = begun;
-        let mut step = transaction.on_time(now);
-        for piece in bytes.chunks(chunk) {
-            now += Duration::from_micros(gap_us);
-            let Step::Wait(until) = step else { break };
-            prop_assert!(until <= deadline);
-            step = if now >= until { transaction.on_time(until) } else { transaction.on_bytes(now, piece) };
-        }
-        if let Step::Wait(until) = step {
-            prop_assert!(until <= deadline);
-            step = transaction.on_time(until);
-        }
-        let Step::Done(ended) = step else {
-            return Err(TestCaseError::fail("it waits beyond what it said"));
-        };
+        let transaction = start(&request, &frame, begun);
+        let ended = fed(transaction, begun, deadline, &pieces.concat(), (chunk, gap_us))?;
         match ended {
             Ended::Reply(reply) => prop_assert_eq!(reply, Reply::Registers(vec![0x4711])),
             Ended::Silent | Ended::Corrupt(_) => {}
@@ -99,24 +114,11 @@ proptest! {
         let (request, frame, _) = in_ascii();
         let begun = Instant::now();
         let deadline = begun + Duration::from_millis(119);
-        let mut transaction = start_ascii(&request, &frame, begun, false);
-        let bytes = pieces.concat();
-        let mut now = begun;
-        let mut step = transaction.on_time(now);
-        for piece in bytes.chunks(chunk) {
-            now += Duration::from_micros(gap_us);
-            let Step::Wait(until) = step else { break };
-            prop_assert!(until <= deadline);
-            step = if now >= until { transaction.on_time(until) } else { transaction.on_bytes(now, piece) };
-        }
-        if let Step::Wait(until) = step {
-            prop_assert!(until <= deadline);
-            step = transaction.on_time(until);
-        }
-        match step {
-            Step::Done(Ended::Reply(reply)) => prop_assert_eq!(reply, Reply::Registers(vec![5, 0])),
-            Step::Done(Ended::Silent | Ended::Corrupt(_)) => {}
-            Step::Wait(_) => return Err(TestCaseError::fail("it waits beyond what it said")),
+        let transaction = start_ascii(&request, &frame, begun, false);
+        let ended = fed(transaction, begun, deadline, &pieces.concat(), (chunk, gap_us))?;
+        match ended {
+            Ended::Reply(reply) => prop_assert_eq!(reply, Reply::Registers(vec![5, 0])),
+            Ended::Silent | Ended::Corrupt(_) => {}
         }
     }
 
