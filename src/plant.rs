@@ -153,7 +153,7 @@ impl DriveHandle {
 
     /// Whether the bus is open.
     pub fn bus_up(&self) -> bool {
-        self.bus.image.health().up
+        self.bus.image.is_up()
     }
 
     /// Gives an order to the drive and waits for its one answer.

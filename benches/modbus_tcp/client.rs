@@ -65,23 +65,20 @@ pub(super) fn load(
         begin_batch(connection, &batch)?;
     }
     let mut buffer = vec![0; 64 * 1024];
-    let mut events = Vec::with_capacity(connections);
+    let mut events: Vec<epoll::Event> = Vec::with_capacity(connections);
+    let mut ready = vec![0];
     while begin.elapsed() < time {
-        let ready: Vec<usize> = if connections == 1 {
-            vec![0]
-        } else {
+        if connections > 1 {
             events.clear();
             let patience = rustix::event::Timespec { tv_sec: 5, tv_nsec: 0 };
             epoll::wait(&epoll, rustix::buffer::spare_capacity(&mut events), Some(&patience))?;
             if events.is_empty() {
                 return Err("no answer for five seconds".into());
             }
-            events
-                .iter()
-                .map(|event: &epoll::Event| event.data.u64() as usize)
-                .collect()
-        };
-        for place in ready {
+            ready.clear();
+            ready.extend(events.iter().map(|event| event.data.u64() as usize));
+        }
+        for &place in &ready {
             let Some(connection) = all.get_mut(place) else { continue };
             let count = match connection.stream.read(&mut buffer) {
                 Ok(0) => return Err("the server has closed the connection".into()),

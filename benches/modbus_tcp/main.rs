@@ -1,8 +1,10 @@
 //! The Modbus TCP server beside others: tokio-modbus, libmodbus with epoll, pymodbus.
 //!
-//! `cargo bench --bench modbus_tcp` (options: `-- --seconds 2 --runs 5`). Every server is a process of its own, reads are
-//! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs. At the end the
-//! rounds of a bus at 115200 baud, without and with that load on the daemon; `--rounds 5` measures these alone, so often.
+//! `cargo bench --bench modbus_tcp` (options: `-- --seconds 0.5 --runs 15`). Every server is a process of its own, reads are
+//! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs; `drivegate of it`
+//! is the median of the ratios turn by turn, so that what slows the machine for a while slows both sides. At the end the
+//! rounds of a bus at 115200 baud, without and with that load on the daemon in turns eight times as long, since one round in
+//! a hundred counts; `--rounds 15` measures these alone, so often.
 
 mod client;
 #[path = "../common/mod.rs"]
@@ -36,12 +38,27 @@ fn main() -> ExitCode {
 }
 
 fn measure() -> Result<(), Box<dyn Error>> {
-    let time = Duration::from_secs_f64(option("--seconds", 2.0)?);
-    let runs: usize = option("--runs", 5)?;
+    let time = Duration::from_secs_f64(option("--seconds", 0.5)?);
+    let runs: usize = option("--runs", 15)?;
     let alone: usize = option("--rounds", 0)?;
-    if alone > 0 {
-        return rounds(time, alone);
+    let stolen = Stolen::begin();
+    if alone == 0 {
+        speed(time, runs)?;
     }
+    rounds(time * 8, if alone == 0 { runs } else { alone })?;
+    println!("\nThe host took {:.1} % of the processors' time.", stolen.percent());
+    Ok(())
+}
+
+/// What a server did in one turn.
+#[derive(Clone, Copy)]
+struct Turn {
+    load: Load,
+    /// Processor time of the server for a request, µs.
+    cost: f64,
+}
+
+fn speed(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
     let mut servers = vec![Process::own("drivegate")?, Process::own("tokio-modbus")?];
     for (name, server) in [("libmodbus", Process::libmodbus()), ("pymodbus", Process::pymodbus())] {
         match server {
@@ -49,61 +66,61 @@ fn measure() -> Result<(), Box<dyn Error>> {
             Err(why) => eprintln!("{name} is left out: {why}"),
         }
     }
-    println!("| server | connections × depth | requests/s | batch p50, µs | p99, µs | server µs/request |");
-    println!("|---|---|---|---|---|---|");
+    println!(
+        "| server | connections × depth | requests/s | batch p50, µs | p99, µs | server µs/request | drivegate of it |"
+    );
+    println!("|---|---|---|---|---|---|---|");
     for (connections, depth) in LOADS {
-        let mut found: Vec<Vec<(Load, f64)>> = servers.iter().map(|_| Vec::new()).collect();
+        let mut found: Vec<Vec<Option<Turn>>> = servers.iter().map(|_| vec![None; runs]).collect();
         for run in 0..runs {
             for turn in 0..servers.len() {
                 let place = (turn + run) % servers.len();
                 let (Some(server), Some(found)) = (servers.get(place), found.get_mut(place)) else {
                     continue;
                 };
+                // pymodbus answers one request of a batch and forgets the others: once is enough.
+                if found.iter().take(run).any(Option::is_none) {
+                    continue;
+                }
                 let before = server.cpu();
                 let load = match load(server.address, connections, depth, time) {
                     Ok(load) => load,
-                    // pymodbus answers one request of a batch and forgets the others.
-                    Err(why) if place > 0 => {
-                        eprintln!("{}, {connections} × {depth}: {why}", server.name);
-                        continue;
-                    }
+                    Err(_) if place > 0 => continue,
                     Err(why) => return Err(why),
                 };
-                found.push((load, (server.cpu() - before) / load.answered.max(1) as f64 * 1e6));
+                let cost = (server.cpu() - before) / load.answered.max(1) as f64 * 1e6;
+                if let Some(found) = found.get_mut(run) {
+                    *found = Some(Turn { load, cost });
+                }
             }
         }
-        let rates: Vec<f64> = found
-            .iter()
-            .map(|runs| median(&runs.iter().map(|(l, _)| l.rate).collect::<Vec<_>>()))
-            .collect();
-        for (server, runs) in servers.iter().zip(&found) {
-            if runs.is_empty() {
-                println!("| {} | {connections} × {depth} | none | | | |", server.name);
+        let own = found.first().cloned().unwrap_or_default();
+        for (server, turns) in servers.iter().zip(&found) {
+            let middle = |of: fn(&Turn) -> f64| median(&turns.iter().flatten().map(of).collect::<Vec<_>>());
+            if turns.iter().flatten().next().is_none() {
+                println!("| {} | {connections} × {depth} | none | | | | |", server.name);
                 continue;
             }
-            let middle = |of: fn(&(Load, f64)) -> f64| median(&runs.iter().map(of).collect::<Vec<_>>());
+            let pairs = own
+                .iter()
+                .zip(turns)
+                .filter_map(|(own, other)| Some((own.as_ref()?, other.as_ref()?)));
+            let ratios: Vec<f64> = pairs.map(|(own, other)| own.load.rate / other.load.rate).collect();
             println!(
-                "| {} | {connections} × {depth} | {:.0} | {:.0} | {:.0} | {:.1} |",
+                "| {} | {connections} × {depth} | {:.0} | {:.0} | {:.0} | {:.1} | {:.2} |",
                 server.name,
-                middle(|(l, _)| l.rate),
-                middle(|(l, _)| l.p50),
-                middle(|(l, _)| l.p99),
-                middle(|(_, cpu)| *cpu),
-            );
-        }
-        let best = rates.iter().skip(1).copied().fold(0.0, f64::max);
-        if let Some(own) = rates.first() {
-            println!(
-                "| drivegate of the best other | {connections} × {depth} | {:.2} | | | |",
-                own / best.max(1.0)
+                middle(|turn| turn.load.rate),
+                middle(|turn| turn.load.p50),
+                middle(|turn| turn.load.p99),
+                middle(|turn| turn.cost),
+                median(&ratios),
             );
         }
     }
-    drop(servers);
-    rounds(time, runs)
+    Ok(())
 }
 
-/// The rounds of a bus, without and with load, in turns; four times as long, since one in a hundred counts.
+/// The rounds of a bus, without and with load, in turns.
 fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
     let mut daemon = Process::own("line")?;
     let mut found = [Vec::new(), Vec::new()];
@@ -111,8 +128,8 @@ fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
     for run in 0..2 * runs {
         daemon.ask("begin")?;
         match run % 2 {
-            0 => std::thread::sleep(time * 4),
-            _ => rates.push(load(daemon.address, 16, 1, time * 4)?.rate),
+            0 => std::thread::sleep(time),
+            _ => rates.push(load(daemon.address, 16, 1, time)?.rate),
         }
         let figures = daemon.ask("end")?;
         let figures: Result<Vec<f64>, _> = figures.split(' ').map(str::parse).collect();
@@ -120,13 +137,54 @@ fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
             found.push(figures?);
         }
     }
-    println!("\n| load on the daemon | cycle p50, ms | cycle p99, ms | p99 of the runs |\n|---|---|---|---|");
+    println!(
+        "\n| load on the daemon | written: cycle p50, ms | p99 | heard by the drives: p50 | p99 |\n|---|---|---|---|---|"
+    );
     let told = format!("16 × 1, {:.0} requests/s", median(&rates));
+    let column =
+        |found: &[Vec<f64>], at: usize| -> Vec<f64> { found.iter().filter_map(|f| f.get(at).copied()).collect() };
     for (load, found) in ["none", &told].iter().zip(&found) {
-        let column = |at: usize| -> Vec<f64> { found.iter().filter_map(|f| f.get(at).copied()).collect() };
-        let each: Vec<String> = column(1).iter().map(|p99| format!("{p99:.2}")).collect();
-        let (p50, p99) = (median(&column(0)), median(&column(1)));
-        println!("| {load} | {p50:.3} | {p99:.3} | {} |", each.join(", "));
+        let figures: Vec<String> = (0..4).map(|at| format!("{:.3}", median(&column(found, at)))).collect();
+        println!("| {load} | {} |", figures.join(" | "));
+    }
+    for (at, who) in [(1, "written"), (3, "heard")] {
+        let pairs = found.each_ref().map(|found| column(found, at));
+        let [quiet, loaded] = pairs.each_ref();
+        let ratios: Vec<f64> = quiet.iter().zip(loaded).map(|(quiet, loaded)| loaded / quiet).collect();
+        let pairs: Vec<String> = quiet
+            .iter()
+            .zip(loaded)
+            .map(|(q, l)| format!("{q:.2} to {l:.2}"))
+            .collect();
+        println!(
+            "\np99 as {who}, pair by pair: {}; median ratio {:.3}",
+            pairs.join(", "),
+            median(&ratios)
+        );
     }
     Ok(())
+}
+
+/// Processor time that the host of a virtual machine gave to others while this one wanted it; 0 on bare metal.
+struct Stolen([f64; 2]);
+
+impl Stolen {
+    fn begin() -> Stolen {
+        Stolen(Self::now())
+    }
+
+    /// Of the time that was wanted since then.
+    fn percent(&self) -> f64 {
+        let ([stolen, wanted], [stolen_before, wanted_before]) = (Self::now(), self.0);
+        100.0 * (stolen - stolen_before) / (wanted - wanted_before).max(1.0)
+    }
+
+    /// Ticks stolen, and all ticks but idle ones.
+    fn now() -> [f64; 2] {
+        let stat = std::fs::read_to_string("/proc/stat").unwrap_or_default();
+        let ticks = stat.lines().next().unwrap_or_default().split_whitespace().skip(1);
+        let ticks: Vec<f64> = ticks.take(8).filter_map(|ticks| ticks.parse().ok()).collect();
+        let at = |place: usize| ticks.get(place).copied().unwrap_or_default();
+        [at(7), ticks.iter().sum::<f64>() - at(3) - at(4)]
+    }
 }

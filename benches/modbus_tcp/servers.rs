@@ -5,7 +5,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::net::SocketAddr;
 use std::path::Path;
 use std::process::{Child, ChildStdin, ChildStdout, Command, Stdio};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
@@ -230,31 +230,57 @@ async fn tokio_modbus() -> Result<(), Box<dyn Error>> {
     }
 }
 
-/// The whole daemon on a simulated line; a line of input begins a measurement of its rounds, the next ends it.
+/// The request of a round.
+const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
+
+/// The whole daemon on a simulated line; a line of input begins a measurement of its rounds, the next ends it and is
+/// answered with median and 99 % of the time between two, as the daemon gave them to its port and as the drives heard them.
 fn line(runtime: &tokio::runtime::Runtime) -> Result<(), Box<dyn Error>> {
     let rules = LineRules::new(LineFormat::new(115_200, "8N1")?);
     let line = SimulatedBus::start(SimulatedBusOptions::new("bench", rules, vec![DriveOptions::nx(1)]))?;
     let daemon = runtime.block_on(Daemon::start(settings(&line.address())?))?;
+    let plant = daemon.plant().load_full();
+    let mut frames = plant.buses.first().ok_or("no bus")?.image.trace.subscribe();
+    let written: Arc<Mutex<Vec<Duration>>> = Arc::default();
+    let writes = written.clone();
+    std::thread::spawn(move || {
+        while let Ok(frame) = frames.blocking_recv() {
+            if frame.bytes.starts_with(&ROUND)
+                && let (Ok(time), Ok(mut writes)) = (frame.time.duration_since(SystemTime::UNIX_EPOCH), writes.lock())
+            {
+                writes.push(time);
+            }
+        }
+    });
     std::thread::sleep(Duration::from_secs(2));
     println!("{}", daemon.modbus_tcp_addresses().first().ok_or("no address")?.port());
     let mut begun = false;
     for input in std::io::stdin().lines() {
         input?;
         begun = !begun;
+        let written = std::mem::take(&mut *written.lock().map_err(|_| "the listener has failed")?);
         if begun {
             line.record(200_000);
             println!("begun");
             continue;
         }
-        let round = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
         let frames = line.transcript();
-        let starts = frames
+        let heard = frames
             .iter()
-            .filter(|f| f.direction == Direction::ToDrives && f.bytes.starts_with(&round));
-        let starts: Vec<f64> = starts.map(|f| f.start.as_secs_f64() * 1e3).collect();
-        let cycles: Vec<f64> = starts.windows(2).filter_map(|w| Some(w.last()? - w.first()?)).collect();
-        println!("{:.4} {:.4}", median(&cycles), quantile(&cycles, 0.99));
+            .filter(|f| f.direction == Direction::ToDrives && f.bytes.starts_with(&ROUND));
+        println!(
+            "{} {}",
+            cycles(&written),
+            cycles(&heard.map(|f| f.start).collect::<Vec<_>>())
+        );
     }
     runtime.block_on(daemon.stop());
     Ok(())
+}
+
+/// Median and 99 % of the times between two, ms.
+fn cycles(starts: &[Duration]) -> String {
+    let pairs = starts.windows(2).filter_map(|w| w.last()?.checked_sub(*w.first()?));
+    let cycles: Vec<f64> = pairs.map(|cycle| cycle.as_secs_f64() * 1e3).collect();
+    format!("{:.4} {:.4}", median(&cycles), quantile(&cycles, 0.99))
 }

@@ -277,6 +277,11 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Whether its port is open.
+    pub fn is_up(&self) -> bool {
+        self.health.lock().unwrap_or_else(PoisonError::into_inner).up
+    }
+
     /// Changes state and figures. Only the bus itself may call this.
     pub fn update_health(&self, change: impl FnOnce(&mut BusHealth)) {
         change(&mut self.health.lock().unwrap_or_else(PoisonError::into_inner));

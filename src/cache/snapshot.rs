@@ -41,6 +41,13 @@ struct Cell {
     outlived: bool,
 }
 
+impl Cell {
+    /// Whether everything but the word is the same.
+    fn is_like(&self, other: &Cell) -> bool {
+        (self.at, self.refused, self.outlived) == (other.at, other.refused, other.outlived)
+    }
+}
+
 /// Cells that lie together and are polled alike.
 #[derive(Debug, Clone, PartialEq, Eq)]
 struct Span {
@@ -200,10 +207,17 @@ impl Reading<'_> {
         let table = self.spec.profile.canonical(table);
         let mut words = Vec::with_capacity(usize::from(count));
         let mut worst = None;
+        // Cells of one poll are of one quality, which is worked out once.
+        let mut last: Option<(PollClass, &Cell, Quality)> = None;
         for offset in 0..count {
             let address = start.checked_add(offset).ok_or(Unavailable::NotPolled)?;
             let (class, cell) = self.snapshot.cell(table, address).ok_or(Unavailable::NotPolled)?;
-            match self.quality(class, cell) {
+            let quality = match last {
+                Some((of, alike, quality)) if of == class && alike.is_like(cell) => quality,
+                _ => self.quality(class, cell),
+            };
+            last = Some((class, cell, quality));
+            match quality {
                 Quality::Good => {}
                 _ if cell.refused.is_some() && self.snapshot.link.is_online() => {
                     worst = cell.refused.map(Unavailable::Refused);

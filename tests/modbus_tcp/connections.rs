@@ -8,7 +8,7 @@ use drivegate::north::modbus_tcp;
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
-use crate::rig::{Client, Rig, listener, options, plant, registers, until, words};
+use crate::rig::{Client, PATIENCE, Rig, frame, listener, options, plant, registers, until, words};
 
 #[tokio::test]
 async fn only_allowed_clients() {
@@ -96,6 +96,20 @@ async fn an_ipv4_client_of_an_ipv6_listener() {
         request,
         "allowed and may write by its IPv4 address"
     );
+    rig.end().await;
+}
+
+/// A runtime that is busy with other things does not hold clients up: this one has a single thread, which waits.
+#[tokio::test]
+async fn nothing_else_keeps_clients_waiting() {
+    use std::io::{Read, Write};
+    let rig = Rig::new().await;
+    let mut client = std::net::TcpStream::connect(rig.address()).unwrap();
+    client.set_read_timeout(Some(PATIENCE)).unwrap();
+    client.write_all(&frame(9, 1, &words(3, &[2102, 1]))).unwrap();
+    let mut answer = [0; 11];
+    client.read_exact(&mut answer).unwrap();
+    assert_eq!(answer, frame(9, 1, &registers(3, &[5000]))[..]);
     rig.end().await;
 }
 
