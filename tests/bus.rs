@@ -7,11 +7,12 @@ use std::time::{Duration, Instant};
 use common::{Rig, drive};
 use drivegate::bus::transaction::{Ended, Step, Transaction};
 use drivegate::cache::{Access, LeaseAction, Supervision};
-use drivegate::codec::{Protocol, Reply, Request, RequestPdu, Table, rtu};
+use drivegate::codec::{Exception, Protocol, Reply, Request, RequestPdu, Table, rtu};
 use drivegate::command::Outcome;
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
 use drivegate::sim::drive::ModelOptions;
+use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::nx::NxOptions;
 use drivegate::sim::statistics::{Direction, Recorded};
 
@@ -293,6 +294,22 @@ async fn commands_are_checked_against_the_drive() {
     assert_eq!(rig.good(1, ModelPoint::FrequencyReference), Some(Value::Number(30.0)));
     let unknown = rig.read(drive(1), 6000, 5).await;
     assert_eq!(unknown, Outcome::Exception(drivegate::codec::Exception::ADDRESS));
+}
+
+#[tokio::test]
+async fn a_garbled_answer_is_told_apart_from_silence() {
+    let rig = Rig::start(&[1], 38_400).await;
+    for (fault, outcome, code) in [
+        ("corrupt=1", Outcome::Garbled, Exception::DEVICE_FAILURE),
+        ("truncate=1", Outcome::Garbled, Exception::DEVICE_FAILURE),
+        ("deaf=1", Outcome::TimedOut, Exception::GATEWAY_TARGET),
+    ] {
+        rig.until("the drive answers", |r| r.state(1) == State::Ready).await;
+        rig.line.set_faults(FaultPlan::new(fault.parse().unwrap(), 1));
+        let told = rig.set(1, &[("speed_reference", 20.0)]).await;
+        assert_eq!((told.exception(), &told), (Some(code), &outcome), "{fault}");
+        rig.line.set_faults(FaultPlan::default());
+    }
 }
 
 /// Parameter P2.7.22 of the drive.

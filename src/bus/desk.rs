@@ -7,8 +7,9 @@ use super::confirm::{Confirmations, NotConfirmed};
 use super::debts::Debts;
 use super::execute::{Execution, Next, Shadow};
 use super::schedule::{Decision, Poll, Schedule};
+use super::transaction::Ended;
 use crate::cache::DriveImage;
-use crate::codec::{Reply, RequestPdu};
+use crate::codec::RequestPdu;
 use crate::command::{Command, Outcome, Pending, Urgency};
 use crate::drive::ModelPoint;
 
@@ -173,7 +174,7 @@ impl Desk {
         &mut self,
         index: usize,
         pdu: &RequestPdu,
-        reply: Option<Reply>,
+        ended: Ended,
         retries: u32,
         drives: &[Arc<DriveImage>],
         now: Instant,
@@ -181,9 +182,10 @@ impl Desk {
         let Some(execution) = self.begun.get_mut(index) else {
             return;
         };
-        let outcome = match reply {
-            Some(reply) => execution.answered(pdu, reply, &mut self.shadow),
-            None => execution.failed(pdu, retries),
+        let outcome = match ended {
+            Ended::Reply(reply) => execution.answered(pdu, reply, &mut self.shadow),
+            Ended::Silent => execution.failed(pdu, Outcome::TimedOut, retries),
+            Ended::Corrupt(_) => execution.failed(pdu, Outcome::Garbled, retries),
         };
         if let Some(outcome) = outcome {
             let execution = self.begun.remove(index);

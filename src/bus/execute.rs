@@ -40,6 +40,8 @@ pub struct Execution {
     expires: Instant,
     /// Set when it ends before all was sent.
     cut: Option<Outcome>,
+    /// How the last try without an answer failed: [`Outcome::TimedOut`] or [`Outcome::Garbled`].
+    unanswered: Outcome,
     /// Nothing is left but the end of a pulse, which is sent whatever happens.
     only_ends: bool,
     reply: Reply,
@@ -90,6 +92,7 @@ impl Execution {
             effects,
             expires,
             cut: None,
+            unanswered: Outcome::TimedOut,
             only_ends: false,
             reply: Reply::Written,
             failures: 0,
@@ -108,7 +111,7 @@ impl Execution {
         self.running = running;
         if self.is_late(now) {
             let outcome = if self.failures > 0 || self.in_doubt {
-                Outcome::TimedOut
+                self.unanswered.clone()
             } else {
                 Outcome::Expired
             };
@@ -225,9 +228,10 @@ impl Execution {
         self.actions.is_empty().then(|| self.success())
     }
 
-    /// No believable answer came. The outcome, when the tries are used up.
-    pub fn failed(&mut self, sent: &RequestPdu, retries: u32) -> Option<Outcome> {
+    /// No believable answer came; `how` tells which way. The outcome, when the tries are used up.
+    pub fn failed(&mut self, sent: &RequestPdu, how: Outcome, retries: u32) -> Option<Outcome> {
         self.failures += 1;
+        self.unanswered = how;
         self.in_doubt |= sent.is_write();
         let over = self.failures > retries;
         if over && matches!(self.actions.front(), Some(Action::Release(_))) {
@@ -238,19 +242,23 @@ impl Execution {
             return None;
         }
         if self.checks(sent) {
-            return over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut));
+            return over.then(|| self.without_answer());
         }
         if self.reads_word(sent) && self.goes_on(false) {
             return None;
         }
         if self.reads_word(sent) && (over || self.urgency == Urgency::Stop) {
-            return self.without_word(Outcome::TimedOut);
+            return self.without_word(self.unanswered.clone());
         }
         if sent.is_write() && self.check == Check::Read {
             // By the next try it may have changed again.
             self.check = Check::NotYet;
         }
-        over.then(|| self.cut.clone().unwrap_or(Outcome::TimedOut))
+        over.then(|| self.without_answer())
+    }
+
+    fn without_answer(&self) -> Outcome {
+        self.cut.clone().unwrap_or_else(|| self.unanswered.clone())
     }
 
     /// What was sent was acknowledged, perhaps by a late reply to something else.

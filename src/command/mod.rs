@@ -122,6 +122,8 @@ pub enum Outcome {
     Refused(Refusal),
     /// The drive did not answer.
     TimedOut,
+    /// What the drive answered cannot be believed: a wrong check code or length.
+    Garbled,
     /// Too old when its turn came; not sent.
     Expired,
     /// A newer reference took its place; not sent.
@@ -146,6 +148,7 @@ impl Outcome {
             Outcome::Exception(_) => "refused_by_drive",
             Outcome::Refused(refusal) => refusal.code(),
             Outcome::TimedOut => "timeout",
+            Outcome::Garbled => "garbled",
             Outcome::Expired => "expired",
             Outcome::Replaced => "replaced",
             Outcome::Purged => "purged",
@@ -166,7 +169,7 @@ impl Outcome {
         match self {
             Outcome::Acknowledged(_) => None,
             Outcome::Exception(code) if code.0 <= 0x0B => Some(*code),
-            Outcome::Exception(_) => Some(Exception::DEVICE_FAILURE),
+            Outcome::Exception(_) | Outcome::Garbled => Some(Exception::DEVICE_FAILURE),
             Outcome::Refused(refusal) => Some(refusal.exception()),
             Outcome::QueueFull => Some(Exception::BUSY),
             Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
@@ -183,6 +186,7 @@ impl fmt::Display for Outcome {
             Outcome::Exception(code) => write!(f, "the drive refused it with {code}"),
             Outcome::Refused(refusal) => refusal.fmt(f),
             Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
+            Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
             Outcome::Expired => {
                 f.write_str("its time ran out before its turn came; what was not sent by then is not sent any more")
             }
@@ -255,6 +259,7 @@ mod tests {
         outcomes.extend([
             Outcome::Acknowledged(Reply::Written),
             Outcome::TimedOut,
+            Outcome::Garbled,
             Outcome::Expired,
             Outcome::Replaced,
             Outcome::Purged,

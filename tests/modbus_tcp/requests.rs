@@ -143,6 +143,7 @@ async fn what_the_drive_refuses() {
         (Outcome::Exception(Exception(0x0B)), 0x0B),
         (Outcome::Exception(Exception(0x21)), 4),
         (Outcome::Exception(Exception(0xFF)), 4),
+        (Outcome::Garbled, 4),
         (Outcome::TimedOut, 0x0B),
         (Outcome::Expired, 0x0B),
         (Outcome::Offline, 0x0B),

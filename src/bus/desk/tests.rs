@@ -9,7 +9,7 @@ use tokio::sync::oneshot::Receiver;
 use super::*;
 use crate::bus::schedule::{Cadence, Change, Polled};
 use crate::cache::{Access, DriveSpec, Link};
-use crate::codec::{Exception, Table};
+use crate::codec::{Exception, Reply, Table};
 use crate::command::{Answer, CAPACITY, CommandQueue, Order, Origin, SourceKind, Ticket, WriteStats, admit};
 use crate::drive::profile::Profiles;
 use crate::drive::{Plan, Profile, Value};
@@ -299,7 +299,8 @@ impl Model {
             Job::Command { index, pdu } => {
                 let urgency = self.desk.begun(index).unwrap().1;
                 self.schedule.command_done(urgency, took);
-                self.desk.ended(index, &pdu, reply, RETRIES, &self.drives, self.now);
+                let ended = reply.map_or(Ended::Silent, Ended::Reply);
+                self.desk.ended(index, &pdu, ended, RETRIES, &self.drives, self.now);
             }
         }
         self.desk.look(drive, &self.drives, self.now);

@@ -204,8 +204,17 @@ fn exceptions_and_silence_end_it() {
     let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut shadow);
     assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
-    assert_eq!(command.failed(&sent, 1), None);
-    assert_eq!(command.failed(&sent, 1), Some(Outcome::TimedOut));
+    assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
+    assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), Some(Outcome::TimedOut));
+    // The last try tells; the time that runs out in between ends it as the try before did.
+    let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+    assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
+    assert_eq!(command.failed(&sent, Outcome::Garbled, 1), Some(Outcome::Garbled));
+    let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+    assert_eq!(command.failed(&sent, Outcome::Garbled, 1), None);
+    let late = bench.now + Duration::from_secs(3600);
+    assert_eq!(command.next(&shadow, &bench.profile, false, late), Next::Done);
+    assert_eq!(command.success(), Outcome::Garbled);
 }
 
 /// What the command sends next.
@@ -231,7 +240,7 @@ fn a_stop_does_not_depend_on_a_read() {
         assert!(!read.is_write());
         let ended = match answer {
             Some(reply) => stop.answered(&read, reply, &mut bench.shadow),
-            None => stop.failed(&read, 3),
+            None => stop.failed(&read, Outcome::TimedOut, 3),
         };
         assert_eq!(ended, None);
         assert_eq!(sends(&bench, &mut stop), word(0));
@@ -255,9 +264,9 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     // A read that is never answered: after the tries.
     let mut bench = Bench::new(0);
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
-    assert_eq!(start.failed(&read, 1), None);
+    assert_eq!(start.failed(&read, Outcome::TimedOut, 1), None);
     assert_eq!(sends(&bench, &mut start), read);
-    assert_eq!(start.failed(&read, 1), None);
+    assert_eq!(start.failed(&read, Outcome::TimedOut, 1), None);
     assert_eq!(sends(&bench, &mut start), word(1));
     // A drive that is only busy is not overruled.
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);

@@ -34,11 +34,7 @@ impl Worker {
         }
         match job {
             Job::Poll(poll) if progress == Progress::Failed => {
-                let ended = match ended {
-                    Ended::Corrupt(why) => Ended::Corrupt(why),
-                    Ended::Silent | Ended::Reply(_) => Ended::Silent,
-                };
-                self.polled(poll, ended, began, took);
+                self.polled(poll, without_reply(ended), began, took);
             }
             Job::Poll(_) => self.schedule.session_done(),
             Job::Command { index, .. } => {
@@ -47,7 +43,8 @@ impl Worker {
                 }
                 if progress == Progress::Failed {
                     let (pdu, drives) = (RequestPdu::N2(step), &self.handle.image.drives);
-                    self.desk.ended(*index, &pdu, None, self.options.retries, drives, now);
+                    self.desk
+                        .ended(*index, &pdu, without_reply(ended), self.options.retries, drives, now);
                 }
             }
         }
@@ -147,11 +144,12 @@ impl Worker {
         if heard == Progress::Restarted {
             self.restarted(drive, now);
         }
-        let reply = match ended {
+        match &ended {
             // The drive did not look at it: it is said again, once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
                 let (pdu, drives) = (RequestPdu::N2(Session::Identify), &self.handle.image.drives);
-                self.desk.ended(index, &pdu, None, self.options.retries, drives, now);
+                self.desk
+                    .ended(index, &pdu, Ended::Silent, self.options.retries, drives, now);
                 return;
             }
             Ended::Reply(reply) => {
@@ -168,18 +166,22 @@ impl Worker {
                 if acknowledged {
                     self.desk.debts.answered(drive, pdu, now);
                 }
-                Some(reply)
             }
-            Ended::Silent | Ended::Corrupt(_) => {
-                self.owes(drive, pdu, began, now);
-                None
-            }
-        };
+            Ended::Silent | Ended::Corrupt(_) => self.owes(drive, pdu, began, now),
+        }
         let drives = &self.handle.image.drives;
-        self.desk.ended(index, pdu, reply, self.options.retries, drives, now);
+        self.desk.ended(index, pdu, ended, self.options.retries, drives, now);
         if let Some((table, items)) = written(pdu) {
             self.schedule
                 .refresh(drive, |read| items.iter().any(|(a, _)| read.covers(table, *a)), now);
         }
+    }
+}
+
+/// A step before the job has failed, whatever was answered: so has the job.
+fn without_reply(ended: Ended) -> Ended {
+    match ended {
+        Ended::Corrupt(why) => Ended::Corrupt(why),
+        Ended::Silent | Ended::Reply(_) => Ended::Silent,
     }
 }

@@ -67,13 +67,12 @@ impl Worker {
     /// The protocol has no such request, so that the drive has no such address: it is refused without the line.
     fn unknown_to_the_protocol(&mut self, job: &Job) {
         let now = Instant::now();
-        let refused = Reply::Exception(Exception::ADDRESS);
+        let refused = Ended::Reply(Reply::Exception(Exception::ADDRESS));
         match job {
-            Job::Poll(poll) => self.polled(poll, Ended::Reply(refused), now, Duration::ZERO),
+            Job::Poll(poll) => self.polled(poll, refused, now, Duration::ZERO),
             Job::Command { index, pdu } => {
                 let drives = &self.handle.image.drives;
-                self.desk
-                    .ended(*index, pdu, Some(refused), self.options.retries, drives, now);
+                self.desk.ended(*index, pdu, refused, self.options.retries, drives, now);
             }
         }
     }

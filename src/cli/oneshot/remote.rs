@@ -466,7 +466,9 @@ pub(in crate::cli) fn refusal(code: Exception) -> String {
         Exception::FUNCTION => "not allowed: the drive is only monitored, or this host is not in `write`",
         Exception::ADDRESS => "the address is read-only or the drive does not have it",
         Exception::VALUE => "the value is outside the type, the profile or the limits",
-        Exception::DEVICE_FAILURE => "the drive refused it with a code of its own, which the log of the gateway tells",
+        Exception::DEVICE_FAILURE => {
+            "the drive refused it with a code of its own, or its answer was garbled; the log of the gateway tells"
+        }
         Exception::BUSY => "the queue is full, or another command took its place; try again",
         Exception::GATEWAY_PATH => "the bus is down",
         Exception::GATEWAY_TARGET => "the drive does not answer, or its value is stale",

@@ -83,7 +83,7 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
         let mut command = reverse(&bench);
         for outcome in [None, ended] {
             assert!(asks(&sends(&bench, &mut command)));
-            assert_eq!(command.failed(&read, 1), outcome);
+            assert_eq!(command.failed(&read, Outcome::TimedOut, 1), outcome);
         }
         if !running {
             assert_eq!(sends(&bench, &mut command), word(2));
@@ -103,10 +103,10 @@ fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
     };
     tell(&mut command, &mut bench, 1);
     assert_eq!(sends(&bench, &mut command), word(3));
-    assert_eq!(command.failed(&word(3), 1), None);
+    assert_eq!(command.failed(&word(3), Outcome::TimedOut, 1), None);
     tell(&mut command, &mut bench, 0);
     assert_eq!(sends(&bench, &mut command), word(2));
-    assert_eq!(command.failed(&word(2), 1), Some(Outcome::TimedOut));
+    assert_eq!(command.failed(&word(2), Outcome::TimedOut, 1), Some(Outcome::TimedOut));
 }
 
 #[test]
@@ -130,7 +130,7 @@ fn no_read_stands_in_the_way_of_the_end_of_a_pulse() {
         assert!(asks(&sends(&bench, &mut reset)));
         let ended = match answer {
             Some(reply) => reset.answered(&read, reply, &mut bench.shadow),
-            None => reset.failed(&read, 3),
+            None => reset.failed(&read, Outcome::TimedOut, 3),
         };
         assert_eq!(ended, None);
         assert_eq!(sends(&bench, &mut reset), word(written), "running: {running}");

@@ -98,9 +98,13 @@ fn a_release_is_behind_the_override_and_may_fail() {
         let ended = match answer {
             Some(reply) => command.answered(&release(), reply, &mut bench.shadow),
             None => {
-                assert_eq!(command.failed(&release(), 1), None, "it is tried again");
+                assert_eq!(
+                    command.failed(&release(), Outcome::TimedOut, 1),
+                    None,
+                    "it is tried again"
+                );
                 assert_eq!(sends(&bench, &mut command), release());
-                command.failed(&release(), 1)
+                command.failed(&release(), Outcome::TimedOut, 1)
             }
         };
         assert_eq!(ended, Some(Outcome::Acknowledged(Reply::Written)));
