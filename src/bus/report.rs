@@ -175,7 +175,8 @@ impl Report {
         drive.update(|s| s.refuse(read.table, read.start, read.count, exception));
         tracing::warn!(
             bus = %self.image.spec.name, drive = %drive.spec.name,
-            "the drive refuses {} {} with {exception}; its points are bad, asked again every minute", read.table, read.start
+            "the drive refuses {} {} with {exception}; its points are bad; asked again after 2 s, later every minute",
+            read.table, read.start
         );
     }
 

@@ -11,8 +11,9 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 const DEAD_SHARE: f64 = 0.016;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
-/// Pause before a request that the drive refused is tried again.
-const REFUSED_PAUSE: Duration = Duration::from_secs(60);
+/// First and longest pause before a request that the drive refused is tried again: a drive that is starting may refuse what
+/// it soon has, one that never has it must not take time from others.
+const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
 #[derive(Debug, Clone)]
 pub(super) struct Item {
@@ -22,6 +23,8 @@ pub(super) struct Item {
     pub(super) due: Instant,
     pub(super) cost: Duration,
     pub(super) refused: bool,
+    /// How often in a row.
+    pub(super) refusals: u32,
     pub(super) failures: u32,
     /// A read of the once class that is still to be done.
     pub(super) wanted: bool,
@@ -70,6 +73,7 @@ impl Item {
             due: now,
             cost,
             refused: false,
+            refusals: 0,
             failures: 0,
             wanted: true,
             unread: true,
@@ -116,17 +120,22 @@ impl DriveSchedule {
             return Change::None;
         }
         let Some((low, high)) = Plan::halves(read) else {
+            let change = match item.refused {
+                true => Change::None,
+                false => Change::Unavailable(read, exception),
+            };
             item.refused = true;
             item.wanted = true;
-            item.due = now + REFUSED_PAUSE;
+            item.due = now + (REFUSED_PAUSE.0 * (1 << item.refusals.min(5))).min(REFUSED_PAUSE.1);
+            item.refusals = item.refusals.saturating_add(1);
             let origin = item.origin;
             self.join(origin, now);
-            return Change::Unavailable(read, exception);
+            return change;
         };
         let (origin, cost) = (item.origin, item.cost);
         let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
         for half in &mut halves {
-            half.whole_again = Some(now + REFUSED_PAUSE);
+            half.whole_again = Some(now + REFUSED_PAUSE.1);
         }
         self.items.splice(index..=index, halves);
         Change::None

@@ -38,6 +38,7 @@ impl Schedule {
         } else if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
             item.failures = 0;
             item.unread = false;
+            item.refusals = 0;
             if std::mem::take(&mut item.refused) {
                 // The bad point is sound again: it is read with its neighbours.
                 item.whole_again = Some(now);

@@ -114,6 +114,38 @@ fn refused_blocks_are_split_joined_and_retried_slowly() {
 }
 
 #[test]
+fn what_a_starting_drive_refuses_is_there_soon() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let starts = bench.now;
+    let mut asked = Vec::new();
+    bench.answer(Duration::from_secs(40), |poll, now| {
+        asked.push((now - starts, poll.read.start, poll.read.count));
+        refused_if(now - starts < Duration::from_millis(1500))
+    });
+    let whole = asked
+        .iter()
+        .find(|(at, start, count)| *at > Duration::from_secs(2) && (*start, *count) == (2100, 11));
+    let after = whole.expect("the process data as a whole").0;
+    assert!(after < Duration::from_secs(4), "{after:?}");
+}
+
+#[test]
+fn what_a_drive_never_has_is_asked_ever_more_seldom() {
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    let starts = bench.now;
+    let mut asked = Vec::new();
+    bench.answer(Duration::from_secs(200), |poll, now| {
+        let refused = poll.read.covers(Table::Holding, 2105);
+        if refused && poll.read.count == 1 {
+            asked.push((now - starts).as_secs());
+        }
+        refused_if(refused)
+    });
+    let pauses: Vec<u64> = asked.windows(2).map(|pair| pair[1] - pair[0]).collect();
+    assert_eq!(pauses, [2, 4, 8, 16, 32, 60, 60]);
+}
+
+#[test]
 fn a_request_that_is_never_answered_does_not_take_the_drive_away() {
     let mut bench = Bench::new(1, Duration::from_millis(10));
     let mut mute = 0;
