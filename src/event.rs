@@ -45,6 +45,24 @@ pub enum EventKind {
 }
 
 impl EventKind {
+    /// Whether somebody should look: the log has it as a warning.
+    pub fn is_trouble(self) -> bool {
+        match self {
+            EventKind::Offline
+            | EventKind::Fault
+            | EventKind::UnlikeProfile
+            | EventKind::Supervision
+            | EventKind::Unsupervised
+            | EventKind::NotConfirmed
+            | EventKind::BusDown => true,
+            EventKind::Online
+            | EventKind::FaultEnd
+            | EventKind::Restarted
+            | EventKind::RefusedCommand
+            | EventKind::BusUp => false,
+        }
+    }
+
     /// The name in payloads.
     pub fn name(self) -> &'static str {
         match self {
@@ -141,8 +159,12 @@ impl Events {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         kept.0 += 1;
         event.id = kept.0;
-        tracing::info!(target: "drivegate::event", kind = event.kind.name(), bus = %event.bus,
-            drive = event.drive.as_deref().unwrap_or(""), "{}", event.text);
+        let (kind, drive) = (event.kind.name(), event.drive.as_deref().unwrap_or(""));
+        if event.kind.is_trouble() {
+            tracing::warn!(target: "drivegate::event", kind, bus = %event.bus, drive, "{}", event.text);
+        } else {
+            tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, "{}", event.text);
+        }
         let event = Arc::new(event);
         if kept.1.len() == KEPT {
             kept.1.pop_front();

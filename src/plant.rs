@@ -104,7 +104,29 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
     }
 }
 
+/// Answers a command that is not taken; audited and counted.
+fn turn_away(writes: &Arc<WriteStats>, drive: &str, what: &str, outcome: Outcome, origin: Origin) -> Answer {
+    let now = Instant::now();
+    let (ticket, _) = Ticket::new(origin, drive, what.to_string(), true, now, writes.clone());
+    ticket.answer(outcome.clone(), now);
+    Answer {
+        outcome,
+        latency: Duration::ZERO,
+    }
+}
+
 impl Plant {
+    /// Refuses a command to a drive that there is not; audited and counted. `why` names the nearest one.
+    pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin) -> Answer {
+        turn_away(
+            &self.writes,
+            drive,
+            what,
+            Outcome::Refused(Refusal::UnknownDrive(why)),
+            origin,
+        )
+    }
+
     /// All drives, bus by bus in the order of the file.
     pub fn drives(&self) -> impl Iterator<Item = DriveHandle> {
         self.buses.iter().flat_map(move |bus| {
@@ -241,14 +263,7 @@ impl DriveHandle {
 
     /// Answers a command that is not taken, for a reason that is not the client's fault; audited and counted.
     pub fn turn_away(&self, what: &str, outcome: Outcome, origin: Origin) -> Answer {
-        let now = Instant::now();
-        let name = &self.image.spec.name;
-        let (ticket, _) = Ticket::new(origin, name, what.to_string(), true, now, self.writes.clone());
-        ticket.answer(outcome.clone(), now);
-        Answer {
-            outcome,
-            latency: Duration::ZERO,
-        }
+        turn_away(&self.writes, &self.image.spec.name, what, outcome, origin)
     }
 
     /// Tells that a command was refused; a flood of them is counted, not told.

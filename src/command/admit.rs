@@ -55,7 +55,9 @@ pub fn admit(order: Order, drive: &Reading<'_>, may_write: bool) -> Result<Admit
 fn authority(drive: &Reading<'_>, may_write: bool) -> Result<(), Refusal> {
     if !may_write {
         return Err(Refusal::NotAllowed(
-            "this client may not write; it is not in the `write` list".to_string(),
+            "this client may not write: its address is not in `write`, or, with TLS, its certificate has no role that \
+             `roles` maps to \"control\""
+                .to_string(),
         ));
     }
     if drive.spec.access == Access::Monitor {

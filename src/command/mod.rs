@@ -216,6 +216,9 @@ pub enum Refusal {
     /// The value is outside the type, the profile or the limits, or the command contradicts itself.
     #[error("{0}")]
     BadValue(String),
+    /// There is no drive of that name.
+    #[error("{0}")]
+    UnknownDrive(String),
 }
 
 impl Refusal {
@@ -225,6 +228,7 @@ impl Refusal {
             Refusal::NotAllowed(_) => "not_allowed",
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
+            Refusal::UnknownDrive(_) => "unknown_drive",
         }
     }
 
@@ -234,6 +238,7 @@ impl Refusal {
             Refusal::NotAllowed(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
+            Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
         }
     }
 }
@@ -254,7 +259,12 @@ mod tests {
     #[test]
     fn the_documentation_tells_every_answer() {
         let page = include_str!("../../docs/commands.md");
-        let refusals = [Refusal::NotAllowed, Refusal::NotWritable, Refusal::BadValue];
+        let refusals = [
+            Refusal::NotAllowed,
+            Refusal::NotWritable,
+            Refusal::BadValue,
+            Refusal::UnknownDrive,
+        ];
         let mut outcomes: Vec<Outcome> = refusals.iter().map(|r| Outcome::Refused(r(String::new()))).collect();
         outcomes.extend([
             Outcome::Acknowledged(Reply::Written),

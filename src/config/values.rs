@@ -105,7 +105,12 @@ fn check_name(text: &str, joints: &str) -> Result<(), String> {
 /// An address to listen on.
 pub(super) fn socket(text: &str) -> Result<SocketAddr, String> {
     text.parse().map_err(|_| {
-        format!("`{text}` is no IP address with a port; write for example \"127.0.0.1:1502\" or \"[::1]:1502\"")
+        let port = text.rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
+        let port = port.unwrap_or(1502);
+        format!(
+            "`{text}` is no IP address with a port; write for example \"127.0.0.1:{port}\" or \"[::1]:{port}\"; host names \
+             are not taken"
+        )
     })
 }
 

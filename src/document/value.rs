@@ -18,7 +18,11 @@ pub trait FromNode: Sized {
 }
 
 fn wrong<T: FromNode>(node: &Node) -> String {
+    let is_quoted = |text: &str| text.parse::<f64>().is_ok() || text.parse::<bool>().is_ok();
     match &node.value {
+        Raw::Text(text) if is_quoted(text) && !T::WANTED.contains("quotes") => {
+            format!("`\"{text}\"` is text; write {}, without quotes", T::WANTED)
+        }
         Raw::Env(text) | Raw::Text(text) => format!("`{text}` is not {}; write {}", T::WANTED, T::WANTED),
         other => format!("{} stands here; write {}", other.kind(), T::WANTED),
     }

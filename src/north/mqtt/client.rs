@@ -271,7 +271,14 @@ impl Client {
             tracing::debug!("no connection to the broker: {why}");
         } else {
             let (host, port) = (&self.options.host, self.options.port);
-            tracing::warn!("no connection to the broker at {host}:{port}: {why}; trying again until there is one");
+            let hint = if why.contains("SessionTakenOver") {
+                "; another client has the same `client_id`: give each gateway a name or a `client_id` of its own"
+            } else {
+                ""
+            };
+            tracing::warn!(
+                "no connection to the broker at {host}:{port}: {why}{hint}; trying again until there is one"
+            );
             self.trouble = Some(why.to_string());
         }
     }

@@ -71,19 +71,19 @@ impl Commands {
             return None; // somebody takes a retained message away
         }
         let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
-        let Some(drive) = plant.drive(target.drive) else {
-            let text = unknown_drive(target.drive, plant);
-            tracing::warn!(topic = %incoming.topic, "command refused: {text}");
-            let id = request::id(&incoming, target.point);
-            return Some(reply.message(id, "unknown_drive", Some(text), Duration::ZERO));
-        };
         let origin = Origin {
             kind: SourceKind::Mqtt,
             who: incoming.topic.clone(),
         };
+        let what = || excerpt(&incoming.payload);
+        let Some(drive) = plant.drive(target.drive) else {
+            let name = excerpt(target.drive.as_bytes());
+            let why = unknown_drive(target.drive, plant);
+            let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin);
+            return Some(reply.answer(request::id(&incoming, target.point), &answer, None));
+        };
         let profile = &drive.image.spec.profile;
         let request = request::read(&incoming, target.point, profile);
-        let what = || excerpt(&incoming.payload);
         let (points, expiry) = match request.order {
             Err(refusal) => return Some(reply.answer(request.id, &drive.refuse(&what(), refusal, origin), None)),
             Ok(order) => order,
@@ -228,10 +228,6 @@ impl Reply {
             None => answer.outcome.code(),
         };
         self.put(id, code, text, answer.latency, confirmed)
-    }
-
-    fn message(&self, id: Option<Json>, code: &str, error: Option<String>, latency: Duration) -> Message {
-        self.put(id, code, error, latency, None)
     }
 
     fn put(
@@ -386,6 +382,10 @@ mod tests {
             (&result["error"]["code"], &result["id"]),
             (&"unknown_drive".into(), &21.into())
         );
+        let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
+        assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
+        let record = bench.plant.writes.audit().recent().pop().unwrap();
+        assert_eq!((record.result, record.drive.as_str()), ("unknown_drive", "p11"));
         assert!(
             result["error"]["message"]
                 .as_str()
