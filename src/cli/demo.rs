@@ -108,7 +108,7 @@ const HTTP: u16 = 9488;
 
 /// Runs the demo until Ctrl-C.
 pub(super) fn run(args: &Args) -> ExitCode {
-    super::log::start(&LogSettings {
+    let _log = super::log::start(&LogSettings {
         level: args.log.clone(),
         format: LogFormat::Auto,
     });

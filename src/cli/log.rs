@@ -2,10 +2,13 @@
 
 use std::fmt;
 use std::io::IsTerminal;
+use std::sync::atomic::{AtomicUsize, Ordering};
 
 use tracing::{Event, Level, Subscriber};
+use tracing_appender::non_blocking::{ErrorCounter, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::filter::LevelFilter;
 use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::writer::BoxMakeWriter;
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::registry::LookupSpan;
@@ -18,21 +21,59 @@ use crate::config::{LogFormat, LogSettings};
 const AUDIT: &str = "audit";
 const AUDIT_LINES: Level = Level::INFO;
 
-/// Changes the level of a running program.
-#[derive(Debug, Clone)]
-pub(super) struct LogHandle(reload::Handle<EnvFilter, Registry>);
+/// Lines that wait for a slow reader of the log; what comes beyond is lost, and counted.
+const WAITING: usize = 8192;
+
+/// The log of a running program; what still waits is written when it is dropped.
+#[derive(Debug)]
+pub(super) struct LogHandle {
+    filter: reload::Handle<EnvFilter, Registry>,
+    lost: ErrorCounter,
+    told: AtomicUsize,
+    _writer: WorkerGuard,
+}
 
 impl LogHandle {
     /// Takes a new level; a format change needs a restart.
     pub(super) fn set_level(&self, level: &str) {
-        if let Err(error) = self.0.reload(filter(level)) {
+        if let Err(error) = self.filter.reload(filter(level)) {
             tracing::error!("the log level stays as it is: {error}");
+        }
+    }
+
+    /// Tells how many lines were lost since it was told last, if any.
+    pub(super) fn tell_lost(&self) {
+        let lost = self.lost.dropped_lines();
+        let more = lost.saturating_sub(self.told.swap(lost, Ordering::Relaxed));
+        if more > 0 {
+            tracing::warn!("{more} lines of the log were lost: who reads it is too slow, or has stopped");
         }
     }
 }
 
-/// Starts logging to standard error.
+/// Starts logging to standard error, by a thread of its own: a reader that stalls (a full pipe, a hanging collector) must
+/// not hold up a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
+    let (writer, guard) = NonBlockingBuilder::default()
+        .buffered_lines_limit(WAITING)
+        .lossy(true)
+        .thread_name("log")
+        .finish(std::io::stderr());
+    let lost = writer.error_counter();
+    LogHandle {
+        filter: subscribe(settings, BoxMakeWriter::new(writer)),
+        lost,
+        told: AtomicUsize::new(0),
+        _writer: guard,
+    }
+}
+
+/// Starts logging for a command that does one thing: in the order of what it prints itself.
+pub(super) fn start_in_order(settings: &LogSettings) {
+    subscribe(settings, BoxMakeWriter::new(std::io::stderr));
+}
+
+fn subscribe(settings: &LogSettings, writer: BoxMakeWriter) -> reload::Handle<EnvFilter, Registry> {
     let (filter, handle) = reload::Layer::new(filter(&settings.level));
     let terminal = std::io::stderr().is_terminal();
     let format = match settings.format {
@@ -41,7 +82,7 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
         LogFormat::Auto => LogFormat::Json,
         other => other,
     };
-    let lines = tracing_subscriber::fmt::layer().with_writer(std::io::stderr);
+    let lines = tracing_subscriber::fmt::layer().with_writer(writer);
     let lines = match format {
         LogFormat::Journal => lines.with_ansi(false).event_format(JournalLine).boxed(),
         LogFormat::Text => lines.with_ansi(terminal).with_target(true).boxed(),
@@ -56,7 +97,7 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
     {
         tracing::debug!("logging was started before");
     }
-    LogHandle(handle)
+    handle
 }
 
 /// What a checked `level` lets through. Whoever wants less to read still has a record of every command: only `off`, of

@@ -105,7 +105,7 @@ pub(super) fn listens(target: &Target) -> Vec<SocketAddr> {
 
 /// A command says what happens itself; of the log only the audit is left.
 pub(super) fn quiet() {
-    super::log::start(&LogSettings {
+    super::log::start_in_order(&LogSettings {
         level: "off,audit=info".to_string(),
         format: LogFormat::Auto,
     });

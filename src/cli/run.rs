@@ -74,6 +74,7 @@ async fn until_stopped(mut daemon: Daemon, path: &Path, log: &LogHandle) -> std:
             _ = interrupt.recv() => break,
             _ = hang_up.recv() => reload(&mut daemon, path, log).await,
             _ = feed.tick() => {
+                log.tell_lost();
                 if daemon.is_moving() && watchdog.is_some() {
                     notify(&[NotifyState::Watchdog]);
                 }

@@ -15,6 +15,7 @@ mod oneshot;
 mod operators;
 mod process;
 mod restart;
+mod slow_log;
 #[path = "../tools/mod.rs"]
 mod tools;
 mod user_profiles;

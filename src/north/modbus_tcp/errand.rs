@@ -70,7 +70,7 @@ impl Errand {
             };
             let name = self.drive.image.spec.name.clone();
             if self.resets && !outcome.is_ok() {
-                shared.with_command_word(&name, |word| *word = register_map::without_reset(*word));
+                shared.with_command_word(&name, |word| *word = word.map(register_map::without_reset));
             }
             Finished {
                 header,

@@ -281,7 +281,7 @@ impl Session {
             let before = register_map::Before { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
             let resets = write.word.is_some_and(|word| before.resets(word));
-            *last = write.word.unwrap_or(*last);
+            *last = write.word.or(*last);
             Ok((write, resets))
         });
         let (work, resets) = match write {

@@ -17,7 +17,7 @@ pub(super) struct Shared {
     pub(super) options: Options,
     pub(super) stats: Arc<NorthStats>,
     /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
-    command_words: Mutex<HashMap<String, u16>>,
+    command_words: Mutex<HashMap<String, Option<u16>>>,
     tls_log: Mutex<Seldom>,
     pub(super) turns: Arc<Turns>,
 }
@@ -39,7 +39,7 @@ impl Shared {
     }
 
     /// Does something with the word of a drive that nobody else may change in between.
-    pub(super) fn with_command_word<T>(&self, drive: &str, act: impl FnOnce(&mut u16) -> T) -> T {
+    pub(super) fn with_command_word<T>(&self, drive: &str, act: impl FnOnce(&mut Option<u16>) -> T) -> T {
         let mut words = self.command_words.lock().unwrap_or_else(PoisonError::into_inner);
         let mut word = words.get(drive).copied().unwrap_or_default();
         let result = act(&mut word);

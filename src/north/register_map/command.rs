@@ -21,8 +21,8 @@ pub struct CommandWrite {
 /// What stands before a write of 0x8100.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
 pub struct Before {
-    /// The word that was written there last.
-    pub word: u16,
+    /// The word that was written there last; none since the server started.
+    pub word: Option<u16>,
     /// The drive tells of a fault.
     pub fault: bool,
 }
@@ -30,10 +30,12 @@ pub struct Before {
 impl Before {
     /// Whether `word` asks for a fault reset: bit 2 changes from 0 to 1, or it comes without run while the drive has a
     /// fault, whatever was written before: no client has to take back a bit that reads as 0. With run only the change
-    /// counts, so a client that repeats its word does not start a motor again after each fault.
+    /// counts, so a client that repeats its word does not start a motor again after each fault; nor does the first word
+    /// after a start of the server, which may be such a repetition.
     pub fn resets(self, word: u16) -> bool {
-        let changes = !self.word & FAULT_RESET != 0;
-        word & FAULT_RESET != 0 && (changes || (self.fault && word & RUN == 0))
+        let runs = word & RUN != 0;
+        let changes = self.word.map_or(!runs, |last| last & FAULT_RESET == 0);
+        word & FAULT_RESET != 0 && (changes || (self.fault && !runs))
     }
 }
 

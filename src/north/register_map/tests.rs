@@ -292,6 +292,7 @@ fn command_writes() {
 }
 
 fn before(word: u16, fault: bool) -> Before {
+    let word = Some(word);
     Before { word, fault }
 }
 
@@ -313,6 +314,20 @@ fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
             before(last, fault).resets(word),
             resets,
             "{last} then {word}, fault {fault}"
+        );
+    }
+    // The first word since the start: with run it may be the repetition of a client that has been writing it for hours.
+    for (word, fault, resets) in [
+        (4, false, true),
+        (4, true, true),
+        (5, true, false),
+        (7, true, false),
+        (1, true, false),
+    ] {
+        assert_eq!(
+            Before { word: None, fault }.resets(word),
+            resets,
+            "{word} first, fault {fault}"
         );
     }
 }
