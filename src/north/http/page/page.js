@@ -146,6 +146,7 @@ function showDrive(row, drive) {
 
 function showSpeed(extra, point, reference) {
   const good = point && point.quality === "good";
+  extra.fill.parentElement.hidden = !good;
   extra.fill.style.width = good ? `${Math.min(100, Math.abs(point.value))}%` : "0";
   const known = reference && reference.quality === "good";
   text(extra.reference, known ? `set ${figure(reference.value, reference.unit)} %` : "");
