@@ -103,7 +103,7 @@ impl Line {
         for row in ["ready", "output_frequency", "maximum_frequency", "frequency_reference"] {
             assert!(all.out.contains(row), "{row} is missing in\n{}", all.out);
         }
-        let started = self.command("write", &["pump-1", "run=true", "speed_reference=50"]);
+        let started = self.command("write", &["pump-1", "run=YES", "speed_reference=50"]);
         assert_eq!(started.code, 0, "{}", started.err);
         assert!(started.out.contains("acknowledged"), "{}", started.out);
         until("a motor that runs", || (self.value("running") == true).then_some(()));
@@ -116,12 +116,37 @@ impl Line {
             (&["pump-1", "speed_reference=fast"], 2, "a number"),
             (&["pump-1", "speed_referenc=1"], 2, "did you mean `speed_reference`?"),
             (&["pump-1", "run"], 2, "POINT=VALUE"),
+            (
+                &["pump-1", "run=maybe"],
+                2,
+                "write true or false, on or off, yes or no, 1 or 0",
+            ),
             (&["pump-2", "run=true"], 2, "did you mean `pump-1`?"),
         ] {
             let ran = self.command("write", arguments);
             assert_eq!(ran.code, code, "{arguments:?}: {}", ran.err);
             assert!(ran.err.contains(wanted), "{arguments:?}: {}", ran.err);
         }
+        // What contradicts itself, in the same words whichever way it would have gone.
+        for (values, twice) in [
+            (&["run=false", "run=true"][..], "run"),
+            (&["run=true", "run=true"], "run"),
+            (&["speed_reference=10", "speed_reference=20"], "speed_reference"),
+            (&["speed_reference=10", "frequency_reference=10"], "speed_reference"),
+            (
+                &["fieldbus_fault_response=0", "fieldbus_fault_response=1"],
+                "fieldbus_fault_response",
+            ),
+        ] {
+            let ran = self.command("write", &[&["pump-1"], values].concat());
+            assert_eq!(ran.code, 1, "{values:?}: {}", ran.err);
+            let wanted = format!(
+                ": the command sets `{twice}` twice; name each point once, and one reference only (bad_value)\n"
+            );
+            assert!(ran.err.ends_with(&wanted), "{values:?}: {}", ran.err);
+            assert_eq!(ran.err.lines().count(), 1, "{values:?}: {}", ran.err);
+        }
+        assert_eq!(self.value("running"), true);
         assert_eq!(self.value("speed_reference"), 50.0, "refused is not written");
         // A fault while it runs (the simulators' own register), and its reset: the motor stays where it is.
         self.trip();
@@ -130,7 +155,7 @@ impl Line {
         assert_eq!(reset.code, 0, "{}", reset.err);
         until("no fault", || (self.value("fault") == false).then_some(()));
         assert_eq!(self.value("running"), false, "a reset starts nothing");
-        let stopped = self.command("write", &["pump-1", "run=false"]);
+        let stopped = self.command("write", &["pump-1", "run=Off"]);
         assert_eq!(stopped.code, 0, "{}", stopped.err);
         until("a motor that stands", || (self.value("running") == false).then_some(()));
     }
