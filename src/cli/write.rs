@@ -90,7 +90,7 @@ fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, Strin
     if let Some(refusal) = contradiction(&target.spec.profile, &values) {
         return Err(format!("{what}: {refusal} ({})", refusal.code()));
     }
-    if let Some(mut remote) = Remote::find(&listens(target), &target.spec)? {
+    if let Some(mut remote) = Remote::find(&listens(target), target)? {
         return match remote.write(&target.spec, &values) {
             Ok(()) => Ok(format!(
                 "{what}: acknowledged, through the gateway at {}\n",

@@ -248,6 +248,68 @@ fn a_refusal_is_told_in_the_words_of_the_gateway() {
     }
 }
 
+/// The file says how registers are read and written, so a gateway that runs by another one is asked for nothing.
+#[test]
+fn a_gateway_with_another_configuration_is_told_and_not_commanded() {
+    let line = Line::start();
+    let folder = line.directory.path().join("profiles");
+    std::fs::create_dir(&folder).unwrap();
+    let profile = |name: &str, scale: &str| {
+        let text = format!("name = \"{name}\"\nbase = \"vacon-nx\"\npoints.output_frequency.scale = {scale}\n");
+        std::fs::write(folder.join(format!("{name}.toml")), text).unwrap();
+    };
+    profile("ours", "0.01");
+    profile("others", "0.1");
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    let text = text.replace("[gateway]\n", "[gateway]\nprofile_dirs = [\"profiles\"]\n");
+    let text = text.replacen("profile = \"vacon-nx\"", "profile = \"ours\"", 1);
+    std::fs::write(line.config(), &text).unwrap();
+    let gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+    gateway.until_printed("drivegate runs");
+    let through = format!("through the gateway at 127.0.0.1:{}", line.modbus);
+    let sound = || {
+        until("a command through the gateway", || {
+            let ran = line.command("write", &["pump-1", "run=false"]);
+            (ran.code == 0 && ran.out.contains(&through)).then_some(())
+        });
+    };
+    sound();
+    let refused = |what: &str| {
+        let wanted = format!(
+            "error: {what}; 127.0.0.1:{}; the gateway there runs with another configuration: reload it, or name its file \
+             by --config\n",
+            line.modbus
+        );
+        for arguments in [&["read", "pump-1"][..], &["write", "pump-1", "run=true"]] {
+            let ran = line.command(arguments[0], &arguments[1..]);
+            assert_eq!((ran.code, ran.err.as_str()), (1, wanted.as_str()), "{arguments:?}");
+        }
+    };
+    let edited = |from: &str, to: &str| std::fs::write(line.config(), text.replacen(from, to, 1)).unwrap();
+    edited("\"plant\"", "\"works\"");
+    refused("the gateway's name is `plant` and `works` in the file");
+    edited("address = 1\n", "address = 1\nunit = 9\n");
+    refused("the gateway shows no drive under unit 9, the file has `pump-1`");
+    std::fs::write(
+        line.config(),
+        text.replacen("address = 1\n", "address = 1\nunit = 5\n", 1).replacen(
+            "address = 5\n",
+            "address = 5\nunit = 1\n",
+            1,
+        ),
+    )
+    .unwrap();
+    refused("the gateway has `pump-5` under unit 5, the file has `pump-1`");
+    edited("\"ours\"", "\"others\"");
+    refused("the gateway has `pump-1` with the profile `ours`, the file has it with `others`");
+    // The profile itself is another one, with the name that it had.
+    std::fs::write(line.config(), &text).unwrap();
+    profile("ours", "0.1");
+    refused("the profile `ours` of the gateway is not the same as that of the file");
+    gateway.signal("HUP");
+    sound();
+}
+
 /// What is known of a drive that is away is stale, what never was is bad: by `read` as over HTTP.
 #[test]
 fn a_drive_that_is_away_has_the_quality_that_http_tells() {
