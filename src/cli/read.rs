@@ -77,7 +77,7 @@ fn points(target: &Target, names: &[String]) -> Result<Vec<usize>, String> {
 }
 
 fn rows(target: Target, points: Vec<usize>) -> Result<Vec<Row>, String> {
-    if let Some(mut remote) = Remote::find(&listens(&target), &target.spec)? {
+    if let Some(mut remote) = Remote::find(&listens(&target), &target)? {
         return remote.read(&target.spec, &points);
     }
     quiet();

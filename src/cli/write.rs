@@ -8,8 +8,9 @@ use super::oneshot::{Target, reason, shown, target};
 use super::read::{listens, quiet, runtime};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
 use crate::codec::Exception;
+use crate::command::{Refusal, sets_twice};
 use crate::drive::model::Kind;
-use crate::drive::{Point, Value};
+use crate::drive::{Point, Profile, Source, Value};
 
 /// Commands a drive once, through the running gateway or alone.
 #[derive(Debug, clap::Args)]
@@ -71,10 +72,10 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
         )
     };
     let meaning = point.texts.iter().find(|(_, meaning)| meaning.as_str() == text);
-    match (point.kind(), text) {
-        (Kind::Bool, "true" | "on" | "1") => Ok(Value::Bool(true)),
-        (Kind::Bool, "false" | "off" | "0") => Ok(Value::Bool(false)),
-        (Kind::Bool, _) => Err(bad("true or false")),
+    match (point.kind(), text.to_ascii_lowercase().as_str()) {
+        (Kind::Bool, "true" | "on" | "yes" | "1") => Ok(Value::Bool(true)),
+        (Kind::Bool, "false" | "off" | "no" | "0") => Ok(Value::Bool(false)),
+        (Kind::Bool, _) => Err(bad("true or false, on or off, yes or no, 1 or 0")),
         _ if meaning.is_some() => Ok(Value::Integer(meaning.map_or(0, |(code, _)| *code))),
         (Kind::Integer, _) => text.parse().map(Value::Integer).map_err(|_| bad("a whole number")),
         (Kind::Number, _) => {
@@ -86,7 +87,10 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
 
 fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, String> {
     let what = described(target, &values);
-    if let Some(mut remote) = Remote::find(&listens(target), &target.spec)? {
+    if let Some(refusal) = contradiction(&target.spec.profile, &values) {
+        return Err(format!("{what}: {refusal} ({})", refusal.code()));
+    }
+    if let Some(mut remote) = Remote::find(&listens(target), target)? {
         return match remote.write(&target.spec, &values) {
             Ok(()) => Ok(format!(
                 "{what}: acknowledged, through the gateway at {}\n",
@@ -111,6 +115,34 @@ fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, Strin
         let latency = answer.latency.as_secs_f64() * 1000.0;
         Ok(format!("{what}: acknowledged within {latency:.0} ms, {seen}\n"))
     })
+}
+
+/// Why the command cannot be meant, whichever way it would go: two values for one point of the drive.
+fn contradiction(profile: &Profile, values: &[(usize, Value)]) -> Option<Refusal> {
+    let mut set = Vec::with_capacity(values.len());
+    for (index, _) in values {
+        let index = written_to(profile, *index);
+        if set.contains(&index) {
+            return profile.points.get(index).map(|point| sets_twice(&point.name));
+        }
+        set.push(index);
+    }
+    None
+}
+
+/// The point that takes what is written to this one.
+fn written_to(profile: &Profile, index: usize) -> usize {
+    let next = |index: usize| {
+        let point = profile.points.get(index)?;
+        let base = match &point.source {
+            Source::Derived(derived) => derived.band().map(|(of, ..)| of),
+            Source::Raw(_) => None,
+        };
+        point.write_to.or(base).filter(|next| *next != index)
+    };
+    // A profile has no circles, and no way is longer than its points.
+    let ways = std::iter::successors(Some(index), |index| next(*index));
+    ways.take(profile.points.len()).last().unwrap_or(index)
 }
 
 /// What to tell of a command that the gateway has refused: its own words where they can be had, else what the exception

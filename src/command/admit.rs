@@ -87,10 +87,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         let (index, value) = resolve(drive, index, point, value)?;
         kin(drive, asked, index, value)?;
         if resolved.iter().any(|(other, _)| *other == index) {
-            let what = profile.points.get(index).map_or("", |p| p.name.as_str());
-            return Err(Refusal::BadValue(format!(
-                "the command sets `{what}` twice; name each point once, and one reference only"
-            )));
+            return Err(sets_twice(profile.points.get(index).map_or("", |p| p.name.as_str())));
         }
         resolved.push((index, value));
     }
@@ -109,6 +106,13 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         urgency,
         reference_only: !bits,
     })
+}
+
+/// The refusal of a command that sets `point` twice, by its name or by that of a point that rests on it.
+pub fn sets_twice(point: &str) -> Refusal {
+    Refusal::BadValue(format!(
+        "the command sets `{point}` twice; name each point once, and one reference only"
+    ))
 }
 
 /// The value in the point's kind and within its limits.

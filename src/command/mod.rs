@@ -9,7 +9,7 @@ mod audit;
 mod queue;
 mod ticket;
 
-pub use admit::{Admitted, admit, written};
+pub use admit::{Admitted, admit, sets_twice, written};
 pub use audit::{AUDIT_KEPT, AUDIT_SHARE, Audit, AuditRecord, Change};
 pub use queue::{CAPACITY, CommandQueue, Pending};
 pub use ticket::{Receipt, Ticket, WriteStats};

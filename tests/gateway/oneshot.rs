@@ -103,7 +103,7 @@ impl Line {
         for row in ["ready", "output_frequency", "maximum_frequency", "frequency_reference"] {
             assert!(all.out.contains(row), "{row} is missing in\n{}", all.out);
         }
-        let started = self.command("write", &["pump-1", "run=true", "speed_reference=50"]);
+        let started = self.command("write", &["pump-1", "run=YES", "speed_reference=50"]);
         assert_eq!(started.code, 0, "{}", started.err);
         assert!(started.out.contains("acknowledged"), "{}", started.out);
         until("a motor that runs", || (self.value("running") == true).then_some(()));
@@ -116,12 +116,37 @@ impl Line {
             (&["pump-1", "speed_reference=fast"], 2, "a number"),
             (&["pump-1", "speed_referenc=1"], 2, "did you mean `speed_reference`?"),
             (&["pump-1", "run"], 2, "POINT=VALUE"),
+            (
+                &["pump-1", "run=maybe"],
+                2,
+                "write true or false, on or off, yes or no, 1 or 0",
+            ),
             (&["pump-2", "run=true"], 2, "did you mean `pump-1`?"),
         ] {
             let ran = self.command("write", arguments);
             assert_eq!(ran.code, code, "{arguments:?}: {}", ran.err);
             assert!(ran.err.contains(wanted), "{arguments:?}: {}", ran.err);
         }
+        // What contradicts itself, in the same words whichever way it would have gone.
+        for (values, twice) in [
+            (&["run=false", "run=true"][..], "run"),
+            (&["run=true", "run=true"], "run"),
+            (&["speed_reference=10", "speed_reference=20"], "speed_reference"),
+            (&["speed_reference=10", "frequency_reference=10"], "speed_reference"),
+            (
+                &["fieldbus_fault_response=0", "fieldbus_fault_response=1"],
+                "fieldbus_fault_response",
+            ),
+        ] {
+            let ran = self.command("write", &[&["pump-1"], values].concat());
+            assert_eq!(ran.code, 1, "{values:?}: {}", ran.err);
+            let wanted = format!(
+                ": the command sets `{twice}` twice; name each point once, and one reference only (bad_value)\n"
+            );
+            assert!(ran.err.ends_with(&wanted), "{values:?}: {}", ran.err);
+            assert_eq!(ran.err.lines().count(), 1, "{values:?}: {}", ran.err);
+        }
+        assert_eq!(self.value("running"), true);
         assert_eq!(self.value("speed_reference"), 50.0, "refused is not written");
         // A fault while it runs (the simulators' own register), and its reset: the motor stays where it is.
         self.trip();
@@ -130,7 +155,7 @@ impl Line {
         assert_eq!(reset.code, 0, "{}", reset.err);
         until("no fault", || (self.value("fault") == false).then_some(()));
         assert_eq!(self.value("running"), false, "a reset starts nothing");
-        let stopped = self.command("write", &["pump-1", "run=false"]);
+        let stopped = self.command("write", &["pump-1", "run=Off"]);
         assert_eq!(stopped.code, 0, "{}", stopped.err);
         until("a motor that stands", || (self.value("running") == false).then_some(()));
     }
@@ -221,6 +246,68 @@ fn a_refusal_is_told_in_the_words_of_the_gateway() {
             "{told}"
         );
     }
+}
+
+/// The file says how registers are read and written, so a gateway that runs by another one is asked for nothing.
+#[test]
+fn a_gateway_with_another_configuration_is_told_and_not_commanded() {
+    let line = Line::start();
+    let folder = line.directory.path().join("profiles");
+    std::fs::create_dir(&folder).unwrap();
+    let profile = |name: &str, scale: &str| {
+        let text = format!("name = \"{name}\"\nbase = \"vacon-nx\"\npoints.output_frequency.scale = {scale}\n");
+        std::fs::write(folder.join(format!("{name}.toml")), text).unwrap();
+    };
+    profile("ours", "0.01");
+    profile("others", "0.1");
+    let text = std::fs::read_to_string(line.config()).unwrap();
+    let text = text.replace("[gateway]\n", "[gateway]\nprofile_dirs = [\"profiles\"]\n");
+    let text = text.replacen("profile = \"vacon-nx\"", "profile = \"ours\"", 1);
+    std::fs::write(line.config(), &text).unwrap();
+    let gateway = Running::drivegate(&["run", "--config", line.config().to_str().unwrap()]);
+    gateway.until_printed("drivegate runs");
+    let through = format!("through the gateway at 127.0.0.1:{}", line.modbus);
+    let sound = || {
+        until("a command through the gateway", || {
+            let ran = line.command("write", &["pump-1", "run=false"]);
+            (ran.code == 0 && ran.out.contains(&through)).then_some(())
+        });
+    };
+    sound();
+    let refused = |what: &str| {
+        let wanted = format!(
+            "error: {what}; 127.0.0.1:{}; the gateway there runs with another configuration: reload it, or name its file \
+             by --config\n",
+            line.modbus
+        );
+        for arguments in [&["read", "pump-1"][..], &["write", "pump-1", "run=true"]] {
+            let ran = line.command(arguments[0], &arguments[1..]);
+            assert_eq!((ran.code, ran.err.as_str()), (1, wanted.as_str()), "{arguments:?}");
+        }
+    };
+    let edited = |from: &str, to: &str| std::fs::write(line.config(), text.replacen(from, to, 1)).unwrap();
+    edited("\"plant\"", "\"works\"");
+    refused("the gateway's name is `plant` and `works` in the file");
+    edited("address = 1\n", "address = 1\nunit = 9\n");
+    refused("the gateway shows no drive under unit 9, the file has `pump-1`");
+    std::fs::write(
+        line.config(),
+        text.replacen("address = 1\n", "address = 1\nunit = 5\n", 1).replacen(
+            "address = 5\n",
+            "address = 5\nunit = 1\n",
+            1,
+        ),
+    )
+    .unwrap();
+    refused("the gateway has `pump-5` under unit 5, the file has `pump-1`");
+    edited("\"ours\"", "\"others\"");
+    refused("the gateway has `pump-1` with the profile `ours`, the file has it with `others`");
+    // The profile itself is another one, with the name that it had.
+    std::fs::write(line.config(), &text).unwrap();
+    profile("ours", "0.1");
+    refused("the profile `ours` of the gateway is not the same as that of the file");
+    gateway.signal("HUP");
+    sound();
 }
 
 /// What is known of a drive that is away is stale, what never was is bad: by `read` as over HTTP.

@@ -4,17 +4,20 @@ use std::io::{Read, Write};
 use std::net::{IpAddr, Ipv4Addr, Ipv6Addr, SocketAddr, TcpStream};
 use std::time::{Duration, SystemTime};
 
-use super::Row;
+use super::{Row, Target};
 use crate::cache::DriveSpec;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::drive::profile::Form;
 use crate::drive::{Bound, ModelPoint, Point, PollClass, Quality, Raw, Sample, Source, Value};
 use crate::north::modbus_tcp::frame::{self, Header};
+use crate::north::modbus_tcp::identify::{MODEL_NAME, PRODUCT_CODE, PROFILE_DIGEST, VENDOR, VENDOR_NAME, as_told};
 
 /// Time to connect.
 const CONNECT: Duration = Duration::from_millis(500);
 /// Time for an answer: a command may wait for its turn, a forwarded read for a slow line.
 const ANSWER: Duration = Duration::from_secs(10);
+/// The gateway itself.
+const GATEWAY_UNIT: u8 = 255;
 /// Age of the process data, and what it is before any was read.
 const AGE: u16 = 0x8002;
 const NEVER: u16 = 0xFFFF;
@@ -62,41 +65,77 @@ impl Remote {
     /// The gateway at one of these addresses, if one runs there.
     ///
     /// # Errors
-    /// When a gateway is there and the unit is another drive: nothing is asked of it.
-    pub(in crate::cli) fn find(addresses: &[SocketAddr], spec: &DriveSpec) -> Result<Option<Remote>, String> {
+    /// When a gateway is there that has another configuration: nothing is asked of it.
+    pub(in crate::cli) fn find(addresses: &[SocketAddr], target: &Target) -> Result<Option<Remote>, String> {
         for address in addresses.iter().map(|a| reachable(*a)) {
-            let Ok(stream) = TcpStream::connect_timeout(&address, CONNECT) else {
+            let Some(mut remote) = Remote::connect(address) else {
                 continue;
             };
-            let timeouts = stream
-                .set_read_timeout(Some(ANSWER))
-                .and_then(|()| stream.set_write_timeout(Some(ANSWER)))
-                .and_then(|()| stream.set_nodelay(true));
-            if timeouts.is_err() {
+            if remote.identity(VENDOR_NAME).as_deref() != Some(VENDOR) {
                 continue;
             }
-            let mut remote = Remote {
-                stream,
-                address,
-                since: SystemTime::now(),
-                unit: spec.unit,
-                transaction: 0,
-                was_read: None,
+            return match remote.difference(target) {
+                None => Ok(Some(remote)),
+                Some(what) => Err(format!(
+                    "{what}; {address}; the gateway there runs with another configuration: reload it, or name its file by \
+                     --config"
+                )),
             };
-            match (remote.identity(0), remote.identity(5)) {
-                (Some(vendor), Some(name)) if vendor == "drivegate" && name == spec.name => return Ok(Some(remote)),
-                (Some(vendor), name) if vendor == "drivegate" => {
-                    return Err(format!(
-                        "the gateway has `{}` under unit {}; {address}; it runs with another configuration: name its \
-                         file by --config, or reload it",
-                        name.unwrap_or_default(),
-                        spec.unit
-                    ));
-                }
-                _ => {}
-            }
         }
         Ok(None)
+    }
+
+    /// A connection that speaks to the gateway itself.
+    fn connect(address: SocketAddr) -> Option<Remote> {
+        let stream = TcpStream::connect_timeout(&address, CONNECT).ok()?;
+        let timeouts = stream
+            .set_read_timeout(Some(ANSWER))
+            .and_then(|()| stream.set_write_timeout(Some(ANSWER)))
+            .and_then(|()| stream.set_nodelay(true));
+        timeouts.ok()?;
+        Some(Remote {
+            stream,
+            address,
+            since: SystemTime::now(),
+            unit: GATEWAY_UNIT,
+            transaction: 0,
+            was_read: None,
+        })
+    }
+
+    /// Turns to the drive's unit and tells what the gateway has there otherwise than the file. Values are read and
+    /// written by the file's profile, so that has to be the gateway's.
+    fn difference(&mut self, target: &Target) -> Option<String> {
+        let spec = &target.spec;
+        let (unit, profile) = (spec.unit, &spec.profile);
+        let gateway = self.identity(MODEL_NAME).unwrap_or_default();
+        let wanted = &target.settings.gateway;
+        if gateway != as_told(wanted) {
+            return Some(format!("the gateway's name is `{gateway}` and `{wanted}` in the file"));
+        }
+        self.unit = unit;
+        let Some(drive) = self.identity(MODEL_NAME) else {
+            return Some(format!(
+                "the gateway shows no drive under unit {unit}, the file has `{}`",
+                spec.name
+            ));
+        };
+        if drive != as_told(&spec.name) {
+            return Some(format!(
+                "the gateway has `{drive}` under unit {unit}, the file has `{}`",
+                spec.name
+            ));
+        }
+        let product = self.identity(PRODUCT_CODE).unwrap_or_default();
+        if product != as_told(&profile.name) {
+            return Some(format!(
+                "the gateway has `{drive}` with the profile `{product}`, the file has it with `{}`",
+                profile.name
+            ));
+        }
+        let digest = self.identity(PROFILE_DIGEST).unwrap_or_default();
+        (digest != profile.digest().to_string())
+            .then(|| format!("the profile `{product}` of the gateway is not the same as that of the file"))
     }
 
     /// An object of the device identification.

@@ -11,7 +11,7 @@ mod dialogue;
 mod door;
 mod errand;
 pub(crate) mod frame;
-mod identify;
+pub(crate) mod identify;
 mod lookout;
 mod offline;
 mod places;

@@ -194,6 +194,7 @@ impl Session {
                     product: &profile.name,
                     title: &profile.title,
                     name: &drive.image.spec.name,
+                    digest: Some(profile.digest()),
                 };
                 identity
                     .reply(code, object)
@@ -228,6 +229,7 @@ impl Session {
                     product: "gateway",
                     title: "drivegate",
                     name: &plant.gateway,
+                    digest: None,
                 };
                 identity.reply(code, object)?
             }
