@@ -5,7 +5,8 @@
 use std::fs;
 use std::io;
 use std::path::Path;
-use std::process::{Command, Output};
+use std::process::{Command, Output, Stdio};
+use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
@@ -395,4 +396,78 @@ fn a_closed_pipe_ends_the_output_quietly() {
         .output()
         .unwrap();
     assert_eq!(bad.status.code(), Some(78));
+}
+
+#[test]
+fn a_bad_log_level_of_the_demo_is_a_wrong_command_line() {
+    for (level, wanted) in [
+        (
+            "verbose",
+            "unknown word `verbose`; write \"off\" or \"error\" or \"warn\" or \"info\" or \"debug\" or \"trace\"",
+        ),
+        ("nonsense=1", "unknown word `1`; write \"off\" or \"error\""),
+        ("inof", "did you mean \"info\"?"),
+    ] {
+        // A demo that started would not end by itself.
+        let mut child = drivegate(&["demo", "--log", level])
+            .stdout(Stdio::null())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap();
+        let began = Instant::now();
+        while child.try_wait().unwrap().is_none() && began.elapsed() < Duration::from_secs(10) {
+            std::thread::sleep(Duration::from_millis(20));
+        }
+        let _ = child.kill();
+        let Output { status, stderr, .. } = child.wait_with_output().unwrap();
+        let told = String::from_utf8(stderr).unwrap();
+        assert_eq!(status.code(), Some(2), "{level}: {told}");
+        assert!(told.contains(wanted), "{level}: {told}");
+    }
+}
+
+#[test]
+fn what_is_wrong_on_a_command_line_is_told_in_its_own_words() {
+    for (args, wanted) in [
+        (
+            &["scan", "--port", "tcp://foo"][..],
+            "`tcp://foo` is no device server; write \"tcp://host:port\"",
+        ),
+        (
+            &["scan", "--port", "/dev/x", "--timeout", "5"],
+            "`5` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min",
+        ),
+        (
+            &["simulate", "--turnaround", "5"],
+            "`5` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min",
+        ),
+        (
+            &["simulate", "--listen", "foo"],
+            "`foo` is no address to listen on; write host:port, such as 127.0.0.1:4001",
+        ),
+        (
+            &["simulate", "--addresses", "250"],
+            "`vacon-nx` has no address 250; in --addresses; its drives have 1 to 247",
+        ),
+    ] {
+        let ran = run(args);
+        assert_eq!(ran.code, Some(2), "{args:?}: {}", ran.err);
+        assert!(ran.err.contains(wanted), "{args:?}: {}", ran.err);
+    }
+}
+
+#[test]
+fn a_simulation_tells_the_bus_whose_port_it_cannot_be() {
+    let (dir, path) = sound();
+    let occupied = dir.path().join("line1");
+    fs::write(&occupied, "").unwrap();
+    fs::write(&path, SOUND.replace("/dev/ttyUSB9", occupied.to_str().unwrap())).unwrap();
+    let ran = run(&["simulate", "--config", &path]);
+    assert_eq!(ran.code, Some(1), "{}", ran.err);
+    let wanted = format!(
+        "error: cannot simulate bus `line1` at its `port` in {path}: {} exists and is no symbolic link; ",
+        occupied.display()
+    );
+    assert!(ran.err.contains(&wanted), "{}", ran.err);
+    assert!(occupied.exists());
 }

@@ -23,8 +23,8 @@ pub(super) struct Args {
     /// True wire times, or as fast as the programs are
     #[arg(long, value_enum, default_value_t = Speed::Real)]
     pub speed: Speed,
-    /// What to log beside the demo's own words: off, error, warn, info, debug
-    #[arg(long, default_value = "error", value_name = "LEVEL")]
+    /// What to log beside the demo's own words: off, error, warn, info, debug, trace, also for each target
+    #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
     pub log: String,
 }
 

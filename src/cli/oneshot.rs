@@ -7,6 +7,7 @@ pub(super) mod alone;
 pub(super) mod reason;
 pub(super) mod remote;
 
+use std::net::SocketAddr;
 use std::path::Path;
 use std::process::ExitCode;
 
@@ -56,6 +57,20 @@ pub(super) fn target(config: &Path, drive: &str) -> Result<Target, ExitCode> {
 }
 
 impl Target {
+    /// Where the configured gateway listens for the drive's bus, without TLS.
+    pub(super) fn listens(&self) -> Vec<SocketAddr> {
+        let bus = &self.bus.spec.name;
+        let listeners = self.settings.modbus_tcp.iter().flat_map(|options| &options.listeners);
+        let shows = |buses: &Option<Vec<String>>| buses.as_ref().is_none_or(|buses| buses.contains(bus));
+        let mut showing: Vec<_> = listeners.filter(|listener| shows(&listener.buses)).collect();
+        // One that takes writes first.
+        showing.sort_by_key(|listener| listener.write.is_empty());
+        showing
+            .into_iter()
+            .flat_map(|listener| listener.listen.clone())
+            .collect()
+    }
+
     /// Index of the point of that name.
     ///
     /// # Errors

@@ -1,6 +1,5 @@
 //! `drivegate read`: points of one drive, once.
 
-use std::net::SocketAddr;
 use std::process::ExitCode;
 
 use super::oneshot::alone::Alone;
@@ -46,6 +45,10 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(rows) => {
             let all = rows.iter().all(Row::is_good);
             let none = !rows.iter().any(Row::is_good);
+            if let Some(why) = only_reason(&rows).filter(|_| !args.json) {
+                report::error(&format!("no point of `{}` has a value: {why}", args.drive));
+                return ExitCode::from(EXIT_FAILED);
+            }
             let printed = report::print(&if args.json { json(&rows) } else { table(&rows) });
             // What was asked for by name must be there.
             if none || (!all && !args.points.is_empty()) {
@@ -77,7 +80,7 @@ fn points(target: &Target, names: &[String]) -> Result<Vec<usize>, String> {
 }
 
 fn rows(target: Target, points: Vec<usize>) -> Result<Vec<Row>, String> {
-    if let Some(mut remote) = Remote::find(&listens(&target), &target)? {
+    if let Some(mut remote) = Remote::find(&target)? {
         return remote.read(&target.spec, &points);
     }
     quiet();
@@ -89,18 +92,14 @@ fn rows(target: Target, points: Vec<usize>) -> Result<Vec<Row>, String> {
     })
 }
 
-/// Where the configured gateway listens for the drive's bus, without TLS.
-pub(super) fn listens(target: &Target) -> Vec<SocketAddr> {
-    let bus = &target.bus.spec.name;
-    let listeners = target.settings.modbus_tcp.iter().flat_map(|options| &options.listeners);
-    let shows = |buses: &Option<Vec<String>>| buses.as_ref().is_none_or(|buses| buses.contains(bus));
-    let mut showing: Vec<_> = listeners.filter(|listener| shows(&listener.buses)).collect();
-    // One that takes writes first.
-    showing.sort_by_key(|listener| listener.write.is_empty());
-    showing
-        .into_iter()
-        .flat_map(|listener| listener.listen.clone())
-        .collect()
+/// Why none of several points has a value, where that is one reason for all: once is enough.
+fn only_reason(rows: &[Row]) -> Option<&str> {
+    let (first, others) = rows.split_first().filter(|(_, others)| !others.is_empty())?;
+    let same = |row: &Row| !row.is_good() && row.why == first.why;
+    first
+        .why
+        .as_deref()
+        .filter(|_| !first.is_good() && others.iter().all(same))
 }
 
 /// A command says what happens itself; of the log only the audit is left.

@@ -4,7 +4,7 @@ mod progress;
 mod snippet;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -17,6 +17,7 @@ use crate::bus::asker::Asker;
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
+use crate::config;
 use crate::document::parse_duration;
 use crate::drive::identify::{self, Probe};
 use crate::drive::profile::Profiles;
@@ -37,7 +38,7 @@ The settings with which a drive answered are the line's: others are not tried an
 The configuration goes to standard output, everything else to standard error.")]
 pub(super) struct Args {
     /// Serial device, or tcp://host:port of a device server.
-    #[arg(long, value_name = "PORT")]
+    #[arg(long, value_name = "PORT", value_parser = parse_port)]
     port: String,
     /// Protocols: modbus-rtu, modbus-ascii, n2, or all.
     #[arg(long, value_name = "LIST", default_value = "all", value_delimiter = ',')]
@@ -48,7 +49,7 @@ pub(super) struct Args {
     /// Data bits, parity and stop bits, or all; without it the usual ones of the protocol.
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     format: Vec<String>,
-    /// Addresses that are tried.
+    /// Addresses that are tried; N2 has them to 255.
     #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = super::simulate::parse_addresses)]
     addresses: super::simulate::Addresses,
     /// Time for the first byte of a reply; without it that of the protocol.
@@ -87,6 +88,7 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
             }
         }
     }
+    check_addresses(args, &settings)?;
     if settings.is_empty() {
         return Err(
             "no protocol goes with these bauds and formats; --baud, --format; N2 is 9600 8N1 always, Modbus \
@@ -95,6 +97,32 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
         );
     }
     Ok(settings)
+}
+
+/// The port as a configuration takes it, seen from here.
+fn parse_port(text: &str) -> Result<String, String> {
+    config::check_port(text, Path::new(""))
+}
+
+/// An address that no protocol of the search has cannot be meant.
+fn check_addresses(args: &Args, settings: &[Setting]) -> Result<(), String> {
+    let has = |setting: &Setting, address: &u8| config::addresses(setting.protocol).contains(address);
+    let nowhere = |address: &&u8| !settings.iter().any(|setting| has(setting, address));
+    let Some(address) = args.addresses.0.iter().find(nowhere).filter(|_| !settings.is_empty()) else {
+        return Ok(());
+    };
+    let protocols: BTreeMap<&str, u8> = settings
+        .iter()
+        .map(|setting| (setting.protocol.name(), *config::addresses(setting.protocol).end()))
+        .collect();
+    let known: Vec<String> = protocols
+        .iter()
+        .map(|(name, most)| format!("{name} has 1 to {most}"))
+        .collect();
+    Err(format!(
+        "no drive has address {address}; --addresses; {}",
+        known.join(", ")
+    ))
 }
 
 fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
@@ -165,12 +193,22 @@ pub(super) fn run(args: &Args) -> ExitCode {
         profiles,
         found: Vec::new(),
         garbage: Vec::new(),
-        progress: Progress::new(args.addresses.0.len() * settings.len(), stop.clone()),
+        progress: Progress::new(settings.iter().map(|s| addresses(args, *s).count()).sum(), stop.clone()),
         stop,
     };
     let outcome = scan.all(&settings);
     scan.progress.end();
     scan.tell(outcome)
+}
+
+/// The addresses that are tried with that setting.
+fn addresses(args: &Args, setting: Setting) -> impl Iterator<Item = u8> {
+    let allowed = config::addresses(setting.protocol);
+    args.addresses
+        .0
+        .iter()
+        .copied()
+        .filter(move |address| allowed.contains(address))
 }
 
 /// Ctrl-C ends the search; what was found is printed all the same.
@@ -214,7 +252,7 @@ impl Scan<'_> {
         let timeout = self.args.timeout.unwrap_or(protocol.usual_timeout());
         let mut asker = Asker::new(&line, protocol, format, silence, timeout);
         let args = self.args;
-        for &address in &args.addresses.0 {
+        for address in addresses(args, setting) {
             if self.stop.load(Ordering::Relaxed) {
                 return Ok(());
             }
@@ -278,7 +316,11 @@ impl Scan<'_> {
             protocol: setting.protocol,
             format: setting.format,
             address,
-            profiles: fitting.iter().map(|p| p.name.clone()).collect(),
+            profiles: fitting
+                .iter()
+                .filter(|profile| profile.addresses.contains(&address))
+                .map(|profile| profile.name.clone())
+                .collect(),
         })
     }
 
@@ -338,9 +380,15 @@ mod tests {
         args: Args,
     }
 
+    fn args(words: &str) -> Result<Args, String> {
+        let port = if words.contains("--port") { "" } else { "--port /dev/x " };
+        let words = format!("scan {port}{words}");
+        let parsed = Command::try_parse_from(words.split_whitespace());
+        Ok(parsed.map_err(|e| e.to_string())?.args)
+    }
+
     fn told(words: &str) -> Result<Vec<String>, String> {
-        let words = ["scan", "--port", "/dev/x"].into_iter().chain(words.split_whitespace());
-        let args = Command::try_parse_from(words).map_err(|e| e.to_string())?.args;
+        let args = args(words)?;
         let one = |s: &Setting| format!("{} {}", s.protocol.name(), s.format);
         Ok(settings(&args)?.iter().map(one).collect())
     }
@@ -369,6 +417,22 @@ mod tests {
     }
 
     #[test]
+    fn each_protocol_is_tried_with_the_addresses_that_it_has() {
+        let args = args("--addresses 246-255").unwrap();
+        let tried = settings(&args).unwrap();
+        for (protocol, most) in [
+            (Protocol::ModbusRtu, 247),
+            (Protocol::ModbusAscii, 247),
+            (Protocol::N2, 255),
+        ] {
+            let setting = tried.iter().find(|setting| setting.protocol == protocol).unwrap();
+            let wanted: Vec<u8> = (246..=most).collect();
+            assert_eq!(addresses(&args, *setting).collect::<Vec<_>>(), wanted, "{protocol:?}");
+        }
+        assert!(told("--protocol n2 --addresses 1-255").is_ok());
+    }
+
+    #[test]
     fn bad_wishes() {
         for (words, wanted) in [
             ("--protocol n3", "--protocol"),
@@ -377,6 +441,21 @@ mod tests {
             ("--protocol modbus-rtu --format 7E1", "--format"),
             ("--protocol n2 --baud 19200", "--baud"),
             ("--addresses 0-9", "addresses"),
+            ("--addresses 256", "1 to 255"),
+            ("--protocol modbus-rtu --addresses 250", "modbus-rtu has 1 to 247"),
+            (
+                "--protocol modbus-rtu,modbus-ascii --addresses 1-255",
+                "no drive has address 248; --addresses; modbus-ascii has 1 to 247, modbus-rtu has 1 to 247",
+            ),
+            ("--port tcp://foo", "write \"tcp://host:port\""),
+            (
+                "--port udp://foo:1",
+                "write the path of a serial device or \"tcp://host:port\"",
+            ),
+            (
+                "--timeout 5",
+                "write a number with its unit, such as 10ms, 1.5s or 2min",
+            ),
             ("--tries 0", "tries"),
         ] {
             let error = told(words).unwrap_err();

@@ -49,7 +49,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "DEVICE", conflicts_with = "listen")]
     pub port: Option<PathBuf>,
     /// Serve the line raw over TCP, as a serial device server does
-    #[arg(long, value_name = "HOST:PORT")]
+    #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen)]
     pub listen: Option<SocketAddr>,
     /// modbus-rtu, modbus-ascii or n2 [default: what the profile names first]
     #[arg(long, value_name = "PROTOCOL", value_parser = parse_protocol)]
@@ -135,14 +135,12 @@ pub(super) enum Speed {
 pub(super) struct Addresses(pub(super) Vec<u8>);
 
 pub(super) fn parse_addresses(text: &str) -> Result<Addresses, String> {
-    let bad = || format!("`{text}` is no list of addresses; write numbers from 1 to 247, such as 1-10 or 1,2,7");
-    let number = |word: &str| {
-        word.trim()
-            .parse::<u8>()
-            .ok()
-            .filter(|n| (1..=247).contains(n))
-            .ok_or_else(bad)
+    let bad = || {
+        format!(
+            "`{text}` is no list of addresses; write numbers from 1 to 247, with N2 from 1 to 255, such as 1-10 or 1,2,7"
+        )
     };
+    let number = |word: &str| word.trim().parse::<u8>().ok().filter(|n| *n >= 1).ok_or_else(bad);
     let mut addresses = Vec::new();
     for part in text.split(',') {
         let (first, last) = part.split_once('-').unwrap_or((part, part));
@@ -167,10 +165,18 @@ fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
             link: Some(PathBuf::from(port)),
         });
     };
-    let listen = address.to_socket_addrs().ok().and_then(|mut found| found.next());
-    listen
+    socket_address(address)
         .map(|listen| EndpointOptions::Tcp { listen })
         .ok_or_else(|| format!("`{port}` is no address to listen on; write it as tcp://127.0.0.1:4001"))
+}
+
+fn socket_address(text: &str) -> Option<SocketAddr> {
+    text.to_socket_addrs().ok().and_then(|mut found| found.next())
+}
+
+fn parse_listen(text: &str) -> Result<SocketAddr, String> {
+    socket_address(text)
+        .ok_or_else(|| format!("`{text}` is no address to listen on; write host:port, such as 127.0.0.1:4001"))
 }
 
 /// The simulated lines of a configuration file, each in the place of its bus's port.
@@ -212,13 +218,21 @@ pub(super) fn run(args: &Args) -> ExitCode {
             Err(message) => return failed(EXIT_USAGE, &message),
         },
     };
-    let started: io::Result<Vec<SimulatedBus>> = lines
-        .into_iter()
-        .map(|line| SimulatedBus::start(args.applied_to(line)))
-        .collect();
-    match started.and_then(|lines| serve(&lines)) {
+    let start = |line: SimulatedBusOptions| {
+        let name = line.name.clone();
+        SimulatedBus::start(args.applied_to(line)).map_err(|error| match &args.config {
+            Some(file) => {
+                let file = file.display();
+                format!("cannot simulate bus `{name}` at its `port` in {file}: {error}")
+            }
+            None => format!("cannot simulate: {error}"),
+        })
+    };
+    let started: Result<Vec<SimulatedBus>, String> = lines.into_iter().map(start).collect();
+    let served = started.and_then(|lines| serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
+    match served {
         Ok(()) => ExitCode::SUCCESS,
-        Err(error) => failed(EXIT_FAILED, &format!("cannot simulate: {error}")),
+        Err(message) => failed(EXIT_FAILED, &message),
     }
 }
 
@@ -429,7 +443,11 @@ mod tests {
     fn addresses() {
         assert_eq!(parse_addresses("3,1-2,2").unwrap().0, [1, 2, 3]);
         assert_eq!(parse_addresses("247").unwrap().0, [247]);
-        for bad in ["", "0", "248", "5-1", "1-", "x", "1,,2"] {
+        assert_eq!(
+            parse_addresses("248-255").unwrap().0,
+            [248, 249, 250, 251, 252, 253, 254, 255]
+        );
+        for bad in ["", "0", "256", "5-1", "1-", "x", "1,,2"] {
             assert!(parse_addresses(bad).is_err(), "{bad}");
         }
     }
@@ -504,6 +522,7 @@ mod tests {
             "--config a.toml --link /tmp/l",
             "--baud 12",
             "--turnaround 5",
+            "--listen foo",
             "--fault drop",
             "--addresses 0-3",
             "--speed warp",
@@ -522,7 +541,22 @@ mod tests {
         );
         let error = told("--profile teco-7300pa --addresses 30-32");
         assert!(error.contains("no address 32") && error.contains("1 to 31"), "{error}");
+        assert!(told("--addresses 250").contains("its drives have 1 to 247"));
+        assert!(
+            parse("--profile teco-7300pa-n2 --addresses 250-255")
+                .unwrap()
+                .line()
+                .is_ok()
+        );
         assert!(parse("--protocol profibus").unwrap_err().contains("modbus-ascii"));
+    }
+
+    #[test]
+    fn the_documentation_names_every_fault() {
+        let page = include_str!("../../docs/simulate.md");
+        for name in NAMES.split(", ").map(str::trim) {
+            assert!(page.contains(&format!("`{name}`")), "docs/simulate.md lacks {name}");
+        }
     }
 
     #[test]

@@ -5,7 +5,7 @@ use std::process::ExitCode;
 use super::oneshot::alone::Alone;
 use super::oneshot::remote::{Failure, Remote, refusal};
 use super::oneshot::{Target, reason, shown, target};
-use super::read::{listens, quiet, runtime};
+use super::read::{quiet, runtime};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
 use crate::codec::Exception;
 use crate::command::{Refusal, sets_twice};
@@ -90,7 +90,7 @@ fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, Strin
     if let Some(refusal) = contradiction(&target.spec.profile, &values) {
         return Err(format!("{what}: {refusal} ({})", refusal.code()));
     }
-    if let Some(mut remote) = Remote::find(&listens(target), target)? {
+    if let Some(mut remote) = Remote::find(target)? {
         return match remote.write(&target.spec, &values) {
             Ok(()) => Ok(format!(
                 "{what}: acknowledged, through the gateway at {}\n",

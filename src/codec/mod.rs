@@ -23,7 +23,7 @@ use serde::{Deserialize, Serialize};
 /// One request to one drive: who is asked, and what.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Request {
-    /// Address of the drive on its bus, 1..=247 (0 is broadcast: no reply follows).
+    /// Address of the drive on its bus, 1..=247, with N2 to 255 (0 is broadcast: no reply follows).
     pub address: u8,
     /// What is asked.
     pub pdu: RequestPdu,

@@ -149,7 +149,10 @@ fn read_options(
 }
 
 /// Path of a device, seen from the directory of the file, or `tcp://host:port`.
-fn check_port(text: &str, base: &Path) -> Result<String, String> {
+///
+/// # Errors
+/// What is wrong and what to write.
+pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, String> {
     match text.split_once("://") {
         Some(("tcp", server)) => match values::host_port(server, None) {
             Some(_) => Ok(text.to_string()),

@@ -95,11 +95,16 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     }
 }
 
-fn read_address(reader: &Reader<'_>, protocol: Protocol) -> Option<u8> {
-    let allowed = match protocol {
+/// Addresses that a drive can have on a line of that protocol.
+pub(crate) fn addresses(protocol: Protocol) -> RangeInclusive<u8> {
+    match protocol {
         Protocol::ModbusRtu | Protocol::ModbusAscii => ADDRESSES,
         Protocol::N2 => N2_ADDRESSES,
-    };
+    }
+}
+
+fn read_address(reader: &Reader<'_>, protocol: Protocol) -> Option<u8> {
+    let allowed = addresses(protocol);
     let most = *allowed.end();
     if !reader.has("address") {
         reader.problem(

@@ -55,7 +55,10 @@ pub(super) fn read(reader: &Reader<'_>) -> LogSettings {
 }
 
 /// `level` or `target=level`, joined by commas, as `tracing` understands them.
-fn parse_level(text: &str) -> Result<String, String> {
+///
+/// # Errors
+/// What is wrong and what to write.
+pub(crate) fn parse_level(text: &str) -> Result<String, String> {
     for part in text.split(',') {
         let part = part.trim();
         let (target, level) = match part.split_once('=') {

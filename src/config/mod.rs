@@ -15,8 +15,9 @@ mod values;
 
 pub use log::{LogFormat, LogSettings};
 
-pub(crate) use bus::default_format;
-pub(crate) use drive::unknown_profile;
+pub(crate) use bus::{check_port, default_format};
+pub(crate) use drive::{addresses, unknown_profile};
+pub(crate) use log::parse_level;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;

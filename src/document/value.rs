@@ -146,7 +146,7 @@ impl<T: FromNode> FromNode for Vec<T> {
 /// # Errors
 /// What is wrong and what to write.
 pub fn parse_duration(text: &str) -> Result<Duration, String> {
-    let bad = || format!("`{text}` is no duration; write {}", Duration::WANTED);
+    let bad = || format!("`{text}` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min");
     let trimmed = text.trim();
     let digits = trimmed
         .find(|c: char| !c.is_ascii_digit() && c != '.')

@@ -15,7 +15,7 @@ const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 /// How one drive on a simulated line is made.
 #[derive(Debug, Clone)]
 pub struct DriveOptions {
-    /// Address on the line, 1..=247.
+    /// Address on the line, 1..=247, with N2 to 255.
     pub address: u8,
     /// What it is.
     pub model: ModelOptions,

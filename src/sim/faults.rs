@@ -326,7 +326,7 @@ fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
     pdu.iter_mut().skip(2).for_each(|byte| *byte ^= 0x55);
     let mut address = address;
     match what {
-        Foreign::Address => address = if address == 247 { 1 } else { address + 1 },
+        Foreign::Address => address = if address >= 247 { 1 } else { address + 1 },
         Foreign::Function => {
             if let Some(function) = pdu.first_mut() {
                 *function = if *function == 3 { 4 } else { 3 };

@@ -7,7 +7,7 @@ use tempfile::TempDir;
 
 use crate::process::{Running, api, free_port, until, until_ready};
 use crate::restart::line_of;
-use crate::tools::tool;
+use crate::tools::{root, tool};
 
 /// How a command ended, what it printed and what it complained of.
 struct Ran {
@@ -187,6 +187,32 @@ fn alone_and_through_the_gateway() {
         "{}",
         ran.err
     );
+    // A section that is there and of no use is not asked for again.
+    let elsewhere = line.directory.path().join("elsewhere.toml");
+    let other = free_port();
+    let moved = format!("{text}[modbus_tcp]\nlisten = [\"127.0.0.1:{other}\"]\n");
+    std::fs::write(&elsewhere, moved).unwrap();
+    let ran = drivegate(&["read", "--config", elsewhere.to_str().unwrap(), "pump-1"]);
+    let wanted = format!("name its file by --config: no gateway answers at 127.0.0.1:{other}");
+    assert!(ran.code == 1 && ran.err.contains(&wanted), "{}", ran.err);
+    let tls = line.directory.path().join("tls");
+    for what in ["ca", "server gateway"] {
+        let made = Command::new(root().join("docs/modbus-tls-ca.sh"))
+            .arg(&tls)
+            .args(what.split(' '))
+            .output()
+            .unwrap();
+        assert!(made.status.success(), "{}", String::from_utf8_lossy(&made.stderr));
+    }
+    let secret = line.directory.path().join("secret.toml");
+    let section = format!(
+        "[modbus_tcp.tls]\nlisten = [\"127.0.0.1:{other}\"]\ncertificate = \"tls/gateway.crt\"\nkey = \"tls/gateway.key\"\n\
+         client_ca = \"tls/ca.crt\"\n"
+    );
+    std::fs::write(&secret, format!("{text}{section}")).unwrap();
+    let ran = drivegate(&["read", "--config", secret.to_str().unwrap(), "pump-1"]);
+    let wanted = "give [modbus_tcp] a `listen`: then this command goes through it; it cannot be asked over TLS";
+    assert!(ran.code == 1 && ran.err.contains(wanted), "{}", ran.err);
     // So does a search.
     let ran = drivegate(&["scan", "--port", &line.port(), "--addresses", "1"]);
     assert_eq!(ran.code, 1);
@@ -354,6 +380,11 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
         }
         assert!(others.is_empty(), "{others:#?}");
     }
+    // One reason for all of its points is told once.
+    let ran = drivegate(&["read", "--config", &config, "pump-2"]);
+    let wanted =
+        "error: no point of `pump-2` has a value: exception 0B (the drive does not answer, or its value is stale)\n";
+    assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));
     // Nobody ever asked for this one, so nothing of it can be old.
     let ran = drivegate(&["read", "--json", "--config", &config, "pump-1", "fault_code_id99"]);
     assert!(ran.out.contains("\"bad\""), "{}{}", ran.out, ran.err);
@@ -448,6 +479,35 @@ fn every_family_is_found_by_reading() {
         let read = drivegate(&["read", "--config", config, "drive-1", "ready", "output_frequency"]);
         assert_eq!(read.code, 0, "{profile}: {}{}", read.out, read.err);
     }
+}
+
+/// N2 has addresses that Modbus lacks; 255 is no unit, so the snippet gives such a drive another.
+#[test]
+fn drives_at_the_last_addresses_of_n2_are_found() {
+    let directory = TempDir::new().unwrap();
+    let link = directory.path().join("line");
+    let port = link.to_str().unwrap();
+    let drives = ["--profile", "teco-7300pa-n2", "--addresses", "248,255"];
+    let _drives = Running::drivegate(&[&["simulate", "--link", port][..], &drives].concat());
+    until("the line", || link.exists().then_some(()));
+    let ran = drivegate(&["scan", "--port", port, "--protocol", "n2", "--addresses", "247-255"]);
+    assert_eq!(ran.code, 0, "{}", ran.err);
+    assert!(
+        ran.out.contains("address = 248\n") && ran.out.contains("address = 255\nunit = 254\n"),
+        "{}",
+        ran.out
+    );
+    let found = directory.path().join("found.toml");
+    std::fs::write(&found, &ran.out).unwrap();
+    let read = drivegate(&[
+        "read",
+        "--config",
+        found.to_str().unwrap(),
+        "drive-2",
+        "ready",
+        "output_frequency",
+    ]);
+    assert_eq!(read.code, 0, "{}{}", read.out, read.err);
 }
 
 /// The way of docs/commissioning.md to a CX board that counts from 1.

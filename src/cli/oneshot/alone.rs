@@ -72,9 +72,10 @@ impl Alone {
                 .reason
                 .unwrap_or_else(|| "it cannot be opened in time".to_string());
             return Err(format!(
-                "{why}; bus `{}`, port {}; where a gateway owns the port, give it [modbus_tcp]: then this command goes \
-                 through it",
-                target.bus.spec.name, target.bus.spec.port
+                "{why}; bus `{}`, port {}; where a gateway owns the port, {}",
+                target.bus.spec.name,
+                target.bus.spec.port,
+                through_the_gateway(target)
             ));
         }
         let options = &target.bus.options;
@@ -167,6 +168,23 @@ impl Alone {
     pub(in crate::cli) async fn stop(self) {
         self.daemon.stop().await;
     }
+}
+
+/// What lets the command go through the gateway that owns the port.
+fn through_the_gateway(target: &Target) -> String {
+    let bus = &target.bus.spec.name;
+    let listens = target.listens();
+    let Some(options) = &target.settings.modbus_tcp else {
+        return "give it [modbus_tcp]: then this command goes through it".to_string();
+    };
+    if let Some(address) = listens.first() {
+        return format!("name its file by --config: no gateway answers at {address}, where that of this file would");
+    }
+    if options.listeners.is_empty() {
+        return "give [modbus_tcp] a `listen`: then this command goes through it; it cannot be asked over TLS"
+            .to_string();
+    }
+    format!("let a listener of [modbus_tcp] without TLS show `{bus}` (`buses`): then this command goes through it")
 }
 
 fn origin() -> Origin {

@@ -62,12 +62,12 @@ impl From<String> for Failure {
 }
 
 impl Remote {
-    /// The gateway at one of these addresses, if one runs there.
+    /// The gateway of the target's file, if one runs where that says.
     ///
     /// # Errors
     /// When a gateway is there that has another configuration: nothing is asked of it.
-    pub(in crate::cli) fn find(addresses: &[SocketAddr], target: &Target) -> Result<Option<Remote>, String> {
-        for address in addresses.iter().map(|a| reachable(*a)) {
+    pub(in crate::cli) fn find(target: &Target) -> Result<Option<Remote>, String> {
+        for address in target.listens().into_iter().map(reachable) {
             let Some(mut remote) = Remote::connect(address) else {
                 continue;
             };

@@ -54,15 +54,25 @@ pub(super) fn snippet(port: &str, found: &[Found]) -> String {
         );
         for drive in found.iter().filter(|f| (f.protocol, f.format) == (*protocol, *format)) {
             number += 1;
-            text += &commented(index > 0, &entry(drive, number));
+            text += &commented(index > 0, &entry(drive, number, unit_of(drive, found)));
         }
     }
     text
 }
 
-fn entry(drive: &Found, number: usize) -> String {
+/// The unit of a drive whose address cannot be one: 255 is the gateway itself.
+fn unit_of(drive: &Found, found: &[Found]) -> Option<u8> {
+    let taken = |unit: &u8| found.iter().any(|other| other.address == *unit);
+    (1..=254)
+        .rev()
+        .find(|unit| !taken(unit))
+        .filter(|_| drive.address == 255)
+}
+
+fn entry(drive: &Found, number: usize, unit: Option<u8>) -> String {
+    let unit = unit.map(|unit| format!("unit = {unit}\n")).unwrap_or_default();
     let head = format!(
-        "\n[[bus.drive]]\nname = \"drive-{number}\"\naddress = {}\n",
+        "\n[[bus.drive]]\nname = \"drive-{number}\"\naddress = {}\n{unit}",
         drive.address
     );
     match drive.profiles.as_slice() {
@@ -107,7 +117,9 @@ mod tests {
     #[test]
     fn check_accepts_it() {
         let rtu = Protocol::ModbusRtu;
+        let far = [254, 255].map(|address| found(Protocol::N2, address, &["teco-7300pa-n2"]));
         let cases = [
+            far.to_vec(),
             vec![
                 found(rtu, 1, &["vacon-nx"]),
                 found(rtu, 7, &[]),
@@ -121,7 +133,9 @@ mod tests {
             let errors: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
             let settings = loaded.settings.unwrap_or_else(|| panic!("{errors:?}\n{text}"));
             let drives = settings.buses.iter().flat_map(|b| &b.drives);
-            let known = case.iter().filter(|f| !f.profiles.is_empty() && f.protocol == rtu);
+            let known = case
+                .iter()
+                .filter(|f| !f.profiles.is_empty() && f.protocol == case[0].protocol);
             assert_eq!(
                 drives.map(|d| d.address).collect::<Vec<_>>(),
                 known.map(|f| f.address).collect::<Vec<_>>()
