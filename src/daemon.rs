@@ -10,7 +10,7 @@ use tokio_util::sync::CancellationToken;
 use crate::bus::BusTask;
 use crate::bus::leases::Leases;
 use crate::cache::{Access, BusImage, DriveImage, OnShutdown};
-use crate::command::{self, Command, CommandQueue, Order, Origin, SourceKind, Ticket, Urgency, WriteStats};
+use crate::command::{CommandQueue, Origin, Refusal, SourceKind, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
@@ -287,46 +287,53 @@ impl Daemon {
             // A command that comes by MQTT now must not start again what is stopped.
             bus.queue.stops_only(Instant::now());
         }
+        // Also one that does not answer just now: it may be back in time.
         let wanted = |d: &DriveHandle| {
             let spec = &d.image.spec;
-            spec.on_shutdown == OnShutdown::Stop
-                && spec.access == Access::Control
-                && d.image.snapshot().link.is_online()
+            spec.on_shutdown == OnShutdown::Stop && spec.access == Access::Control
         };
-        let stops = plant.drives().filter(wanted).map(|drive| self.stop_drive(drive));
-        let all = futures_util::future::join_all(stops);
-        if tokio::time::timeout(STOP_DRIVES, all).await.is_err() {
-            tracing::error!("not every drive acknowledged its stop in time; the gateway stops all the same");
+        let stops = plant.drives().filter(wanted).map(|drive| self.stop_in_time(drive));
+        let missing: Vec<String> = futures_util::future::join_all(stops)
+            .await
+            .into_iter()
+            .flatten()
+            .collect();
+        if !missing.is_empty() {
+            tracing::error!(
+                "not every drive acknowledged its stop in time; the gateway stops all the same: {}",
+                missing.join(", ")
+            );
         }
     }
 
-    async fn stop_drive(&self, drive: DriveHandle) {
-        let Some(run) = drive.image.spec.profile.model_index(ModelPoint::Run) else {
-            return;
-        };
+    /// What became of the stop of a drive that did not acknowledge it.
+    async fn stop_in_time(&self, drive: DriveHandle) -> Option<String> {
+        let name = &drive.image.spec.name;
+        let mut tried = false;
+        match tokio::time::timeout(STOP_DRIVES, self.stop_drive(&drive, &mut tried)).await {
+            Ok(Ok(())) => None,
+            Ok(Err(refusal)) => Some(format!("`{name}` was not told to stop ({refusal})")),
+            Err(_) if tried => Some(format!("`{name}` did not acknowledge it")),
+            Err(_) => Some(format!("`{name}` does not answer and was not told to stop")),
+        }
+    }
+
+    async fn stop_drive(&self, drive: &DriveHandle, tried: &mut bool) -> Result<(), Refusal> {
         loop {
-            let now = Instant::now();
-            let origin = Origin {
-                kind: SourceKind::Shutdown,
-                who: "on_shutdown".to_string(),
-            };
-            let name = &drive.image.spec.name;
-            let (ticket, answer) = Ticket::new(origin, name, "run=false".to_string(), true, now, self.writes.clone());
-            let order = Order::Points(vec![(run, Value::Bool(false))]);
-            let expires = now + command::DEFAULT_EXPIRY;
-            let command = Command {
-                drive: drive.index,
-                order,
-                urgency: Urgency::Stop,
-                reference_only: false,
-                expires,
-                ticket,
-            };
-            drive.bus.queue.submit(command, now);
-            match answer.await {
-                Ok(answer) if answer.outcome.is_ok() => return,
-                _ => tokio::time::sleep(Duration::from_millis(50)).await,
+            if drive.image.snapshot().link.is_online() {
+                let origin = Origin {
+                    kind: SourceKind::Shutdown,
+                    who: "on_shutdown".to_string(),
+                };
+                let (run, reading) = (ModelPoint::Run, drive.reading(Instant::now()));
+                let (bus, stop) = (&drive.bus, Value::Bool(false));
+                let answer = bus.own_order(drive.index, &reading, run, stop, origin, &self.writes)?;
+                *tried = true;
+                if answer.await.is_ok_and(|answer| answer.outcome.is_ok()) {
+                    return Ok(());
+                }
             }
+            tokio::time::sleep(Duration::from_millis(50)).await;
         }
     }
 }

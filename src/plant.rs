@@ -11,7 +11,7 @@ use crate::codec::{Table, describe};
 use crate::command::{
     self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats,
 };
-use crate::drive::Value;
+use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
 
 /// The plant as it is configured now; a reload puts a new one in its place.
@@ -105,13 +105,51 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
 }
 
 /// Answers a command that is not taken; audited and counted.
-fn turn_away(writes: &Arc<WriteStats>, drive: &str, what: &str, outcome: Outcome, origin: Origin) -> Answer {
+pub(crate) fn turn_away(writes: &Arc<WriteStats>, drive: &str, what: &str, outcome: Outcome, origin: Origin) -> Answer {
     let now = Instant::now();
     let (ticket, _) = Ticket::new(origin, drive, what.to_string(), true, now, writes.clone());
     ticket.answer(outcome.clone(), now);
     Answer {
         outcome,
         latency: Duration::ZERO,
+    }
+}
+
+impl BusHandle {
+    /// Gives the drive of `reading`, at place `drive` on this bus, an order of the gateway itself: a point of the model.
+    /// No client is behind it, so it renews no lease, and no newer reference of a client takes its place.
+    ///
+    /// # Errors
+    /// The refusal; it is neither audited nor counted.
+    pub fn own_order(
+        &self,
+        drive: usize,
+        reading: &Reading<'_>,
+        point: ModelPoint,
+        value: Value,
+        origin: Origin,
+        writes: &Arc<WriteStats>,
+    ) -> Result<oneshot::Receiver<Answer>, Refusal> {
+        let (spec, now) = (reading.spec, reading.now);
+        let index = spec.profile.model_index(point).ok_or_else(|| {
+            let (profile, point) = (&spec.profile.name, point.name());
+            Refusal::NotWritable(format!("profile `{profile}` has no `{point}`"))
+        })?;
+        let order = Order::Points(vec![(index, value)]);
+        let changes = changes(reading, &order);
+        let admitted = command::admit(order, reading, true)?;
+        let what = format!("{}={value}", point.name());
+        let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
+        let command = Command {
+            drive,
+            order: admitted.order,
+            urgency: admitted.urgency,
+            reference_only: false,
+            expires: now + command::DEFAULT_EXPIRY,
+            ticket: ticket.with_changes(changes),
+        };
+        self.queue.submit(command, now);
+        Ok(answer)
     }
 }
 

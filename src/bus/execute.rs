@@ -8,7 +8,7 @@ use std::time::Instant;
 
 pub use self::shadow::Shadow;
 
-use self::actions::{Action, Check, Known, actions, names_run, request, sets_all_bits, sparing};
+use self::actions::{Action, Check, Known, actions, names_run, request, sets_all_bits, sparing, unsendable};
 use self::shadow::{learn, note_write};
 use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, RequestPdu};
@@ -62,7 +62,7 @@ pub struct Execution {
 
 impl Execution {
     /// Lays the command out in the order that is safe: a stop before anything, references before run, a reset
-    /// before a new run edge.
+    /// before a new run edge. One that cannot be sent as a whole is refused; only of a stop goes out what can.
     pub fn new(command: Command, profile: &Profile) -> Execution {
         let Command {
             drive,
@@ -75,8 +75,13 @@ impl Execution {
         let effects = confirm::effects(profile, &order);
         let whole = matches!(&order, Order::Points(values) if sets_all_bits(profile, values));
         let names_run = matches!(&order, Order::Points(values) if names_run(profile, values));
+        let unsendable = match &order {
+            Order::Points(values) => unsendable(profile, values),
+            Order::Write(_) | Order::Read(_) => None,
+        };
         let actions = match order {
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
+            Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
         };
         let actions = actions
@@ -91,7 +96,7 @@ impl Execution {
             ticket,
             effects,
             expires,
-            cut: None,
+            cut: unsendable.map(Outcome::Refused),
             unanswered: Outcome::TimedOut,
             only_ends: false,
             reply: Reply::Written,

@@ -7,11 +7,11 @@ use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::oneshot::Receiver;
 
-use crate::cache::LeaseAction;
-use crate::command::{Answer, Command, Order, Origin, SourceKind, Ticket, Urgency, WriteStats};
+use crate::cache::{DriveSpec, LeaseAction, Reading, Unavailable};
+use crate::command::{Answer, Origin, Outcome, Refusal, SourceKind, WriteStats};
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, EventKind, Events};
-use crate::plant::BusHandle;
+use crate::plant::{self, BusHandle};
 
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);
@@ -27,12 +27,15 @@ pub struct Leases {
     owed: Vec<Owed>,
 }
 
-/// An action that is not acknowledged yet.
+/// An action that is not acknowledged yet. That it is owed stands in the drive's image, which outlives the bus; here is
+/// how far it got.
 #[derive(Debug)]
 struct Owed {
     drive: usize,
     answer: Option<Receiver<Answer>>,
     next_try: Instant,
+    /// Why it could not be written, as it was told.
+    refused: Option<Refusal>,
 }
 
 impl Leases {
@@ -47,32 +50,55 @@ impl Leases {
 
     /// Looks for leases that ran out and for actions that are still owed.
     pub fn look(&mut self, bus: &BusHandle, now: Instant) {
-        for (index, drive) in bus.image.drives.iter().enumerate() {
+        let drives = bus.image.drives.iter().enumerate();
+        for (index, drive) in drives.filter(|(_, drive)| drive.spec.supervision.is_some()) {
+            let reading = drive.reading(now, FRESH);
             // Of a drive that does not answer nobody knows whether it runs: its lease stays until it is back.
-            let Some(running) = drive.reading(now, FRESH).model(ModelPoint::Running).good() else {
-                continue;
-            };
-            if drive.lease_ran_out(now) && running.as_bool() {
+            if let Some(running) = reading.model(ModelPoint::Running).good().map(Value::as_bool)
+                && (running || !may_start(&reading))
+                && drive.lease_ran_out(now)
+                && running
+            {
                 drive.count_supervision();
-                self.ran_out(bus, index, now);
+                self.tell_ran_out(&drive.spec);
+                drive.owe_action(true);
+            }
+            if drive.owes_action() && !self.owed.iter().any(|o| o.drive == index) {
+                self.owed.push(Owed {
+                    drive: index,
+                    answer: None,
+                    next_try: now,
+                    refused: None,
+                });
             }
         }
+        self.settle(bus, now);
         let mut owed = std::mem::take(&mut self.owed);
-        owed.retain_mut(|item| !item.settled(now));
-        for item in owed
-            .iter_mut()
-            .filter(|item| item.answer.is_none() && item.next_try <= now)
-        {
-            item.answer = self.submit(bus, item.drive, now);
+        let due = |item: &&mut Owed| item.answer.is_none() && item.next_try <= now;
+        for item in owed.iter_mut().filter(due) {
+            self.attempt(item, bus, now);
         }
         self.owed = owed;
     }
 
-    fn ran_out(&mut self, bus: &BusHandle, index: usize, now: Instant) {
-        let Some(drive) = bus.image.drives.get(index) else {
-            return;
-        };
-        let Some(supervision) = &drive.spec.supervision else {
+    /// Takes note of what was answered: an action that was acknowledged is owed no more.
+    pub fn settle(&mut self, bus: &BusHandle, now: Instant) {
+        self.owed.retain_mut(|item| {
+            let Some(drive) = bus.image.drives.get(item.drive) else {
+                return false;
+            };
+            // One that could not be written while nobody commanded must not surprise a client that is back.
+            let overtaken = item.answer.is_none() && item.refused.is_some() && drive.has_lease();
+            let over = item.settled(now) || overtaken;
+            if over {
+                drive.owe_action(false);
+            }
+            !over
+        });
+    }
+
+    fn tell_ran_out(&self, spec: &DriveSpec) {
+        let Some(supervision) = &spec.supervision else {
             return;
         };
         let action = match supervision.action {
@@ -80,58 +106,72 @@ impl Leases {
             LeaseAction::Hold => "nothing is written".to_string(),
             LeaseAction::SpeedReference(percent) => format!("the speed reference is set to {percent} %"),
         };
+        let (name, timeout) = (&spec.name, supervision.timeout);
+        self.tell(
+            spec,
+            format!("no commanding client of {name} for {timeout:?}: {action}"),
+        );
+    }
+
+    fn tell(&self, spec: &DriveSpec, text: String) {
         self.events.tell(Event {
             id: 0,
             time: SystemTime::now(),
             kind: EventKind::Supervision,
-            bus: drive.spec.bus.clone(),
-            drive: Some(drive.spec.name.clone()),
+            bus: spec.bus.clone(),
+            drive: Some(spec.name.clone()),
             fault_code: None,
-            text: format!(
-                "no commanding client of {} for {:?}: {action}",
-                drive.spec.name, supervision.timeout
-            ),
+            text,
         });
-        if supervision.action != LeaseAction::Hold && !self.owed.iter().any(|o| o.drive == index) {
-            self.owed.push(Owed {
-                drive: index,
-                answer: None,
-                next_try: now,
-            });
-        }
     }
 
-    fn submit(&self, bus: &BusHandle, index: usize, now: Instant) -> Option<Receiver<Answer>> {
-        let drive = bus.image.drives.get(index)?;
-        let (point, value, urgency) = match drive.spec.supervision.as_ref()?.action {
-            LeaseAction::Stop => (ModelPoint::Run, Value::Bool(false), Urgency::Stop),
-            LeaseAction::SpeedReference(percent) => {
-                (ModelPoint::SpeedReference, Value::Number(percent), Urgency::Command)
-            }
-            LeaseAction::Hold => return None,
+    /// Writes the action. Nothing reaches a drive that does not answer: it is written when the drive is back.
+    fn attempt(&self, item: &mut Owed, bus: &BusHandle, now: Instant) {
+        let Some(drive) = bus.image.drives.get(item.drive) else {
+            return;
         };
-        let point_index = drive.spec.profile.model_index(point)?;
+        let reading = drive.reading(now, FRESH);
+        if !reading.snapshot.link.is_online() {
+            return;
+        }
+        let (point, value) = match drive.spec.supervision.as_ref().map(|s| &s.action) {
+            Some(LeaseAction::Stop) => (ModelPoint::Run, Value::Bool(false)),
+            Some(LeaseAction::SpeedReference(percent)) => (ModelPoint::SpeedReference, Value::Number(*percent)),
+            Some(LeaseAction::Hold) | None => return,
+        };
         let origin = Origin {
             kind: SourceKind::Supervision,
             who: "lease".to_string(),
         };
-        let what = format!("{}={value}", point.name());
-        let (ticket, answer) = Ticket::new(origin, &drive.spec.name, what, true, now, self.stats.clone());
-        let order = Order::Points(vec![(point_index, value)]);
-        let expires = now + crate::command::DEFAULT_EXPIRY;
-        bus.queue.submit(
-            Command {
-                drive: index,
-                order,
-                urgency,
-                reference_only: false,
-                expires,
-                ticket,
-            },
-            now,
-        );
-        Some(answer)
+        match bus.own_order(item.drive, &reading, point, value, origin.clone(), &self.stats) {
+            Ok(answer) => item.answer = Some(answer),
+            Err(refusal) => {
+                item.next_try = now + AGAIN;
+                if item.refused.as_ref() == Some(&refusal) {
+                    return;
+                }
+                let what = format!("{}={value}", point.name());
+                let text = format!(
+                    "the lease of {} ran out, and {what} cannot be written: {refusal}; it is tried again every \
+                     {AGAIN:?}, until a client commands the drive",
+                    drive.spec.name
+                );
+                self.tell(&drive.spec, text);
+                item.refused = Some(refusal.clone());
+                plant::turn_away(&self.stats, &drive.spec.name, &what, Outcome::Refused(refusal), origin);
+            }
+        }
     }
+}
+
+/// Whether a motor that stands may start without another command: the run command is set in the drive's word, or is not
+/// read yet. Of a drive that does not tell it, it is taken to be unset.
+fn may_start(reading: &Reading<'_>) -> bool {
+    if let Some(run) = reading.model(ModelPoint::Run).good() {
+        return run.as_bool();
+    }
+    let run = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
+    run.is_some_and(|raw| reading.words(raw.table, raw.address, 1) == Err(Unavailable::Stale))
 }
 
 impl Owed {
@@ -151,109 +191,4 @@ impl Owed {
 }
 
 #[cfg(test)]
-mod tests {
-
-    use super::*;
-    use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision};
-    use crate::codec::{Exception, LineFormat, Protocol, Reply, Table};
-    use crate::command::{CommandQueue, Outcome};
-    use crate::drive::profile::Profiles;
-
-    struct Bench {
-        bus: BusHandle,
-        leases: Leases,
-        now: Instant,
-    }
-
-    impl Bench {
-        fn new(action: LeaseAction) -> Bench {
-            let spec = DriveSpec {
-                access: Access::Control,
-                supervision: Some(Supervision {
-                    timeout: Duration::from_secs(5),
-                    action,
-                }),
-                turnaround: Duration::ZERO,
-                ..DriveSpec::new("d", "b", 1, Profiles::built_in().get("vacon-nx").unwrap().clone())
-            };
-            let bus = BusSpec {
-                name: "b".to_string(),
-                port: "none".to_string(),
-                protocol: Protocol::ModbusRtu,
-                format: LineFormat::new(38_400, "8N1").unwrap(),
-                cycle: Duration::from_millis(10),
-                slow_cycle: Duration::from_secs(1),
-            };
-            let drive = DriveImage::new(spec, bus.slow_cycle);
-            drive.update(|s| s.link = Link::Online(SystemTime::now()));
-            Bench {
-                bus: BusHandle {
-                    image: Arc::new(BusImage::new(bus, vec![Arc::new(drive)])),
-                    queue: Arc::new(CommandQueue::new().unwrap()),
-                },
-                leases: Leases::new(Events::default(), Arc::default()),
-                now: Instant::now(),
-            }
-        }
-
-        /// `ms` later the drive says whether it runs, and the leases are looked at: the rank of the action that is
-        /// written then, and where its answer goes.
-        fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
-            self.now += Duration::from_millis(ms);
-            let now = self.now;
-            let word = u16::from(runs) << 1;
-            self.bus.image.drives[0].update(|s| s.store(Table::Holding, 2100, &[word], now));
-            self.leases.look(&self.bus, now);
-            assert!(self.bus.queue.lock().len() <= 1, "one at a time");
-            self.bus.queue.lock().pop(Urgency::Read, now)
-        }
-
-        fn told(&self) -> usize {
-            self.leases.events.recent().len()
-        }
-    }
-
-    #[test]
-    fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
-        for (action, urgency) in [
-            (LeaseAction::Stop, Urgency::Stop),
-            (LeaseAction::SpeedReference(20.0), Urgency::Command),
-        ] {
-            let mut bench = Bench::new(action);
-            assert!(bench.after(60_000, true).is_none(), "nobody commanded it");
-            bench.bus.image.drives[0].renew_lease(bench.now);
-            assert!(bench.after(4_900, true).is_none());
-            for failed in [
-                Outcome::TimedOut,
-                Outcome::Exception(Exception::BUSY),
-                Outcome::QueueFull,
-            ] {
-                let command = bench.after(1_000, true).expect("the action");
-                assert_eq!(command.urgency, urgency);
-                assert!(bench.after(10, true).is_none(), "not while its answer is waited for");
-                command.ticket.answer(failed, bench.now);
-                assert!(bench.after(10, true).is_none(), "a pause first");
-            }
-            // Also when the drive was seen to stand meanwhile: nobody knows why.
-            let command = bench.after(1_000, false).expect("the action");
-            command.ticket.answer(Outcome::Acknowledged(Reply::Written), bench.now);
-            for _ in 0..20 {
-                assert!(bench.after(1_000, true).is_none(), "once");
-            }
-            assert_eq!(bench.told(), 1);
-            assert_eq!(bench.bus.image.drives[0].supervisions(), 1);
-        }
-    }
-
-    #[test]
-    fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
-        let mut bench = Bench::new(LeaseAction::Stop);
-        bench.bus.image.drives[0].renew_lease(bench.now);
-        assert!(bench.after(10_000, false).is_none());
-        assert_eq!(bench.told(), 0);
-        let mut bench = Bench::new(LeaseAction::Hold);
-        bench.bus.image.drives[0].renew_lease(bench.now);
-        assert!(bench.after(10_000, true).is_none());
-        assert_eq!(bench.told(), 1);
-    }
-}
+mod tests;

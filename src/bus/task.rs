@@ -186,7 +186,10 @@ impl Worker {
             self.rest(pause);
             pause = (pause * 2).min(REOPEN.1);
         }
-        self.desk.close(&Outcome::ShuttingDown, Instant::now());
+        let now = Instant::now();
+        self.desk.close(&Outcome::ShuttingDown, now);
+        // What the drive acknowledged last is not owed by the bus that takes over.
+        self.leases.settle(&self.handle, now);
     }
 
     fn stopping(&self) -> bool {

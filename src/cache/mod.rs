@@ -13,7 +13,7 @@ pub use trace::{Direction, FrameRecord, Trace};
 
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -120,6 +120,8 @@ pub struct DriveImage {
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
     lease: Mutex<Option<Instant>>,
+    /// The action of a lease that ran out is not acknowledged yet.
+    action_owed: AtomicBool,
     supervisions: AtomicU64,
 }
 
@@ -138,6 +140,7 @@ impl DriveImage {
             outcomes,
             turnaround: AtomicU64::new(0),
             lease: Mutex::default(),
+            action_owed: AtomicBool::new(false),
             supervisions: AtomicU64::new(0),
         }
     }
@@ -218,12 +221,33 @@ impl DriveImage {
         self.supervisions.load(Ordering::Relaxed)
     }
 
-    /// Goes on with the lease of the image that this one replaces.
+    /// Goes on with the lease of the image that this one replaces, and with the action that it still owes.
     pub fn take_over_lease(&self, from: &DriveImage) {
+        if self.spec.access != Access::Control {
+            return;
+        }
         let renewed = *from.lease.lock().unwrap_or_else(PoisonError::into_inner);
-        if let (Some(renewed), true) = (renewed, self.spec.supervision.is_some()) {
+        if let Some(renewed) = renewed {
             self.renew_lease(renewed);
         }
+        self.owe_action(from.owes_action());
+    }
+
+    /// Whether a lease runs, or ran out and was not ended yet.
+    pub fn has_lease(&self) -> bool {
+        self.lease.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
+    /// The action of a lease that ran out is to be written, or was acknowledged.
+    pub fn owe_action(&self, owed: bool) {
+        let writes = |s: &Supervision| s.action != LeaseAction::Hold;
+        let owed = owed && self.spec.supervision.as_ref().is_some_and(writes);
+        self.action_owed.store(owed, Ordering::Relaxed);
+    }
+
+    /// Whether the action of a lease that ran out is not acknowledged yet.
+    pub fn owes_action(&self) -> bool {
+        self.action_owed.load(Ordering::Relaxed)
     }
 
     /// Ends the lease if it ran out; true exactly once for each lease.

@@ -163,6 +163,33 @@ fn a_stop_that_nobody_acknowledges_holds_up_the_shutdown_for_a_bounded_time() {
 }
 
 #[test]
+fn a_drive_that_is_offline_when_the_gateway_stops_is_told_as_soon_as_it_answers() {
+    for back in [true, false] {
+        let folder = tempfile::tempdir().unwrap();
+        let line = line(&folder.path().join("line1"));
+        let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
+        let mut gateway = Running::drivegate(&["run", "--config", &file]);
+        until_ready(http);
+        crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+        until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
+        line.record(100_000);
+        line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
+        gateway.until_printed("drive pump-1 is offline");
+        if back {
+            line.set_faults(FaultPlan::default());
+        }
+        gateway.signal("TERM");
+        let (status, _) = gateway.ended();
+        assert!(status.success(), "{status}");
+        let stops = functions(&line).into_iter().filter(|f| *f == 6).count();
+        let named = gateway
+            .output()
+            .contains("`pump-1` does not answer and was not told to stop");
+        assert_eq!((stops > 0, named), (back, !back), "{}", gateway.output());
+    }
+}
+
+#[test]
 fn a_reload_that_opens_the_line_anew_writes_no_control_word() {
     let folder = tempfile::tempdir().unwrap();
     let line = line(&folder.path().join("line1"));

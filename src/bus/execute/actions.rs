@@ -6,7 +6,7 @@ use std::time::Duration;
 use super::shadow::Shadow;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
-use crate::command::written;
+use crate::command::{Refusal, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, Point, Profile, Raw, Value};
 
@@ -65,6 +65,25 @@ pub(super) fn sets_all_bits(profile: &Profile, values: &[(usize, Value)]) -> boo
     let level = |p: &Point| p.write && !p.pulse && p.raw().is_some_and(|r| matches!(r.form, Form::Bit { .. }));
     let mut bits = profile.points.iter().enumerate().filter(|(_, p)| level(p));
     bits.all(|(bit, _)| values.iter().any(|(index, _)| *index == bit))
+}
+
+/// Why a command cannot be sent as it is: a point without a place at the drive, or a value that its place does not hold.
+/// Admitted ones have neither; one that has must not end as if the drive had taken it.
+pub(super) fn unsendable(profile: &Profile, values: &[(usize, Value)]) -> Option<Refusal> {
+    values.iter().find_map(|(index, value)| {
+        let Some(point) = profile.points.get(*index) else {
+            return Some(Refusal::NotWritable(format!("there is no point {index}")));
+        };
+        let name = &point.name;
+        match point.raw().map(|raw| raw.encode(*value, 0)) {
+            Some(Ok(words)) if !words.is_empty() => None,
+            Some(Ok(_)) => Some(Refusal::BadValue(format!("`{name}` = {value} is nothing to write"))),
+            Some(Err(why)) => Some(Refusal::BadValue(format!("`{name}`: {why}"))),
+            None => Some(Refusal::NotWritable(format!(
+                "`{name}` is no register of the drive; the command does not name those that it rests on"
+            ))),
+        }
+    })
 }
 
 /// Whether a command says whether the motor is to run.

@@ -290,3 +290,21 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
     assert_eq!(both.answered(&read, refused(), &mut bench.shadow), None);
     assert_eq!(sends(&bench, &mut both), word(3));
 }
+
+#[test]
+fn what_cannot_be_sent_is_no_success() {
+    let refused = |execution: &Execution| matches!(execution.success(), Outcome::Refused(_));
+    // Its place is that of another point, which is not named.
+    let mut bench = Bench::new(0);
+    let (mut derived, _a) = bench.begin(&[("run", 1.0), ("frequency_reference", 20.0)], Urgency::Command);
+    assert_eq!(bench.run(&mut derived), [], "not a part of it either");
+    assert!(refused(&derived), "{:?}", derived.success());
+    let (mut large, _a) = bench.begin(&[("speed_reference", 1e9)], Urgency::Command);
+    assert_eq!(bench.run(&mut large), []);
+    assert!(refused(&large), "{:?}", large.success());
+    // Of a stop goes out what can.
+    let mut bench = Bench::new(1);
+    let (mut stop, _a) = bench.begin(&[("frequency_reference", 0.0), ("run", 0.0)], Urgency::Stop);
+    assert_eq!(bench.run(&mut stop), [(0, 2000, 0)]);
+    assert!(refused(&stop), "{:?}", stop.success());
+}
