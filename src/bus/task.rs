@@ -8,6 +8,7 @@ mod turn;
 
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
@@ -37,6 +38,8 @@ pub struct BusTask {
     handle: BusHandle,
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
+    /// Present until the bus begins.
+    begin: Option<SyncSender<()>>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
@@ -46,17 +49,42 @@ impl BusTask {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(handle: BusHandle, options: BusOptions, leases: Leases, events: Events) -> std::io::Result<BusTask> {
+        let mut task = BusTask::prepare(handle, options, leases, events)?;
+        task.begin();
+        Ok(task)
+    }
+
+    /// Gets all that a bus needs from the system; its thread waits for [`BusTask::begin`] and touches no port before.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn prepare(handle: BusHandle, options: BusOptions, leases: Leases, events: Events) -> std::io::Result<BusTask> {
         let stop = Arc::new(AtomicBool::new(false));
         let beats = Arc::new(AtomicU64::new(0));
         let worker = Worker::new(handle.clone(), options, leases, events, stop.clone(), beats.clone());
         let name = format!("bus-{}", handle.image.spec.name);
-        let thread = std::thread::Builder::new().name(name).spawn(move || worker.run())?;
+        let (begin, begun) = sync_channel(1);
+        let thread = std::thread::Builder::new().name(name).spawn(move || {
+            // A bus that is given up before it began has nothing to end.
+            if begun.recv().is_ok() {
+                worker.run();
+            }
+        })?;
         Ok(BusTask {
             handle,
             stop,
             beats,
+            begin: Some(begin),
             thread: Some(thread),
         })
+    }
+
+    /// Lets a prepared bus open its port; nothing further can fail.
+    pub fn begin(&mut self) {
+        if let Some(begin) = self.begin.take() {
+            // Room for one; the thread waits for it.
+            let _ = begin.send(());
+        }
     }
 
     /// Turns that the bus has taken: it hangs when this stands still for seconds.
@@ -76,6 +104,7 @@ impl BusTask {
 
     fn halt(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
+        self.begin = None;
         self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
         self.handle.queue.wake();
         if let Some(thread) = self.thread.take()
