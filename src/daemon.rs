@@ -9,7 +9,7 @@ use tokio_util::sync::CancellationToken;
 
 use crate::bus::BusTask;
 use crate::bus::leases::Leases;
-use crate::cache::{Access, BusImage, DriveImage, OnShutdown};
+use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, Origin, Refusal, SourceKind, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::drive::{ModelPoint, Value};
@@ -75,7 +75,8 @@ impl Daemon {
         };
         // First whoever keeps events, so that none is missed; last the servers that tell whether all is ready.
         daemon.take_mqtt(&settings).await;
-        daemon.take_buses(&settings)?;
+        let begins = daemon.prepare_buses(&settings)?;
+        daemon.take_buses(&settings, begins);
         daemon.take_servers(&settings).await?;
         daemon.settings = settings;
         Ok(daemon)
@@ -101,7 +102,10 @@ impl Daemon {
 
     /// Whether every bus has moved since the last call; a bus that hangs must not be hidden by a watchdog that is fed.
     pub fn is_moving(&mut self) -> bool {
-        let mut moving = true;
+        let mut moving = self.buses.len() >= self.settings.buses.len();
+        if !moving {
+            tracing::error!("not every bus of the configuration runs; the watchdog is not fed");
+        }
         for (settings, task) in &self.buses {
             let beats = task.beats();
             if self.beats.insert(settings.spec.name.clone(), beats) == Some(beats) {
@@ -115,41 +119,55 @@ impl Daemon {
     /// Takes a new configuration: what is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// When a server cannot listen on its new address: everything is as it was before, the old servers are open again.
-    /// When the system gives no thread for a bus.
+    /// When the system gives no thread or no file descriptor for a bus, or a server cannot listen on its new address:
+    /// everything is as it was before, the old servers are open again.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
         let before = self.settings.clone();
+        // All that can fail comes before anything that runs is ended.
+        let begins = self.prepare_buses(&settings)?;
         if let Err(error) = self.take_servers(&settings).await {
             return Err(match self.take_servers(&before).await {
                 Ok(()) => error,
                 Err(back) => StartError(format!("{error}; the old servers cannot be opened again: {back}")),
             });
         }
-        self.take_buses(&settings)?;
+        self.take_buses(&settings, begins);
         self.take_mqtt(&settings).await;
         self.settings = settings;
         Ok(())
     }
 
-    fn take_buses(&mut self, settings: &Settings) -> Result<(), StartError> {
-        let mut old: Vec<(BusSettings, BusTask)> = std::mem::take(&mut self.buses);
-        let mut kept = Vec::new();
-        let mut wanted = Vec::new();
-        for bus in &settings.buses {
-            match old.iter().position(|(before, _)| before == bus) {
-                Some(index) => kept.push(old.remove(index)),
-                None => wanted.push(bus.clone()),
-            }
-        }
+    /// The buses that do not run as they are wanted, ready to begin.
+    fn prepare_buses(&self, settings: &Settings) -> Result<Vec<(BusSettings, BusTask)>, StartError> {
+        let runs = |bus: &BusSettings| self.buses.iter().any(|(before, _)| before == bus);
+        let wanted = settings.buses.iter().filter(|bus| !runs(bus));
+        wanted.map(|bus| Ok((bus.clone(), self.prepare_bus(bus)?))).collect()
+    }
+
+    /// Ends the buses that are wanted no more, and lets those begin that are new.
+    fn take_buses(&mut self, settings: &Settings, begins: Vec<(BusSettings, BusTask)>) {
+        let (mut kept, ends): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
+            .into_iter()
+            .partition(|(before, _)| settings.buses.contains(before));
         // Ports are free again before a changed bus opens one of them.
-        for (before, task) in old {
+        for (before, task) in ends {
             tracing::info!(bus = %before.spec.name, "the bus ends");
             task.stop();
         }
-        for bus in wanted {
+        for (bus, mut task) in begins {
             tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
-            let task = self.start_bus(&bus, settings.stale_after_written)?;
+            self.take_over_leases(&task);
+            task.begin();
             kept.push((bus, task));
+        }
+        for (bus, task) in &kept {
+            // Where nobody wrote when process data is stale, three rounds of a slow line are not.
+            let floor = match settings.stale_after_written {
+                true => Duration::ZERO,
+                false => 3 * bus.achievable().0,
+            };
+            let drives = &task.handle().image.drives;
+            drives.iter().for_each(|drive| drive.set_stale_floor(floor));
         }
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
@@ -162,41 +180,39 @@ impl Daemon {
             writes: self.writes.clone(),
         }));
         self.buses = kept;
-        Ok(())
     }
 
-    fn start_bus(&self, bus: &BusSettings, stale_after_written: bool) -> Result<BusTask, StartError> {
+    fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error: std::io::Error| {
             StartError(format!(
                 "cannot start bus `{}`: {error}; free memory or file descriptors",
                 bus.spec.name
             ))
         };
-        let before = self.plant.load();
-        let (cycle, slow_cycle) = bus.achievable();
-        // Where nobody wrote when process data is stale, three rounds of a slow line are not.
-        let stale_floor = if stale_after_written { Duration::ZERO } else { 3 * cycle };
-        let drives = bus.drives.iter().map(|spec| {
-            let image = DriveImage::new(spec.clone(), slow_cycle).with_stale_floor(stale_floor);
-            // A bus that starts anew does not set a running drive free of its supervision.
-            if let Some(same) = before
-                .drive(&spec.name)
-                .filter(|d| d.image.spec.address == spec.address)
-            {
-                image.take_over_lease(&same.image);
-            }
-            Arc::new(image)
-        });
-        let image = Arc::new(BusImage::new(bus.spec.clone(), drives.collect()));
+        let (_, slow_cycle) = bus.achievable();
+        let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle));
+        let drives = bus.drives.iter().map(image).collect();
+        let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
         let queue = Arc::new(CommandQueue::new().map_err(failed)?);
         let leases = Leases::new(self.events.clone(), self.writes.clone());
-        BusTask::start(
+        BusTask::prepare(
             BusHandle { image, queue },
             bus.options.clone(),
             leases,
             self.events.clone(),
         )
         .map_err(failed)
+    }
+
+    /// A bus that starts anew does not set a running drive free of its supervision.
+    fn take_over_leases(&self, task: &BusTask) {
+        let before = self.plant.load();
+        for image in &task.handle().image.drives {
+            let same = before.drive(&image.spec.name);
+            if let Some(same) = same.filter(|d| d.image.spec.address == image.spec.address) {
+                image.take_over_lease(&same.image);
+            }
+        }
     }
 
     async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {

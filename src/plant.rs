@@ -178,17 +178,8 @@ impl Plant {
 
     /// The drive of that name.
     pub fn drive(&self, name: &str) -> Option<DriveHandle> {
-        self.find(|drive| drive.spec.name == name)
-    }
-
-    /// The drive of that Modbus TCP unit id.
-    pub fn unit(&self, unit: u8) -> Option<DriveHandle> {
-        self.find(|drive| drive.spec.unit == unit)
-    }
-
-    fn find(&self, which: impl Fn(&DriveImage) -> bool) -> Option<DriveHandle> {
         self.buses.iter().find_map(|bus| {
-            let index = bus.image.drives.iter().position(|d| which(d))?;
+            let index = bus.image.drives.iter().position(|drive| drive.spec.name == name)?;
             Some(self.handle(bus, index, bus.image.drives.get(index)?))
         })
     }

@@ -6,8 +6,10 @@
 mod results;
 mod turn;
 
+use std::panic::AssertUnwindSafe;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
 use super::BusOptions;
@@ -21,7 +23,7 @@ use crate::command::Outcome;
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead};
 use crate::event::Events;
-use crate::line::{self, Line, Lost, Woken};
+use crate::line::{self, Line, Lost, Names, Woken};
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
@@ -37,6 +39,8 @@ pub struct BusTask {
     handle: BusHandle,
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
+    /// Present until the bus begins.
+    begin: Option<SyncSender<()>>,
     thread: Option<std::thread::JoinHandle<()>>,
 }
 
@@ -46,17 +50,42 @@ impl BusTask {
     /// # Errors
     /// When the system gives no thread.
     pub fn start(handle: BusHandle, options: BusOptions, leases: Leases, events: Events) -> std::io::Result<BusTask> {
+        let mut task = BusTask::prepare(handle, options, leases, events)?;
+        task.begin();
+        Ok(task)
+    }
+
+    /// Gets all that a bus needs from the system; its thread waits for [`BusTask::begin`] and touches no port before.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn prepare(handle: BusHandle, options: BusOptions, leases: Leases, events: Events) -> std::io::Result<BusTask> {
         let stop = Arc::new(AtomicBool::new(false));
         let beats = Arc::new(AtomicU64::new(0));
         let worker = Worker::new(handle.clone(), options, leases, events, stop.clone(), beats.clone());
         let name = format!("bus-{}", handle.image.spec.name);
-        let thread = std::thread::Builder::new().name(name).spawn(move || worker.run())?;
+        let (begin, begun) = sync_channel(1);
+        let thread = std::thread::Builder::new().name(name).spawn(move || {
+            // A bus that is given up before it began has nothing to end.
+            if begun.recv().is_ok() {
+                or_end_the_process(|| worker.run());
+            }
+        })?;
         Ok(BusTask {
             handle,
             stop,
             beats,
+            begin: Some(begin),
             thread: Some(thread),
         })
+    }
+
+    /// Lets a prepared bus open its port; nothing further can fail.
+    pub fn begin(&mut self) {
+        if let Some(begin) = self.begin.take() {
+            // Room for one; the thread waits for it.
+            let _ = begin.send(());
+        }
     }
 
     /// Turns that the bus has taken: it hangs when this stands still for seconds.
@@ -76,12 +105,12 @@ impl BusTask {
 
     fn halt(&mut self) {
         self.stop.store(true, Ordering::Relaxed);
+        self.begin = None;
         self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
         self.handle.queue.wake();
-        if let Some(thread) = self.thread.take()
-            && thread.join().is_err()
-        {
-            tracing::error!(bus = %self.handle.image.spec.name, "the bus ended by a panic");
+        if let Some(thread) = self.thread.take() {
+            // Never an error: a panic of the bus has ended the process.
+            let _ = thread.join();
         }
     }
 }
@@ -89,6 +118,18 @@ impl BusTask {
 impl Drop for BusTask {
     fn drop(&mut self) {
         self.halt();
+    }
+}
+
+/// A bus that panicked would take commands that nobody serves, and show the last values for ever: a stop would be lost
+/// in it. A process that dies is started again, and its clients see that it is gone.
+fn or_end_the_process(work: impl FnOnce()) {
+    if std::panic::catch_unwind(AssertUnwindSafe(work)).is_err() {
+        let bus = std::thread::current().name().unwrap_or_default().to_string();
+        tracing::error!(
+            "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
+        );
+        std::process::abort();
     }
 }
 
@@ -166,9 +207,11 @@ impl Worker {
     fn run(mut self) {
         line::sharpen_timers();
         let mut pause = REOPEN.0;
+        let mut names = Names::default();
         while !self.stopping() {
             let spec = &self.handle.image.spec;
-            match Line::open(&spec.port, &spec.format, self.options.rs485) {
+            let go_on = || !self.stopping();
+            match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
                 Ok((line, warnings)) => {
                     self.opened(warnings);
                     let opened = Instant::now();
@@ -181,6 +224,8 @@ impl Worker {
                         self.lost(&lost.to_string());
                     }
                 }
+                // Whoever ended the bus ended the try, too.
+                Err(_) if self.stopping() => {}
                 Err(error) => self.lost(&error.to_string()),
             }
             self.rest(pause);
@@ -286,5 +331,29 @@ impl Worker {
             self.report.fast_round(round.cycle);
         }
         decided
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::Command;
+
+    use super::*;
+
+    /// Set in the process that the test below starts to see it die.
+    const DIES: &str = "DRIVEGATE_TEST_DIES";
+
+    #[test]
+    fn a_bus_that_panics_ends_the_process() {
+        if std::env::var_os(DIES).is_some() {
+            let bus = std::thread::spawn(|| or_end_the_process(|| panic!("as a test wants it")));
+            let _ = bus.join();
+            return;
+        }
+        let test = "bus::task::tests::a_bus_that_panics_ends_the_process";
+        let mut same = Command::new(std::env::current_exe().unwrap());
+        let ended = same.args([test, "--exact"]).env(DIES, "1").output().unwrap();
+        assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
     }
 }

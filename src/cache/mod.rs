@@ -113,8 +113,8 @@ pub struct DriveImage {
     pub plan: Plan,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
-    /// Process data of a line that cannot be faster is not stale before that age.
-    stale_floor: Duration,
+    /// Process data of a line that cannot be faster is not stale before that age, ns; a reload may change it.
+    stale_floor: AtomicU64,
     snapshot: ArcSwap<Snapshot>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
@@ -135,7 +135,7 @@ impl DriveImage {
             spec,
             plan,
             slow_cycle,
-            stale_floor: Duration::ZERO,
+            stale_floor: AtomicU64::new(0),
             snapshot,
             outcomes,
             turnaround: AtomicU64::new(0),
@@ -147,7 +147,14 @@ impl DriveImage {
 
     /// Process data is not stale before that age: the line cannot renew it faster.
     pub fn with_stale_floor(self, stale_floor: Duration) -> DriveImage {
-        DriveImage { stale_floor, ..self }
+        self.set_stale_floor(stale_floor);
+        self
+    }
+
+    /// As [`DriveImage::with_stale_floor`], for a drive that is read already.
+    pub fn set_stale_floor(&self, stale_floor: Duration) {
+        let nanos = u64::try_from(stale_floor.as_nanos()).unwrap_or(u64::MAX);
+        self.stale_floor.store(nanos, Ordering::Relaxed);
     }
 
     /// What is known now; stays as it is while the caller holds it.
@@ -169,7 +176,7 @@ impl DriveImage {
             spec: &self.spec,
             snapshot,
             now,
-            stale_after: stale_after.max(self.stale_floor),
+            stale_after: stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed))),
             slow_cycle: self.slow_cycle,
         }
     }
@@ -347,12 +354,6 @@ impl DriveSpec {
             on_shutdown: OnShutdown::Hold,
             frequency_range: None,
         }
-    }
-
-    /// Percent of the speed range as Hz, or Hz as percent, with the band `minimum..maximum` in Hz.
-    pub fn percent_of(frequency: f64, minimum: f64, maximum: f64) -> Option<f64> {
-        let span = maximum - minimum;
-        (span > 0.0).then(|| (frequency - minimum) / span * 100.0)
     }
 
     /// Limits of a command to that point: the configured ones, else the profile's.

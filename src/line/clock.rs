@@ -6,7 +6,8 @@ use std::io;
 use std::num::NonZeroU64;
 use std::time::{Duration, Instant};
 use thread_priority::unix::{
-    RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy, thread_native_id,
+    NormalThreadSchedulePolicy, RealtimeThreadSchedulePolicy, ThreadSchedulePolicy, set_thread_priority_and_policy,
+    thread_native_id,
 };
 use thread_priority::{ThreadPriority, ThreadPriorityValue};
 
@@ -38,6 +39,21 @@ fn real_time() -> Result<(), String> {
     let priority = ThreadPriorityValue::try_from(REAL_TIME)?;
     // Round robin: the threads of two lines do not wait for each other longer than a slice.
     let policy = ThreadSchedulePolicy::Realtime(RealtimeThreadSchedulePolicy::RoundRobin);
+    set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
+        .map_err(|error| error.to_string())
+}
+
+/// Takes back what a thread has from the thread of a line that started it.
+pub(super) fn be_ordinary() {
+    if let Err(error) = ordinary() {
+        tracing::debug!("a thread keeps the precedence of its line: {error}");
+    }
+}
+
+fn ordinary() -> Result<(), String> {
+    // Just below the usual precedence, so that no privilege is needed.
+    let priority = ThreadPriorityValue::try_from(45)?;
+    let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Other);
     set_thread_priority_and_policy(thread_native_id(), ThreadPriority::Crossplatform(priority), policy)
         .map_err(|error| error.to_string())
 }
@@ -134,6 +150,11 @@ mod tests {
         };
         let own = std::thread::spawn(move || {
             sharpen_timers();
+            let helper = std::thread::spawn(move || {
+                be_ordinary();
+                policy()
+            });
+            assert_eq!(helper.join().unwrap(), (0, 0), "nor who works for it");
             policy()
         });
         // Fields 40 and 41 of proc_pid_stat(5): priority in real time, policy; 2 is round robin.

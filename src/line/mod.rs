@@ -5,15 +5,17 @@
 //! of an async runtime ticks at a millisecond, which is longer than the silence of a frame at 38400 baud.
 
 mod clock;
+mod names;
 mod sys;
 
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
+pub use names::Names;
 
 use std::cell::Cell;
 use std::fmt;
 use std::io;
-use std::net::{TcpStream, ToSocketAddrs};
+use std::net::TcpStream;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
@@ -23,7 +25,7 @@ use tokio_serial::{DataBits, FlowControl, Parity as SerialParity, StopBits};
 
 use crate::codec::{LineFormat, Parity};
 
-/// Time to reach a device server; the bus stops for no longer.
+/// Time to reach a device server at one address.
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
 /// A connection whose other end has not taken a request for that time is lost.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
@@ -111,8 +113,23 @@ impl Line {
     /// # Errors
     /// When the port cannot be opened or cannot do what is asked of it.
     pub fn open(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, Vec<String>), OpenError> {
+        Line::open_by(&mut Names::default(), port, format, rs485, &|| true)
+    }
+
+    /// As [`Line::open`], for whoever opens the same port again and again: `names` remembers the addresses of a device
+    /// server, and `go_on`, called at least once a second, says whether it is still wanted.
+    ///
+    /// # Errors
+    /// As [`Line::open`].
+    pub fn open_by(
+        names: &mut Names,
+        port: &str,
+        format: &LineFormat,
+        rs485: Rs485,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<(Line, Vec<String>), OpenError> {
         match port.strip_prefix("tcp://") {
-            Some(address) => open_tcp(port, address).map(|port| (Line::new(port), Vec::new())),
+            Some(address) => open_tcp(names, port, address, go_on).map(|port| (Line::new(port), Vec::new())),
             None => open_serial(port, format, rs485),
         }
     }
@@ -215,13 +232,16 @@ fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {
     poll_until(fds, until).map_err(|error| Lost(error.to_string()))
 }
 
-fn open_tcp(port: &str, address: &str) -> Result<Port, OpenError> {
+fn open_tcp(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bool) -> Result<Port, OpenError> {
     let failed = |reason| OpenError::Tcp {
         port: port.to_string(),
         reason,
     };
-    let mut last = io::Error::new(io::ErrorKind::NotFound, "the name has no address");
-    for address in address.to_socket_addrs().map_err(failed)? {
+    let mut last = io::ErrorKind::Interrupted.into();
+    for address in names.addresses(address, go_on).map_err(failed)? {
+        if !go_on() {
+            break;
+        }
         match TcpStream::connect_timeout(&address, CONNECT_TIMEOUT) {
             Ok(stream) => {
                 stream.set_nodelay(true).map_err(failed)?;

@@ -270,3 +270,83 @@ fn a_reload_does_not_end_supervision() {
         (crate::process::point(http, "pump-1", "run") == false).then_some(())
     });
 }
+
+/// Leaves a process room for that many open files more; `None` takes the limit back.
+fn leave_room_for(pid: u32, more: Option<usize>) {
+    let open: Vec<u32> = std::fs::read_dir(format!("/proc/{pid}/fd"))
+        .unwrap()
+        .map(|entry| entry.unwrap().file_name().to_string_lossy().parse().unwrap())
+        .collect();
+    let free = (0..).filter(|number| !open.contains(number));
+    let limit = more.map_or(1024, |more| free.take(more).last().unwrap() + 1);
+    let (pid, limit) = (pid.to_string(), format!("--nofile={limit}:"));
+    run_well(&tool("prlimit"), &["--pid", &pid, &limit]);
+}
+
+#[test]
+fn a_reload_without_room_for_a_new_bus_changes_nothing() {
+    let folder = tempfile::tempdir().unwrap();
+    let _line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), "");
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    let text = std::fs::read_to_string(&file).unwrap();
+    let more: String = (2..10)
+        .map(|n| {
+            format!(
+                "[[bus]]\nname = \"line{n}\"\nport = \"/nowhere/line{n}\"\n[[bus.drive]]\nname = \"pump-{n}\"\n\
+                 address = {n}\nprofile = \"vacon-nx\"\n"
+            )
+        })
+        .collect();
+    // The bus that runs is another one, too: it must not be ended for one that never comes.
+    for silence in ["chars", "spec"] {
+        let old = text.replace("[modbus_tcp]", &format!("{more}[modbus_tcp]"));
+        std::fs::write(&file, old.replace("\"chars\"", &format!("\"{silence}\""))).unwrap();
+        let refused = gateway.output().matches("the new configuration is not taken").count();
+        leave_room_for(gateway.pid(), Some(3));
+        gateway.signal("HUP");
+        until("the refusal", || {
+            (gateway.output().matches("the new configuration is not taken").count() > refused).then_some(())
+        });
+        leave_room_for(gateway.pid(), None);
+        let log = gateway.output();
+        assert!(
+            log.contains("cannot start bus") && !log.contains("the bus ends"),
+            "{log}"
+        );
+        crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+        assert_eq!(api(http, "pump-1")["online"], true);
+        assert!(crate::process::point(http, "pump-1", "output_frequency").is_number());
+    }
+    gateway.signal("HUP");
+    gateway.until_printed("the new configuration is taken");
+    until("the bus with its new settings", || {
+        crate::process::mbpoll_write(modbus, 1, 33_024, &[0]).ok()
+    });
+}
+
+#[test]
+fn a_reload_carries_stale_after_to_the_buses_that_run() {
+    let folder = tempfile::tempdir().unwrap();
+    let _line = line(&folder.path().join("line1"));
+    let (file, _, http) = configure(folder.path(), "");
+    let slow = std::fs::read_to_string(&file)
+        .unwrap()
+        .replace("silence =", "cycle = \"2s\"\nsilence =");
+    std::fs::write(&file, &slow).unwrap();
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    let is_good = || crate::process::point(http, "pump-1", "output_frequency").is_number();
+    until("values", || is_good().then_some(()));
+    let written = slow.replace("[modbus_tcp]", "[modbus_tcp]\nstale_after = \"100ms\"");
+    std::fs::write(&file, written).unwrap();
+    gateway.signal("HUP");
+    until("stale values", || (!is_good()).then_some(()));
+    assert!(!gateway.output().contains("the bus ends"));
+    std::fs::write(&file, slow).unwrap();
+    let taken = || gateway.output().matches("the new configuration is taken").count();
+    gateway.signal("HUP");
+    until("the old file again", || (taken() == 2).then_some(()));
+    assert!(is_good(), "three rounds of this bus are six seconds");
+}

@@ -19,6 +19,7 @@ needed=(
     "tshark tshark"
     "chromium chromium"
     "systemd-analyze systemd"
+    "prlimit util-linux"
     "/usr/include/modbus/modbus.h libmodbus-dev"
 )
 cargo_deny=0.20.2
