@@ -137,6 +137,12 @@ struct Watch {
     receipt: Receipt,
 }
 
+impl Watch {
+    fn is_over(&self, now: Instant) -> bool {
+        now.saturating_duration_since(self.since) >= self.within
+    }
+}
+
 /// A command that showed no effect in time.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct NotConfirmed {
@@ -174,11 +180,11 @@ impl Confirmations {
         });
     }
 
-    /// A drive was read: what shows its effect now is confirmed.
+    /// A drive was read: what shows its effect now, in time, is confirmed.
     pub fn look(&mut self, drive: usize, reading: &Reading<'_>, now: Instant) {
         let mut index = 0;
         while let Some(watch) = self.0.get_mut(index) {
-            if watch.drive == drive {
+            if watch.drive == drive && !watch.is_over(now) {
                 let (since, speed) = (watch.since, watch.speed);
                 watch.effects.retain(|e| !shows(*e, reading, since, speed));
                 if watch.effects.is_empty() {
@@ -194,8 +200,8 @@ impl Confirmations {
     pub fn expire<'p>(&mut self, profile: impl Fn(usize) -> Option<&'p Profile>, now: Instant) -> Vec<NotConfirmed> {
         let mut told = Vec::new();
         self.0.retain(|watch| {
-            let waiting = now.saturating_duration_since(watch.since) < watch.within;
-            if !waiting {
+            let over = watch.is_over(now);
+            if over {
                 let missing: Vec<String> = profile(watch.drive)
                     .map(|p| watch.effects.iter().map(|e| e.missing(p)).collect())
                     .unwrap_or_default();
@@ -209,14 +215,14 @@ impl Confirmations {
                     ),
                 });
             }
-            waiting
+            !over
         });
         told
     }
 
-    /// Commands that are watched.
-    pub fn len(&self) -> usize {
-        self.0.len()
+    /// Waits for nothing any more: what was acknowledged stays so.
+    pub fn clear(&mut self) {
+        self.0.clear();
     }
 
     /// Whether none is watched.
@@ -347,6 +353,27 @@ mod tests {
         );
         bench.read(2100, &[2]);
         assert_eq!(bench.results(), ["confirmed", "confirmed"]);
+    }
+
+    #[test]
+    fn what_shows_too_late_is_not_confirmed() {
+        let mut bench = Bench::new();
+        bench.set("run", Value::Bool(true));
+        bench.now += Duration::from_secs(2);
+        bench.read(2100, &[2]);
+        assert!(bench.results().is_empty());
+        assert_eq!(bench.expired().len(), 1);
+        assert_eq!(bench.results(), ["acknowledged"]);
+    }
+
+    #[test]
+    fn what_is_not_waited_for_any_more_stays_acknowledged() {
+        let mut bench = Bench::new();
+        bench.set("run", Value::Bool(true));
+        bench.confirmations.clear();
+        assert_eq!(bench.results(), ["acknowledged"]);
+        bench.read(2100, &[2]);
+        assert!(bench.expired().is_empty() && bench.results().len() == 1);
     }
 
     #[test]

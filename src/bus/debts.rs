@@ -9,10 +9,14 @@
 //! little slower than the deadline stays one reply behind as long as the same request follows upon itself. So while a
 //! look-alike waits, the request that is in debt is held back too after a while: the drive gets the time to pay.
 //!
-//! A write acknowledged late is worth nothing once another write to that drive was acknowledged in between: the same
+//! A write acknowledged late is worth nothing once the drive may have taken another write in between: the same
 //! write then waits as a look-alike does. A stop does not wait. So the first acknowledgement of such a stop proves nothing:
 //! it may be that of the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
-//! acknowledged in between, either acknowledgement tells the truth: the drive's last word is a stop.
+//! written in between, either acknowledgement tells the truth: the drive's last word is a stop.
+//!
+//! Nor does a stop wait for look-alikes. The acknowledgement of a write of several registers or coils has first address and
+//! count, not the values. So a stop by such a write is sent once more for each acknowledgement of another one that may
+//! still come. From then on it is the stop that owes an acknowledgement, in place of the other write.
 
 use std::time::{Duration, Instant};
 
@@ -22,6 +26,8 @@ use crate::codec::RequestPdu;
 const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
 /// A look-alike waits no longer than that before the request in debt is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
+/// No more tries of one write than that are acknowledged late: neither the drive nor what is before it keeps more.
+const KEPT: u32 = 3;
 
 /// What the drives of a bus owe.
 #[derive(Debug, Default)]
@@ -44,18 +50,34 @@ struct Debt {
     newer: Option<Instant>,
     /// Since when a look-alike waits.
     wanted: Option<Instant>,
-    /// Another write was acknowledged meanwhile.
-    overtaken: bool,
+    /// Replies that may still come.
+    unpaid: u32,
+    /// How many of them are of tries before another write, which the drive may have taken.
+    overtaken: u32,
 }
 
 impl Debt {
+    fn new(drive: usize, pdu: &RequestPdu, began: Instant, until: Instant) -> Debt {
+        Debt {
+            drive,
+            pdu: pdu.clone(),
+            since: Some(began),
+            until,
+            late: Duration::ZERO,
+            newer: None,
+            wanted: None,
+            unpaid: 1,
+            overtaken: 0,
+        }
+    }
+
     fn ends(&self) -> Instant {
         self.newer.map_or(self.until, |newer| newer.max(self.until))
     }
 
     fn blocks(&self, pdu: &RequestPdu, now: Instant) -> bool {
         if self.pdu == *pdu {
-            self.overtaken || self.wanted.is_some_and(|since| now >= since + PATIENCE)
+            self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
         } else {
             Look::of(&self.pdu) == Look::of(pdu)
         }
@@ -66,27 +88,25 @@ impl Debts {
     /// No believable answer to `pdu` came in an exchange from `began` to `now`.
     pub fn given_up(&mut self, drive: usize, pdu: &RequestPdu, began: Instant, now: Instant) {
         self.owed.retain(|debt| debt.ends() > now);
+        self.overtake(drive, pdu);
         let until = now + FORGOTTEN_AFTER;
-        match self
-            .owed
-            .iter_mut()
-            .find(|debt| debt.drive == drive && debt.pdu == *pdu)
-        {
+        match self.of(drive, pdu) {
             Some(debt) => {
                 debt.until = until;
                 debt.since.get_or_insert(began);
+                // Reads tell the truth in any order.
+                if pdu.is_write() {
+                    debt.unpaid = (debt.unpaid + 1).min(KEPT);
+                }
             }
-            None => self.owed.push(Debt {
-                drive,
-                pdu: pdu.clone(),
-                since: Some(began),
-                until,
-                late: Duration::ZERO,
-                newer: None,
-                wanted: None,
-                overtaken: false,
-            }),
+            None => self.owed.push(Debt::new(drive, pdu, began, until)),
         }
+    }
+
+    fn of(&mut self, drive: usize, pdu: &RequestPdu) -> Option<&mut Debt> {
+        self.owed
+            .iter_mut()
+            .find(|debt| debt.drive == drive && debt.pdu == *pdu)
     }
 
     /// An answer to `pdu` came.
@@ -100,20 +120,43 @@ impl Debts {
                     debt.late = now.saturating_duration_since(since).max(debt.late).min(FORGOTTEN_AFTER);
                 }
                 debt.newer = Some(now + debt.late);
-            } else if pdu.is_write() && debt.pdu.is_write() {
-                debt.overtaken = true;
             }
+        }
+        self.overtake(drive, pdu);
+    }
+
+    /// The drive may have taken `pdu`: an acknowledgement of another write from before does not tell how it is now.
+    fn overtake(&mut self, drive: usize, pdu: &RequestPdu) {
+        let others = self
+            .owed
+            .iter_mut()
+            .filter(|debt| debt.drive == drive && debt.pdu != *pdu);
+        for debt in others.filter(|debt| pdu.is_write() && debt.pdu.is_write()) {
+            debt.overtaken = debt.unpaid;
         }
     }
 
-    /// Whether an acknowledgement of `pdu` may be that of an earlier one that another write has overtaken. To be asked
-    /// before [`Debts::answered`]; told once, for the drive owes that acknowledgement no more.
-    pub fn proves_nothing(&mut self, drive: usize, pdu: &RequestPdu, sent: Instant) -> bool {
-        let of = |debt: &&mut Debt| debt.drive == drive && debt.pdu == *pdu && debt.ends() > sent;
-        self.owed
-            .iter_mut()
-            .find(of)
-            .is_some_and(|debt| std::mem::take(&mut debt.overtaken))
+    /// Whether the reply to `pdu`, sent at `sent`, may be that to an earlier request: to another one that looks the same,
+    /// or to the same write before another one. To be asked before [`Debts::answered`]; told once for each
+    /// reply that is owed, and `pdu`, which is to be sent once more, owes one in its place.
+    pub fn proves_nothing(&mut self, drive: usize, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
+        let owed = |debt: &Debt| debt.drive == drive && debt.ends() > sent;
+        let same = |debt: &&mut Debt| owed(debt) && debt.pdu == *pdu && debt.overtaken > 0;
+        if let Some(debt) = self.owed.iter_mut().find(same) {
+            debt.overtaken -= 1;
+            return true;
+        }
+        let alike = |debt: &Debt| owed(debt) && debt.pdu != *pdu && Look::of(&debt.pdu) == Look::of(pdu);
+        let Some(index) = self.owed.iter().position(alike) else {
+            return false;
+        };
+        if let Some(debt) = self.owed.get_mut(index).filter(|debt| debt.unpaid > 1) {
+            debt.unpaid -= 1;
+        } else {
+            self.owed.swap_remove(index);
+        }
+        self.given_up(drive, pdu, sent, now);
+        true
     }
 
     /// Whether the last reply, if it came once more, could pass for the reply to `pdu`.
@@ -329,17 +372,81 @@ mod tests {
         let (stop, run) = (write(0), write(1));
         let mut debts = Debts::default();
         debts.given_up(0, &stop, now - DEADLINE, now);
-        assert!(!debts.proves_nothing(0, &stop, now), "nothing came in between");
+        assert!(!debts.proves_nothing(0, &stop, now, now), "nothing came in between");
         debts.answered(0, &run, now);
-        assert!(!debts.proves_nothing(1, &stop, now) && !debts.proves_nothing(0, &run, now));
-        assert!(debts.proves_nothing(0, &stop, now));
+        assert!(!debts.proves_nothing(1, &stop, now, now) && !debts.proves_nothing(0, &run, now, now));
+        assert!(debts.proves_nothing(0, &stop, now, now));
         debts.answered(0, &stop, now);
-        assert!(!debts.proves_nothing(0, &stop, now), "the second one counts");
+        assert!(!debts.proves_nothing(0, &stop, now, now), "the second one counts");
         debts.answered(0, &stop, now);
         assert_eq!(debts.blocks(0, &run, now), None);
         // Forgotten: it will not come any more.
         debts.given_up(0, &stop, now - DEADLINE, now);
         debts.answered(0, &run, now);
-        assert!(!debts.proves_nothing(0, &stop, now + FORGOTTEN_AFTER));
+        let later = now + FORGOTTEN_AFTER;
+        assert!(!debts.proves_nothing(0, &stop, later, later));
+    }
+
+    #[test]
+    fn an_acknowledgement_that_may_be_that_of_a_look_alike_proves_nothing() {
+        let now = Instant::now();
+        let registers = |value| RequestPdu::WriteRegisters {
+            start: 2000,
+            values: vec![value, 0],
+        };
+        let coils = |on| RequestPdu::WriteCoils {
+            start: 0,
+            bits: vec![on, false],
+        };
+        for (run, stop) in [(registers(1), registers(0)), (coils(true), coils(false))] {
+            let mut debts = Debts::default();
+            debts.given_up(0, &run, now - DEADLINE, now);
+            assert!(!debts.proves_nothing(1, &stop, now, now), "another drive");
+            assert!(debts.proves_nothing(0, &stop, now, now));
+            assert!(!debts.proves_nothing(0, &stop, now, now), "the second one counts");
+            debts.answered(0, &stop, now);
+            // The stop went out twice and was acknowledged once.
+            assert!(debts.blocks(0, &run, now).is_some());
+            let later = now + FORGOTTEN_AFTER;
+            assert_eq!(debts.blocks(0, &run, later), None);
+
+            debts.given_up(0, &run, later, later);
+            debts.given_up(0, &run, later, later);
+            assert!(debts.proves_nothing(0, &stop, later, later) && debts.proves_nothing(0, &stop, later, later));
+            assert!(!debts.proves_nothing(0, &stop, later, later), "one for each try");
+            let forgotten = later + FORGOTTEN_AFTER;
+            debts.given_up(0, &run, later, later);
+            assert!(!debts.proves_nothing(0, &stop, forgotten, forgotten));
+        }
+    }
+
+    #[test]
+    fn a_drive_that_never_answers_does_not_hold_up_a_stop() {
+        let now = Instant::now();
+        let write = |value| RequestPdu::WriteRegisters {
+            start: 2000,
+            values: vec![value],
+        };
+        let mut debts = Debts::default();
+        for _ in 0..100 {
+            debts.given_up(0, &write(1), now - DEADLINE, now);
+            debts.given_up(0, &read(1500, 1), now - DEADLINE, now);
+        }
+        let doubts = |debts: &mut Debts, pdu: &RequestPdu| {
+            (0..100).take_while(|_| debts.proves_nothing(0, pdu, now, now)).count()
+        };
+        assert_eq!(doubts(&mut debts, &write(0)), 3);
+        assert_eq!(doubts(&mut debts, &read(2000, 1)), 1);
+    }
+
+    #[test]
+    fn a_write_that_was_not_answered_may_have_been_taken_all_the_same() {
+        let now = Instant::now();
+        let write = |value| RequestPdu::WriteRegister { address: 2000, value };
+        let mut debts = Debts::default();
+        debts.given_up(0, &write(0), now - DEADLINE, now);
+        debts.given_up(0, &write(1), now - DEADLINE, now);
+        assert!(debts.proves_nothing(0, &write(0), now, now));
+        assert!(!debts.proves_nothing(0, &write(0), now, now));
     }
 }

@@ -10,11 +10,13 @@ use super::schedule::{Decision, Poll, Schedule};
 use super::transaction::Ended;
 use crate::cache::DriveImage;
 use crate::codec::RequestPdu;
-use crate::command::{Command, Outcome, Pending, Urgency};
+use crate::command::{CAPACITY, Command, Order, Outcome, Pending, Urgency};
 use crate::drive::ModelPoint;
 
-/// Commands begun at one time (a reset pulse is held while others go on).
+/// Commands begun at one time (a reset pulse is held while others go on), those apart that wait for a late reply.
 pub const BEGUN: usize = 8;
+/// Begun commands of one drive that wait for a late reply; at that many, no further one that may need one is begun.
+const HELD: usize = 2;
 /// A status older than this does not tell whether the motor runs.
 const FRESH: Duration = Duration::from_secs(2);
 
@@ -46,6 +48,36 @@ pub struct Desk {
 /// The begun command that goes on next: rank, place, request.
 type Ready = (Urgency, usize, RequestPdu);
 
+/// Begun commands that wait for a late reply: they must not hold up the commands of other drives.
+#[derive(Debug, Default)]
+struct Held {
+    /// The drive of each.
+    drives: Vec<usize>,
+    /// Begun commands that do not wait for one.
+    others: usize,
+    /// When the first of those that were not admitted for a late reply's sake may be.
+    until: Option<Instant>,
+}
+
+impl Held {
+    /// Whether a command may be begun now. A stop always is.
+    fn admits(&mut self, command: &Command, debts: &mut Debts, now: Instant) -> bool {
+        if command.urgency == Urgency::Stop {
+            return true;
+        }
+        if let Order::Read(pdu) | Order::Write(pdu) = &command.order
+            && let Some(until) = debts.blocks(command.drive, pdu, now)
+        {
+            self.until = Some(self.until.map_or(until, |at| at.min(until)));
+            return false;
+        }
+        // What else such a command needs, if it is to be asked for first, shows when it is begun.
+        let of_drive = self.drives.iter().filter(|drive| **drive == command.drive).count();
+        let room = self.others < BEGUN && self.drives.len() < CAPACITY;
+        room && (of_drive < HELD || !matches!(command.order, Order::Points(_)))
+    }
+}
+
 impl Desk {
     /// What goes on the line next, or until when nothing does (`now`: decide anew).
     ///
@@ -61,10 +93,9 @@ impl Desk {
         for drive in pending.take_stopped() {
             self.purge(drive, now);
         }
-        let (begun, mut wake_at) = self.begun_next(drives, now);
-        let queued = pending.next_urgency(now);
-        // A full hand of begun commands takes only a stop besides.
-        let queued = queued.filter(|u| self.begun.len() < BEGUN || *u == Urgency::Stop);
+        let (begun, mut held, mut wake_at) = self.begun_next(drives, now);
+        let queued = pending.next_urgency(now, |c| held.admits(c, &mut self.debts, now));
+        wake_at = [wake_at, held.until].into_iter().flatten().min();
         let waiting = [begun.as_ref().map(|(u, _, _)| *u), queued].into_iter().flatten().min();
         match schedule.next(now, waiting) {
             Decision::Poll(poll) => match self.debts.blocks(poll.drive, &poll.read.pdu(), now) {
@@ -81,7 +112,7 @@ impl Desk {
             Decision::Command(urgency) => match begun {
                 Some((of_begun, index, pdu)) if queued.is_none_or(|q| of_begun <= q) => Ok(Job::Command { index, pdu }),
                 _ => {
-                    if let Some(command) = pending.pop(urgency, now) {
+                    if let Some(command) = pending.pop_of(urgency, now, |c| held.admits(c, &mut self.debts, now)) {
                         let online = schedule.is_online(command.drive);
                         self.begin(command, drives, online, now);
                     }
@@ -93,8 +124,9 @@ impl Desk {
     }
 
     /// The begun command that can go on, of the highest rank; else when one can.
-    fn begun_next(&mut self, drives: &[Arc<DriveImage>], now: Instant) -> (Option<Ready>, Option<Instant>) {
+    fn begun_next(&mut self, drives: &[Arc<DriveImage>], now: Instant) -> (Option<Ready>, Held, Option<Instant>) {
         let mut best: Option<Ready> = None;
+        let mut held = Held::default();
         let mut wake_at: Option<Instant> = None;
         let mut index = 0;
         while let Some(execution) = self.begun.get_mut(index) {
@@ -110,6 +142,7 @@ impl Desk {
                     // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
                     let blocked = self.debts.blocks(execution.drive, &pdu, now);
                     if let Some(until) = blocked.filter(|_| execution.urgency != Urgency::Stop) {
+                        held.drives.push(execution.drive);
                         wake_at = Some(wake_at.map_or(until, |at| at.min(until)));
                     } else if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
                         best = Some((execution.urgency, index, pdu));
@@ -126,7 +159,8 @@ impl Desk {
             }
             index += 1;
         }
-        (best, wake_at)
+        held.others = self.begun.len().saturating_sub(held.drives.len());
+        (best, held, wake_at)
     }
 
     /// Begins a command that was taken from the queue.
@@ -162,11 +196,21 @@ impl Desk {
         self.begun.get(index).is_some_and(|e| e.is_late(now))
     }
 
-    /// The acknowledgement of a step may be that of an earlier request: the step is done once more.
-    pub fn doubted(&mut self, index: usize) {
-        if let Some(execution) = self.begun.get_mut(index) {
+    /// The drive answered a step that was sent at `sent`, refusals apart. Whether that is believed: the reply to a stop,
+    /// which waits for nobody, may be that to an earlier request (`strayed`: known from elsewhere). The step is done once
+    /// more then.
+    pub fn believes(&mut self, index: usize, pdu: &RequestPdu, strayed: bool, sent: Instant, now: Instant) -> bool {
+        let Some(execution) = self.begun.get_mut(index) else {
+            return true;
+        };
+        let drive = execution.drive;
+        let stray = pdu.is_write() && strayed;
+        let believed = !stray && !self.debts.proves_nothing(drive, pdu, sent, now);
+        if !believed && pdu.is_write() {
             execution.doubted();
         }
+        self.debts.answered(drive, pdu, now);
+        believed
     }
 
     /// A step of a begun command is over: with the drive's reply, or without one to be believed.
@@ -227,16 +271,7 @@ impl Desk {
         for execution in self.begun.drain(..) {
             execution.finish(outcome.clone(), now);
         }
-    }
-
-    /// Commands begun and not over yet.
-    pub fn len(&self) -> usize {
-        self.begun.len()
-    }
-
-    /// Whether none is begun.
-    pub fn is_empty(&self) -> bool {
-        self.begun.is_empty()
+        self.confirmations.clear();
     }
 }
 

@@ -208,7 +208,7 @@ impl Report {
     }
 
     /// Faults that came or went with the last poll.
-    pub(super) fn look(&mut self, index: usize, _began: Instant) {
+    pub(super) fn look(&mut self, index: usize) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };

@@ -99,18 +99,32 @@ impl Pending {
         std::mem::take(&mut self.stopped)
     }
 
-    /// Rank of the command that would come next, expired ones answered and removed.
-    pub fn next_urgency(&mut self, now: Instant) -> Option<Urgency> {
+    /// Rank of the command that would come next of those that `may`, expired ones answered and removed.
+    pub fn next_urgency(&mut self, now: Instant, mut may: impl FnMut(&Command) -> bool) -> Option<Urgency> {
         self.remove(now, &Outcome::Expired, |c| c.expires <= now);
-        self.waiting.iter().map(|c| c.urgency).min()
+        self.waiting.iter().filter(|c| may(c)).map(|c| c.urgency).min()
     }
 
     /// Takes the next command of at least that rank: of the highest rank, the oldest of the client that was served
     /// longest ago.
     pub fn pop(&mut self, at_least: Urgency, now: Instant) -> Option<Command> {
-        let urgency = self.next_urgency(now).filter(|u| *u <= at_least)?;
+        self.pop_of(at_least, now, |_| true)
+    }
+
+    /// As [`Pending::pop`], of those that `may`.
+    pub fn pop_of(
+        &mut self,
+        at_least: Urgency,
+        now: Instant,
+        mut may: impl FnMut(&Command) -> bool,
+    ) -> Option<Command> {
+        let urgency = self.next_urgency(now, &mut may).filter(|u| *u <= at_least)?;
         let served = |c: &Command| self.served.iter().position(|s| s == c.ticket.client());
-        let of_rank = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency == urgency);
+        let of_rank = self
+            .waiting
+            .iter()
+            .enumerate()
+            .filter(|(_, c)| c.urgency == urgency && may(c));
         // `None`, never served, comes before any place.
         let (index, _) = of_rank.min_by_key(|(index, c)| (served(c), *index))?;
         let command = self.waiting.remove(index)?;

@@ -10,7 +10,7 @@ use super::*;
 use crate::bus::schedule::{Cadence, Change, Polled};
 use crate::cache::{Access, DriveSpec, Link};
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{Answer, CAPACITY, CommandQueue, Order, Origin, SourceKind, Ticket, WriteStats, admit};
+use crate::command::{Answer, CommandQueue, Origin, SourceKind, Ticket, WriteStats, admit, written};
 use crate::drive::profile::Profiles;
 use crate::drive::{Plan, Profile, Value};
 
@@ -26,7 +26,30 @@ enum Line {
     Exception,
     /// The drive does as it is told, the answer is lost.
     AnswerLost,
+    /// The drive does as it is told; the acknowledgement of a write comes when it is not waited for any more.
+    AnswerLate,
     RequestLost,
+}
+
+/// An acknowledgement that is under way.
+#[derive(Debug)]
+struct Late {
+    drive: usize,
+    pdu: RequestPdu,
+    sent: Instant,
+    /// It comes before then, or not at all.
+    until: Instant,
+}
+
+/// Whether both writes are acknowledged by the same bytes.
+fn look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
+    match (a, b) {
+        (
+            RequestPdu::WriteRegisters { start: a, values: of_a },
+            RequestPdu::WriteRegisters { start: b, values: of_b },
+        ) => a == b && of_a.len() == of_b.len(),
+        _ => a == b,
+    }
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -39,6 +62,9 @@ enum Kind {
     Reverse,
     RawRun,
     RawStop,
+    /// By function 16.
+    RawRuns,
+    RawStops,
     RawRead,
 }
 
@@ -67,6 +93,8 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
         Just(Kind::Reverse),
         Just(Kind::RawRun),
         Just(Kind::RawStop),
+        Just(Kind::RawRuns),
+        Just(Kind::RawStops),
         Just(Kind::RawRead),
     ];
     let command = (0u8..4, 0..DRIVES, kind, 1u64..400);
@@ -80,6 +108,7 @@ fn steps() -> impl Strategy<Value = Vec<Step>> {
         8 => Just(Line::Good),
         1 => Just(Line::Exception),
         1 => Just(Line::AnswerLost),
+        2 => Just(Line::AnswerLate),
         1 => Just(Line::RequestLost),
     ];
     let step = prop_oneof![
@@ -108,6 +137,7 @@ struct Model {
     may_run: Vec<Option<Instant>>,
     /// Until when each reference may go out: references are told apart by their values.
     references: BTreeMap<u16, Instant>,
+    late: Vec<Late>,
     answers: Vec<Receiver<Answer>>,
     writes: u64,
 }
@@ -143,6 +173,7 @@ impl Model {
             words: vec![BTreeMap::from([(CONTROL, 0), (REFERENCE, 0)]); DRIVES],
             may_run: vec![None; DRIVES],
             references: BTreeMap::new(),
+            late: Vec::new(),
             answers: Vec::new(),
             writes: 0,
             drives,
@@ -165,6 +196,12 @@ impl Model {
                 value,
             })
         };
+        let raws = |value: u16| {
+            Order::Write(RequestPdu::WriteRegisters {
+                start: CONTROL,
+                values: vec![value, 0],
+            })
+        };
         let order = match kind {
             Kind::Run => Order::Points(vec![run(true)]),
             Kind::Stop => Order::Points(vec![run(false)]),
@@ -174,6 +211,8 @@ impl Model {
             Kind::Reverse => Order::Points(vec![(self.point("reverse"), Value::Bool(true))]),
             Kind::RawRun => raw(1),
             Kind::RawStop => raw(0),
+            Kind::RawRuns => raws(1),
+            Kind::RawStops => raws(0),
             Kind::RawRead => Order::Read(RequestPdu::Read {
                 table: Table::Holding,
                 start: 1500,
@@ -196,8 +235,8 @@ impl Model {
         let offline = !reading.snapshot.link.is_online();
         match kind {
             _ if offline => {}
-            Kind::Stop | Kind::RawStop => self.may_run[drive] = None,
-            Kind::Run | Kind::RunAtReference | Kind::RawRun => {
+            Kind::Stop | Kind::RawStop | Kind::RawStops => self.may_run[drive] = None,
+            Kind::Run | Kind::RunAtReference | Kind::RawRun | Kind::RawRuns => {
                 self.may_run[drive] = self.may_run[drive].max(Some(expires));
             }
             _ => {}
@@ -225,25 +264,24 @@ impl Model {
                     .map(|i| self.words[drive].get(&(start + i)).copied().unwrap_or(0))
                     .collect(),
             ),
-            RequestPdu::WriteRegister { address, value } => {
-                self.words[drive].insert(*address, *value);
+            other => {
+                let (_, items) = written(other).expect("a read or a write");
+                self.words[drive].extend(items);
                 Reply::Written
             }
-            other => panic!("nobody asked for {other:?}"),
         }
     }
 
     /// What must hold of all that goes out.
     fn check(&self, drive: usize, pdu: &RequestPdu) {
-        let RequestPdu::WriteRegister { address, value } = pdu else {
-            return;
-        };
-        if *address == CONTROL && value & 1 == 1 && self.words[drive][&CONTROL] & 1 == 0 {
-            let until = self.may_run[drive].expect("a run went out behind a stop");
-            assert!(self.now < until, "an expired run went out");
-        }
-        if *address == REFERENCE {
-            assert!(self.now < self.references[value], "an expired reference went out");
+        for (address, value) in written(pdu).map(|(_, items)| items).unwrap_or_default() {
+            if address == CONTROL && value & 1 == 1 && self.words[drive][&CONTROL] & 1 == 0 {
+                let until = self.may_run[drive].expect("a run went out behind a stop");
+                assert!(self.now < until, "an expired run went out");
+            }
+            if address == REFERENCE {
+                assert!(self.now < self.references[&value], "an expired reference went out");
+            }
         }
     }
 
@@ -255,7 +293,7 @@ impl Model {
             let decided = self
                 .desk
                 .decide(&self.drives, &mut self.queue.lock(), &mut self.schedule, self.now);
-            assert!(self.desk.len() <= BEGUN + CAPACITY && self.queue.lock().len() <= CAPACITY);
+            assert!(self.desk.begun.len() <= BEGUN + CAPACITY && self.queue.lock().len() <= CAPACITY);
             match decided {
                 Err(until) if until <= self.now => {}
                 Err(until) => {
@@ -277,34 +315,74 @@ impl Model {
             Job::Command { index, pdu } => (self.desk.begun(*index).unwrap().0, pdu.clone()),
         };
         self.check(drive, &pdu);
-        let reply = match line {
-            Line::Good => Some(self.drive_does(drive, &pdu)),
-            Line::Exception => Some(Reply::Exception(Exception::BUSY)),
-            Line::AnswerLost => {
-                self.drive_does(drive, &pdu);
-                None
-            }
-            Line::RequestLost => None,
-        };
         let began = self.now;
+        let reply = self.on_the_line(drive, &pdu, line);
         let took = Duration::from_millis(if reply.is_some() { 5 } else { 50 });
         self.now += took;
-        match &reply {
-            None => self.desk.debts.given_up(drive, &pdu, began, self.now),
-            Some(Reply::Exception(_)) => {}
-            Some(_) => self.desk.debts.answered(drive, &pdu, self.now),
-        }
+        let answered = match &reply {
+            None => {
+                self.desk.debts.given_up(drive, &pdu, began, self.now);
+                false
+            }
+            Some(reply) => !matches!(reply, Reply::Exception(_)),
+        };
         match job {
-            Job::Poll(poll) => self.polled(&poll, reply, took),
+            Job::Poll(poll) => {
+                if answered {
+                    self.desk.debts.answered(drive, &pdu, self.now);
+                }
+                self.polled(&poll, reply, took);
+            }
             Job::Command { index, pdu } => {
                 let urgency = self.desk.begun(index).unwrap().1;
                 self.schedule.command_done(urgency, took);
+                if answered && !self.desk.believes(index, &pdu, false, began, self.now) {
+                    return;
+                }
+                for (address, value) in written(&pdu).filter(|_| answered).map(|w| w.1).unwrap_or_default() {
+                    assert_eq!(self.words[drive][&address], value, "what was acknowledged was done");
+                }
                 let ended = reply.map_or(Ended::Silent, Ended::Reply);
                 self.desk.ended(index, &pdu, ended, RETRIES, &self.drives, self.now);
             }
         }
         self.desk.look(drive, &self.drives, self.now);
         self.desk.not_confirmed(&self.drives, self.now);
+    }
+
+    /// What comes back for a request: its own reply, or an acknowledgement that comes late and looks the same.
+    fn on_the_line(&mut self, drive: usize, pdu: &RequestPdu, line: Line) -> Option<Reply> {
+        let now = self.now;
+        self.late.retain(|late| late.until > now);
+        let alike = |late: &Late| late.drive == drive && look_alike(&late.pdu, pdu);
+        let older = self.late.iter().position(alike).map(|index| self.late.remove(index));
+        let heard = !matches!(line, Line::Exception | Line::RequestLost);
+        let own = heard.then(|| self.drive_does(drive, pdu));
+        let wait = match (&older, line) {
+            // Each reply is as late as the one before.
+            (Some(older), Line::Good) => now - older.sent,
+            (_, Line::AnswerLate) => Duration::from_secs(1),
+            _ => Duration::ZERO,
+        };
+        let kept = self
+            .late
+            .iter()
+            .filter(|late| late.drive == drive && late.pdu == *pdu)
+            .count();
+        if pdu.is_write() && !wait.is_zero() && kept < 3 {
+            self.late.push(Late {
+                drive,
+                pdu: pdu.clone(),
+                sent: now,
+                until: now + wait.min(Duration::from_secs(1)),
+            });
+        }
+        match line {
+            _ if older.is_some() => Some(Reply::Written),
+            Line::Good => own,
+            Line::Exception => Some(Reply::Exception(Exception::BUSY)),
+            Line::AnswerLost | Line::AnswerLate | Line::RequestLost => None,
+        }
     }
 
     fn polled(&mut self, poll: &Poll, reply: Option<Reply>, took: Duration) {
@@ -348,6 +426,8 @@ impl Model {
         }
         self.queue.close(Outcome::BusDown, self.now);
         self.desk.close(&Outcome::BusDown, self.now);
+        let told = self.stats.results().values().sum::<u64>();
+        assert_eq!(told, self.writes, "nobody waits for a drive that is away");
         for index in 0..DRIVES {
             self.desk.shadow.forget(index);
             self.drives[index].update(|s| s.link = Link::Offline(std::time::SystemTime::UNIX_EPOCH));
@@ -430,4 +510,75 @@ fn an_unanswered_stop_is_not_undone_by_a_bit_of_another_client() {
     }
     assert_eq!(model.words[0][&CONTROL], 2, "reverse is set, run stays away");
     model.end();
+}
+
+#[test]
+fn a_stop_is_not_acknowledged_by_the_late_answer_to_another_write() {
+    let mut model = Model::new();
+    for _ in 0..60 {
+        model.exchange(Line::Good);
+    }
+    let expiry = Duration::from_secs(2);
+    model.command(0, 0, Kind::RawRuns, expiry);
+    while model.late.is_empty() {
+        model.exchange(Line::AnswerLate);
+    }
+    model.command(1, 0, Kind::RawStops, expiry);
+    // The drive is busy and does not hear it; what comes is the answer to the run.
+    while !model.late.is_empty() {
+        model.exchange(Line::RequestLost);
+    }
+    assert_eq!(model.words[0][&CONTROL], 1);
+    for _ in 0..4 {
+        model.exchange(Line::Good);
+    }
+    assert_eq!(model.words[0][&CONTROL], 0);
+    model.end();
+}
+
+/// A drive owes a reply, and twelve commands of one client wait for that: those of another drive go on.
+#[test]
+fn what_waits_for_one_drive_does_not_hold_up_another() {
+    for kind in [Kind::RawRead, Kind::Reverse, Kind::RawRuns] {
+        let mut model = Model::new();
+        for _ in 0..60 {
+            model.exchange(Line::Good);
+        }
+        let owed = [
+            RequestPdu::Read {
+                table: Table::Holding,
+                start: 1400,
+                count: 1,
+            },
+            RequestPdu::WriteRegisters {
+                start: CONTROL,
+                values: vec![0, 1],
+            },
+        ];
+        for pdu in &owed {
+            model.desk.debts.given_up(0, pdu, model.now, model.now);
+        }
+        model.desk.shadow.forget(0);
+        let expiry = Duration::from_secs(3);
+        for _ in 0..12 {
+            model.command(0, 0, kind, expiry);
+        }
+        for _ in 0..12 {
+            model.exchange(Line::Good);
+        }
+        let began = model.now;
+        model.command(1, 1, Kind::RawRun, expiry);
+        while model.words[1][&CONTROL] == 0 {
+            model.exchange(Line::Good);
+            assert!(model.now < began + Duration::from_millis(50), "behind {kind:?}");
+        }
+        // They are not forgotten either.
+        let due = began + Duration::from_secs(2);
+        while model.now < due {
+            model.exchange(Line::Good);
+        }
+        for answer in &mut model.answers {
+            assert!(answer.try_recv().is_ok(), "{kind:?}");
+        }
+    }
 }

@@ -108,7 +108,7 @@ impl Worker {
             Change::None => {}
         }
         if matches!(ended, Ended::Reply(_)) {
-            self.report.look(poll.drive, began);
+            self.report.look(poll.drive);
             self.report.look_at_supervision(poll.drive);
             self.desk.look(poll.drive, &self.handle.image.drives, now);
         }
@@ -154,17 +154,10 @@ impl Worker {
             }
             Ended::Reply(reply) => {
                 self.schedule.seen(drive);
-                let acknowledged = !matches!(reply, Reply::Exception(_));
-                let late = urgency == Urgency::Stop && self.sessions.doubts_stop(drive);
-                let late = late || self.desk.debts.proves_nothing(drive, pdu, began);
-                if acknowledged && pdu.is_write() && late {
-                    // It goes out once more.
-                    self.desk.doubted(index);
-                    self.desk.debts.answered(drive, pdu, now);
+                let strayed = urgency == Urgency::Stop && self.sessions.doubts_stop(drive);
+                let refused = matches!(reply, Reply::Exception(_));
+                if !refused && !self.desk.believes(index, pdu, strayed, began, now) {
                     return;
-                }
-                if acknowledged {
-                    self.desk.debts.answered(drive, pdu, now);
                 }
             }
             Ended::Silent | Ended::Corrupt(_) => self.owes(drive, pdu, began, now),
