@@ -144,7 +144,7 @@ fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     assert_eq!(bench.told(), 1);
 }
 
-/// What a command writes to a drive whose words are all zero: the point that takes it, and its value there.
+/// What a command writes to a drive that has the run command: the point that takes it, and its value there.
 fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Value)> {
     let mut execution = Execution::new(command, profile);
     let (mut shadow, mut now, mut sets) = (Shadow::default(), now, Vec::new());
@@ -158,9 +158,11 @@ fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Val
             Next::Send(pdu) => pdu,
         };
         let reply = match &pdu {
-            RequestPdu::Read { table, count, .. } if matches!(table, Table::Coil | Table::DiscreteInput) => {
-                Reply::Bits(vec![true; usize::from(*count)])
-            }
+            RequestPdu::Read {
+                table: Table::Coil | Table::DiscreteInput,
+                count,
+                ..
+            } => Reply::Bits(vec![true; usize::from(*count)]),
             // The run command is set wherever it is, so that a stop has something to take away.
             RequestPdu::Read { count, .. } => Reply::Registers(vec![0x0003; usize::from(*count)]),
             RequestPdu::N2(Session::Release { .. }) => Reply::Written,
