@@ -362,7 +362,7 @@ impl Model {
         let own = heard.then(|| self.drive_does(drive, pdu));
         let wait = match (&older, line) {
             // Each reply is as late as the one before.
-            (Some(older), Line::Good) => now - older.sent,
+            (Some(older), Line::Good | Line::AnswerLate) => now - older.sent,
             (_, Line::AnswerLate) => Duration::from_secs(1),
             _ => Duration::ZERO,
         };
