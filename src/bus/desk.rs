@@ -132,7 +132,7 @@ impl Desk {
         while let Some(execution) = self.begun.get_mut(index) {
             let Some(drive) = drives.get(execution.drive) else {
                 self.begun.remove(index).finish(Outcome::Offline, now);
-                continue;
+                return self.begun_next(drives, now);
             };
             let reading = drive.reading(now, FRESH);
             // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
@@ -142,8 +142,11 @@ impl Desk {
                     // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
                     let blocked = self.debts.blocks(execution.drive, &pdu, now);
                     if let Some(until) = blocked.filter(|_| execution.urgency != Urgency::Stop) {
+                        execution.held_up();
                         held.drives.push(execution.drive);
                         wake_at = Some(wake_at.map_or(until, |at| at.min(until)));
+                    } else if execution.asks_again() {
+                        continue;
                     } else if best.as_ref().is_none_or(|(urgency, _, _)| execution.urgency < *urgency) {
                         best = Some((execution.urgency, index, pdu));
                     }
@@ -151,10 +154,10 @@ impl Desk {
                 Next::Wait(until) => wake_at = Some(wake_at.map_or(until, |at| at.min(until))),
                 Next::Done => {
                     let outcome = execution.success();
-                    // Only later places move, `best` is before them.
                     let execution = self.begun.remove(index);
                     self.end(execution, outcome, drives, now);
-                    continue;
+                    // What was decided so far may rest on words that are not known any more.
+                    return self.begun_next(drives, now);
                 }
             }
             index += 1;

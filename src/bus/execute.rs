@@ -58,6 +58,8 @@ pub struct Execution {
     check: Check,
     /// The drive does not tell its own word: bits that the command does not set are written as 0.
     blind: bool,
+    /// It waited for a late reply since it was decided on last.
+    held_up: bool,
 }
 
 impl Execution {
@@ -107,6 +109,7 @@ impl Execution {
             running: true,
             check: Check::NotYet,
             blind: false,
+            held_up: false,
         }
     }
 
@@ -156,6 +159,21 @@ impl Execution {
                 }
             }
         }
+    }
+
+    /// It must wait for a late reply: what it has read by then is old.
+    pub fn held_up(&mut self) {
+        self.held_up = true;
+    }
+
+    /// It may go on. Whether it asks again first for what it read before it was held up: a motor may have been stopped
+    /// meanwhile.
+    pub fn asks_again(&mut self) -> bool {
+        let again = std::mem::take(&mut self.held_up) && self.check == Check::Read;
+        if again {
+            self.check = Check::NotYet;
+        }
+        again
     }
 
     fn pop(&mut self) {

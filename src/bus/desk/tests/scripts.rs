@@ -98,3 +98,62 @@ fn what_waits_for_one_drive_does_not_hold_up_another() {
         }
     }
 }
+
+/// A drive owes the answer to a run; a reset has been set and the word read, and its end, which looks like that run, waits.
+/// Until when.
+fn held_up(model: &mut Model) -> Instant {
+    for _ in 0..60 {
+        model.exchange(Line::Good);
+    }
+    model.command(0, 0, Kind::RawRun, Duration::from_millis(51));
+    model.exchange(Line::AnswerLost);
+    // The drive says that its motor runs.
+    model.words[0].insert(2100, 2);
+    for _ in 0..10 {
+        model.exchange(Line::Good);
+    }
+    model.command(0, 0, Kind::Reset, Duration::from_secs(5));
+    for _ in 0..40 {
+        model.exchange(Line::Good);
+    }
+    assert_eq!(model.words[0][&CONTROL], 5);
+    let end = RequestPdu::WriteRegister {
+        address: CONTROL,
+        value: 1,
+    };
+    model.desk.debts.blocks(0, &end, model.now).expect("the end waits")
+}
+
+#[test]
+fn the_end_of_a_pulse_that_was_held_up_does_not_undo_a_stop_that_is_not_answered() {
+    let mut model = Model::new();
+    let until = held_up(&mut model);
+    while model.now + Duration::from_millis(30) < until {
+        model.exchange(Line::Good);
+    }
+    model.command(1, 0, Kind::RawStop, Duration::from_millis(1));
+    model.exchange(Line::AnswerLost);
+    assert!(model.now > until && model.words[0][&CONTROL] == 0);
+    for _ in 0..20 {
+        model.exchange(Line::Good);
+    }
+    assert_eq!(model.words[0][&CONTROL], 0);
+    model.end();
+}
+
+#[test]
+fn the_end_of_a_pulse_that_was_held_up_does_not_undo_a_stop_at_the_panel() {
+    let mut model = Model::new();
+    let until = held_up(&mut model);
+    while model.now + Duration::from_millis(6) < until {
+        model.exchange(Line::Good);
+    }
+    model.words[0].insert(CONTROL, 4);
+    model.may_run[0] = None;
+    model.now = until;
+    for _ in 0..20 {
+        model.exchange(Line::Good);
+    }
+    assert_eq!(model.words[0][&CONTROL], 0);
+    model.end();
+}
