@@ -121,6 +121,9 @@ impl Drop for BusTask {
     }
 }
 
+/// Time for the log to be written before the process ends.
+const LAST_WORDS: Duration = Duration::from_millis(200);
+
 /// A bus that panicked would take commands that nobody serves, and show the last values for ever: a stop would be lost
 /// in it. A process that dies is started again, and its clients see that it is gone.
 fn or_end_the_process(work: impl FnOnce()) {
@@ -129,6 +132,8 @@ fn or_end_the_process(work: impl FnOnce()) {
         tracing::error!(
             "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
         );
+        // Log lines are written by a thread of their own.
+        std::thread::sleep(LAST_WORDS);
         std::process::abort();
     }
 }

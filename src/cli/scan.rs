@@ -50,8 +50,8 @@ pub(super) struct Args {
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     format: Vec<String>,
     /// Addresses that are tried; N2 has them to 255.
-    #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = super::simulate::parse_addresses)]
-    addresses: super::simulate::Addresses,
+    #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = super::addresses::parse_addresses)]
+    addresses: super::addresses::Addresses,
     /// Time for the first byte of a reply; without it that of the protocol.
     #[arg(long, value_name = "TIME", value_parser = parse_duration)]
     timeout: Option<Duration>,

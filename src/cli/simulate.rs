@@ -1,5 +1,8 @@
 //! `drivegate simulate`: simulated drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults.
 
+mod watch;
+
+use super::addresses::{Addresses, parse_addresses};
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::cache::DriveSpec;
 use crate::codec::{LineFormat, Protocol};
@@ -11,14 +14,11 @@ use crate::sim::drive::{DriveOptions, ModelOptions};
 use crate::sim::endpoint::EndpointOptions;
 use crate::sim::faults::{FaultPlan, NAMES, Rates};
 use crate::sim::half_duplex::{Delivery, LineRules, Wire};
-use crate::sim::statistics::Statistics;
 use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
-use std::io::{self, IsTerminal, Write};
 use std::net::{SocketAddr, ToSocketAddrs};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
-use tokio::signal::unix::{SignalKind, signal};
+use std::time::Duration;
 
 /// Simulates drives on a pseudo-terminal, a real port or a TCP port, with wire timing and faults
 #[derive(Debug, clap::Args)]
@@ -130,31 +130,6 @@ pub(super) enum Speed {
     Max,
 }
 
-/// Addresses of drives, ascending, none twice.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Addresses(pub(super) Vec<u8>);
-
-pub(super) fn parse_addresses(text: &str) -> Result<Addresses, String> {
-    let bad = || {
-        format!(
-            "`{text}` is no list of addresses; write numbers from 1 to 247, with N2 from 1 to 255, such as 1-10 or 1,2,7"
-        )
-    };
-    let number = |word: &str| word.trim().parse::<u8>().ok().filter(|n| *n >= 1).ok_or_else(bad);
-    let mut addresses = Vec::new();
-    for part in text.split(',') {
-        let (first, last) = part.split_once('-').unwrap_or((part, part));
-        let (first, last) = (number(first)?, number(last)?);
-        if first > last {
-            return Err(bad());
-        }
-        addresses.extend(first..=last);
-    }
-    addresses.sort_unstable();
-    addresses.dedup();
-    Ok(Addresses(addresses))
-}
-
 /// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
 ///
 /// # Errors
@@ -229,7 +204,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         })
     };
     let started: Result<Vec<SimulatedBus>, String> = lines.into_iter().map(start).collect();
-    let served = started.and_then(|lines| serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
+    let served = started.and_then(|lines| watch::serve(&lines).map_err(|error| format!("cannot simulate: {error}")));
     match served {
         Ok(()) => ExitCode::SUCCESS,
         Err(message) => failed(EXIT_FAILED, &message),
@@ -358,255 +333,5 @@ impl Args {
     }
 }
 
-/// Tells where the lines are, and once a second, on a terminal, what goes on; ends on Ctrl-C and SIGTERM.
-fn serve(lines: &[SimulatedBus]) -> io::Result<()> {
-    let mut out = io::stdout();
-    for line in lines {
-        writeln!(out, "{}", line.description())?;
-    }
-    writeln!(out, "Ctrl-C ends the simulation.")?;
-    out.flush()?;
-    let runtime = tokio::runtime::Builder::new_current_thread().enable_all().build()?;
-    runtime.block_on(watch(lines))?;
-    writeln!(out, "{}", summary(&total(lines)))
-}
-
-async fn watch(lines: &[SimulatedBus]) -> io::Result<()> {
-    let mut interrupt = signal(SignalKind::interrupt())?;
-    let mut terminate = signal(SignalKind::terminate())?;
-    let mut second = tokio::time::interval(Duration::from_secs(1));
-    let live = io::stdout().is_terminal();
-    let (mut before, mut then) = (total(lines), Instant::now());
-    loop {
-        tokio::select! {
-            _ = interrupt.recv() => break,
-            _ = terminate.recv() => break,
-            _ = second.tick(), if live => {
-                let (now, at) = (total(lines), Instant::now());
-                let seconds = at.duration_since(then).as_secs_f64().max(0.001);
-                let rate = (now.requests - before.requests) as f64 / seconds;
-                print!("\r\x1b[K{rate:7.1} requests/s   {}", summary(&now));
-                io::stdout().flush()?;
-                (before, then) = (now, at);
-            }
-        }
-    }
-    if live {
-        println!();
-    }
-    Ok(())
-}
-
-fn total(lines: &[SimulatedBus]) -> Statistics {
-    lines.iter().map(|line| line.statistics()).sum()
-}
-
-/// The counters that tell a good master from a bad one; those at rest stay unsaid.
-fn summary(s: &Statistics) -> String {
-    let mut text = format!(
-        "{} requests, {} replies, {} too early",
-        s.requests, s.replies, s.silence_violations
-    );
-    let rare = [
-        (s.collisions, "collisions"),
-        (s.bad_crc, "bad frames"),
-        (s.unanswered, "to nobody"),
-        (s.broadcasts, "broadcasts"),
-        (s.faults, "faults injected"),
-        (s.bytes_lost, "bytes nobody read"),
-    ];
-    for (count, name) in rare.into_iter().filter(|(count, _)| *count > 0) {
-        text.push_str(&format!(", {count} {name}"));
-    }
-    text
-}
-
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use clap::Parser;
-
-    #[derive(Debug, Parser)]
-    struct Command {
-        #[command(flatten)]
-        args: Args,
-    }
-
-    fn parse(words: &str) -> Result<Args, String> {
-        let words = std::iter::once("simulate").chain(words.split_whitespace());
-        Command::try_parse_from(words)
-            .map(|command| command.args)
-            .map_err(|error| error.to_string())
-    }
-
-    #[test]
-    fn addresses() {
-        assert_eq!(parse_addresses("3,1-2,2").unwrap().0, [1, 2, 3]);
-        assert_eq!(parse_addresses("247").unwrap().0, [247]);
-        assert_eq!(
-            parse_addresses("248-255").unwrap().0,
-            [248, 249, 250, 251, 252, 253, 254, 255]
-        );
-        for bad in ["", "0", "256", "5-1", "1-", "x", "1,,2"] {
-            assert!(parse_addresses(bad).is_err(), "{bad}");
-        }
-    }
-
-    #[test]
-    fn a_line_from_the_command_line() {
-        let args =
-            parse("--addresses 1-10 --link /tmp/l --baud 9600 --format 8E1 --fault drop=0.5 --chunk 14 --lenient");
-        let args = args.unwrap();
-        let line = args.applied_to(args.line().unwrap());
-        assert_eq!(line.drives.len(), 10);
-        assert_eq!(line.rules.format.to_string(), "9600 8E1");
-        assert_eq!((line.rules.delivery, line.rules.strict), (Delivery::Chunks(14), false));
-        assert_eq!(
-            line.endpoint,
-            EndpointOptions::Pty {
-                link: Some("/tmp/l".into())
-            }
-        );
-        assert!(line.drives.iter().all(|drive| drive.autopilot.is_none()));
-        let args = parse("--listen 127.0.0.1:4001 --autopilot --speed max").unwrap();
-        let line = args.applied_to(args.line().unwrap());
-        assert!(!line.boards.leading_byte);
-        let n2 = parse("--profile vacon-nx-n2 --link /tmp/l --n2-leading-byte").unwrap();
-        assert!(n2.applied_to(n2.line().unwrap()).boards.leading_byte);
-        assert_eq!(line.rules.wire, Wire::Instant);
-        assert!(line.drives.iter().all(|drive| drive.autopilot.is_some()));
-    }
-
-    #[test]
-    fn boards_that_count_from_one() {
-        let offset = |words: &str| {
-            let args = parse(words).unwrap();
-            let line = args.applied_to(args.line().unwrap());
-            line.drives
-                .iter()
-                .map(|drive| match &drive.model {
-                    ModelOptions::Cx(cx) => cx.offset,
-                    other => panic!("{other:?}"),
-                })
-                .collect::<Vec<_>>()
-        };
-        let none = AddressOffset::default();
-        assert_eq!(offset("--profile vacon-cx"), [none]);
-        let wanted = AddressOffset {
-            discrete_input: 1,
-            holding: 1,
-            ..none
-        };
-        let words = "--profile vacon-cx --addresses 1-2 --cx-address-offset holding=1,discrete-input=1,coil=0";
-        assert_eq!(offset(words), [wanted; 2]);
-        let all = AddressOffset {
-            coil: 1,
-            discrete_input: 1,
-            input: 1,
-            holding: 1,
-        };
-        assert_eq!("coil=1, input=1,holding=1,discrete-input=1".parse(), Ok(all));
-        for bad in ["", "holding", "holding=2", "holding=-1", "hold=1", "holding=1,"] {
-            assert!(bad.parse::<AddressOffset>().is_err(), "{bad}");
-        }
-        let error = parse("--profile vacon-cx --cx-address-offset coils=1").unwrap_err();
-        assert!(error.contains("names no table; write coil, "), "{error}");
-        let error = parse("--cx-address-offset coil=1").unwrap().line().unwrap_err();
-        assert!(error.contains("`vacon-nx` have no address offset"), "{error}");
-    }
-
-    #[test]
-    fn bad_command_lines() {
-        for bad in [
-            "--link /tmp/l --port /dev/ttyUSB0",
-            "--config a.toml --link /tmp/l",
-            "--baud 12",
-            "--turnaround 5",
-            "--listen foo",
-            "--fault drop",
-            "--addresses 0-3",
-            "--speed warp",
-        ] {
-            assert!(parse(bad).is_err(), "{bad}");
-        }
-        let error = parse("--profile vacon-nv").unwrap().line().unwrap_err();
-        assert!(error.contains("did you mean `vacon-nx`"), "{error}");
-        assert!(parse("--format 9N1").unwrap().line().unwrap_err().contains("--format"));
-        assert!(parse("--format 8N1").unwrap().line().is_ok());
-        let told = |words: &str| parse(words).unwrap().line().unwrap_err();
-        let error = told("--protocol n2");
-        assert!(
-            error.contains("speak modbus-rtu") && error.contains("`vacon-nx-n2`"),
-            "{error}"
-        );
-        let error = told("--profile teco-7300pa --addresses 30-32");
-        assert!(error.contains("no address 32") && error.contains("1 to 31"), "{error}");
-        assert!(told("--addresses 250").contains("its drives have 1 to 247"));
-        assert!(
-            parse("--profile teco-7300pa-n2 --addresses 250-255")
-                .unwrap()
-                .line()
-                .is_ok()
-        );
-        assert!(parse("--protocol profibus").unwrap_err().contains("modbus-ascii"));
-    }
-
-    #[test]
-    fn the_documentation_names_every_fault() {
-        let page = include_str!("../../docs/simulate.md");
-        for name in NAMES.split(", ").map(str::trim) {
-            assert!(page.contains(&format!("`{name}`")), "docs/simulate.md lacks {name}");
-        }
-    }
-
-    #[test]
-    fn every_built_in_profile_can_be_simulated() {
-        let profiles = Profiles::built_in();
-        for name in profiles.names() {
-            let args = parse(&format!("--profile {name}")).unwrap();
-            let line = args.applied_to(args.line().unwrap());
-            let profile = profiles.get(name).unwrap();
-            assert_eq!(Some(&line.rules.protocol), profile.protocols.first(), "{name}");
-            assert!(
-                profile.bauds.contains(&line.rules.format.baud),
-                "{name}: {}",
-                line.rules.format
-            );
-            let word = format!("{} ", profile.simulator.as_deref().unwrap());
-            let address = line.drives[0].model.trip_address().to_string();
-            assert!(trip_registers().replace(',', " ").contains(&word) && trip_registers().contains(&address));
-        }
-        let line = |words: &str| {
-            let args = parse(words).unwrap();
-            args.applied_to(args.line().unwrap())
-        };
-        let teco = line("--profile teco-7300pa");
-        assert_eq!(teco.rules.format.to_string(), "19200 7N2");
-        assert_eq!(teco.drives[0].model.turnaround(), Some(Duration::from_millis(15)));
-        let answers = |line: SimulatedBusOptions| matches!(&line.drives[0].model, ModelOptions::Teco(teco) if teco.answer_check_error);
-        assert!(!answers(teco));
-        assert!(answers(line("--profile teco-7300pa --teco-answer-check-error")));
-        let teco = line("--profile teco-7300pa --turnaround 3ms");
-        assert_eq!(teco.drives[0].model.turnaround(), None);
-        assert_eq!(teco.rules.turnaround, Duration::from_millis(3));
-        assert_eq!(line("--profile vacon-cx").rules.format.to_string(), "19200 8N1");
-        assert_eq!(line("--profile vacon-nx-n2").rules.format.to_string(), "9600 8N1");
-        assert_eq!(line("").rules.format.to_string(), "38400 8N1");
-    }
-
-    #[test]
-    fn the_endpoint_of_a_configured_bus() {
-        assert_eq!(
-            endpoint_for("/dev/ttyUSB0"),
-            Ok(EndpointOptions::Pty {
-                link: Some("/dev/ttyUSB0".into())
-            })
-        );
-        let listen = "127.0.0.1:4001".parse().unwrap();
-        assert_eq!(
-            endpoint_for("tcp://127.0.0.1:4001"),
-            Ok(EndpointOptions::Tcp { listen })
-        );
-        assert!(endpoint_for("tcp://127.0.0.1").is_err());
-    }
-}
+mod tests;

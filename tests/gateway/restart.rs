@@ -115,17 +115,43 @@ fn no_control_word_is_written_at_start_after_a_kill_or_from_a_retained_message()
     assert_eq!(line.statistics().silence_violations, 0);
 }
 
+/// A gateway whose drive was commanded and runs; the line is recorded from then on.
+struct Plant {
+    line: SimulatedBus,
+    file: String,
+    http: u16,
+    gateway: Running,
+    _folder: tempfile::TempDir,
+}
+
+/// `keys` stand in the section of the drive.
+fn running(keys: &str) -> Plant {
+    let folder = tempfile::tempdir().unwrap();
+    let line = line(&folder.path().join("line1"));
+    let (file, modbus, http) = configure(folder.path(), keys);
+    let gateway = Running::drivegate(&["run", "--config", &file]);
+    until_ready(http);
+    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
+    until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
+    line.record(100_000);
+    Plant {
+        line,
+        file,
+        http,
+        gateway,
+        _folder: folder,
+    }
+}
+
 #[test]
 fn on_shutdown_stop_stops_and_hold_holds() {
     for (action, last) in [("stop", Some(6)), ("hold", None)] {
-        let folder = tempfile::tempdir().unwrap();
-        let line = line(&folder.path().join("line1"));
-        let (file, modbus, http) = configure(folder.path(), &format!("on_shutdown = \"{action}\"\n"));
-        let mut gateway = Running::drivegate(&["run", "--config", &file]);
-        until_ready(http);
-        crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
-        until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
-        line.record(100_000);
+        let Plant {
+            line,
+            mut gateway,
+            _folder,
+            ..
+        } = running(&format!("on_shutdown = \"{action}\"\n"));
         gateway.signal("TERM");
         let (status, _) = gateway.ended();
         assert!(status.success(), "{status}");
@@ -144,14 +170,12 @@ fn on_shutdown_stop_stops_and_hold_holds() {
 
 #[test]
 fn a_stop_that_nobody_acknowledges_holds_up_the_shutdown_for_a_bounded_time() {
-    let folder = tempfile::tempdir().unwrap();
-    let line = line(&folder.path().join("line1"));
-    let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
-    let mut gateway = Running::drivegate(&["run", "--config", &file]);
-    until_ready(http);
-    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
-    until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
-    line.record(100_000);
+    let Plant {
+        line,
+        mut gateway,
+        _folder,
+        ..
+    } = running("on_shutdown = \"stop\"\n");
     line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
     gateway.signal("TERM");
     let (status, time) = gateway.ended();
@@ -165,14 +189,12 @@ fn a_stop_that_nobody_acknowledges_holds_up_the_shutdown_for_a_bounded_time() {
 #[test]
 fn a_drive_that_is_offline_when_the_gateway_stops_is_told_as_soon_as_it_answers() {
     for back in [true, false] {
-        let folder = tempfile::tempdir().unwrap();
-        let line = line(&folder.path().join("line1"));
-        let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
-        let mut gateway = Running::drivegate(&["run", "--config", &file]);
-        until_ready(http);
-        crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
-        until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
-        line.record(100_000);
+        let Plant {
+            line,
+            mut gateway,
+            _folder,
+            ..
+        } = running("on_shutdown = \"stop\"\n");
         line.set_faults(FaultPlan::new("deaf=1".parse().unwrap(), 1));
         gateway.until_printed("drive pump-1 is offline");
         if back {
@@ -191,14 +213,13 @@ fn a_drive_that_is_offline_when_the_gateway_stops_is_told_as_soon_as_it_answers(
 
 #[test]
 fn a_reload_that_opens_the_line_anew_writes_no_control_word() {
-    let folder = tempfile::tempdir().unwrap();
-    let line = line(&folder.path().join("line1"));
-    let (file, modbus, http) = configure(folder.path(), "on_shutdown = \"stop\"\n");
-    let gateway = Running::drivegate(&["run", "--config", &file]);
-    until_ready(http);
-    crate::process::mbpoll_write(modbus, 1, 33_024, &[1]).unwrap();
-    until("it runs", || (api(http, "pump-1")["state"] == "running").then_some(()));
-    line.record(100_000);
+    let Plant {
+        line,
+        file,
+        http,
+        gateway,
+        _folder,
+    } = running("on_shutdown = \"stop\"\n");
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
     gateway.signal("HUP");

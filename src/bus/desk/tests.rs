@@ -182,6 +182,19 @@ impl Model {
         }
     }
 
+    /// One whose drives were found.
+    fn found() -> Model {
+        let mut model = Model::new();
+        model.goes_well(60);
+        model
+    }
+
+    fn goes_well(&mut self, exchanges: usize) {
+        for _ in 0..exchanges {
+            self.exchange(Line::Good);
+        }
+    }
+
     fn point(&self, name: &str) -> usize {
         self.profile.point_index(name).unwrap()
     }
@@ -476,11 +489,7 @@ proptest! {
 
     #[test]
     fn one_answer_each_and_nothing_runs_behind_a_stop(steps in steps()) {
-        let mut model = Model::new();
-        // The drives are found first.
-        for _ in 0..60 {
-            model.exchange(Line::Good);
-        }
+        let mut model = Model::found();
         for step in steps {
             model.take(step);
         }

@@ -4,10 +4,7 @@ use super::*;
 
 #[test]
 fn an_unanswered_stop_is_not_undone_by_a_bit_of_another_client() {
-    let mut model = Model::new();
-    for _ in 0..60 {
-        model.exchange(Line::Good);
-    }
+    let mut model = Model::found();
     let expiry = Duration::from_secs(2);
     model.command(0, 0, Kind::Run, expiry);
     // Its control word may have to be read first.
@@ -21,19 +18,14 @@ fn an_unanswered_stop_is_not_undone_by_a_bit_of_another_client() {
     model.exchange(Line::AnswerLost);
     model.exchange(Line::AnswerLost);
     model.command(1, 0, Kind::Reverse, expiry);
-    for _ in 0..60 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(60);
     assert_eq!(model.words[0][&CONTROL], 2, "reverse is set, run stays away");
     model.end();
 }
 
 #[test]
 fn a_stop_is_not_acknowledged_by_the_late_answer_to_another_write() {
-    let mut model = Model::new();
-    for _ in 0..60 {
-        model.exchange(Line::Good);
-    }
+    let mut model = Model::found();
     let expiry = Duration::from_secs(2);
     model.command(0, 0, Kind::RawRuns, expiry);
     while model.late.is_empty() {
@@ -45,9 +37,7 @@ fn a_stop_is_not_acknowledged_by_the_late_answer_to_another_write() {
         model.exchange(Line::RequestLost);
     }
     assert_eq!(model.words[0][&CONTROL], 1);
-    for _ in 0..4 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(4);
     assert_eq!(model.words[0][&CONTROL], 0);
     model.end();
 }
@@ -56,10 +46,7 @@ fn a_stop_is_not_acknowledged_by_the_late_answer_to_another_write() {
 #[test]
 fn what_waits_for_one_drive_does_not_hold_up_another() {
     for kind in [Kind::RawRead, Kind::Reverse, Kind::RawRuns] {
-        let mut model = Model::new();
-        for _ in 0..60 {
-            model.exchange(Line::Good);
-        }
+        let mut model = Model::found();
         let owed = [
             RequestPdu::Read {
                 table: Table::Holding,
@@ -79,9 +66,7 @@ fn what_waits_for_one_drive_does_not_hold_up_another() {
         for _ in 0..12 {
             model.command(0, 0, kind, expiry);
         }
-        for _ in 0..12 {
-            model.exchange(Line::Good);
-        }
+        model.goes_well(12);
         let began = model.now;
         model.command(1, 1, Kind::RawRun, expiry);
         while model.words[1][&CONTROL] == 0 {
@@ -101,59 +86,48 @@ fn what_waits_for_one_drive_does_not_hold_up_another() {
 
 /// A drive owes the answer to a run; a reset has been set and the word read, and its end, which looks like that run, waits.
 /// Until when.
-fn held_up(model: &mut Model) -> Instant {
-    for _ in 0..60 {
-        model.exchange(Line::Good);
-    }
+fn held_up() -> (Model, Instant) {
+    let mut model = Model::found();
     model.command(0, 0, Kind::RawRun, Duration::from_millis(51));
     model.exchange(Line::AnswerLost);
     // The drive says that its motor runs.
     model.words[0].insert(2100, 2);
-    for _ in 0..10 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(10);
     model.command(0, 0, Kind::Reset, Duration::from_secs(5));
-    for _ in 0..40 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(40);
     assert_eq!(model.words[0][&CONTROL], 5);
     let end = RequestPdu::WriteRegister {
         address: CONTROL,
         value: 1,
     };
-    model.desk.debts.blocks(0, &end, model.now).expect("the end waits")
+    let until = model.desk.debts.blocks(0, &end, model.now).expect("the end waits");
+    (model, until)
 }
 
 #[test]
 fn the_end_of_a_pulse_that_was_held_up_does_not_undo_a_stop_that_is_not_answered() {
-    let mut model = Model::new();
-    let until = held_up(&mut model);
+    let (mut model, until) = held_up();
     while model.now + Duration::from_millis(30) < until {
         model.exchange(Line::Good);
     }
     model.command(1, 0, Kind::RawStop, Duration::from_millis(1));
     model.exchange(Line::AnswerLost);
     assert!(model.now > until && model.words[0][&CONTROL] == 0);
-    for _ in 0..20 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(20);
     assert_eq!(model.words[0][&CONTROL], 0);
     model.end();
 }
 
 #[test]
 fn the_end_of_a_pulse_that_was_held_up_does_not_undo_a_stop_at_the_panel() {
-    let mut model = Model::new();
-    let until = held_up(&mut model);
+    let (mut model, until) = held_up();
     while model.now + Duration::from_millis(6) < until {
         model.exchange(Line::Good);
     }
     model.words[0].insert(CONTROL, 4);
     model.may_run[0] = None;
     model.now = until;
-    for _ in 0..20 {
-        model.exchange(Line::Good);
-    }
+    model.goes_well(20);
     assert_eq!(model.words[0][&CONTROL], 0);
     model.end();
 }
