@@ -8,17 +8,16 @@ use arc_swap::ArcSwap;
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::BusTask;
-use crate::bus::leases::Leases;
+use crate::bus::supervision::Lease;
 use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
-use crate::command::{CommandQueue, Origin, Refusal, SourceKind, WriteStats};
+use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
-use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
 use crate::north::{NorthStats, http, modbus_tcp, mqtt};
-use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
+use crate::plant::{BusHandle, Plant, SharedPlant};
 
-/// Time that the stops of a shutdown may take together.
-const STOP_DRIVES: Duration = Duration::from_millis(800);
+/// Time beyond that of its stops after which a bus is not waited for any more.
+const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time that a server may take to end.
 const STOP_SERVER: Duration = Duration::from_secs(2);
 
@@ -149,15 +148,21 @@ impl Daemon {
         let (mut kept, ends): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
-        // Ports are free again before a changed bus opens one of them.
+        // Ports are free again before a changed bus opens one of them. A bus that starts anew does not set a running drive
+        // free of its supervision.
+        let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         for (before, task) in ends {
             tracing::info!(bus = %before.spec.name, "the bus ends");
-            task.stop();
+            let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
+            leases.extend(drives.zip(task.stop()));
         }
         for (bus, mut task) in begins {
             tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
-            self.take_over_leases(&task);
-            task.begin();
+            let lease = |d: &DriveSpec| {
+                let before = leases.get(&(d.name.clone(), d.address)).copied().unwrap_or_default();
+                if d.access == Access::Control { before } else { Lease::default() }
+            };
+            task.begin(bus.drives.iter().map(lease).collect());
             kept.push((bus, task));
         }
         for (bus, task) in &kept {
@@ -194,25 +199,13 @@ impl Daemon {
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
         let queue = Arc::new(CommandQueue::new().map_err(failed)?);
-        let leases = Leases::new(self.events.clone(), self.writes.clone());
         BusTask::prepare(
             BusHandle { image, queue },
             bus.options.clone(),
-            leases,
+            self.writes.clone(),
             self.events.clone(),
         )
         .map_err(failed)
-    }
-
-    /// A bus that starts anew does not set a running drive free of its supervision.
-    fn take_over_leases(&self, task: &BusTask) {
-        let before = self.plant.load();
-        for image in &task.handle().image.drives {
-            let same = before.drive(&image.spec.name);
-            if let Some(same) = same.filter(|d| d.image.spec.address == image.spec.address) {
-                image.take_over_lease(&same.image);
-            }
-        }
     }
 
     async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
@@ -283,7 +276,11 @@ impl Daemon {
         }
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
-        let ended = tokio::task::spawn_blocking(move || buses.into_iter().for_each(|(_, task)| task.stop()));
+        let ended = tokio::task::spawn_blocking(move || {
+            for (_, task) in buses {
+                task.stop();
+            }
+        });
         within(STOP_SERVER, "buses", async {
             // A panic of a bus was told by the bus itself.
             let _ = ended.await;
@@ -296,60 +293,28 @@ impl Daemon {
         }
     }
 
-    /// Writes the stop to the drives that are configured so, and waits for their acknowledgements.
+    /// Lets each bus stop the drives that are configured so, as long as that takes on its line.
     async fn stop_drives(&self) {
-        let plant = self.plant.load_full();
-        for bus in &plant.buses {
-            // A command that comes by MQTT now must not start again what is stopped.
-            bus.queue.stops_only(Instant::now());
-        }
-        // Also one that does not answer just now: it may be back in time.
-        let wanted = |d: &DriveHandle| {
-            let spec = &d.image.spec;
-            spec.on_shutdown == OnShutdown::Stop && spec.access == Access::Control
-        };
-        let stops = plant.drives().filter(wanted).map(|drive| self.stop_in_time(drive));
-        let missing: Vec<String> = futures_util::future::join_all(stops)
-            .await
-            .into_iter()
-            .flatten()
-            .collect();
+        let now = Instant::now();
+        let stops = self.buses.iter().map(|(settings, task)| {
+            let time = Duration::from_secs(10);
+            let missing = task.handle().queue.begin_shutdown(now + time, now);
+            async move {
+                // A bus whose port is closed cannot say what became of its drives.
+                let missing = tokio::time::timeout(time + STOP_SLACK, missing).await;
+                missing.ok().and_then(Result::ok).unwrap_or_else(|| {
+                    let stop = |d: &&DriveSpec| d.on_shutdown == OnShutdown::Stop && d.access == Access::Control;
+                    let wanted = settings.drives.iter().filter(stop);
+                    wanted.map(|d| format!("`{}` was not told to stop", d.name)).collect()
+                })
+            }
+        });
+        let missing: Vec<String> = futures_util::future::join_all(stops).await.into_iter().flatten().collect();
         if !missing.is_empty() {
             tracing::error!(
                 "not every drive acknowledged its stop in time; the gateway stops all the same: {}",
                 missing.join(", ")
             );
-        }
-    }
-
-    /// What became of the stop of a drive that did not acknowledge it.
-    async fn stop_in_time(&self, drive: DriveHandle) -> Option<String> {
-        let name = &drive.image.spec.name;
-        let mut tried = false;
-        match tokio::time::timeout(STOP_DRIVES, self.stop_drive(&drive, &mut tried)).await {
-            Ok(Ok(())) => None,
-            Ok(Err(refusal)) => Some(format!("`{name}` was not told to stop ({refusal})")),
-            Err(_) if tried => Some(format!("`{name}` did not acknowledge it")),
-            Err(_) => Some(format!("`{name}` does not answer and was not told to stop")),
-        }
-    }
-
-    async fn stop_drive(&self, drive: &DriveHandle, tried: &mut bool) -> Result<(), Refusal> {
-        loop {
-            if drive.image.snapshot().link.is_online() {
-                let origin = Origin {
-                    kind: SourceKind::Shutdown,
-                    who: "on_shutdown".to_string(),
-                };
-                let (run, reading) = (ModelPoint::Run, drive.reading(Instant::now()));
-                let (bus, stop) = (&drive.bus, Value::Bool(false));
-                let answer = bus.own_order(drive.index, &reading, run, stop, origin, &self.writes)?;
-                *tried = true;
-                if answer.await.is_ok_and(|answer| answer.outcome.is_ok()) {
-                    return Ok(());
-                }
-            }
-            tokio::time::sleep(Duration::from_millis(50)).await;
         }
     }
 }

@@ -9,7 +9,8 @@ use tokio::sync::oneshot;
 use crate::cache::{BusImage, DriveImage, Reading};
 use crate::codec::{Table, describe};
 use crate::command::{
-    self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, WriteStats,
+    self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
+    WriteStats,
 };
 use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
@@ -105,8 +106,14 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
 }
 
 /// Answers a command that is not taken; audited and counted.
-pub(crate) fn turn_away(writes: &Arc<WriteStats>, drive: &str, what: &str, outcome: Outcome, origin: Origin) -> Answer {
-    let now = Instant::now();
+pub(crate) fn turn_away(
+    writes: &Arc<WriteStats>,
+    drive: &str,
+    what: &str,
+    outcome: Outcome,
+    origin: Origin,
+    now: Instant,
+) -> Answer {
     let (ticket, _) = Ticket::new(origin, drive, what.to_string(), true, now, writes.clone());
     ticket.answer(outcome.clone(), now);
     Answer {
@@ -116,8 +123,8 @@ pub(crate) fn turn_away(writes: &Arc<WriteStats>, drive: &str, what: &str, outco
 }
 
 impl BusHandle {
-    /// Gives the drive of `reading`, at place `drive` on this bus, an order of the gateway itself: a point of the model.
-    /// No client is behind it, so it renews no lease, and no newer reference of a client takes its place.
+    /// Gives the drive of `reading`, at place `drive` on this bus, an order of the gateway itself: a point of the model and
+    /// its value. No client is behind it, so it renews no lease, and no newer reference of a client takes its place.
     ///
     /// # Errors
     /// The refusal; it is neither audited nor counted.
@@ -125,9 +132,9 @@ impl BusHandle {
         &self,
         drive: usize,
         reading: &Reading<'_>,
-        point: ModelPoint,
-        value: Value,
+        (point, value): (ModelPoint, Value),
         origin: Origin,
+        expiry: Duration,
         writes: &Arc<WriteStats>,
     ) -> Result<oneshot::Receiver<Answer>, Refusal> {
         let (spec, now) = (reading.spec, reading.now);
@@ -137,17 +144,11 @@ impl BusHandle {
         })?;
         let order = Order::Points(vec![(index, value)]);
         let changes = changes(reading, &order);
-        let admitted = command::admit(order, reading, true)?;
+        let mut admitted = command::admit(order, reading, true)?;
+        admitted.reference_only = false;
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
-        let command = Command {
-            drive,
-            order: admitted.order,
-            urgency: admitted.urgency,
-            reference_only: false,
-            expires: now + command::DEFAULT_EXPIRY,
-            ticket: ticket.with_changes(changes),
-        };
+        let command = Command::new(drive, admitted, now + expiry, ticket.with_changes(changes));
         self.queue.submit(command, now);
         Ok(answer)
     }
@@ -162,6 +163,7 @@ impl Plant {
             what,
             Outcome::Refused(Refusal::UnknownDrive(why)),
             origin,
+            Instant::now(),
         )
     }
 
@@ -265,19 +267,12 @@ impl DriveHandle {
                 ticket.answer(Outcome::Refused(refusal), accepted);
             }
             Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, accepted),
-            Ok(_) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, accepted),
+            // A stop goes to a drive that does not answer too: it may be back.
+            Ok(admitted) if !reading.snapshot.link.is_online() && admitted.urgency != Urgency::Stop => {
+                ticket.answer(Outcome::Offline, accepted);
+            }
             Ok(admitted) => {
-                if write {
-                    self.image.renew_lease(accepted);
-                }
-                let command = Command {
-                    drive: self.index,
-                    order: admitted.order,
-                    urgency: admitted.urgency,
-                    reference_only: admitted.reference_only,
-                    expires: accepted + expiry,
-                    ticket,
-                };
+                let command = Command::new(self.index, admitted, accepted + expiry, ticket);
                 self.bus.queue.submit(command, accepted);
             }
         }
@@ -292,7 +287,7 @@ impl DriveHandle {
 
     /// Answers a command that is not taken, for a reason that is not the client's fault; audited and counted.
     pub fn turn_away(&self, what: &str, outcome: Outcome, origin: Origin) -> Answer {
-        turn_away(&self.writes, &self.image.spec.name, what, outcome, origin)
+        turn_away(&self.writes, &self.image.spec.name, what, outcome, origin, Instant::now())
     }
 
     /// Tells that a command was refused; a flood of them is counted, not told.

@@ -7,17 +7,19 @@ use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, PollClass, Profile, Value};
 
-/// Commands watched at one time; beyond that the oldest stays "acknowledged".
-const WATCHED: usize = 64;
-/// A motor whose speed fell by this, in percent of the speed range, is on its way to a stop.
-const SLOWER: f64 = 0.5;
+/// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
+const WATCHED: usize = 8;
+/// A motor whose speed fell by more than that, in percent of the speed range, is on its way to a stop. Less is ripple.
+const RIPPLE: f64 = 0.5;
+/// A motor slower than that, in percent of the speed range, has stopped as far as its speed shows.
+const NEAR_ZERO: f64 = 1.0;
 
 /// What a read must show.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Effect {
     /// The motor runs.
     Runs,
-    /// The motor stands, or is slower than at the acknowledgement.
+    /// The motor stands, or is near zero speed.
     Stops,
     /// No fault is active.
     NoFault,
@@ -39,7 +41,7 @@ impl Effect {
     fn missing(self, profile: &Profile) -> String {
         match self {
             Effect::Runs => "the motor does not run".to_string(),
-            Effect::Stops => "the motor does not slow down".to_string(),
+            Effect::Stops => "the motor does not stop".to_string(),
             Effect::NoFault => "the fault is still active".to_string(),
             Effect::ReadBack(index, value) => {
                 let name = profile.points.get(index).map_or("?", |p| p.name.as_str());
@@ -100,17 +102,15 @@ fn effect_of(profile: &Profile, index: usize, value: Value) -> Option<Effect> {
 }
 
 /// Whether the reading shows it, by samples that were read after `since`.
-fn shows(effect: Effect, reading: &Reading<'_>, since: Instant, speed: Option<f64>) -> bool {
+fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> bool {
     let after = |sample: crate::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
     match effect {
         Effect::Runs => after(reading.model(ModelPoint::Running)).is_some_and(Value::as_bool),
         Effect::NoFault => after(reading.model(ModelPoint::Fault)).is_some_and(|fault| !fault.as_bool()),
         Effect::Stops => {
             let stands = after(reading.model(ModelPoint::Running)).is_some_and(|running| !running.as_bool());
-            let slower = after(reading.model(ModelPoint::ActualSpeed))
-                .zip(speed)
-                .is_some_and(|(now, before)| now.as_f64().abs() < before - SLOWER);
-            stands || slower
+            let near_zero = after(reading.model(ModelPoint::ActualSpeed)).is_some_and(|v| v.as_f64().abs() < NEAR_ZERO);
+            stands || near_zero
         }
         Effect::ReadBack(index, value) => {
             let read = after(reading.sample(index));
@@ -128,41 +128,52 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant, speed: Option<f6
 /// An acknowledged command whose effect is waited for.
 #[derive(Debug)]
 struct Watch {
-    drive: usize,
     effects: Vec<Effect>,
     since: Instant,
     within: Duration,
-    /// Amount of the speed at the acknowledgement, percent.
-    speed: Option<f64>,
-    receipt: Receipt,
+    /// Least amount of the speed since the acknowledgement, percent, and when it last fell.
+    slowest: Option<f64>,
+    fell_at: Instant,
+    /// What it was, for people.
+    what: String,
+    /// Of those who wait for the effect; none once its time is over while the motor still slows down.
+    receipts: Vec<Receipt>,
 }
 
 impl Watch {
     fn is_over(&self, now: Instant) -> bool {
         now.saturating_duration_since(self.since) >= self.within
     }
+
+    /// Whether a motor that is to stop still slows down.
+    fn slows_down(&self, now: Instant) -> bool {
+        self.effects.contains(&Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
+    }
+
+    fn note_speed(&mut self, reading: &Reading<'_>, now: Instant) {
+        let speed = reading.model(ModelPoint::ActualSpeed);
+        let Some(speed) = speed.good().map(|v| v.as_f64().abs()) else {
+            return;
+        };
+        match self.slowest {
+            Some(slowest) if speed >= slowest - RIPPLE => {}
+            Some(_) => (self.slowest, self.fell_at) = (Some(speed), now),
+            None => self.slowest = Some(speed),
+        }
+    }
 }
 
-/// A command that showed no effect in time.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct NotConfirmed {
-    /// Index of the drive.
-    pub drive: usize,
-    /// For people.
-    pub text: String,
-}
-
-/// The acknowledged commands of a bus that may still be confirmed.
+/// The acknowledged commands of a drive that may still be confirmed.
 #[derive(Debug, Default)]
 pub struct Confirmations(Vec<Watch>);
 
 impl Confirmations {
     /// A command was acknowledged at `now`; `reading` is the drive as it is known then. Older commands that want the
     /// contrary are not waited for any more.
-    pub fn watch(&mut self, drive: usize, effects: Vec<Effect>, receipt: Receipt, reading: &Reading<'_>, now: Instant) {
+    pub fn watch(&mut self, effects: Vec<Effect>, receipts: Vec<Receipt>, reading: &Reading<'_>, now: Instant) {
         self.0.retain(|w| {
             let pointless = |old: &Effect| effects.iter().any(|new| new.same_subject(*old));
-            w.drive != drive || !w.effects.iter().any(pointless)
+            !w.effects.iter().any(pointless)
         });
         if effects.is_empty() {
             return;
@@ -171,53 +182,56 @@ impl Confirmations {
             self.0.remove(0);
         }
         self.0.push(Watch {
-            drive,
             effects,
             since: now,
             within: reading.spec.profile.confirm_within,
-            speed: reading.model(ModelPoint::ActualSpeed).good().map(|v| v.as_f64().abs()),
-            receipt,
+            slowest: reading.model(ModelPoint::ActualSpeed).good().map(|v| v.as_f64().abs()),
+            fell_at: now,
+            what: receipts.first().map(|receipt| receipt.what().to_string()).unwrap_or_default(),
+            receipts,
         });
     }
 
-    /// A drive was read: what shows its effect now, in time, is confirmed.
-    pub fn look(&mut self, drive: usize, reading: &Reading<'_>, now: Instant) {
+    /// The drive was read: what shows its effect now, in time, is confirmed.
+    pub fn look(&mut self, reading: &Reading<'_>, now: Instant) {
         let mut index = 0;
         while let Some(watch) = self.0.get_mut(index) {
-            if watch.drive == drive && !watch.is_over(now) {
-                let (since, speed) = (watch.since, watch.speed);
-                watch.effects.retain(|e| !shows(*e, reading, since, speed));
-                if watch.effects.is_empty() {
-                    self.0.remove(index).receipt.confirm(now);
-                    continue;
-                }
+            let since = watch.since;
+            watch.note_speed(reading, now);
+            if !watch.is_over(now) || watch.slows_down(now) {
+                watch.effects.retain(|e| !shows(*e, reading, since));
             }
-            index += 1;
+            if watch.effects.is_empty() {
+                let receipts = self.0.remove(index).receipts;
+                receipts.into_iter().for_each(|receipt| receipt.confirm(now));
+            } else {
+                index += 1;
+            }
         }
     }
 
-    /// What showed no effect in time, each told once. `profile` gives that of a drive.
-    pub fn expire<'p>(&mut self, profile: impl Fn(usize) -> Option<&'p Profile>, now: Instant) -> Vec<NotConfirmed> {
-        let mut told = Vec::new();
-        self.0.retain(|watch| {
-            let over = watch.is_over(now);
-            if over {
-                let missing: Vec<String> = profile(watch.drive)
-                    .map(|p| watch.effects.iter().map(|e| e.missing(p)).collect())
-                    .unwrap_or_default();
-                told.push(NotConfirmed {
-                    drive: watch.drive,
-                    text: format!(
-                        "acknowledged {} but did not show it within {:?}: {}",
-                        watch.receipt.what(),
-                        watch.within,
-                        missing.join(", ")
-                    ),
-                });
+    /// What showed no effect in time, in words, each once. Of a motor that still slows down nothing is said yet, but
+    /// nobody waits for it any longer.
+    pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<String> {
+        let mut late = Vec::new();
+        self.0.retain_mut(|watch| {
+            if !watch.is_over(now) {
+                return true;
             }
-            !over
+            if watch.slows_down(now) {
+                watch.receipts.clear();
+                return true;
+            }
+            let missing: Vec<String> = watch.effects.iter().map(|e| e.missing(profile)).collect();
+            late.push(format!(
+                "acknowledged {} but did not show it within {:?}: {}",
+                watch.what,
+                watch.within,
+                missing.join(", ")
+            ));
+            false
         });
-        told
+        late
     }
 
     /// Waits for nothing any more: what was acknowledged stays so.
@@ -232,167 +246,4 @@ impl Confirmations {
 }
 
 #[cfg(test)]
-mod tests {
-
-    use std::sync::Arc;
-
-    use super::*;
-    use crate::cache::{Access, DriveImage, DriveSpec, Link};
-    use crate::codec::{Reply, RequestPdu, Table};
-    use crate::command::{Origin, Outcome, SourceKind, Ticket, WriteStats};
-    use crate::drive::profile::Profiles;
-
-    struct Bench {
-        drive: DriveImage,
-        stats: Arc<WriteStats>,
-        confirmations: Confirmations,
-        now: Instant,
-    }
-
-    impl Bench {
-        fn new() -> Bench {
-            let spec = DriveSpec {
-                access: Access::Control,
-                turnaround: Duration::ZERO,
-                ..DriveSpec::new("d", "b", 1, Profiles::built_in().get("vacon-nx").unwrap().clone())
-            };
-            let drive = DriveImage::new(spec, Duration::from_secs(1));
-            drive.update(|s| s.link = Link::Online(std::time::SystemTime::now()));
-            let mut bench = Bench {
-                drive,
-                stats: Arc::default(),
-                confirmations: Confirmations::default(),
-                now: Instant::now(),
-            };
-            bench.read(2100, &[0]);
-            bench
-        }
-
-        fn acknowledge(&mut self, order: &Order) {
-            let origin = Origin {
-                kind: SourceKind::Mqtt,
-                who: "t".to_string(),
-            };
-            let (ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
-            let receipt = ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now);
-            let effects = effects(&self.drive.spec.profile, order);
-            let reading = self.drive.reading(self.now, Duration::from_secs(1));
-            self.confirmations.watch(0, effects, receipt, &reading, self.now);
-        }
-
-        fn set(&mut self, point: &str, value: Value) {
-            let index = self.drive.spec.profile.point_index(point).unwrap();
-            self.acknowledge(&Order::Points(vec![(index, value)]));
-        }
-
-        /// 10 ms later the drive answered with these words.
-        fn read(&mut self, start: u16, words: &[u16]) {
-            self.now += Duration::from_millis(10);
-            let now = self.now;
-            self.drive.update(|s| s.store(Table::Holding, start, words, now));
-            let reading = self.drive.reading(now, Duration::from_secs(1));
-            self.confirmations.look(0, &reading, now);
-        }
-
-        fn results(&self) -> Vec<&'static str> {
-            self.stats.audit().recent().iter().map(|r| r.result).collect()
-        }
-
-        fn expired(&mut self) -> Vec<NotConfirmed> {
-            let profile = self.drive.spec.profile.clone();
-            self.confirmations.expire(|_| Some(&profile), self.now)
-        }
-    }
-
-    #[test]
-    fn only_a_read_after_the_acknowledgement_confirms() {
-        let mut bench = Bench::new();
-        bench.read(2100, &[2]);
-        bench.set("run", Value::Bool(true));
-        let reading_before = bench.drive.reading(bench.now, Duration::from_secs(1));
-        let now = bench.now;
-        bench.confirmations.look(0, &reading_before, now);
-        assert!(bench.results().is_empty(), "the old sample proves nothing");
-        bench.read(2100, &[2]);
-        assert_eq!(bench.results(), ["confirmed"]);
-        assert_eq!(
-            bench.stats.audit().recent()[0].confirmed,
-            Some(Duration::from_millis(10))
-        );
-        assert!(bench.expired().is_empty());
-    }
-
-    #[test]
-    fn a_stop_is_confirmed_while_the_motor_slows_down() {
-        let mut bench = Bench::new();
-        bench.read(2100, &[2, 0, 5000]);
-        bench.set("run", Value::Bool(false));
-        bench.read(2100, &[2, 0, 4990]);
-        assert!(bench.results().is_empty());
-        bench.read(2100, &[2, 0, 4900]);
-        assert_eq!(bench.results(), ["confirmed"]);
-    }
-
-    #[test]
-    fn references_and_raw_writes_are_read_back() {
-        let mut bench = Bench::new();
-        bench.set("speed_reference", Value::Number(33.333));
-        bench.read(2002, &[0]);
-        assert!(bench.results().is_empty());
-        bench.read(2002, &[3333]);
-        assert_eq!(bench.results(), ["confirmed"]);
-        bench.acknowledge(&Order::Write(RequestPdu::WriteRegisters {
-            start: 2000,
-            values: vec![1, 0, 2000],
-        }));
-        bench.read(2000, &[1, 0, 2000]);
-        assert_eq!(
-            bench.results().len(),
-            1,
-            "the run bit was read back, the motor does not run yet"
-        );
-        bench.read(2100, &[2]);
-        assert_eq!(bench.results(), ["confirmed", "confirmed"]);
-    }
-
-    #[test]
-    fn what_shows_too_late_is_not_confirmed() {
-        let mut bench = Bench::new();
-        bench.set("run", Value::Bool(true));
-        bench.now += Duration::from_secs(2);
-        bench.read(2100, &[2]);
-        assert!(bench.results().is_empty());
-        assert_eq!(bench.expired().len(), 1);
-        assert_eq!(bench.results(), ["acknowledged"]);
-    }
-
-    #[test]
-    fn what_is_not_waited_for_any_more_stays_acknowledged() {
-        let mut bench = Bench::new();
-        bench.set("run", Value::Bool(true));
-        bench.confirmations.clear();
-        assert_eq!(bench.results(), ["acknowledged"]);
-        bench.read(2100, &[2]);
-        assert!(bench.expired().is_empty() && bench.results().len() == 1);
-    }
-
-    #[test]
-    fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
-        let mut bench = Bench::new();
-        bench.set("fault_reset", Value::Bool(true));
-        bench.set("run", Value::Bool(true));
-        bench.set("run", Value::Bool(false));
-        assert_eq!(bench.results(), ["acknowledged"], "the stop overtook the run");
-        bench.read(2100, &[8]);
-        assert_eq!(bench.results(), ["acknowledged", "confirmed"], "it stands");
-        bench.now += Duration::from_secs(2);
-        let told = bench.expired();
-        assert_eq!(told.len(), 1);
-        assert_eq!(
-            told[0].text,
-            "acknowledged it but did not show it within 2s: the fault is still active"
-        );
-        assert_eq!(bench.results(), ["acknowledged", "confirmed", "acknowledged"]);
-        assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
-    }
-}
+mod tests;

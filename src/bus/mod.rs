@@ -1,22 +1,25 @@
 //! The bus: one owner of the line, one transaction at a time.
 
-pub mod asker;
+pub mod command_run;
 pub mod confirm;
-pub mod debts;
-pub mod desk;
-mod exchange;
-pub mod execute;
-pub mod leases;
+pub mod core;
+mod drive_state;
+pub mod late_replies;
+mod line_loop;
+pub mod line_state;
+pub mod master;
+pub mod n2_late_replies;
+pub mod n2_session;
+pub mod news;
 pub mod predict;
+pub mod prober;
 mod report;
 pub mod schedule;
-pub mod session;
+pub mod supervision;
 mod tap;
-mod task;
 pub mod transaction;
-mod watchdog;
 
-pub use task::BusTask;
+pub use line_loop::BusTask;
 
 use std::time::Duration;
 

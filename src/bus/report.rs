@@ -1,28 +1,31 @@
-//! What the bus tells: health and figures of the image, and events.
+//! Applies what the master has to say to the process image, and turns it into events and log lines.
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::confirm::NotConfirmed;
+use super::line_state::Exchanged;
+use super::news::{Adopted, News};
+use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
-use super::transaction::{Ended, Transaction};
-use super::watchdog::{OwnResponse, own_response};
-use crate::cache::{Access, BusImage, Link, Outcome as Counted, PollCycle};
+use super::transaction::Ended;
+use crate::cache::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
 use crate::codec::{Exception, Reply, Request};
-use crate::drive::{ModelPoint, PlannedRead, Value};
+use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
 
 /// The load of the line is reckoned over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
+/// What was read longer ago does not tell of faults and parameters.
+const RECENT: Duration = Duration::from_secs(60);
 
-/// Tells what a bus does.
+/// Reports what a bus does.
 #[derive(Debug)]
 pub(super) struct Report {
     image: Arc<BusImage>,
     events: Events,
     window: Instant,
     busy: Duration,
-    /// Fault code of each drive as last told; `None` is no fault.
+    /// Fault code of each drive as last reported; `None` is no fault.
     faults: Vec<Option<i64>>,
     /// Drives whose own response to a silent master was looked at since they came online.
     looked_at: Vec<bool>,
@@ -31,12 +34,12 @@ pub(super) struct Report {
 }
 
 impl Report {
-    pub(super) fn new(image: Arc<BusImage>, events: Events) -> Report {
+    pub(super) fn new(image: Arc<BusImage>, events: Events, now: Instant) -> Report {
         let faults = vec![None; image.drives.len()];
         Report {
             image,
             events,
-            window: Instant::now(),
+            window: now,
             busy: Duration::ZERO,
             looked_at: vec![false; faults.len()],
             faults,
@@ -45,26 +48,119 @@ impl Report {
         }
     }
 
-    fn tell(&self, kind: EventKind, drive: Option<usize>, fault_code: Option<i64>, text: String) {
-        let drive = drive
-            .and_then(|i| self.image.drives.get(i))
-            .map(|d| d.spec.name.clone());
-        let bus = self.image.spec.name.clone();
+    /// Applies one piece of news.
+    pub(super) fn apply(&mut self, news: &News, now: Instant) {
+        match news {
+            News::FastRound(cycle) => self.fast_round(*cycle),
+            News::SlowRound(cycle) => self.slow_round(*cycle),
+            News::Read { drive, read, words, at } => self.read(*drive, read, words, *at),
+            News::Online(drive) => self.online(*drive),
+            News::Offline(drive) => self.offline(*drive),
+            News::Restarted(drive) => self.restarted(*drive),
+            News::Unlike(drive, device) => self.unlike(*drive, *device),
+            News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception),
+            News::NotConfirmed(drive, text) => {
+                self.tell(*drive, EventKind::NotConfirmed, None, |name| format!("drive {name} {text}"));
+            }
+            News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
+            News::ActionRefused { drive, what, refusal } => {
+                self.tell(*drive, EventKind::Supervision, None, |name| {
+                    format!(
+                        "the lease of {name} ran out, and {what} cannot be written: {refusal}; it is tried again every \
+                         second, until a client commands the drive"
+                    )
+                });
+            }
+            News::RunningUnknown(drive) => {
+                self.tell(*drive, EventKind::Supervision, None, |name| {
+                    format!(
+                        "drive {name} does not say whether it runs; its supervision goes by the run command, and takes a \
+                         motor whose run command is not known to run"
+                    )
+                });
+            }
+            News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
+        }
+        if let News::Read { drive, .. } = news {
+            self.look_at_fault(*drive, now);
+            self.look_at_own_response(*drive, now);
+        }
+    }
+
+    fn drive(&self, index: usize) -> Option<Arc<DriveImage>> {
+        self.image.drives.get(index).cloned()
+    }
+
+    /// Reports an event of a drive; `text` makes the words from its name.
+    fn tell(&self, index: usize, kind: EventKind, fault_code: Option<i64>, text: impl FnOnce(&str) -> String) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        let name = drive.spec.name.clone();
+        let text = text(&name);
+        self.event(kind, Some(name), fault_code, text);
+    }
+
+    fn event(&self, kind: EventKind, drive: Option<String>, fault_code: Option<i64>, text: String) {
         self.events.tell(Event {
             id: 0,
             time: SystemTime::now(),
             kind,
-            bus,
+            bus: self.image.spec.name.clone(),
             drive,
             fault_code,
             text,
         });
     }
 
-    pub(super) fn bus_up(&mut self) {
+    fn read(&self, index: usize, read: &PlannedRead, words: &[u16], at: Instant) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.update(|snapshot: &mut Snapshot| {
+            snapshot.store(read.table, read.start, words, at);
+            if read.class == PollClass::Fast {
+                snapshot.fast_at = Some(at);
+            }
+        });
+    }
+
+    fn lease_ran_out(&self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
+        let Some(supervision) = &drive.spec.supervision else {
+            return;
+        };
+        drive.count_supervision();
+        let action = match supervision.action {
+            LeaseAction::Stop => "the drive is stopped".to_string(),
+            LeaseAction::Hold => "nothing is written".to_string(),
+            LeaseAction::SpeedReference(percent) => format!("the speed reference is set to {percent} %"),
+        };
+        let timeout = supervision.timeout;
+        self.tell(index, EventKind::Supervision, None, |name| {
+            format!("no commanding client of {name} for {timeout:?}: {action}")
+        });
+    }
+
+    fn runs_unsupervised(&self, index: usize, adopted: Adopted) {
+        let Some(drive) = self.drive(index) else { return };
+        drive.set_unsupervised(adopted == Adopted::No);
+        let then = match adopted {
+            Adopted::Yes => "its lease starts now (supervision.adopt)",
+            Adopted::No => {
+                "its lease starts with the first order or heartbeat of a client; set supervision.adopt = true to start it \
+                 with the gateway"
+            }
+        };
+        self.tell(index, EventKind::Unsupervised, None, |name| {
+            format!("drive {name} runs, and nobody has commanded it since the gateway started; {then}")
+        });
+    }
+
+    pub(super) fn bus_up(&mut self, now: Instant) {
         self.up = true;
         self.reason.clear();
-        self.window = Instant::now();
+        self.window = now;
         self.busy = Duration::ZERO;
         self.image.update_health(|h| {
             h.up = true;
@@ -74,7 +170,7 @@ impl Report {
             h.opened += 1;
         });
         let text = format!("port {} of bus {} is open", self.image.spec.port, self.image.spec.name);
-        self.tell(EventKind::BusUp, None, None, text);
+        self.event(EventKind::BusUp, None, None, text);
     }
 
     /// Told once a reason, not at every try.
@@ -93,7 +189,7 @@ impl Report {
         if news {
             self.reason = why.to_string();
             let name = &self.image.spec.name;
-            self.tell(
+            self.event(
                 EventKind::BusDown,
                 None,
                 None,
@@ -102,26 +198,18 @@ impl Report {
         }
     }
 
-    pub(super) fn online(&mut self, index: usize) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+    fn online(&mut self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
         drive.update(|s| s.link = Link::Online(SystemTime::now()));
         if let Some(looked_at) = self.looked_at.get_mut(index) {
             *looked_at = false;
         }
-        self.tell(
-            EventKind::Online,
-            Some(index),
-            None,
-            format!("drive {} answers", drive.spec.name),
-        );
+        self.tell(index, EventKind::Online, None, |name| format!("drive {name} answers"));
     }
 
-    pub(super) fn offline(&mut self, index: usize, why: &str) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
+    /// Also while the bus is down, when nothing was heard of the drive before.
+    fn offline(&mut self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
         if matches!(drive.snapshot().link, Link::Offline(_)) {
             return;
         }
@@ -129,46 +217,34 @@ impl Report {
             s.link = Link::Offline(SystemTime::now());
             s.outlive();
         });
-        let text = format!(
-            "drive {} is offline: {why}; it is asked again with pauses up to 10 s",
-            drive.spec.name
-        );
-        self.tell(EventKind::Offline, Some(index), None, text);
+        let why = if self.up { "it does not answer" } else { "its bus is down" };
+        self.tell(index, EventKind::Offline, None, |name| {
+            format!("drive {name} is offline: {why}; it is asked again with pauses up to 10 s")
+        });
     }
 
-    pub(super) fn restarted(&self, index: usize) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
-        let text = format!(
-            "drive {} has started anew; it is read again, and takes only commands that come from now on",
-            drive.spec.name
-        );
-        self.tell(EventKind::Restarted, Some(index), None, text);
+    fn restarted(&self, index: usize) {
+        let Some(drive) = self.drive(index) else { return };
+        drive.update(Snapshot::outlive);
+        self.tell(index, EventKind::Restarted, None, |name| {
+            format!("drive {name} has started anew; it is read again, and takes only commands that come from now on")
+        });
     }
 
-    /// A drive told another device type than its profile expects.
-    pub(super) fn unlike(&self, index: usize, device: u8) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
-        let text = format!(
-            "drive {} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check address and \
-             profile, or set device_type in [n2] of the profile",
-            drive.spec.name, drive.spec.profile.name, drive.spec.profile.n2.device_type
-        );
-        self.tell(EventKind::UnlikeProfile, Some(index), None, text);
+    /// A drive says that it is of another device type than its profile expects.
+    fn unlike(&self, index: usize, device: u8) {
+        let Some(drive) = self.drive(index) else { return };
+        let profile = &drive.spec.profile;
+        self.tell(index, EventKind::UnlikeProfile, None, |name| {
+            format!(
+                "drive {name} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check \
+                 address and profile, or set device_type in [n2] of the profile",
+                profile.name, profile.n2.device_type
+            )
+        });
     }
 
-    pub(super) fn not_confirmed(&self, late: &NotConfirmed) {
-        let Some(drive) = self.image.drives.get(late.drive) else {
-            return;
-        };
-        let text = format!("drive {} {}", drive.spec.name, late.text);
-        self.tell(EventKind::NotConfirmed, Some(late.drive), None, text);
-    }
-
-    pub(super) fn unavailable(&self, index: usize, read: &PlannedRead, exception: Exception) {
+    fn unavailable(&self, index: usize, read: &PlannedRead, exception: Exception) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -180,76 +256,67 @@ impl Report {
         );
     }
 
-    /// Tells, once each time it comes online, of a controlled drive that does not respond to a silent master.
-    pub(super) fn look_at_supervision(&mut self, index: usize) {
+    /// Reports, once each time it comes online, a controlled drive that does not respond to a silent master.
+    fn look_at_own_response(&mut self, index: usize, now: Instant) {
         let (Some(drive), Some(looked_at)) = (self.image.drives.get(index), self.looked_at.get_mut(index)) else {
             return;
         };
         if *looked_at || drive.spec.access == Access::Monitor {
             return;
         }
-        let response = own_response(&drive.reading(Instant::now(), Duration::from_secs(60)));
+        let response = own_response(&drive.reading(now, RECENT));
         *looked_at = response != OwnResponse::Unknown;
         let OwnResponse::Off(point) = response else { return };
-        let name = &drive.spec.name;
         if drive.spec.supervision.is_some() {
             tracing::warn!(
-                bus = %self.image.spec.name, drive = %name,
+                bus = %self.image.spec.name, drive = %drive.spec.name,
                 "the drive does not respond to a silent master ({point} = 0), its lease stops it only while the gateway \
                  works; set the parameter to a stop if the process allows it"
             );
             return;
         }
-        let text = format!(
-            "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response to a \
-             silent master is off ({point} = 0); configure supervision, and set the parameter if the process allows it"
-        );
-        self.tell(EventKind::Unsupervised, Some(index), None, text);
+        self.tell(index, EventKind::Unsupervised, None, |name| {
+            format!(
+                "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response \
+                 to a silent master is off ({point} = 0); configure supervision, and set the parameter if the process \
+                 allows it"
+            )
+        });
     }
 
     /// Faults that came or went with the last poll.
-    pub(super) fn look(&mut self, index: usize) {
-        let Some(drive) = self.image.drives.get(index) else {
-            return;
-        };
-        let reading = drive.reading(Instant::now(), Duration::from_secs(60));
+    fn look_at_fault(&mut self, index: usize, now: Instant) {
+        let Some(drive) = self.drive(index) else { return };
+        let reading = drive.reading(now, RECENT);
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
             return;
         };
-        let told = reading.model(ModelPoint::FaultCode);
-        let code = match told.good() {
+        let shown = reading.model(ModelPoint::FaultCode);
+        let code = match shown.good() {
             Some(Value::Integer(code)) => code,
             _ => 0,
         };
         // A code that was read before the fault came, in a request of its own, is not that of the fault.
-        let before_the_fault = told.at < reading.model(ModelPoint::Fault).at;
-        if fault.as_bool() && code == 0 && told.good().is_some() && before_the_fault {
+        let before_the_fault = shown.at < reading.model(ModelPoint::Fault).at;
+        if fault.as_bool() && code == 0 && shown.good().is_some() && before_the_fault {
             return;
         }
-        let now = fault.as_bool().then_some(code);
-        let Some(before) = self.faults.get_mut(index) else {
-            return;
-        };
-        if *before == now {
-            return;
+        let active = fault.as_bool().then_some(code);
+        match self.faults.get_mut(index) {
+            Some(before) if *before != active => *before = active,
+            _ => return,
         }
-        *before = now;
-        let name = &drive.spec.name;
-        match now {
-            Some(code) => {
-                let text = format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code));
-                self.tell(EventKind::Fault, Some(index), Some(code), text);
-            }
-            None => self.tell(
-                EventKind::FaultEnd,
-                Some(index),
-                None,
-                format!("the fault of drive {name} is gone"),
-            ),
+        match active {
+            Some(code) => self.tell(index, EventKind::Fault, Some(code), |name| {
+                format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code))
+            }),
+            None => self.tell(index, EventKind::FaultEnd, None, |name| {
+                format!("the fault of drive {name} is gone")
+            }),
         }
     }
 
-    pub(super) fn fast_round(&self, cycle: Option<Duration>) {
+    fn fast_round(&self, cycle: Option<Duration>) {
         if let Some(cycle) = cycle {
             self.image.fast_cycles.observe(cycle);
         }
@@ -261,7 +328,7 @@ impl Report {
         });
     }
 
-    pub(super) fn slow_round(&self, cycle: Option<Duration>) {
+    fn slow_round(&self, cycle: Option<Duration>) {
         if let Some(cycle) = cycle {
             self.image.slow_cycles.observe(cycle);
         }
@@ -275,24 +342,24 @@ impl Report {
 
     /// Looks at an exchange for whoever listens to the frames; `None` while nobody does. The request was given to the
     /// line at `began`, which had been silent since `quiet_since`.
-    pub(super) fn tap<'r>(
+    pub(super) fn tap(
         &self,
         index: usize,
-        request: &'r Request,
-        frame: &'r [u8],
+        request: &Request,
+        frame: &[u8],
         quiet_since: Instant,
         began: Instant,
-    ) -> Option<Tap<'r>> {
+    ) -> Option<Tap> {
         if !self.image.trace.wanted() {
             return None;
         }
-        let tap = Tap::new(self.image.clone(), index, request, frame, began);
+        let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);
         tap.sent(quiet_since, began);
         Some(tap)
     }
 
     /// Bytes that are nobody's answer came in an exchange.
-    pub(super) fn foreign(&self) {
+    fn foreign(&self) {
         self.image.update_health(|h| h.foreign += 1);
     }
 
@@ -302,31 +369,25 @@ impl Report {
         tap::noise(&self.image, bytes, quiet_since, now);
     }
 
-    /// An exchange is over: counters, turnaround, load. `sent` is when the drive knew that the request was over.
-    pub(super) fn exchanged(
-        &mut self,
-        index: usize,
-        transaction: &Transaction<'_>,
-        ended: &Ended,
-        sent: Instant,
-        reply_time: Duration,
-        took: Duration,
-    ) {
-        self.busy += took;
-        self.image.transactions.observe(took);
-        if transaction.foreign() > 0 {
-            self.image
-                .update_health(|h| h.foreign += u64::from(transaction.foreign()));
+    /// An exchange is over: counters, turnaround, load.
+    pub(super) fn exchanged(&mut self, index: usize, exchanged: &Exchanged, now: Instant) {
+        let transaction = &exchanged.transaction;
+        self.busy += exchanged.took;
+        self.image.transactions.observe(exchanged.took);
+        let stray = matches!(exchanged.ended, Ended::Reply(_)) && !transaction.rest().is_empty();
+        let foreign = u64::from(transaction.foreign()) + u64::from(stray);
+        if foreign > 0 {
+            self.image.update_health(|h| h.foreign += foreign);
         }
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
-        drive.count(counted(ended));
-        let now = Instant::now();
-        if let (Ended::Reply(reply), Some(first)) = (ended, transaction.first_byte()) {
+        drive.count(counted(&exchanged.ended));
+        if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
             // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
-            let by_first = first.saturating_duration_since(sent);
-            let by_last = now.saturating_duration_since(sent).saturating_sub(reply_time);
+            let by_first = first.saturating_duration_since(exchanged.sent);
+            let by_last = now.saturating_duration_since(exchanged.sent);
+            let by_last = by_last.saturating_sub(exchanged.reply_time);
             if !matches!(reply, Reply::Exception(_)) {
                 drive.set_turnaround(by_first.min(by_last));
             }

@@ -268,10 +268,22 @@ impl Schedule {
         }
     }
 
-    /// The drive answered a command: it is alive.
-    pub fn seen(&mut self, drive: usize) {
+    /// The drive answered a command: it is alive, and probed at once if it was away.
+    pub fn seen(&mut self, drive: usize, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
             drive.failures = 0;
+            if let Presence::Away(at, pause) = drive.presence {
+                drive.presence = Presence::Away(at.min(now), pause);
+            }
+        }
+    }
+
+    /// A drive that is away did not answer a command, which was as good as a probe.
+    pub fn probed_in_vain(&mut self, drive: usize, took: Duration, now: Instant) {
+        if let Some(drive) = self.drives.get_mut(drive)
+            && let Presence::Away(_, pause) = drive.presence
+        {
+            drive.presence = drives::away(now, pause, took);
         }
     }
 

@@ -16,31 +16,31 @@ const KEPT: usize = 2048;
 
 /// One exchange that somebody listens to.
 #[derive(Debug)]
-pub(super) struct Tap<'r> {
+pub(super) struct Tap {
     image: Arc<BusImage>,
     drive: Option<String>,
-    request: &'r Request,
-    frame: &'r [u8],
+    request: Request,
+    frame: Vec<u8>,
     hearing: Hearing,
 }
 
-impl<'r> Tap<'r> {
+impl Tap {
     /// The exchange whose request was given to the line at `began`.
     pub(super) fn new(
         image: Arc<BusImage>,
         index: usize,
-        request: &'r Request,
-        frame: &'r [u8],
+        request: Request,
+        frame: Vec<u8>,
         began: Instant,
-    ) -> Tap<'r> {
+    ) -> Tap {
         let format = image.spec.format;
         let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
         Tap {
             image,
             drive,
             request,
-            frame,
             hearing: Hearing::new(format, began + format.chars(frame.len())),
+            frame,
         }
     }
 
@@ -66,7 +66,7 @@ impl<'r> Tap<'r> {
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
-        let parts = describe::parts(protocol, self.request, self.frame, &self.hearing.bytes, answered);
+        let parts = describe::parts(protocol, &self.request, &self.frame, &self.hearing.bytes, answered);
         // The outcome stands at its own part; where there is none (nothing came, or only foreign frames) at nothing.
         let its_kind = if answered { Kind::Reply } else { Kind::Garbage };
         let its_part = parts.iter().rposition(|part| part.kind == its_kind);
@@ -76,7 +76,7 @@ impl<'r> Tap<'r> {
             quiet_since = end;
             let bytes = self.hearing.bytes.get(part.range).unwrap_or_default();
             let (decode, verdict) = match part.kind {
-                _ if its_part == Some(place) => (describe::reply(protocol, self.request, bytes), verdict(ended)),
+                _ if its_part == Some(place) => (describe::reply(protocol, &self.request, bytes), verdict(ended)),
                 Kind::Echo => ("the request comes back".to_string(), "echo".to_string()),
                 _ => (describe::stray(protocol, bytes), "foreign".to_string()),
             };

@@ -10,6 +10,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::n2_late_replies::N2LateReplies;
 use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
 /// Most bytes looked at in one exchange: more is babble, whatever it says.
@@ -39,10 +40,10 @@ pub enum Step {
 
 /// An exchange whose request is on the line.
 #[derive(Debug)]
-pub struct Transaction<'r> {
+pub struct Transaction {
     protocol: Protocol,
-    request: &'r Request,
-    frame: &'r [u8],
+    request: Request,
+    frame: Vec<u8>,
     received: Vec<u8>,
     seen: Vec<u8>,
     deadline: Instant,
@@ -56,20 +57,22 @@ pub struct Transaction<'r> {
     /// A reply that is whole before then was not made for this request.
     doubted_before: Option<Instant>,
     doubted: bool,
+    /// What may still come of earlier exchanges on an N2 line.
+    late: N2LateReplies,
 }
 
-impl<'r> Transaction<'r> {
+impl Transaction {
     /// The request whose `frame` was given to the line. The deadline is set once: end of transmission, time
     /// for the first byte, wire time of the reply. `echo`: the adapter is known to send back what it is given.
     pub fn new(
         protocol: Protocol,
-        request: &'r Request,
-        frame: &'r [u8],
+        request: Request,
+        frame: Vec<u8>,
         end_of_transmission: Instant,
         response_timeout: Duration,
         reply_time: Duration,
         echo: bool,
-    ) -> Transaction<'r> {
+    ) -> Transaction {
         Transaction {
             protocol,
             request,
@@ -85,6 +88,7 @@ impl<'r> Transaction<'r> {
             echo_seen: false,
             doubted_before: None,
             doubted: false,
+            late: N2LateReplies::default(),
         }
     }
 
@@ -99,9 +103,30 @@ impl<'r> Transaction<'r> {
         self.doubted
     }
 
-    /// Whether the bytes that could not be believed are as many as the reply has: nothing is owed any more.
-    pub fn is_paid(&self) -> bool {
-        self.received.len() >= self.protocol.reply_chars(&self.request.pdu)
+    /// Frames that could be late replies of earlier exchanges are passed over.
+    pub fn pass_over(&mut self, late: N2LateReplies) {
+        self.late = late;
+    }
+
+    /// What may still come of earlier exchanges.
+    pub fn take_late(&mut self) -> N2LateReplies {
+        std::mem::take(&mut self.late)
+    }
+
+    /// Whether what could not be believed was the drive's reply, mangled: it begins as that, or is as long. Nothing else
+    /// is to come of it then.
+    pub fn is_mangled_reply(&self) -> bool {
+        self.protocol.begins_reply(&self.request, &self.received)
+    }
+
+    /// The request.
+    pub fn request(&self) -> &Request {
+        &self.request
+    }
+
+    /// The frame that was sent.
+    pub fn frame(&self) -> &[u8] {
+        &self.frame
     }
 
     /// Bytes came in.
@@ -117,7 +142,14 @@ impl<'r> Transaction<'r> {
             if self.strip_echo() {
                 continue;
             }
-            match self.protocol.decode(self.request, &self.received) {
+            if let Some(used) = self.late.pass_over(&self.received, now) {
+                self.foreign += 1;
+                self.received.drain(..used.min(self.received.len()));
+                self.first_byte = (!self.received.is_empty()).then_some(now);
+                self.garbage = None;
+                continue;
+            }
+            match self.protocol.decode(&self.request, &self.received) {
                 Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => return self.replied(used, reply),
                 Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
@@ -169,7 +201,7 @@ impl<'r> Transaction<'r> {
                 rest.first()
                     .is_some_and(|&first| self.protocol.may_begin_behind_garbage(self.request.address, first))
             })?;
-            match self.protocol.decode(self.request, rest) {
+            match self.protocol.decode(&self.request, rest) {
                 Decoded::Reply {
                     reply: Reply::Exception(_),
                     ..
@@ -212,7 +244,7 @@ impl<'r> Transaction<'r> {
         let tells = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
         let noise = self.protocol.noise(&self.received);
         let from_frame = self.received.get(noise..).unwrap_or_default();
-        if !tells || !from_frame.starts_with(self.frame) {
+        if !tells || !from_frame.starts_with(&self.frame) {
             return false;
         }
         self.received.drain(..noise + self.frame.len());

@@ -49,6 +49,8 @@ pub struct Supervision {
     pub timeout: Duration,
     /// What is done then, once.
     pub action: LeaseAction,
+    /// A drive that runs when the gateway starts gets its lease started then.
+    pub adopt: bool,
 }
 
 /// What is done with a drive when the gateway stops.
@@ -119,10 +121,10 @@ pub struct DriveImage {
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
-    lease: Mutex<Option<Instant>>,
-    /// The action of a lease that ran out is not acknowledged yet.
-    action_owed: AtomicBool,
+    /// The last heartbeat that the bus has not taken note of.
+    heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
+    unsupervised: AtomicBool,
 }
 
 impl DriveImage {
@@ -139,9 +141,9 @@ impl DriveImage {
             snapshot,
             outcomes,
             turnaround: AtomicU64::new(0),
-            lease: Mutex::default(),
-            action_owed: AtomicBool::new(false),
+            heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
+            unsupervised: AtomicBool::new(false),
         }
     }
 
@@ -211,11 +213,26 @@ impl DriveImage {
         }
     }
 
-    /// A commanding client was heard of: the lease runs anew.
+    /// A commanding client sent its heartbeat: the lease runs anew.
     pub fn renew_lease(&self, now: Instant) {
         if self.spec.supervision.is_some() {
-            *self.lease.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
+            *self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner) = Some(now);
         }
+    }
+
+    /// The last heartbeat since the last call. Only the bus itself may call this.
+    pub fn take_heartbeat(&self) -> Option<Instant> {
+        self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).take()
+    }
+
+    /// Notes whether the drive ran without a lease when the gateway started, and no client was heard of since.
+    pub fn set_unsupervised(&self, unsupervised: bool) {
+        self.unsupervised.store(unsupervised, Ordering::Relaxed);
+    }
+
+    /// Whether the drive has supervision, but runs without a lease since the gateway started.
+    pub fn is_unsupervised(&self) -> bool {
+        self.unsupervised.load(Ordering::Relaxed)
     }
 
     /// Counts a lease that ran out while the drive ran.
@@ -226,48 +243,6 @@ impl DriveImage {
     /// Leases that ran out while the drive ran, so far.
     pub fn supervisions(&self) -> u64 {
         self.supervisions.load(Ordering::Relaxed)
-    }
-
-    /// Goes on with the lease of the image that this one replaces, and with the action that it still owes.
-    pub fn take_over_lease(&self, from: &DriveImage) {
-        if self.spec.access != Access::Control {
-            return;
-        }
-        let renewed = *from.lease.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some(renewed) = renewed {
-            self.renew_lease(renewed);
-        }
-        self.owe_action(from.owes_action());
-    }
-
-    /// Whether a lease runs, or ran out and was not ended yet.
-    pub fn has_lease(&self) -> bool {
-        self.lease.lock().unwrap_or_else(PoisonError::into_inner).is_some()
-    }
-
-    /// The action of a lease that ran out is to be written, or was acknowledged.
-    pub fn owe_action(&self, owed: bool) {
-        let writes = |s: &Supervision| s.action != LeaseAction::Hold;
-        let owed = owed && self.spec.supervision.as_ref().is_some_and(writes);
-        self.action_owed.store(owed, Ordering::Relaxed);
-    }
-
-    /// Whether the action of a lease that ran out is not acknowledged yet.
-    pub fn owes_action(&self) -> bool {
-        self.action_owed.load(Ordering::Relaxed)
-    }
-
-    /// Ends the lease if it ran out; true exactly once for each lease.
-    pub fn lease_ran_out(&self, now: Instant) -> bool {
-        let Some(supervision) = &self.spec.supervision else {
-            return false;
-        };
-        let mut lease = self.lease.lock().unwrap_or_else(PoisonError::into_inner);
-        let out = lease.is_some_and(|renewed| now.saturating_duration_since(renewed) >= supervision.timeout);
-        if out {
-            *lease = None;
-        }
-        out
     }
 }
 

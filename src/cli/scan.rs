@@ -13,7 +13,7 @@ use std::time::Duration;
 use self::progress::Progress;
 use self::snippet::Found;
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
-use crate::bus::asker::Asker;
+use crate::bus::prober::Prober;
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
@@ -250,7 +250,7 @@ impl Scan<'_> {
         let (line, _) = Line::open(&self.args.port, &format, Rs485::Off).map_err(|error| error.to_string())?;
         let silence = protocol.silence(Silence::Spec, &format);
         let timeout = self.args.timeout.unwrap_or(protocol.usual_timeout());
-        let mut asker = Asker::new(&line, protocol, format, silence, timeout);
+        let mut prober = Prober::new(&line, protocol, format, silence, timeout);
         let args = self.args;
         for address in addresses(args, setting) {
             if self.stop.load(Ordering::Relaxed) {
@@ -258,11 +258,11 @@ impl Scan<'_> {
             }
             let at = format!("{} {format}, address {address}", protocol.name());
             let hello = hello(protocol, address);
-            self.progress.show(&at, asker.patience(&hello) * args.tries);
-            let answered = self.tries(&mut asker, &hello, setting)?;
+            self.progress.show(&at, prober.patience(&hello) * args.tries);
+            let answered = self.tries(&mut prober, &hello, setting)?;
             self.progress.step();
             if answered {
-                let found = self.look_closer(&mut asker, setting, address)?;
+                let found = self.look_closer(&mut prober, setting, address)?;
                 self.progress.say(&format!("found {at}: {}", found.title()));
                 self.found.push(found);
             }
@@ -271,14 +271,14 @@ impl Scan<'_> {
     }
 
     /// Whether a drive answers, with whatever.
-    fn tries(&mut self, asker: &mut Asker<'_>, hello: &Request, setting: Setting) -> Result<bool, String> {
+    fn tries(&mut self, prober: &mut Prober<'_>, hello: &Request, setting: Setting) -> Result<bool, String> {
         for _ in 0..self.args.tries {
-            match self.ask(asker, hello)? {
+            match self.ask(prober, hello)? {
                 Ended::Reply(_) => return Ok(true),
                 Ended::Silent => {}
                 Ended::Corrupt(_) => {
                     // Once more: noise does not come twice.
-                    if matches!(self.ask(asker, hello)?, Ended::Reply(_)) {
+                    if matches!(self.ask(prober, hello)?, Ended::Reply(_)) {
                         return Ok(true);
                     }
                     self.garbage.push((setting, hello.address));
@@ -288,18 +288,18 @@ impl Scan<'_> {
         Ok(false)
     }
 
-    fn ask(&self, asker: &mut Asker<'_>, request: &Request) -> Result<Ended, String> {
-        asker
+    fn ask(&self, prober: &mut Prober<'_>, request: &Request) -> Result<Ended, String> {
+        prober
             .ask(request)
             .map_err(|lost| format!("{lost}; {}; plug the adapter in and try again", self.args.port))
     }
 
-    fn look_closer(&mut self, asker: &mut Asker<'_>, setting: Setting, address: u8) -> Result<Found, String> {
+    fn look_closer(&mut self, prober: &mut Prober<'_>, setting: Setting, address: u8) -> Result<Found, String> {
         let mut outcomes: BTreeMap<Probe, bool> = BTreeMap::new();
         for one in identify::probes(&self.profiles, setting.protocol) {
             let request = Request::new(address, one.pdu());
             for _ in 0..2 {
-                match self.ask(asker, &request)? {
+                match self.ask(prober, &request)? {
                     Ended::Reply(Reply::Exception(_)) => {
                         outcomes.insert(one, false);
                     }

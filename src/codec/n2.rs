@@ -108,7 +108,7 @@ pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
 
 /// What the regular reply to a request holds.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Expected {
+pub enum Form {
     /// A status byte with the state.
     State,
     /// A float, perhaps behind a byte.
@@ -123,16 +123,17 @@ enum Expected {
     Acknowledgement,
 }
 
-fn expected(pdu: &RequestPdu) -> Option<Expected> {
+/// The form of the regular reply to a request; none of one that means no object.
+pub fn form(pdu: &RequestPdu) -> Option<Form> {
     Some(match command_of(pdu)? {
         Command::Read { object, .. } => match object.region {
-            Region::Bi | Region::Bo => Expected::State,
-            Region::Adi => Expected::Integer,
-            _ => Expected::Float,
+            Region::Bi | Region::Bo => Form::State,
+            Region::Adi => Form::Integer,
+            _ => Form::Float,
         },
-        Command::Identify => Expected::Identity,
-        Command::Poll { .. } => Expected::Changes,
-        _ => Expected::Acknowledgement,
+        Command::Identify => Form::Identity,
+        Command::Poll { .. } => Form::Changes,
+        _ => Form::Acknowledgement,
     })
 }
 
@@ -178,31 +179,31 @@ fn unended(frame: &[u8]) -> Decoded {
 
 fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
     let answer = Answer::decode(line)?;
-    let expected = expected(&request.pdu).ok_or("nothing was asked")?;
+    let expected = form(&request.pdu).ok_or("nothing was asked")?;
     let data = match answer {
         // The drive saw a wrong checksum: the line, not the drive, refuses.
         Answer::Nak(command::CHECKSUM) => return Err("the drive saw a wrong checksum (N02)"),
         Answer::Nak(code) => return Ok(Reply::Exception(Exception::n2(code))),
-        Answer::Data(digits) if expected == Expected::Changes => return Ok(Reply::Changes(digits)),
+        Answer::Data(digits) if expected == Form::Changes => return Ok(Reply::Changes(digits)),
         Answer::Data(digits) => bytes_of(&digits).ok_or("an odd number of digits")?,
         Answer::Ack => Vec::new(),
     };
     let word = |high: u8, low: u8| u16::from_be_bytes([high, low]);
     match (expected, data.as_slice()) {
-        (Expected::Acknowledgement, []) => Ok(Reply::Written),
-        (Expected::Changes, []) => Ok(Reply::Changes(Vec::new())),
-        (Expected::Identity, [device]) => Ok(Reply::Identified(*device)),
-        (Expected::State, [status]) => Ok(state(*status, &request.n2)),
-        (Expected::Integer, [a, b] | [_, a, b]) => Ok(Reply::Registers(vec![word(*a, *b)])),
+        (Form::Acknowledgement, []) => Ok(Reply::Written),
+        (Form::Changes, []) => Ok(Reply::Changes(Vec::new())),
+        (Form::Identity, [device]) => Ok(Reply::Identified(*device)),
+        (Form::State, [status]) => Ok(state(*status, &request.n2)),
+        (Form::Integer, [a, b] | [_, a, b]) => Ok(Reply::Registers(vec![word(*a, *b)])),
         // Whatever the bits are: what is no number becomes no value where the point is decoded.
-        (Expected::Float, [a, b, c, d] | [_, a, b, c, d]) => Ok(Reply::Registers(vec![word(*a, *b), word(*c, *d)])),
-        (Expected::Acknowledgement, _) => Err("data where an acknowledgement was expected"),
+        (Form::Float, [a, b, c, d] | [_, a, b, c, d]) => Ok(Reply::Registers(vec![word(*a, *b), word(*c, *d)])),
+        (Form::Acknowledgement, _) => Err("data where an acknowledgement was expected"),
         (_, []) => Err("an acknowledgement where data was expected"),
-        (Expected::Identity, _) => Err("the reply has not the length of a device type"),
-        (Expected::State, _) => Err("the reply has not the length of a status byte"),
-        (Expected::Integer, _) => Err("the reply has not the length of an integer"),
-        (Expected::Float, _) => Err("the reply has not the length of a float"),
-        (Expected::Changes, _) => Err("the reply is no report of changes"),
+        (Form::Identity, _) => Err("the reply has not the length of a device type"),
+        (Form::State, _) => Err("the reply has not the length of a status byte"),
+        (Form::Integer, _) => Err("the reply has not the length of an integer"),
+        (Form::Float, _) => Err("the reply has not the length of a float"),
+        (Form::Changes, _) => Err("the reply is no report of changes"),
     }
 }
 
@@ -236,22 +237,22 @@ pub fn request_chars(request: &RequestPdu) -> usize {
 
 /// Characters of the longest regular reply's frame: with a byte before the value, or a full report.
 pub fn reply_chars(request: &RequestPdu) -> usize {
-    framed(match expected(request) {
-        Some(Expected::Float) => 10,
-        Some(Expected::Integer) => 6,
-        Some(Expected::Changes) => command::LONGEST_REPORT,
-        Some(Expected::State | Expected::Identity) => 2,
-        Some(Expected::Acknowledgement) | None => 0,
+    framed(match form(request) {
+        Some(Form::Float) => 10,
+        Some(Form::Integer) => 6,
+        Some(Form::Changes) => command::LONGEST_REPORT,
+        Some(Form::State | Form::Identity) => 2,
+        Some(Form::Acknowledgement) | None => 0,
     })
 }
 
 /// Characters of the shortest regular reply's frame.
 pub fn least_reply_chars(request: &RequestPdu) -> usize {
-    framed(match expected(request) {
-        Some(Expected::Float) => 8,
-        Some(Expected::Integer) => 4,
-        Some(Expected::State | Expected::Identity) => 2,
-        Some(Expected::Changes | Expected::Acknowledgement) | None => 0,
+    framed(match form(request) {
+        Some(Form::Float) => 8,
+        Some(Form::Integer) => 4,
+        Some(Form::State | Form::Identity) => 2,
+        Some(Form::Changes | Form::Acknowledgement) | None => 0,
     })
 }
 

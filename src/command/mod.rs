@@ -11,7 +11,7 @@ mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
 pub use audit::{AUDIT_KEPT, AUDIT_SHARE, Audit, AuditRecord, Change};
-pub use queue::{CAPACITY, CommandQueue, Pending};
+pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
 use std::fmt;
@@ -72,6 +72,16 @@ pub struct Origin {
     pub who: String,
 }
 
+impl Origin {
+    /// The gateway itself.
+    pub fn gateway(kind: SourceKind, who: &str) -> Origin {
+        Origin {
+            kind,
+            who: who.to_string(),
+        }
+    }
+}
+
 /// What is wanted of a drive.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Order {
@@ -109,6 +119,50 @@ pub struct Command {
     pub expires: Instant,
     /// Answers it.
     pub ticket: Ticket,
+    /// Those who wait for the same stop.
+    pub joined: Vec<Ticket>,
+    /// Younger commands that went before it.
+    pub overtaken: usize,
+    /// Its number in the queue.
+    pub number: u64,
+}
+
+impl Command {
+    /// A command to the drive at that place of its bus.
+    pub fn new(drive: usize, admitted: Admitted, expires: Instant, ticket: Ticket) -> Command {
+        Command {
+            drive,
+            order: admitted.order,
+            urgency: admitted.urgency,
+            reference_only: admitted.reference_only,
+            expires,
+            ticket,
+            joined: Vec::new(),
+            overtaken: 0,
+            number: 0,
+        }
+    }
+
+    /// Answers whoever gave it and all who joined.
+    pub fn answer(self, outcome: &Outcome, now: Instant) {
+        let tickets = [self.ticket].into_iter().chain(self.joined);
+        tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));
+    }
+}
+
+/// What cut a command short that had begun.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Interruption {
+    /// A stop came in.
+    Stop,
+    /// Its time ran out.
+    Expired,
+    /// The port was lost.
+    BusDown,
+    /// The drive does not answer any more.
+    Offline,
+    /// The gateway stops, or its bus starts anew.
+    ShuttingDown,
 }
 
 /// How a command ended.
@@ -130,6 +184,10 @@ pub enum Outcome {
     Replaced,
     /// A stop removed it; not sent.
     Purged,
+    /// An action of supervision that waited while a client came back; not sent.
+    Withdrawn,
+    /// It was begun and did not come to its end: whether the drive took it, or a part of it, is not known.
+    Interrupted(Interruption),
     /// The port is not open.
     BusDown,
     /// The drive is offline.
@@ -152,6 +210,8 @@ impl Outcome {
             Outcome::Expired => "expired",
             Outcome::Replaced => "replaced",
             Outcome::Purged => "purged",
+            Outcome::Withdrawn => "withdrawn",
+            Outcome::Interrupted(_) => "interrupted",
             Outcome::BusDown => "bus_down",
             Outcome::Offline => "offline",
             Outcome::QueueFull => "queue_full",
@@ -174,7 +234,9 @@ impl Outcome {
             Outcome::QueueFull => Some(Exception::BUSY),
             Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
             Outcome::TimedOut | Outcome::Offline | Outcome::Expired => Some(Exception::GATEWAY_TARGET),
-            Outcome::Replaced | Outcome::Purged => Some(Exception::BUSY),
+            Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => Some(Exception::BUSY),
+            Outcome::Interrupted(Interruption::BusDown | Interruption::ShuttingDown) => Some(Exception::GATEWAY_PATH),
+            Outcome::Interrupted(_) => Some(Exception::GATEWAY_TARGET),
         }
     }
 }
@@ -188,10 +250,21 @@ impl fmt::Display for Outcome {
             Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
             Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
             Outcome::Expired => {
-                f.write_str("its time ran out before its turn came; what was not sent by then is not sent any more")
+                f.write_str("its time ran out before its turn came; it was not sent")
             }
             Outcome::Replaced => f.write_str("a newer reference took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
+            Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
+            Outcome::Interrupted(why) => {
+                let why = match why {
+                    Interruption::Stop => "a stop came in",
+                    Interruption::Expired => "its time ran out",
+                    Interruption::BusDown => "the bus went down",
+                    Interruption::Offline => "the drive went offline",
+                    Interruption::ShuttingDown => "the gateway stops",
+                };
+                write!(f, "it was begun, then {why}; whether the drive took it is not known")
+            }
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
             Outcome::QueueFull => write!(f, "{CAPACITY} commands wait already; it was not sent, try again"),
@@ -273,6 +346,8 @@ mod tests {
             Outcome::Expired,
             Outcome::Replaced,
             Outcome::Purged,
+            Outcome::Withdrawn,
+            Outcome::Interrupted(Interruption::Stop),
             Outcome::BusDown,
             Outcome::Offline,
             Outcome::QueueFull,

@@ -7,13 +7,19 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use rustix::event::{EventfdFlags, eventfd};
+use tokio::sync::oneshot;
 
-use super::{Command, Order, Outcome, Urgency};
+use super::{Command, Order, Outcome, SourceKind, Urgency};
 
-/// Commands that may wait on one bus.
+/// Commands and forwarded reads that may wait on one bus, besides one stop for each drive.
 pub const CAPACITY: usize = 64;
+/// Clients and drives whose turns are remembered.
+const SERVED_KEPT: usize = 4 * CAPACITY;
 
 /// The waiting commands: pure, time is an argument.
+///
+/// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. Between
+/// drives the clients take turns, and within a client its drives.
 #[derive(Debug, Default)]
 pub struct Pending {
     waiting: VecDeque<Command>,
@@ -21,44 +27,73 @@ pub struct Pending {
     closed: Option<Outcome>,
     /// The gateway is about to stop: only stops get in.
     stops_only: bool,
-    /// Clients in the order in which they were served, the last one last.
-    served: VecDeque<String>,
+    /// Clients and their drives in the order in which they were served, the last one last.
+    served: VecDeque<(String, usize)>,
     /// Drives for which a stop came in since the bus last asked, each once.
     stopped: Vec<usize>,
+    /// Commands taken in so far.
+    numbered: u64,
+    /// The stops that the gateway wants before it ends, until the bus takes note of it.
+    stopping: Option<Stopping>,
+}
+
+/// The wish of the gateway, which is about to end, that a bus stops its drives.
+#[derive(Debug)]
+pub struct Stopping {
+    deadline: Instant,
+    report: oneshot::Sender<Vec<String>>,
+}
+
+impl Stopping {
+    /// When the gateway ends all the same.
+    pub fn deadline(&self) -> Instant {
+        self.deadline
+    }
+
+    /// The bus has done what it can; `missing` are the drives that were not stopped, in words.
+    pub fn report(self, missing: Vec<String>) {
+        // The gateway may have given up waiting.
+        let _ = self.report.send(missing);
+    }
+}
+
+/// The command that has its turn.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Chosen {
+    /// Rank with which it competes for the line: a stop that tells the drive nothing new has that of a command.
+    pub rank: Urgency,
+    number: u64,
 }
 
 impl Pending {
-    /// Takes a command in. A stop removes the queued run and reference commands of its drive; a newer
-    /// reference takes the place of an older one. When 64 wait, a stop takes the place of the youngest command or
-    /// forwarded read of the client that has the most of them; anything takes the place of the youngest of a client
-    /// that has more waiting than its own client would have.
-    pub fn push(&mut self, command: Command, now: Instant) {
+    /// Takes a command in. A stop removes the queued run and reference commands of its drive, or joins the stop that
+    /// waits; a newer reference takes the place of an older one. Stops always find room. When 64 other commands and
+    /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would have.
+    pub fn push(&mut self, mut command: Command, now: Instant) {
+        self.numbered += 1;
+        command.number = self.numbered;
         if let Some(outcome) = &self.closed {
-            command.ticket.answer(outcome.clone(), now);
+            command.answer(&outcome.clone(), now);
             return;
         }
         if self.stops_only && command.urgency != Urgency::Stop {
-            command.ticket.answer(Outcome::ShuttingDown, now);
+            command.answer(&Outcome::ShuttingDown, now);
             return;
         }
         if command.urgency == Urgency::Stop {
-            self.remove(now, &Outcome::Purged, |c| {
-                c.drive == command.drive && c.urgency == Urgency::Command
-            });
-            if !self.stopped.contains(&command.drive) {
-                self.stopped.push(command.drive);
-            }
+            self.push_stop(command, now);
+            return;
         }
-        if command.reference_only {
-            self.remove(now, &Outcome::Replaced, |c| {
-                c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order)
-            });
+        if let Some(older) = self.replaced_by(&command) {
+            std::mem::replace(older, command).answer(&Outcome::Replaced, now);
+            return;
         }
-        if self.waiting.len() >= CAPACITY {
+        let others = self.waiting.iter().filter(|c| c.urgency != Urgency::Stop).count();
+        if others >= CAPACITY {
             match self.victim(&command).and_then(|index| self.waiting.remove(index)) {
-                Some(victim) => victim.ticket.answer(Outcome::QueueFull, now),
+                Some(victim) => victim.answer(&Outcome::QueueFull, now),
                 None => {
-                    command.ticket.answer(Outcome::QueueFull, now);
+                    command.answer(&Outcome::QueueFull, now);
                     return;
                 }
             }
@@ -66,30 +101,53 @@ impl Pending {
         self.waiting.push_back(command);
     }
 
+    /// One stop of a drive waits. What joins it must not ask for more than is sent: the stop that does nothing else
+    /// gives way to one that does, and of two that do different things the newer one is sent.
+    fn push_stop(&mut self, mut stop: Command, now: Instant) {
+        let drive = stop.drive;
+        self.remove(now, &Outcome::Purged, |c| c.drive == drive && c.urgency == Urgency::Command);
+        if !self.stopped.contains(&drive) {
+            self.stopped.push(drive);
+        }
+        let waits = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
+        let Some(waiting) = self.waiting.iter_mut().find(waits) else {
+            self.waiting.push_back(stop);
+            return;
+        };
+        let expires = waiting.expires.max(stop.expires);
+        if stop.order == waiting.order || stop.is_bare_stop() {
+            waiting.joined.push(stop.ticket);
+        } else if waiting.is_bare_stop() {
+            stop.joined.append(&mut waiting.joined);
+            stop.overtaken = waiting.overtaken;
+            let bare = std::mem::replace(waiting, stop);
+            waiting.joined.push(bare.ticket);
+        } else {
+            std::mem::replace(waiting, stop).answer(&Outcome::Replaced, now);
+            return;
+        }
+        waiting.expires = expires;
+    }
+
+    /// The queued reference whose place a newer one takes.
+    fn replaced_by(&mut self, command: &Command) -> Option<&mut Command> {
+        let same = |c: &&mut Command| {
+            c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order)
+        };
+        self.waiting.iter_mut().filter(|_| command.reference_only).find(same)
+    }
+
     /// Whose place a command takes in a full queue.
     fn victim(&self, command: &Command) -> Option<usize> {
-        let held = |client: &str, least: Urgency| {
-            let of_client = |c: &&Command| c.ticket.client() == client && c.urgency >= least;
+        let held = |client: &str| {
+            let of_client = |c: &&Command| c.ticket.client() == client && c.urgency != Urgency::Stop;
             self.waiting.iter().filter(of_client).count()
         };
-        let youngest = |least: Urgency| {
-            let candidates = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency >= least);
-            candidates.max_by_key(|(index, c)| (held(c.ticket.client(), least), *index))
-        };
-        if command.urgency == Urgency::Stop
-            && let Some((index, _)) = youngest(Urgency::Command)
-        {
-            return Some(index);
-        }
-        // Stops are never pushed out by less than a stop.
-        let least = if command.urgency == Urgency::Stop {
-            Urgency::Stop
-        } else {
-            Urgency::Command
-        };
-        let own = held(command.ticket.client(), Urgency::Stop) + 1;
-        youngest(least)
-            .filter(|(_, c)| held(c.ticket.client(), least) > own)
+        let candidates = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency != Urgency::Stop);
+        let own = held(command.ticket.client()) + 1;
+        candidates
+            .max_by_key(|(index, c)| (held(c.ticket.client()), *index))
+            .filter(|(_, c)| held(c.ticket.client()) > own)
             .map(|(index, _)| index)
     }
 
@@ -99,56 +157,111 @@ impl Pending {
         std::mem::take(&mut self.stopped)
     }
 
-    /// Rank of the command that would come next of those that `may`, expired ones answered and removed.
-    pub fn next_urgency(&mut self, now: Instant, mut may: impl FnMut(&Command) -> bool) -> Option<Urgency> {
-        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
-        self.waiting.iter().filter(|c| may(c)).map(|c| c.urgency).min()
-    }
-
-    /// Takes the next command of at least that rank: of the highest rank, the oldest of the client that was served
-    /// longest ago.
-    pub fn pop(&mut self, at_least: Urgency, now: Instant) -> Option<Command> {
-        self.pop_of(at_least, now, |_| true)
-    }
-
-    /// As [`Pending::pop`], of those that `may`.
-    pub fn pop_of(
+    /// The command of that rank that has its turn at `now`, expired ones answered and removed. `may` says whether a
+    /// command can be begun now: while the oldest of a drive cannot, the later ones to that drive wait behind it.
+    /// `redundant` says whether a stop tells its drive nothing new, which gives it the rank of a command.
+    pub fn next(
         &mut self,
-        at_least: Urgency,
+        rank: Urgency,
         now: Instant,
         mut may: impl FnMut(&Command) -> bool,
-    ) -> Option<Command> {
-        let urgency = self.next_urgency(now, &mut may).filter(|u| *u <= at_least)?;
-        let served = |c: &Command| self.served.iter().position(|s| s == c.ticket.client());
-        let of_rank = self
-            .waiting
-            .iter()
-            .enumerate()
-            .filter(|(_, c)| c.urgency == urgency && may(c));
-        // `None`, never served, comes before any place.
-        let (index, _) = of_rank.min_by_key(|(index, c)| (served(c), *index))?;
+        redundant: impl Fn(usize) -> bool,
+    ) -> Option<Chosen> {
+        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
+        // Drives whose later commands wait: behind an older one, or behind a stop.
+        let mut behind: Vec<usize> = self.drives_of(Urgency::Stop);
+        let mut best = None;
+        for (index, command) in self.waiting.iter().enumerate() {
+            let drive = command.drive;
+            let own = match command.urgency {
+                Urgency::Command if behind.contains(&drive) => continue,
+                Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
+                urgency => urgency,
+            };
+            if command.urgency == Urgency::Command {
+                behind.push(drive);
+            }
+            if own != rank || !may(command) {
+                continue;
+            }
+            let (client, of_client) = self.served(command);
+            // `None`, never served, comes before any place. What was overtaken often enough comes before all.
+            let key = (command.overtaken < CAPACITY, client, of_client, index);
+            if best.is_none_or(|(best, _)| key < best) {
+                best = Some((key, command.number));
+            }
+        }
+        best.map(|(_, number)| Chosen { rank, number })
+    }
+
+    /// Takes the command that [`Pending::next`] chose, unless it is gone since.
+    pub fn take(&mut self, chosen: Chosen) -> Option<Command> {
+        let index = self.waiting.iter().position(|c| c.number == chosen.number)?;
         let command = self.waiting.remove(index)?;
-        let client = command.ticket.client();
-        self.served.retain(|s| s != client);
+        for older in self.waiting.iter_mut().take(index) {
+            if older.urgency >= command.urgency {
+                older.overtaken += 1;
+            }
+        }
+        let of = (command.ticket.client().to_string(), command.drive);
+        self.served.retain(|served| *served != of);
         // Only clients that wait are told apart; more of them than commands can wait there are not.
-        if self.served.len() >= CAPACITY {
+        if self.served.len() >= SERVED_KEPT {
             self.served.pop_front();
         }
-        self.served.push_back(client.to_string());
+        self.served.push_back(of);
         Some(command)
+    }
+
+    /// When the client of that command was served last, and when its drive for it: places in order.
+    fn served(&self, command: &Command) -> (Option<usize>, Option<usize>) {
+        let client = command.ticket.client();
+        let last = self.served.iter().rposition(|(of, _)| of == client);
+        let of_drive = self.served.iter().position(|(of, drive)| of == client && *drive == command.drive);
+        (last, of_drive)
+    }
+
+    fn drives_of(&self, urgency: Urgency) -> Vec<usize> {
+        let of_rank = self.waiting.iter().filter(|c| c.urgency == urgency);
+        of_rank.map(|c| c.drive).collect()
+    }
+
+    /// Whether a command waits that may start the drive.
+    fn may_start(&self, drive: usize) -> bool {
+        let starts = |c: &Command| c.drive == drive && c.urgency == Urgency::Command && !c.reference_only;
+        self.waiting.iter().any(starts)
+    }
+
+    /// Until when at most a command or stop of a client to that drive waits; none where none waits.
+    pub fn client_waits_until(&self, drive: usize) -> Option<Instant> {
+        let of_client = |c: &&Command| c.drive == drive && c.urgency != Urgency::Read && c.is_of_client();
+        self.waiting.iter().filter(of_client).map(|c| c.expires).max()
+    }
+
+    /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
+    pub fn withdraw_supervision(&mut self, drive: usize, now: Instant) {
+        self.remove(now, &Outcome::Withdrawn, |c| {
+            c.drive == drive && c.joined.is_empty() && c.ticket.origin().kind == SourceKind::Supervision
+        });
     }
 
     /// Answers and removes the commands that `which` names.
     pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
-        let mut kept = VecDeque::with_capacity(self.waiting.len());
-        for command in self.waiting.drain(..) {
-            if which(&command) {
-                command.ticket.answer(outcome.clone(), now);
+        let mut index = 0;
+        while let Some(command) = self.waiting.get(index) {
+            if which(command) {
+                if let Some(command) = self.waiting.remove(index) {
+                    command.answer(outcome, now);
+                }
             } else {
-                kept.push_back(command);
+                index += 1;
             }
         }
-        self.waiting = kept;
+    }
+
+    /// The stops that the gateway wants before it ends, once.
+    pub fn take_stopping(&mut self) -> Option<Stopping> {
+        self.stopping.take()
     }
 
     /// Commands that wait.
@@ -164,6 +277,23 @@ impl Pending {
     /// Whether none waits.
     pub fn is_empty(&self) -> bool {
         self.waiting.is_empty()
+    }
+}
+
+impl Command {
+    /// A stop that does nothing but take the run command away.
+    fn is_bare_stop(&self) -> bool {
+        match &self.order {
+            Order::Points(values) => values.len() == 1,
+            Order::Write(_) | Order::Read(_) => false,
+        }
+    }
+
+    /// Whether a client gave it: no order of the gateway's own.
+    fn is_of_client(&self) -> bool {
+        let own = [SourceKind::Supervision, SourceKind::Shutdown];
+        let tickets = std::iter::once(&self.ticket).chain(&self.joined);
+        tickets.into_iter().any(|ticket| !own.contains(&ticket.origin().kind))
     }
 }
 
@@ -214,12 +344,17 @@ impl CommandQueue {
         pending.closed = Some(outcome);
     }
 
-    /// From now on only stops get in: the gateway is about to stop, and nothing may start a drive again. What waits
-    /// is answered, stops apart.
-    pub fn stops_only(&self, now: Instant) {
+    /// The gateway is about to end: from now on only stops get in, since nothing may start a drive again. What waits
+    /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
+    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<String>> {
+        let (report, missing) = oneshot::channel();
         let mut pending = self.lock();
         pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
         pending.stops_only = true;
+        pending.stopping = Some(Stopping { deadline, report });
+        drop(pending);
+        self.wake();
+        missing
     }
 
     /// Takes commands again.
@@ -247,206 +382,4 @@ impl CommandQueue {
 }
 
 #[cfg(test)]
-mod tests {
-    use std::sync::Arc;
-    use std::time::Duration;
-
-    use tokio::sync::oneshot::Receiver;
-
-    use super::super::ticket::tests::ticket;
-    use super::super::{Answer, Origin, SourceKind, Ticket, WriteStats};
-    use super::*;
-    use crate::drive::Value;
-
-    struct Bench {
-        pending: Pending,
-        stats: Arc<WriteStats>,
-        now: Instant,
-    }
-
-    impl Bench {
-        fn new() -> Bench {
-            Bench {
-                pending: Pending::default(),
-                stats: Arc::default(),
-                now: Instant::now(),
-            }
-        }
-
-        fn push(&mut self, drive: usize, urgency: Urgency, points: &[usize], reference_only: bool) -> Receiver<Answer> {
-            let (ticket, receiver) = ticket(&self.stats, self.now);
-            let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
-            let expires = self.now + Duration::from_secs(2);
-            self.pending.push(
-                Command {
-                    drive,
-                    order,
-                    urgency,
-                    reference_only,
-                    expires,
-                    ticket,
-                },
-                self.now,
-            );
-            receiver
-        }
-
-        fn push_from(&mut self, who: &str, drive: usize, points: &[usize]) -> Receiver<Answer> {
-            let origin = Origin {
-                kind: SourceKind::Mqtt,
-                who: who.to_string(),
-            };
-            let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-            let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
-            let command = Command {
-                drive,
-                order,
-                urgency: Urgency::Command,
-                reference_only: false,
-                expires: self.now + Duration::from_secs(2),
-                ticket,
-            };
-            self.pending.push(command, self.now);
-            receiver
-        }
-
-        fn pop(&mut self) -> Option<(usize, Urgency)> {
-            self.pending.pop(Urgency::Read, self.now).map(|c| (c.drive, c.urgency))
-        }
-    }
-
-    fn outcome(receiver: &mut Receiver<Answer>) -> Option<Outcome> {
-        receiver.try_recv().ok().map(|a| a.outcome)
-    }
-
-    #[test]
-    fn stop_first_and_it_purges_its_drive() {
-        let mut bench = Bench::new();
-        let mut read = bench.push(1, Urgency::Read, &[], false);
-        let mut run = bench.push(1, Urgency::Command, &[1], false);
-        let mut other = bench.push(2, Urgency::Command, &[1], false);
-        let _stop = bench.push(1, Urgency::Stop, &[1], false);
-        assert_eq!(outcome(&mut run), Some(Outcome::Purged));
-        assert_eq!((outcome(&mut read), outcome(&mut other)), (None, None));
-        assert_eq!(bench.pop(), Some((1, Urgency::Stop)));
-        assert_eq!(bench.pop(), Some((2, Urgency::Command)));
-        assert_eq!(bench.pop(), Some((1, Urgency::Read)));
-        assert_eq!(bench.pop(), None);
-    }
-
-    #[test]
-    fn newer_references_replace_older_ones_of_the_same_points() {
-        let mut bench = Bench::new();
-        let mut old = bench.push(1, Urgency::Command, &[7], true);
-        let mut other_point = bench.push(1, Urgency::Command, &[8], true);
-        let mut other_drive = bench.push(2, Urgency::Command, &[7], true);
-        let _new = bench.push(1, Urgency::Command, &[7], true);
-        assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
-        assert_eq!((outcome(&mut other_point), outcome(&mut other_drive)), (None, None));
-        assert_eq!(bench.pending.len(), 3);
-    }
-
-    #[test]
-    fn full_queue_refuses_all_but_a_stop() {
-        let mut bench = Bench::new();
-        let mut waiting: Vec<_> = (0..CAPACITY)
-            .map(|_| bench.push(1, Urgency::Command, &[1], false))
-            .collect();
-        let mut refused = bench.push(1, Urgency::Command, &[1], false);
-        assert_eq!(outcome(&mut refused), Some(Outcome::QueueFull));
-        let mut stop = bench.push(2, Urgency::Stop, &[1], false);
-        assert_eq!(outcome(&mut stop), None);
-        assert_eq!(
-            outcome(waiting.last_mut().unwrap()),
-            Some(Outcome::QueueFull),
-            "the youngest made room"
-        );
-        assert_eq!(outcome(waiting.first_mut().unwrap()), None);
-        assert_eq!(bench.pending.len(), CAPACITY);
-        assert_eq!(bench.pop(), Some((2, Urgency::Stop)));
-    }
-
-    #[test]
-    fn clients_take_turns_and_each_keeps_its_order() {
-        let mut bench = Bench::new();
-        let mut flood: Vec<_> = (0..CAPACITY).map(|i| bench.push_from("flood", 1, &[i])).collect();
-        let mut quiet: Vec<_> = (0..3).map(|i| bench.push_from("quiet", 2, &[i])).collect();
-        assert_eq!(bench.pending.len(), CAPACITY);
-        assert_eq!(flood.iter_mut().filter_map(outcome).count(), 3, "the flood made room");
-        assert!(quiet.iter_mut().all(|q| outcome(q).is_none()));
-        let popped: Vec<_> = (0..8)
-            .map(|_| bench.pending.pop(Urgency::Read, bench.now).unwrap())
-            .map(|c| (c.drive, c.order))
-            .collect();
-        let of = |drive: usize, point: usize| (drive, Order::Points(vec![(point, Value::Bool(true))]));
-        assert_eq!(
-            popped[..6],
-            [of(1, 0), of(2, 0), of(1, 1), of(2, 1), of(1, 2), of(2, 2)]
-        );
-        assert_eq!(popped[6..], [of(1, 3), of(1, 4)]);
-    }
-
-    #[test]
-    fn many_clients_get_equal_places() {
-        let mut bench = Bench::new();
-        let mut all: Vec<(usize, Receiver<Answer>)> = Vec::new();
-        for round in 0..CAPACITY {
-            for client in 0..4 {
-                all.push((client, bench.push_from(&client.to_string(), client, &[round])));
-            }
-        }
-        for client in 0..4 {
-            let waiting = all.iter_mut().filter(|(c, _)| *c == client);
-            assert_eq!(
-                waiting.filter_map(|(_, r)| outcome(r).is_none().then_some(())).count(),
-                CAPACITY / 4
-            );
-        }
-    }
-
-    #[test]
-    fn before_the_end_only_stops_get_in() {
-        let queue = CommandQueue::new().unwrap();
-        let mut bench = Bench::new();
-        std::mem::swap(&mut *queue.lock(), &mut bench.pending);
-        queue.stops_only(bench.now);
-        std::mem::swap(&mut *queue.lock(), &mut bench.pending);
-        let mut run = bench.push(1, Urgency::Command, &[1], false);
-        let mut stop = bench.push(1, Urgency::Stop, &[1], false);
-        assert_eq!(
-            (outcome(&mut run), outcome(&mut stop)),
-            (Some(Outcome::ShuttingDown), None)
-        );
-    }
-
-    #[test]
-    fn expired_commands_are_never_sent() {
-        let mut bench = Bench::new();
-        let mut late = bench.push(1, Urgency::Command, &[1], false);
-        bench.now += Duration::from_secs(2);
-        assert_eq!(bench.pop(), None);
-        assert_eq!(outcome(&mut late), Some(Outcome::Expired));
-    }
-
-    #[test]
-    fn a_closed_queue_answers_at_once() {
-        let queue = CommandQueue::new().unwrap();
-        let mut bench = Bench::new();
-        let (ticket_a, mut a) = ticket(&bench.stats, bench.now);
-        let command = |ticket| Command {
-            drive: 0,
-            order: Order::Points(Vec::new()),
-            urgency: Urgency::Command,
-            reference_only: false,
-            expires: bench.now + Duration::from_secs(1),
-            ticket,
-        };
-        queue.submit(command(ticket_a), bench.now);
-        queue.close(Outcome::BusDown, bench.now);
-        assert_eq!(outcome(&mut a), Some(Outcome::BusDown));
-        let (ticket_b, mut b) = ticket(&bench.stats, bench.now);
-        queue.submit(command(ticket_b), bench.now);
-        assert_eq!(outcome(&mut b), Some(Outcome::BusDown));
-        bench.now += Duration::from_secs(1);
-    }
-}
+mod tests;

@@ -325,6 +325,7 @@ fn read_supervision(
     Some(Supervision {
         timeout: timeout?,
         action: action?,
+        adopt: false,
     })
 }
 

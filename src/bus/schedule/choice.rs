@@ -161,6 +161,7 @@ impl Schedule {
         let mut next = self.round_due;
         for drive in &self.drives {
             let due = match drive.presence {
+                Presence::Away(_, _) if drive.items.is_empty() => None,
                 Presence::Away(at, _) => Some(at),
                 Presence::Online => {
                     let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| i.due);

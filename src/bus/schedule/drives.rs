@@ -58,7 +58,7 @@ pub(super) struct DriveSchedule {
 pub(super) fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
     let (first, longest) = PROBE_PAUSE;
     if pause.is_zero() {
-        return Presence::Away(now + first.max(took * 4), first);
+        return Presence::Away(now + (took * 4).clamp(first, longest), first);
     }
     let doubled = (pause * 2).min(longest);
     let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use super::shadow::Shadow;
+use super::known_words::KnownWords;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
 use crate::command::{Refusal, written};
@@ -22,7 +22,7 @@ pub(super) enum Action {
     },
     /// Gives what was overridden before back to the drive's own control; that it fails changes nothing.
     Release(RequestPdu),
-    /// Bits of one word, merged into the shadow when they are sent.
+    /// Bits of one word; its other bits stay as they are known.
     Bits { raw: Raw, changes: Vec<(u8, bool)> },
     /// Takes the run command away from a motor that stands, where it is no bit of the word with the reset bit.
     Disarm { raw: Raw, bit: u8, invert: bool },
@@ -36,6 +36,34 @@ pub(super) enum Action {
     Hold(Duration),
 }
 
+/// What a request of a command is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum StepPurpose {
+    /// Reads the drive's own word, whose other bits are to stay as they are.
+    ReadWord,
+    /// Asks whether the drive has the value already, which would spare its memory a write.
+    Compare,
+    /// Does what was ordered.
+    Execute,
+    /// Gives an overridden output back to the drive's own control.
+    Release,
+}
+
+/// One request of a command.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Step {
+    /// What it is for.
+    pub purpose: StepPurpose,
+    /// What is sent.
+    pub pdu: RequestPdu,
+}
+
+impl Step {
+    fn new(purpose: StepPurpose, pdu: RequestPdu) -> Step {
+        Step { purpose, pdu }
+    }
+}
+
 /// Whether the drive was asked for what it has before it is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Check {
@@ -45,7 +73,7 @@ pub(super) enum Check {
     InVain,
 }
 
-/// What the request of a step depends on besides the shadow.
+/// What the request of a step depends on besides the known words.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Known {
     pub(super) check: Check,
@@ -188,77 +216,79 @@ fn write_of(address: u16, words: Vec<u16>) -> Option<RequestPdu> {
     }
 }
 
-/// The request of an action with the shadow as it is now; a read where the shadow does not know the word;
-/// `None` where there is nothing to do.
-pub(super) fn request(
-    action: &Action,
-    drive: usize,
-    shadow: &Shadow,
-    profile: &Profile,
-    known: Known,
-) -> Option<RequestPdu> {
-    let Known {
-        check, blind, running, ..
-    } = known;
-    let (raw, changes) = match action {
-        Action::Send(pdu) | Action::Release(pdu) => return Some(pdu.clone()),
-        Action::Change { pdu, table, items } => {
-            return match check {
-                // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.
-                Check::NotYet if shadow.differs(drive, *table, items) => Some(pdu.clone()),
-                Check::NotYet => read_of(*table, items).or_else(|| Some(pdu.clone())),
-                Check::Read => (!shadow.has(drive, *table, items)).then(|| pdu.clone()),
-                Check::InVain => Some(pdu.clone()),
-            };
-        }
-        Action::Hold(_) => return None,
-        Action::Bits { raw, changes } => (raw, changes.clone()),
-        Action::Disarm { .. } if running => return None,
-        Action::Disarm { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
-        Action::PulseHigh { raw, bit, invert } => (raw, vec![(*bit, !invert)]),
-        Action::PulseEnd { raw, bit, invert } => (raw, vec![(*bit, *invert)]),
+/// The request of an action with the words as they are known; a read where a word is not known; `None` where there is
+/// nothing to do.
+pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, known: Known) -> Option<Step> {
+    let execute = |pdu: &RequestPdu| Step::new(StepPurpose::Execute, pdu.clone());
+    match action {
+        Action::Hold(_) => None,
+        Action::Send(pdu) => Some(execute(pdu)),
+        Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),
+        Action::Change { pdu, table, items } => match known.check {
+            // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.
+            Check::NotYet if words.differs(*table, items) => Some(execute(pdu)),
+            Check::NotYet => {
+                let read = read_of(*table, items).map(|read| Step::new(StepPurpose::Compare, read));
+                read.or_else(|| Some(execute(pdu)))
+            }
+            Check::Read => (!words.has(*table, items)).then(|| execute(pdu)),
+            Check::InVain => Some(execute(pdu)),
+        },
+        Action::Disarm { .. } if known.running => None,
+        Action::Disarm { raw, bit, invert } => bits(action, raw, vec![(*bit, *invert)], words, profile, known),
+        Action::Bits { raw, changes } => bits(action, raw, changes.clone(), words, profile, known),
+        Action::PulseHigh { raw, bit, invert } => bits(action, raw, vec![(*bit, !invert)], words, profile, known),
+        Action::PulseEnd { raw, bit, invert } => bits(action, raw, vec![(*bit, *invert)], words, profile, known),
         Action::PulseLow { raw, bit, invert } => {
             let mut changes = vec![(*bit, *invert)];
             // A reset must not start the motor: a run bit left over from before the fault is taken away.
-            if !running && let Some(run) = standing_run_bit(profile, raw) {
+            if !known.running && let Some(run) = standing_run_bit(profile, raw) {
                 changes.push(run);
             }
-            (raw, changes)
+            bits(action, raw, changes, words, profile, known)
         }
-    };
+    }
+}
+
+/// The write that changes bits of one word, or the read that it needs before.
+fn bits(
+    action: &Action,
+    raw: &Raw,
+    changes: Vec<(u8, bool)>,
+    words: &KnownWords,
+    profile: &Profile,
+    known: Known,
+) -> Option<Step> {
+    let only_if_set = matches!(action, Action::PulseLow { .. } | Action::Disarm { .. });
+    let address = raw.address;
     if raw.table == Table::Coil {
         let on = changes.first().is_some_and(|(_, on)| *on);
-        return Some(RequestPdu::WriteCoil {
-            address: raw.address,
-            on,
-        });
+        return Some(Step::new(StepPurpose::Execute, RequestPdu::WriteCoil { address, on }));
     }
     let read = RequestPdu::Read {
         table: raw.table,
-        start: raw.address,
+        start: address,
         count: 1,
     };
-    let Some(old) = shadow.get(drive, raw.address).or(blind.then_some(0)) else {
+    let read = Step::new(StepPurpose::ReadWord, read);
+    let Some(old) = words.get(Table::Holding, address).or(known.blind.then_some(0)) else {
         return Some(read);
     };
     let set = |word: u16, (bit, on): (u8, bool)| if on { word | (1 << bit) } else { word & !(1 << bit) };
     let value = changes.into_iter().fold(old, set);
-    if matches!(action, Action::PulseLow { .. } | Action::Disarm { .. }) && value == old {
+    if only_if_set && value == old {
         return None;
     }
     // A run bit that the command does not name may have been taken away elsewhere since the word was read, and to write
     // it would start the motor: the drive is asked, and where it does not tell, a motor that stands goes on standing.
     let stands = standing_run_bit(profile, raw).map_or(value, |run| set(value, run));
-    let value = match check {
+    let value = match known.check {
         _ if known.names_run || value == stands => value,
         Check::NotYet => return Some(read),
-        Check::InVain if !running => stands,
+        Check::InVain if !known.running => stands,
         Check::Read | Check::InVain => value,
     };
-    Some(RequestPdu::WriteRegister {
-        address: raw.address,
-        value,
-    })
+    Some(Step::new(StepPurpose::Execute, RequestPdu::WriteRegister { address, value }))
 }
 
 /// The run bit, if it is in the same word, as it is where the motor is to stand.
@@ -272,7 +302,7 @@ fn standing_run_bit(profile: &Profile, of: &Raw) -> Option<(u8, bool)> {
 
 /// A write that spares the drive's memory, where its words are such that wear: left out when the drive says that it has
 /// them, and what N2 overrides is released afterwards, where the profile says so. A stop is never left out.
-pub(super) fn sparing(action: Action, profile: &Profile) -> Vec<Action> {
+pub(super) fn write_on_change(action: Action, profile: &Profile) -> Vec<Action> {
     let written = match &action {
         Action::Send(pdu) => written(pdu).map(|(table, items)| (pdu.clone(), table, items)),
         Action::Bits { raw, changes } if raw.table == Table::Coil => changes.first().map(|(_, on)| {

@@ -15,7 +15,7 @@ mod on_change;
 
 struct Bench {
     profile: Arc<Profile>,
-    shadow: Shadow,
+    words: KnownWords,
     now: Instant,
     /// Control word and reference as the drive has them.
     drive: BTreeMap<u16, u16>,
@@ -27,14 +27,14 @@ impl Bench {
         let drive = BTreeMap::from([(2000, control_word), (2002, 0)]);
         Bench {
             profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
-            shadow: Shadow::default(),
+            words: KnownWords::default(),
             now: Instant::now(),
             drive,
             running: false,
         }
     }
 
-    fn begin(&self, points: &[(&str, f64)], urgency: Urgency) -> (Execution, Receiver<Answer>) {
+    fn begin(&self, points: &[(&str, f64)], urgency: Urgency) -> (CommandRun, Receiver<Answer>) {
         let values = points
             .iter()
             .map(|(name, v)| {
@@ -65,15 +65,15 @@ impl Bench {
             expires,
             ticket,
         };
-        (Execution::new(command, &self.profile), receiver)
+        (CommandRun::new(command, &self.profile), receiver)
     }
 
     /// Runs the command against a drive that does as it is told; the writes as (ms, address, value).
-    fn run(&mut self, execution: &mut Execution) -> Vec<(u128, u16, u16)> {
+    fn run(&mut self, run: &mut CommandRun) -> Vec<(u128, u16, u16)> {
         let start = self.now;
         let mut writes = Vec::new();
         for _ in 0..50 {
-            match execution.next(&self.shadow, &self.profile, self.running, self.now) {
+            match run.next(&self.words, &self.profile, self.running, self.now) {
                 Next::Done => return writes,
                 Next::Wait(until) => self.now = until,
                 Next::Send(pdu) => {
@@ -86,7 +86,7 @@ impl Bench {
                         }
                         _ => unreachable!(),
                     };
-                    if execution.answered(&pdu, reply, &mut self.shadow).is_some() {
+                    if run.answered(&pdu, reply, &mut self.words).is_some() {
                         return writes;
                     }
                 }
@@ -99,17 +99,17 @@ impl Bench {
 #[test]
 fn bits_of_others_are_kept_and_the_word_is_read_first() {
     let mut bench = Bench::new(0x0800);
-    let (mut execution, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    let (mut run, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
     assert!(matches!(
-        execution.next(&bench.shadow, &bench.profile, false, bench.now),
+        run.next(&bench.words, &bench.profile, false, bench.now),
         Next::Send(RequestPdu::Read {
             start: 2000,
             count: 1,
             ..
         })
     ));
-    assert_eq!(bench.run(&mut execution), [(0, 2000, 0x0801)]);
-    assert_eq!(execution.success(), Outcome::Acknowledged(Reply::Written));
+    assert_eq!(bench.run(&mut run), [(0, 2000, 0x0801)]);
+    assert_eq!(run.success(), Outcome::Acknowledged(Reply::Written));
 }
 
 #[test]
@@ -158,17 +158,17 @@ fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
 #[test]
 fn a_stop_purges_what_was_begun() {
     let mut bench = Bench::new(0);
-    bench.shadow.learn(0, Table::Holding, 2000, 0);
+    bench.words.learn(Table::Holding, 2000, 0);
     let (mut start, _a) = bench.begin(&[("run", 1.0), ("speed_reference", 50.0)], Urgency::Command);
     let sent = RequestPdu::WriteRegister {
         address: 2002,
         value: 5000,
     };
     assert_eq!(
-        start.next(&bench.shadow, &bench.profile, false, bench.now),
+        start.next(&bench.words, &bench.profile, false, bench.now),
         Next::Send(sent.clone())
     );
-    assert_eq!(start.answered(&sent, Reply::Written, &mut bench.shadow), None);
+    assert_eq!(start.answered(&sent, Reply::Written, &mut bench.words), None);
     assert!(start.purge(), "the run bit is not sent any more");
     assert_eq!(start.success(), Outcome::Purged);
 }
@@ -176,17 +176,17 @@ fn a_stop_purges_what_was_begun() {
 #[test]
 fn a_stop_lets_a_pulse_end() {
     let mut bench = Bench::new(0);
-    bench.shadow.learn(0, Table::Holding, 2000, 0);
+    bench.words.learn(Table::Holding, 2000, 0);
     let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
     let high = RequestPdu::WriteRegister {
         address: 2000,
         value: 4,
     };
     assert_eq!(
-        both.next(&bench.shadow, &bench.profile, false, bench.now),
+        both.next(&bench.words, &bench.profile, false, bench.now),
         Next::Send(high.clone())
     );
-    assert_eq!(both.answered(&high, Reply::Written, &mut bench.shadow), None);
+    assert_eq!(both.answered(&high, Reply::Written, &mut bench.words), None);
     assert!(!both.purge());
     assert_eq!(bench.run(&mut both), [(20, 2000, 0)], "no run behind the stop");
     assert_eq!(both.success(), Outcome::Purged);
@@ -195,7 +195,7 @@ fn a_stop_lets_a_pulse_end() {
 #[test]
 fn exceptions_and_silence_end_it() {
     let bench = Bench::new(0);
-    let mut shadow = Shadow::default();
+    let mut shadow = KnownWords::default();
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     let sent = RequestPdu::WriteRegister {
         address: 2002,
@@ -218,8 +218,8 @@ fn exceptions_and_silence_end_it() {
 }
 
 /// What the command sends next.
-fn sends(bench: &Bench, command: &mut Execution) -> RequestPdu {
-    match command.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
+fn sends(bench: &Bench, command: &mut CommandRun) -> RequestPdu {
+    match command.next(&bench.words, &bench.profile, bench.running, bench.now) {
         Next::Send(pdu) => pdu,
         other => panic!("{other:?}"),
     }
@@ -239,7 +239,7 @@ fn a_stop_does_not_depend_on_a_read() {
         let read = sends(&bench, &mut stop);
         assert!(!read.is_write());
         let ended = match answer {
-            Some(reply) => stop.answered(&read, reply, &mut bench.shadow),
+            Some(reply) => stop.answered(&read, reply, &mut bench.words),
             None => stop.failed(&read, Outcome::TimedOut, 3),
         };
         assert_eq!(ended, None);
@@ -253,11 +253,11 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     let refused = || Reply::Exception(Exception::ADDRESS);
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut start);
-    assert_eq!(start.answered(&read, refused(), &mut bench.shadow), None);
+    assert_eq!(start.answered(&read, refused(), &mut bench.words), None);
     assert_eq!(sends(&bench, &mut start), word(1));
-    assert!(start.answered(&word(1), Reply::Written, &mut bench.shadow).is_some());
+    assert!(start.answered(&word(1), Reply::Written, &mut bench.words).is_some());
     assert_eq!(
-        bench.shadow.get(0, 2000),
+        bench.words.get(0, 2000),
         Some(1),
         "known from the acknowledged write on"
     );
@@ -270,7 +270,7 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     assert_eq!(sends(&bench, &mut start), word(1));
     // A drive that is only busy is not overruled.
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
-    let busy = start.answered(&read, Reply::Exception(Exception::BUSY), &mut bench.shadow);
+    let busy = start.answered(&read, Reply::Exception(Exception::BUSY), &mut bench.words);
     assert_eq!(busy, Some(Outcome::Exception(Exception::BUSY)));
 }
 
@@ -282,18 +282,18 @@ fn an_unknown_word_is_not_guessed_while_the_motor_runs() {
     for points in [&[("reverse", 1.0)][..], &[("run", 1.0)], &[("fault_reset", 1.0)]] {
         let (mut command, _a) = bench.begin(points, Urgency::Command);
         let read = sends(&bench, &mut command);
-        let ended = command.answered(&read, refused(), &mut bench.shadow);
+        let ended = command.answered(&read, refused(), &mut bench.words);
         assert_eq!(ended, Some(Outcome::Exception(Exception::ADDRESS)), "{points:?}");
     }
     let (mut both, _a) = bench.begin(&[("run", 1.0), ("reverse", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut both);
-    assert_eq!(both.answered(&read, refused(), &mut bench.shadow), None);
+    assert_eq!(both.answered(&read, refused(), &mut bench.words), None);
     assert_eq!(sends(&bench, &mut both), word(3));
 }
 
 #[test]
 fn what_cannot_be_sent_is_no_success() {
-    let refused = |execution: &Execution| matches!(execution.success(), Outcome::Refused(_));
+    let refused = |run: &CommandRun| matches!(run.success(), Outcome::Refused(_));
     // Its place is that of another point, which is not named.
     let mut bench = Bench::new(0);
     let (mut derived, _a) = bench.begin(&[("run", 1.0), ("frequency_reference", 20.0)], Urgency::Command);

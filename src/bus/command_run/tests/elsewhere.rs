@@ -6,11 +6,11 @@ use super::*;
 fn bench(word: u16) -> Bench {
     let mut bench = Bench::new(word);
     bench.running = true;
-    bench.shadow.learn(0, Table::Holding, 2000, 1);
+    bench.words.learn(Table::Holding, 2000, 1);
     bench
 }
 
-fn reverse(bench: &Bench) -> Execution {
+fn reverse(bench: &Bench) -> CommandRun {
     bench.begin(&[("reverse", 1.0)], Urgency::Command).0
 }
 
@@ -35,7 +35,7 @@ fn the_word_is_read_before_a_run_bit_that_is_not_named_is_written() {
     }
     // Nothing that could start the motor: no read.
     let mut bench = bench(0);
-    bench.shadow.learn(0, Table::Holding, 2000, 0);
+    bench.words.learn(Table::Holding, 2000, 0);
     assert_eq!(sends(&bench, &mut reverse(&bench)), word(2));
 }
 
@@ -68,7 +68,7 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
         let mut command = reverse(&bench);
         let read = sends(&bench, &mut command);
         let refused = Reply::Exception(Exception::ADDRESS);
-        assert_eq!(command.answered(&read, refused, &mut bench.shadow), None);
+        assert_eq!(command.answered(&read, refused, &mut bench.words), None);
         assert_eq!(sends(&bench, &mut command), word(written), "running: {running}");
     }
     // One that is only busy, or silent, is not overruled while its motor runs.
@@ -76,7 +76,7 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
     let mut command = reverse(&bench);
     let read = sends(&bench, &mut command);
     let busy = Reply::Exception(Exception::BUSY);
-    let ended = command.answered(&read, busy, &mut bench.shadow);
+    let ended = command.answered(&read, busy, &mut bench.words);
     assert_eq!(ended, Some(Outcome::Exception(Exception::BUSY)));
     for (running, ended) in [(true, Some(Outcome::TimedOut)), (false, None)] {
         bench.running = running;
@@ -95,11 +95,11 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
 fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
     let mut bench = bench(1);
     let mut command = reverse(&bench);
-    let tell = |command: &mut Execution, bench: &mut Bench, has: u16| {
+    let tell = |command: &mut CommandRun, bench: &mut Bench, has: u16| {
         let read = sends(bench, command);
         assert!(asks(&read));
         let told = Reply::Registers(vec![has]);
-        assert_eq!(command.answered(&read, told, &mut bench.shadow), None);
+        assert_eq!(command.answered(&read, told, &mut bench.words), None);
     };
     tell(&mut command, &mut bench, 1);
     assert_eq!(sends(&bench, &mut command), word(3));
@@ -117,19 +117,19 @@ fn no_read_stands_in_the_way_of_the_end_of_a_pulse() {
         let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
         let read = sends(&bench, &mut reset);
         let has = Reply::Registers(vec![1]);
-        assert_eq!(reset.answered(&read, has, &mut bench.shadow), None);
+        assert_eq!(reset.answered(&read, has, &mut bench.words), None);
         assert_eq!(sends(&bench, &mut reset), word(5));
-        assert_eq!(reset.answered(&word(5), Reply::Written, &mut bench.shadow), None);
+        assert_eq!(reset.answered(&word(5), Reply::Written, &mut bench.words), None);
         bench.now += Duration::from_millis(20);
         bench.running = running;
         assert!(matches!(
-            reset.next(&bench.shadow, &bench.profile, running, bench.now),
+            reset.next(&bench.words, &bench.profile, running, bench.now),
             Next::Wait(_)
         ));
         bench.now += Duration::from_millis(20);
         assert!(asks(&sends(&bench, &mut reset)));
         let ended = match answer {
-            Some(reply) => reset.answered(&read, reply, &mut bench.shadow),
+            Some(reply) => reset.answered(&read, reply, &mut bench.words),
             None => reset.failed(&read, Outcome::TimedOut, 3),
         };
         assert_eq!(ended, None);

@@ -34,11 +34,11 @@ fn coil(address: u16, on: bool) -> RequestPdu {
 
 /// AO 1 was something else when it was read last.
 fn changed(bench: &mut Bench) {
-    bench.shadow.learn(0, Table::Holding, 0, 0);
-    bench.shadow.learn(0, Table::Holding, 1, HALF[1]);
+    bench.words.learn(Table::Holding, 0, 0);
+    bench.words.learn(Table::Holding, 1, HALF[1]);
 }
 
-fn reference(bench: &Bench) -> Execution {
+fn reference(bench: &Bench) -> CommandRun {
     bench.begin(&[("speed_reference", 50.0)], Urgency::Command).0
 }
 
@@ -48,9 +48,9 @@ fn what_the_drive_has_is_read_and_not_written() {
     let mut command = reference(&bench);
     assert_eq!(sends(&bench, &mut command), read(Table::Holding, 2));
     let has = Reply::Registers(HALF.to_vec());
-    assert_eq!(command.answered(&read(Table::Holding, 2), has, &mut bench.shadow), None);
+    assert_eq!(command.answered(&read(Table::Holding, 2), has, &mut bench.words), None);
     // Neither override nor release.
-    let next = command.next(&bench.shadow, &bench.profile, false, bench.now);
+    let next = command.next(&bench.words, &bench.profile, false, bench.now);
     assert_eq!(next, Next::Done);
     assert_eq!(command.success(), Outcome::Acknowledged(Reply::Written));
 }
@@ -61,14 +61,14 @@ fn what_was_read_earlier_lets_write_and_leaves_nothing_out() {
     changed(&mut bench);
     assert_eq!(sends(&bench, &mut reference(&bench)), override_ao());
     // It had the value when it was read last: it is asked, and may have another one by now.
-    bench.shadow.learn(0, Table::Holding, 0, HALF[0]);
+    bench.words.learn(Table::Holding, 0, HALF[0]);
     for (has, next) in [(HALF[0], Next::Done), (0x429A, Next::Send(override_ao()))] {
         let mut command = reference(&bench);
         let check = sends(&bench, &mut command);
         assert_eq!(check, read(Table::Holding, 2));
         let has = Reply::Registers(vec![has, HALF[1]]);
-        assert_eq!(command.answered(&check, has, &mut bench.shadow), None);
-        assert_eq!(command.next(&bench.shadow, &bench.profile, false, bench.now), next);
+        assert_eq!(command.answered(&check, has, &mut bench.words), None);
+        assert_eq!(command.next(&bench.words, &bench.profile, false, bench.now), next);
     }
 }
 
@@ -78,7 +78,7 @@ fn a_drive_that_does_not_tell_is_written() {
     let mut command = reference(&bench);
     let check = sends(&bench, &mut command);
     let refused = Reply::Exception(Exception::n2(0x10));
-    assert_eq!(command.answered(&check, refused, &mut bench.shadow), None);
+    assert_eq!(command.answered(&check, refused, &mut bench.words), None);
     assert_eq!(sends(&bench, &mut command), override_ao());
 }
 
@@ -91,12 +91,12 @@ fn a_release_is_behind_the_override_and_may_fail() {
         let mut command = reference(&bench);
         assert_eq!(sends(&bench, &mut command), override_ao());
         assert_eq!(
-            command.answered(&override_ao(), Reply::Written, &mut bench.shadow),
+            command.answered(&override_ao(), Reply::Written, &mut bench.words),
             None
         );
         assert_eq!(sends(&bench, &mut command), release());
         let ended = match answer {
-            Some(reply) => command.answered(&release(), reply, &mut bench.shadow),
+            Some(reply) => command.answered(&release(), reply, &mut bench.words),
             None => {
                 assert_eq!(
                     command.failed(&release(), Outcome::TimedOut, 1),
@@ -119,26 +119,26 @@ fn an_override_that_is_refused_is_not_released() {
     let mut command = reference(&bench);
     assert_eq!(sends(&bench, &mut command), override_ao());
     let refused = Exception::n2(0x10);
-    let ended = command.answered(&override_ao(), Reply::Exception(refused), &mut bench.shadow);
+    let ended = command.answered(&override_ao(), Reply::Exception(refused), &mut bench.words);
     assert_eq!(ended, Some(Outcome::Exception(refused)));
 }
 
 #[test]
 fn a_stop_is_never_left_out() {
     let mut bench = bench();
-    bench.shadow.learn(0, Table::Coil, 0, 0);
+    bench.words.learn(Table::Coil, 0, 0);
     for urgency in [Urgency::Stop, Urgency::Command] {
         let (mut stop, _answer) = bench.begin(&[("run", 0.0)], urgency);
         assert_eq!(sends(&bench, &mut stop), coil(0, false));
     }
     // A start is, where the drive says that it has it.
     for (has, next) in [(true, Next::Done), (false, Next::Send(coil(0, true)))] {
-        bench.shadow.learn(0, Table::Coil, 0, 1);
+        bench.words.learn(Table::Coil, 0, 1);
         let (mut start, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
         let check = sends(&bench, &mut start);
         assert_eq!(check, read(Table::Coil, 1));
-        assert_eq!(start.answered(&check, Reply::Bits(vec![has]), &mut bench.shadow), None);
-        assert_eq!(start.next(&bench.shadow, &bench.profile, true, bench.now), next);
+        assert_eq!(start.answered(&check, Reply::Bits(vec![has]), &mut bench.words), None);
+        assert_eq!(start.next(&bench.words, &bench.profile, true, bench.now), next);
     }
 }
 
@@ -147,16 +147,16 @@ fn a_pulse_is_never_left_out() {
     let mut bench = bench();
     bench.running = true;
     for (address, word) in [(0, 0), (2, 0)] {
-        bench.shadow.learn(0, Table::Coil, address, word);
+        bench.words.learn(Table::Coil, address, word);
     }
     let (mut reset, _answer) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
     let mut sent = Vec::new();
     loop {
-        match reset.next(&bench.shadow, &bench.profile, bench.running, bench.now) {
+        match reset.next(&bench.words, &bench.profile, bench.running, bench.now) {
             Next::Wait(until) => bench.now = until,
             Next::Done => break,
             Next::Send(pdu) => {
-                let over = reset.answered(&pdu, Reply::Written, &mut bench.shadow).is_some();
+                let over = reset.answered(&pdu, Reply::Written, &mut bench.words).is_some();
                 sent.push(pdu);
                 if over {
                     break;

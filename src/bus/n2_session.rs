@@ -4,11 +4,7 @@
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
 //! is read. `N00` at any time means that it has started anew: the same again.
 //!
-//! A reply names neither drive nor request. After an exchange that was not answered, or not believably, a late value of
-//! one drive could pass for that of another. So the whole line has a fence then: it rests for the time of another reply,
-//! and the next thing said, to whichever drive, is Identify, whose answer no float and no acknowledgement looks like. A
-//! state does (a byte of 10h), and a late identity looks like a state; so a poll comes behind, whose answer is neither.
-//! A stop does not wait for that: its acknowledgement is not taken for true, it goes out once more.
+//! What tells late replies apart is not here but in `n2_late_replies`.
 
 use std::time::Instant;
 
@@ -32,24 +28,10 @@ enum Phase {
     Ready,
 }
 
-/// What has to be answered in its own form before an answer on the line is believed.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-enum Fence {
-    /// Nothing: no answer is owed.
-    #[default]
-    Open,
-    /// Identify, and a poll behind it.
-    Identify,
-    /// A poll.
-    Poll,
-}
-
 #[derive(Debug, Clone)]
 struct Drive {
     options: N2Options,
     phase: Phase,
-    /// A stop went out behind such an exchange and was acknowledged, perhaps late and by mistake.
-    stop_repeated: bool,
     polled: Option<Instant>,
     /// It answered something since it was identified.
     proved: bool,
@@ -74,28 +56,22 @@ pub enum Progress {
 
 /// The sessions with the drives of a bus; none on a bus of another protocol.
 #[derive(Debug, Default)]
-pub struct Sessions {
+pub struct N2Sessions {
     drives: Vec<Drive>,
-    /// Of the line, not of a drive: the answer that is owed could pass for that of any drive.
-    fence: Fence,
-    /// Until then the line rests: what comes meanwhile is nobody's answer.
-    rest: Option<Instant>,
 }
 
-impl Sessions {
+impl N2Sessions {
     /// Sessions with drives of these options.
-    pub fn new(drives: impl IntoIterator<Item = N2Options>) -> Sessions {
+    pub fn new(drives: impl IntoIterator<Item = N2Options>) -> N2Sessions {
         let drive = |options: N2Options| Drive {
             phase: first(&options),
             options,
-            stop_repeated: false,
             polled: None,
             proved: false,
             device: None,
         };
-        Sessions {
+        N2Sessions {
             drives: drives.into_iter().map(drive).collect(),
-            ..Sessions::default()
         }
     }
 
@@ -106,17 +82,14 @@ impl Sessions {
 
     /// What must be said to the drive before it is read (`None`) or commanded.
     pub fn before(&mut self, drive: usize, command: Option<Urgency>, now: Instant) -> Option<Session> {
-        let fence = self.fence;
         let drive = self.drives.get_mut(drive)?;
-        let fenced = drive.options.identify && command != Some(Urgency::Stop);
-        if (fenced && fence == Fence::Identify) || matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
+        if matches!(drive.phase, Phase::Unknown | Phase::Waiting) {
             return Some(Session::Identify);
         }
-        let fenced = fenced && fence == Fence::Poll;
-        if command.is_some() && !fenced {
+        if command.is_some() {
             return None;
         }
-        if drive.phase == Phase::Ready && (fenced || drive.is_due(now)) {
+        if drive.phase == Phase::Ready && drive.is_due(now) {
             drive.report();
         }
         match drive.phase {
@@ -125,7 +98,7 @@ impl Sessions {
         }
     }
 
-    /// A step that [`Sessions::before`] gave is over.
+    /// A step that [`N2Sessions::before`] gave is over.
     pub fn done(&mut self, drive: usize, step: Session, ended: &Ended, now: Instant) -> Progress {
         let heard = self.heard(drive, ended);
         let (Progress::Going, Ended::Reply(reply)) = (heard, ended) else {
@@ -134,15 +107,6 @@ impl Sessions {
             } else {
                 heard
             };
-        };
-        if self.is_late_identity(step, reply) {
-            self.raise();
-            return Progress::Failed;
-        }
-        self.fence = match (self.fence, step) {
-            (Fence::Identify, Session::Identify) => Fence::Poll,
-            (Fence::Poll, Session::Poll { .. }) => Fence::Open,
-            (fence, _) => fence,
         };
         let Some(drive) = self.drives.get_mut(drive) else {
             return Progress::Failed;
@@ -155,32 +119,13 @@ impl Sessions {
         }
     }
 
-    /// Whether the answer to a poll behind a fence is that to an Identify which was thought to be answered.
-    fn is_late_identity(&self, step: Session, reply: &Reply) -> bool {
-        let (Fence::Poll, Session::Poll { .. }, Reply::Changes(digits)) = (self.fence, step, reply) else {
-            return false;
-        };
-        let told = |device: u8| digits.eq_ignore_ascii_case(format!("{device:02X}").as_bytes());
-        let mut drives = self.drives.iter();
-        drives.any(|drive| told(drive.options.device_type) || drive.device.is_some_and(told))
-    }
-
-    /// An answer is owed, or one came that nobody asked for.
-    fn raise(&mut self) {
-        self.fence = Fence::Identify;
-        for drive in &mut self.drives {
-            drive.stop_repeated = false;
-        }
-    }
-
     /// Any exchange with the drive is over; [`Progress::Failed`] where it was refused though just identified.
     pub fn heard(&mut self, drive: usize, ended: &Ended) -> Progress {
         if matches!(ended, Ended::Silent | Ended::Corrupt(_)) {
-            if self.drives.is_empty() {
-                return Progress::Going;
-            }
-            self.raise();
-            return Progress::Failed;
+            return match self.drives.is_empty() {
+                true => Progress::Going,
+                false => Progress::Failed,
+            };
         }
         let Some(drive) = self.drives.get_mut(drive) else {
             return Progress::Going;
@@ -200,43 +145,6 @@ impl Sessions {
         }
     }
 
-    /// Characters came that nobody asked for: perhaps the answer to what was asked last.
-    pub fn strayed(&mut self) {
-        if !self.drives.is_empty() {
-            self.raise();
-        }
-    }
-
-    /// The drive owes an answer, which may come until then. A drive that is known to be away owes none, so that it does
-    /// not cost the others more than its probes.
-    pub fn owes(&mut self, drive: usize, until: Instant) {
-        if self.drives.get(drive).is_some_and(|drive| drive.proved) {
-            self.rest = self.rest.max(Some(until));
-        }
-    }
-
-    /// Whether an answer is owed, so that what cannot be believed may be that one.
-    pub fn is_fenced(&self) -> bool {
-        self.fence != Fence::Open
-    }
-
-    /// Until when nothing but a stop goes on the line.
-    pub fn rest(&self) -> Option<Instant> {
-        self.rest
-    }
-
-    /// Whether the acknowledgement of a stop proves nothing, because it may be that of what was not answered before.
-    /// The stop goes out once more, and only once.
-    pub fn doubts_stop(&mut self, drive: usize) -> bool {
-        let fenced = self.is_fenced();
-        let Some(drive) = self.drives.get_mut(drive) else {
-            return false;
-        };
-        let doubted = fenced && !drive.stop_repeated;
-        drive.stop_repeated = doubted;
-        doubted
-    }
-
     /// Drives that are due for a poll and would not be asked otherwise, because nothing of them is read so often.
     pub fn neglected(&self, now: Instant) -> impl Iterator<Item = usize> {
         let due = move |drive: &Drive| drive.phase == Phase::Ready && drive.polled.is_some() && drive.is_due(now);
@@ -253,11 +161,15 @@ impl Sessions {
         }
     }
 
+    /// The device type by which a drive identifies itself, or is expected to.
+    pub fn device(&self, drive: usize) -> u8 {
+        let drive = self.drives.get(drive);
+        drive.map_or(0, |drive| drive.device.unwrap_or(drive.options.device_type))
+    }
+
     /// The port was lost: all drives are found anew.
     pub fn reset(&mut self) {
         (0..self.drives.len()).for_each(|drive| self.gone(drive));
-        self.fence = Fence::Open;
-        self.rest = None;
     }
 }
 

@@ -1,0 +1,442 @@
+//! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
+
+mod known_words;
+mod steps;
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+pub use self::known_words::KnownWords;
+pub use self::steps::{StepPurpose, Step};
+
+use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
+use super::confirm::{self, Effect};
+use crate::codec::{Exception, Reply, RequestPdu};
+use crate::command::{Command, Interruption, Order, Outcome, Receipt, SourceKind, Ticket, Urgency};
+use crate::drive::Profile;
+
+/// What a command needs next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Next {
+    /// This request on the line.
+    Send(Step),
+    /// Nothing before then.
+    Wait(Instant),
+    /// It is done.
+    Done,
+}
+
+/// What the command is, as far as its steps depend on it.
+#[derive(Debug)]
+struct Scope {
+    /// It sets every bit that can be commanded, reset bits apart.
+    whole: bool,
+    /// It says whether the motor is to run.
+    names_run: bool,
+    /// It sets references only.
+    reference_only: bool,
+}
+
+/// How far the tries of the present step got.
+#[derive(Debug)]
+struct Tries {
+    failures: u32,
+    /// How the last try without an answer failed: [`Outcome::TimedOut`] or [`Outcome::Garbled`].
+    unanswered: Outcome,
+    /// A write was sent and not answered: whether the drive took it is not known.
+    in_doubt: bool,
+}
+
+/// A command that the bus has begun.
+#[derive(Debug)]
+pub struct CommandRun {
+    urgency: Urgency,
+    /// With which it competes for the line; a stop that tells its drive nothing new has that of a command.
+    pub rank: Urgency,
+    scope: Scope,
+    actions: VecDeque<Action>,
+    not_before: Option<Instant>,
+    expires: Instant,
+    /// All who wait for its answer: whoever gave it, then those who joined.
+    tickets: Vec<Ticket>,
+    effects: Vec<Effect>,
+    tries: Tries,
+    /// The outcome where it ends before all was sent.
+    cut: Option<Outcome>,
+    /// Nothing is left but the end of a pulse, which is sent whatever happens.
+    only_ends: bool,
+    reply: Reply,
+    /// It, or a part of it, was on the wire.
+    begun: bool,
+    /// What the drive last said of its motor.
+    running: bool,
+    check: Check,
+    /// The drive does not tell its own word: bits that the command does not set are written as 0.
+    blind: bool,
+    /// It waited for a late reply since its last step was chosen.
+    held_up: bool,
+}
+
+impl CommandRun {
+    /// Lays the command out in the order that is safe: a stop before anything, references before run, a reset
+    /// before a new run edge. One that cannot be sent as a whole is refused; only of a stop goes out what can.
+    pub fn new(command: Command, profile: &Profile) -> CommandRun {
+        let Command {
+            order,
+            urgency,
+            reference_only,
+            expires,
+            ticket,
+            joined,
+            ..
+        } = command;
+        let effects = confirm::effects(profile, &order);
+        let scope = Scope {
+            whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
+            names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
+            reference_only,
+        };
+        let unsendable = match &order {
+            Order::Points(values) => unsendable(profile, values),
+            Order::Write(_) | Order::Read(_) => None,
+        };
+        let actions = match order {
+            Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
+            Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
+            Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
+        };
+        let actions = actions
+            .into_iter()
+            .flat_map(|action| write_on_change(action, profile))
+            .collect();
+        CommandRun {
+            urgency,
+            rank: urgency,
+            scope,
+            actions,
+            not_before: None,
+            expires,
+            tickets: [ticket].into_iter().chain(joined).collect(),
+            effects,
+            tries: Tries {
+                failures: 0,
+                unanswered: Outcome::TimedOut,
+                in_doubt: false,
+            },
+            cut: unsendable.map(Outcome::Refused),
+            only_ends: false,
+            reply: Reply::Written,
+            begun: false,
+            running: true,
+            check: Check::NotYet,
+            blind: false,
+            held_up: false,
+        }
+    }
+
+    /// Rank of the command.
+    pub fn urgency(&self) -> Urgency {
+        self.urgency
+    }
+
+    /// Whether it sets references only, which starts no motor.
+    pub fn is_reference_only(&self) -> bool {
+        self.scope.reference_only
+    }
+
+    /// When its time runs out.
+    pub fn expires(&self) -> Instant {
+        self.expires
+    }
+
+    /// Whether a client gave it: no order of the gateway's own.
+    pub fn is_of_client(&self) -> bool {
+        let own = [SourceKind::Supervision, SourceKind::Shutdown];
+        let kind = |ticket: &Ticket| ticket.origin().kind;
+        self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| !own.contains(&kind(ticket)))
+    }
+
+    /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
+    /// sent any more, but a reset bit that is set is taken away.
+    pub fn next(&mut self, words: &KnownWords, profile: &Profile, running: bool, now: Instant) -> Next {
+        self.running = running;
+        if self.is_late(now) {
+            let outcome = if self.tries.failures > 0 || self.tries.in_doubt {
+                self.tries.unanswered.clone()
+            } else {
+                self.unless_begun(Outcome::Expired, Interruption::Expired)
+            };
+            self.cut_off(outcome);
+        }
+        if let Some(at) = self.not_before {
+            if now < at {
+                return Next::Wait(at);
+            }
+            self.not_before = None;
+        }
+        loop {
+            let Some(action) = self.actions.front() else {
+                return Next::Done;
+            };
+            if let Action::Hold(time) = action {
+                let until = now + *time;
+                self.actions.pop_front();
+                self.not_before = Some(until);
+                return Next::Wait(until);
+            }
+            let known = Known {
+                check: self.check,
+                blind: self.blind,
+                names_run: self.scope.names_run,
+                running,
+            };
+            match step_of(action, words, profile, known) {
+                Some(step) => return Next::Send(step),
+                // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
+                // overridden that would have to be released.
+                None => {
+                    self.pop();
+                    if matches!(self.actions.front(), Some(Action::Hold(_) | Action::Release(_))) {
+                        self.pop();
+                    }
+                }
+            }
+        }
+    }
+
+    /// Whether it, or a part of it, was on the wire.
+    pub fn has_begun(&self) -> bool {
+        self.begun
+    }
+
+    /// A step of it is on the wire.
+    pub fn sent(&mut self, step: &Step) {
+        self.begun |= step.pdu.is_write() || self.urgency == Urgency::Read;
+    }
+
+    /// `unbegun` where nothing of it was sent; else that it was cut short, its end being unknown.
+    fn unless_begun(&self, unbegun: Outcome, why: Interruption) -> Outcome {
+        if self.begun { Outcome::Interrupted(why) } else { unbegun }
+    }
+
+    /// It must wait for a late reply: what it has read by then is old.
+    pub fn hold_up(&mut self) {
+        self.held_up = true;
+    }
+
+    /// It may go on. Whether it asks again first for what it read before it was held up: a motor may have been stopped
+    /// meanwhile.
+    pub fn asks_again(&mut self) -> bool {
+        let again = std::mem::take(&mut self.held_up) && self.check == Check::Read;
+        if again {
+            self.check = Check::NotYet;
+        }
+        again
+    }
+
+    fn pop(&mut self) {
+        self.actions.pop_front();
+        self.check = Check::NotYet;
+    }
+
+    /// Its time ran out, and what is left of it was not cut off yet.
+    pub fn is_late(&self, now: Instant) -> bool {
+        now >= self.expires && !self.only_ends
+    }
+
+    /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command is over.
+    pub fn answered(&mut self, step: &Step, reply: Reply, words: &mut KnownWords) -> Option<Outcome> {
+        // A read between the tries of a write does not make them more.
+        if !self.tries.in_doubt || step.purpose != StepPurpose::ReadWord {
+            self.tries.failures = 0;
+        }
+        // An exception tells nothing of an earlier try that was not answered.
+        if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            self.tries.in_doubt = false;
+        }
+        match (step.purpose, reply) {
+            (StepPurpose::Release, Reply::Exception(code)) => self.not_released(&code.to_string()),
+            (StepPurpose::Compare, reply) => {
+                self.check = learn(step, &reply, words);
+                None
+            }
+            (StepPurpose::ReadWord, Reply::Exception(code)) => self.word_refused(step, code, words),
+            (StepPurpose::ReadWord, reply) => match learn(step, &reply, words) {
+                Check::Read => {
+                    self.check = Check::Read;
+                    None
+                }
+                _ => Some(Outcome::Exception(Exception::DEVICE_FAILURE)),
+            },
+            (StepPurpose::Execute, Reply::Exception(code)) => Some(Outcome::Exception(code)),
+            (purpose, reply) => {
+                words.written(&step.pdu);
+                if purpose == StepPurpose::Execute {
+                    self.reply = reply;
+                }
+                self.pop();
+                self.actions.is_empty().then(|| self.success())
+            }
+        }
+    }
+
+    fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
+        let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
+        let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
+        if self.goes_on(kept_back && known) {
+            return None;
+        }
+        if kept_back || self.urgency == Urgency::Stop {
+            return self.without_word(Outcome::Exception(code));
+        }
+        Some(Outcome::Exception(code))
+    }
+
+    /// The value stands all the same: a supervisor that looks away does not see changes at the panel, no more.
+    fn not_released(&mut self, why: &str) -> Option<Outcome> {
+        tracing::warn!("an output was written but not released to the drive's own control: {why}");
+        self.tries.failures = 0;
+        self.pop();
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    /// No believable answer came; `how` says which way. The outcome, when the tries are used up.
+    pub fn failed(&mut self, step: &Step, how: Outcome, retries: u32) -> Option<Outcome> {
+        self.tries.failures += 1;
+        self.tries.unanswered = how;
+        self.tries.in_doubt |= step.pdu.is_write();
+        let over = self.tries.failures > retries;
+        match step.purpose {
+            StepPurpose::Release if over => return self.not_released("no answer"),
+            StepPurpose::Compare if self.urgency == Urgency::Stop => {
+                self.check = Check::InVain;
+                return None;
+            }
+            StepPurpose::ReadWord if self.goes_on(false) => return None,
+            StepPurpose::ReadWord if over || self.urgency == Urgency::Stop => {
+                return self.without_word(self.tries.unanswered.clone());
+            }
+            _ => {}
+        }
+        if step.pdu.is_write() && self.check == Check::Read {
+            // By the next try it may have changed again.
+            self.check = Check::NotYet;
+        }
+        over.then(|| self.without_answer())
+    }
+
+    fn without_answer(&self) -> Outcome {
+        self.cut.clone().unwrap_or_else(|| self.tries.unanswered.clone())
+    }
+
+    /// What was sent was acknowledged, perhaps by a late reply to something else.
+    pub fn doubted(&mut self) {
+        self.tries.in_doubt = true;
+    }
+
+    /// Whether the drive may have taken a write that it did not answer: its words are not known then.
+    pub fn in_doubt(&self) -> bool {
+        self.tries.in_doubt
+    }
+
+    /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
+    /// tells it (`untold`), and at the end of a pulse, which no read stands in the way of.
+    fn goes_on(&mut self, untold: bool) -> bool {
+        let ends = matches!(self.actions.front(), Some(Action::PulseEnd { .. }));
+        let goes_on = self.check == Check::NotYet && (untold || ends);
+        if goes_on {
+            self.check = Check::InVain;
+            self.tries.failures = 0;
+        }
+        goes_on
+    }
+
+    /// The drive does not tell its own word. A stop goes out all the same: no read stands in its way. So does a
+    /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
+    /// and ends with `outcome`.
+    fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {
+        if self.urgency != Urgency::Stop && self.running && !self.scope.whole {
+            return Some(outcome);
+        }
+        self.blind = true;
+        self.check = Check::InVain;
+        self.tries.failures = 0;
+        None
+    }
+
+    /// A stop came in: what is not sent yet is not sent any more, but a reset bit that is set is taken away.
+    /// The outcome, if the command is over by that.
+    pub fn purge(&mut self) -> Option<Outcome> {
+        self.cut_off(self.unless_begun(Outcome::Purged, Interruption::Stop));
+        self.actions.is_empty().then(|| self.success())
+    }
+
+    fn cut_off(&mut self, outcome: Outcome) {
+        let before = self.actions.len();
+        // A bit whose setting was sent and not answered may be set.
+        if self.tries.failures > 0 && matches!(self.actions.front(), Some(Action::PulseHigh { .. })) {
+            self.actions.pop_front();
+        }
+        let high = self.actions.iter().any(|a| matches!(a, Action::PulseHigh { .. }));
+        self.actions
+            .retain(|a| !high && matches!(a, Action::PulseEnd { .. } | Action::Hold(_)));
+        // A hold without the end of a pulse behind it holds nothing.
+        if !self.actions.iter().any(|a| matches!(a, Action::PulseEnd { .. })) {
+            self.actions.clear();
+        }
+        self.only_ends = true;
+        if before != self.actions.len() {
+            self.cut = Some(outcome);
+            self.tries.failures = 0;
+        }
+    }
+
+    /// How the command ends when nothing is left to do.
+    pub fn success(&self) -> Outcome {
+        match &self.cut {
+            Some(outcome) => outcome.clone(),
+            None => Outcome::Acknowledged(self.reply.clone()),
+        }
+    }
+
+    /// Answers a command that the drive took; what a read must show, and the receipts of those who wait for that.
+    pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
+        let receipts = self.tickets.into_iter();
+        let receipts = receipts.map(|ticket| ticket.acknowledge(outcome.clone(), now)).collect();
+        (self.effects, receipts)
+    }
+
+    /// Answers the command with that outcome.
+    pub fn finish(self, outcome: &Outcome, now: Instant) {
+        self.tickets
+            .into_iter()
+            .for_each(|ticket| ticket.answer(outcome.clone(), now));
+    }
+
+    /// Answers the command, which cannot go on: with `unbegun` where nothing of it was sent.
+    pub fn abandon(self, unbegun: Outcome, why: Interruption, now: Instant) {
+        let outcome = match &self.cut {
+            Some(outcome) => outcome.clone(),
+            None => self.unless_begun(unbegun, why),
+        };
+        self.finish(&outcome, now);
+    }
+}
+
+/// What the drive has, as it says.
+fn learn(step: &Step, reply: &Reply, words: &mut KnownWords) -> Check {
+    let (RequestPdu::Read { table, start, count }, Some(read)) = (&step.pdu, reply.words()) else {
+        return Check::InVain;
+    };
+    for (address, word) in (*start..).zip(&read) {
+        words.learn(*table, address, *word);
+    }
+    if read.len() == usize::from(*count) {
+        Check::Read
+    } else {
+        Check::InVain
+    }
+}
+
+#[cfg(test)]
+mod tests;

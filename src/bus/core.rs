@@ -1,0 +1,256 @@
+//! A bus without its thread: the line, the master and what is reported of them. Pure: bytes and time are arguments, and
+//! what is to be done with the port is what [`BusCore::poll`] returns.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::BusOptions;
+use super::line_state::{Exchanged, LineState};
+use super::master::{Master, Turn, TurnEnd};
+use super::news::News;
+use super::report::Report;
+use super::supervision::Lease;
+use super::tap::Tap;
+use super::transaction::Ended;
+use crate::codec::{Exception, Reply, Request};
+use crate::command::{Outcome, Urgency, WriteStats};
+use crate::event::Events;
+use crate::plant::BusHandle;
+
+/// What is to be done with the port.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Action {
+    /// Read what has come in; if that is nothing, give what [`BusCore::sending`] returns to the port.
+    Send,
+    /// Wait for bytes, or until then.
+    Wait {
+        /// When to come back at the latest.
+        until: Instant,
+        /// Whether a command that comes in ends the wait.
+        commands: bool,
+        /// Whether tens of microseconds count.
+        precise: bool,
+    },
+}
+
+/// What was chosen to go out when the line is clear.
+#[derive(Debug)]
+struct Chosen {
+    turn: Turn,
+    request: Request,
+    frame: Vec<u8>,
+    since: Instant,
+}
+
+/// A bus without its thread.
+#[derive(Debug)]
+pub struct BusCore {
+    bus: BusHandle,
+    line: LineState,
+    master: Master,
+    report: Report,
+    chosen: Option<Chosen>,
+    /// What is on the line.
+    asked: Option<Turn>,
+    tap: Option<Tap>,
+}
+
+impl BusCore {
+    /// A bus whose port is not open yet; `leases` are those of the bus before it, by drive.
+    pub fn new(
+        bus: BusHandle,
+        options: &BusOptions,
+        events: Events,
+        writes: Arc<WriteStats>,
+        leases: &[Lease],
+        now: Instant,
+    ) -> BusCore {
+        let spec = &bus.image.spec;
+        let silence = spec.protocol.silence(options.silence, &spec.format);
+        BusCore {
+            line: LineState::new(spec.protocol, spec.format, silence, now),
+            master: Master::new(bus.clone(), options, silence, writes, leases, now),
+            report: Report::new(bus.image.clone(), events, now),
+            bus,
+            chosen: None,
+            asked: None,
+            tap: None,
+        }
+    }
+
+    /// The port was opened.
+    pub fn opened(&mut self, now: Instant) {
+        self.line.reset(now);
+        self.master.opened(now);
+        self.bus.queue.open();
+        self.report.bus_up(now);
+    }
+
+    /// The port is gone or cannot be opened: everything is stale at once, everybody who waits is answered.
+    pub fn lost(&mut self, why: &str, now: Instant) {
+        self.bus.queue.close(Outcome::BusDown, now);
+        (self.chosen, self.asked, self.tap) = (None, None, None);
+        let news = self.master.lost(now);
+        self.report.bus_down(why);
+        self.tell(&news, now);
+    }
+
+    /// The bus ends: everybody who waits is answered. The leases, for the bus that comes after.
+    pub fn ended(&mut self, now: Instant) -> Vec<Lease> {
+        self.master.ended(now)
+    }
+
+    /// What is to be done now.
+    pub fn poll(&mut self, now: Instant) -> Action {
+        loop {
+            if self.line.is_underway() {
+                match self.line.on_time(now) {
+                    Ok(exchanged) => self.over(exchanged, now),
+                    Err(until) => return wait(until.unwrap_or(now), false, false),
+                }
+            }
+            let Some(chosen) = &self.chosen else {
+                if let Some(until) = self.choose(now) {
+                    return wait(until, true, true);
+                }
+                continue;
+            };
+            let clear = self.line.clear_at(chosen.since);
+            if now < clear {
+                return wait(clear, !chosen.turn.is_stop(), true);
+            }
+            // What came too late while the line fell silent is not sent.
+            if self.master.is_still_due(&chosen.turn, now) {
+                return Action::Send;
+            }
+            self.chosen = None;
+        }
+    }
+
+    /// Chooses what goes out next; else until when nothing does.
+    fn choose(&mut self, now: Instant) -> Option<Instant> {
+        let mut news = Vec::new();
+        let next = self.master.next(now, &mut news);
+        self.tell(&news, now);
+        self.report.tick(now);
+        let turn = match next {
+            Ok(turn) => turn,
+            Err(until) => return Some(until),
+        };
+        let image = self.bus.image.drives.get(turn.drive)?;
+        let request = Request {
+            address: image.spec.address,
+            pdu: turn.pdu().clone(),
+            n2: image.spec.profile.n2,
+        };
+        let mut frame = Vec::with_capacity(32);
+        self.bus.image.spec.protocol.encode(&request, &mut frame);
+        if frame.is_empty() {
+            // The protocol has no such request, so that the drive has no such address.
+            let refused = Ended::Reply(Reply::Exception(Exception::ADDRESS));
+            self.done(&turn, refused, now, now, Duration::ZERO, false);
+            return None;
+        }
+        self.chosen = Some(Chosen {
+            turn,
+            request,
+            frame,
+            since: now,
+        });
+        None
+    }
+
+    /// A command came in while nothing was on the line: what goes next is chosen anew, but for a stop.
+    pub fn command_came(&mut self) {
+        if self.chosen.as_ref().is_some_and(|chosen| !chosen.turn.is_stop()) {
+            self.chosen = None;
+        }
+    }
+
+    /// The chosen frame goes to the port at `now`: to be called before the port gets it, since what the port does with
+    /// it is not known.
+    pub fn sending(&mut self, now: Instant) -> Vec<u8> {
+        let Some(Chosen {
+            turn,
+            request,
+            frame,
+            since,
+        }) = self.chosen.take()
+        else {
+            return Vec::new();
+        };
+        if self.line.babbles(since) {
+            tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
+        }
+        let quiet_since = self.line.quiet_since();
+        self.tap = self.report.tap(turn.drive, &request, &frame, quiet_since, now);
+        let sending = self.master.sending(&turn, now);
+        let late = self.master.take_late();
+        self.line.send(request, frame.clone(), sending, late, now);
+        self.asked = Some(turn);
+        frame
+    }
+
+    /// Bytes came in.
+    pub fn heard(&mut self, bytes: &[u8], now: Instant) {
+        if !self.line.is_underway() {
+            if !bytes.is_empty() {
+                self.report.noise(bytes, self.line.quiet_since(), now);
+                self.line.heard(bytes, now);
+            }
+            return;
+        }
+        if let Some(tap) = &mut self.tap {
+            tap.heard(bytes, now);
+        }
+        if let Some(exchanged) = self.line.heard(bytes, now) {
+            self.over(exchanged, now);
+        }
+    }
+
+    /// An exchange is over.
+    fn over(&mut self, mut exchanged: Exchanged, now: Instant) {
+        let Some(turn) = self.asked.take() else { return };
+        self.report.exchanged(turn.drive, &exchanged, now);
+        if let Some(tap) = self.tap.take() {
+            tap.ended(&exchanged.ended, now);
+        }
+        self.master.put_late(exchanged.transaction.take_late());
+        let mangled = exchanged.transaction.is_mangled_reply();
+        let Exchanged {
+            ended, began, took, ..
+        } = exchanged;
+        self.done(&turn, ended, began, now, took, mangled);
+    }
+
+    fn done(&mut self, turn: &Turn, ended: Ended, began: Instant, now: Instant, took: Duration, mangled: bool) {
+        let end = TurnEnd {
+            ended,
+            began,
+            took,
+            mangled,
+        };
+        let news = self.master.done(turn, end, now);
+        self.tell(&news, now);
+    }
+
+    fn tell(&mut self, news: &[News], now: Instant) {
+        for one in news {
+            self.report.apply(one, now);
+        }
+    }
+}
+
+fn wait(until: Instant, commands: bool, precise: bool) -> Action {
+    Action::Wait {
+        until,
+        commands,
+        precise,
+    }
+}
+
+impl Turn {
+    fn is_stop(&self) -> bool {
+        self.rank() == Some(Urgency::Stop)
+    }
+}

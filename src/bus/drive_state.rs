@@ -1,0 +1,224 @@
+//! All that the master knows of one drive beside its image, its polls and its N2 session.
+
+use std::time::{Duration, Instant};
+
+use super::command_run::{CommandRun, KnownWords, Next, Step};
+use super::confirm::Confirmations;
+use super::late_replies::LateReplies;
+use super::supervision::Supervision;
+use crate::cache::{DriveImage, Reading};
+use crate::codec::Reply;
+use crate::command::{Interruption, Outcome, Urgency};
+use crate::drive::ModelPoint;
+
+/// A status older than this does not tell whether the motor runs.
+pub(super) const FRESH: Duration = Duration::from_secs(2);
+
+/// One drive.
+#[derive(Debug, Default)]
+pub(super) struct DriveState {
+    /// Its own command words.
+    pub(super) words: KnownWords,
+    /// Replies that it may still send.
+    pub(super) late: LateReplies,
+    /// Its lease.
+    pub(super) supervision: Supervision,
+    /// Commands that it acknowledged and has not shown yet.
+    pub(super) confirmations: Confirmations,
+    /// Begun commands: one of each rank, so that they keep their order.
+    runs: [Option<CommandRun>; 3],
+    /// When a stop was acknowledged after which no other command was sent.
+    stopped: Option<Instant>,
+    /// It did not answer a command: the next one waits until it answers something, or until then.
+    pub(super) silent_until: Option<Instant>,
+    /// It was read since its confirmations were looked at.
+    pub(super) was_read: bool,
+}
+
+/// What the begun commands of a drive want.
+#[derive(Debug)]
+pub(super) enum Wanted {
+    /// A step of the command of that rank.
+    Step(Urgency, Step),
+    /// Nothing before then.
+    Wait(Instant),
+    /// Nothing.
+    Nothing,
+}
+
+fn slot(urgency: Urgency) -> usize {
+    urgency as usize
+}
+
+impl DriveState {
+    /// The begun command of that rank.
+    pub(super) fn run(&mut self, urgency: Urgency) -> Option<&mut CommandRun> {
+        self.runs.get_mut(slot(urgency))?.as_mut()
+    }
+
+    /// Whether a command of that rank is begun.
+    pub(super) fn is_busy(&self, urgency: Urgency) -> bool {
+        self.runs.get(slot(urgency)).is_some_and(Option::is_some)
+    }
+
+    /// Whether any command is begun.
+    pub(super) fn has_runs(&self) -> bool {
+        self.runs.iter().any(Option::is_some)
+    }
+
+    /// Begins a command.
+    pub(super) fn begin(&mut self, run: CommandRun) {
+        if let Some(place) = self.runs.get_mut(slot(run.urgency())) {
+            *place = Some(run);
+        }
+    }
+
+    /// Until when a begun order of a client holds the lease.
+    pub(super) fn client_holds_until(&self) -> Option<Instant> {
+        let of_client = self.runs.iter().flatten().filter(|run| run.is_of_client());
+        of_client.map(CommandRun::expires).max()
+    }
+
+    /// What the begun commands want at `now`: that of the highest rank first. Those that are over are answered.
+    pub(super) fn wanted(&mut self, image: &DriveImage, now: Instant) -> Wanted {
+        let reading = image.reading(now, FRESH);
+        let profile = &image.spec.profile;
+        let mut wake_at: Option<Instant> = None;
+        let mut wait = |until: Instant| wake_at = Some(wake_at.map_or(until, |at: Instant| at.min(until)));
+        for urgency in [Urgency::Stop, Urgency::Command, Urgency::Read] {
+            loop {
+                // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
+                let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
+                let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
+                    break;
+                };
+                match run.next(&self.words, profile, running, now) {
+                    Next::Send(step) => {
+                        // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
+                        let blocked = self.late.blocks(&step.pdu, now);
+                        if let Some(until) = blocked.filter(|_| urgency != Urgency::Stop) {
+                            run.hold_up();
+                            wait(until.min(run.expires().max(now + Duration::from_millis(1))));
+                            break;
+                        }
+                        if !run.asks_again() {
+                            return Wanted::Step(urgency, step);
+                        }
+                    }
+                    Next::Wait(until) => {
+                        wait(until);
+                        break;
+                    }
+                    Next::Done => {
+                        let outcome = run.success();
+                        self.end(urgency, &outcome, image, now);
+                        break;
+                    }
+                }
+            }
+        }
+        wake_at.map_or(Wanted::Nothing, Wanted::Wait)
+    }
+
+    /// The drive answered a step of a begun command. The outcome, when the command is over.
+    pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply) -> Option<Outcome> {
+        let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
+        run.answered(step, reply, &mut self.words)
+    }
+
+    /// A begun command is over.
+    pub(super) fn end(&mut self, urgency: Urgency, outcome: &Outcome, image: &DriveImage, now: Instant) {
+        let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) else {
+            return;
+        };
+        if run.in_doubt() {
+            // A bit of another command must not bring back what an unanswered stop took away.
+            self.words.forget();
+        }
+        if run.is_of_client() && run.has_begun() {
+            self.supervision.renew(now);
+        }
+        if urgency == Urgency::Stop && outcome.is_ok() {
+            self.stopped = Some(now);
+        }
+        if outcome.is_ok() {
+            let (effects, receipts) = run.acknowledge(outcome, now);
+            self.confirmations.watch(effects, receipts, &image.reading(now, FRESH), now);
+        } else {
+            run.finish(outcome, now);
+        }
+    }
+
+    /// A step of a begun command goes onto the wire.
+    pub(super) fn sent(&mut self, urgency: Urgency, step: &Step, now: Instant) {
+        let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut) else {
+            return;
+        };
+        run.sent(step);
+        if step.pdu.is_write() {
+            if !run.is_reference_only() {
+                self.stopped = None;
+            }
+            if run.is_of_client() {
+                self.supervision.renew(now);
+            }
+        }
+    }
+
+    /// Whether a stop was acknowledged after which no other command was sent.
+    pub(super) fn was_stopped(&self) -> bool {
+        self.stopped.is_some()
+    }
+
+    /// Whether a stop tells the drive nothing new: it acknowledged one, a later sample shows the motor standing, and
+    /// nothing that is begun may start it.
+    pub(super) fn stands_by_stop(&self, reading: &Reading<'_>) -> bool {
+        let begun = self.runs.get(slot(Urgency::Command)).and_then(Option::as_ref);
+        let running = reading.model(ModelPoint::Running);
+        let stands = running.good().is_some_and(|running| !running.as_bool());
+        begun.is_none_or(CommandRun::is_reference_only)
+            && stands
+            && self.stopped.is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
+    }
+
+    /// A stop came in: nothing that was begun goes on, but a reset bit that is set is taken away.
+    pub(super) fn purge(&mut self, image: &DriveImage, now: Instant) {
+        let outcome = self.run(Urgency::Command).and_then(CommandRun::purge);
+        if let Some(outcome) = outcome {
+            self.end(Urgency::Command, &outcome, image, now);
+        }
+    }
+
+    /// The drive does not answer any more. A stop is tried on; what else was begun has failed.
+    pub(super) fn went_offline(&mut self, now: Instant) {
+        self.words.forget();
+        self.stopped = None;
+        for urgency in [Urgency::Command, Urgency::Read] {
+            if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
+                run.abandon(Outcome::Offline, Interruption::Offline, now);
+            }
+        }
+    }
+
+    /// The drive has started anew: nothing that is known of it holds.
+    pub(super) fn restarted(&mut self) {
+        self.words.forget();
+        self.stopped = None;
+    }
+
+    /// Everything that was begun is answered; what was acknowledged stays so.
+    pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
+        for run in self.runs.iter_mut().filter_map(Option::take) {
+            if run.is_of_client() && run.has_begun() {
+                self.supervision.renew(now);
+            }
+            run.abandon(unbegun.clone(), why, now);
+        }
+        self.confirmations.clear();
+        self.words.forget();
+        self.late = LateReplies::default();
+        self.stopped = None;
+        self.silent_until = None;
+        self.supervision.settle();
+    }
+}

@@ -1,0 +1,204 @@
+//! Replies that a drive may still send after its exchange was given up: a late one must not be taken for the answer to a
+//! later request. Pure: time is an argument.
+//!
+//! A Modbus reply names neither register nor request. After an exchange without a believable answer, the reply may come
+//! during a later exchange. It is told apart by address, function and length; only a request to the same drive whose
+//! reply would look the same could be answered wrongly. Such a request waits until no late reply can come any more. The
+//! same request may be sent again at once: whichever reply comes, it is true of the same registers.
+//!
+//! But the reply that comes then may be the older one, and the newer one is still to come: a drive that is always a
+//! little slower than the deadline stays one reply behind as long as the same request follows upon itself. So while a
+//! look-alike waits, that request is held back too after a while, and the drive gets the time to catch up.
+//!
+//! A write acknowledged late proves nothing once the drive may have taken another write in between: the same
+//! write then waits as a look-alike does. A stop does not wait, so the first acknowledgement of such a stop proves nothing:
+//! it may belong to the earlier stop, and the stop is sent once more, which does no harm. Where nothing was
+//! written in between, either acknowledgement is true: the drive's last word is a stop.
+//!
+//! Nor does a stop wait for look-alikes. The acknowledgement of a write of several registers or coils has first address and
+//! count, not the values. So a stop by such a write is sent once more for each acknowledgement of another one that may
+//! still come. From then on it is the stop whose acknowledgement may come late, in place of the other write's.
+
+use std::time::{Duration, Instant};
+
+use crate::codec::RequestPdu;
+
+/// A reply that has not come by then will not come.
+const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
+/// A look-alike waits no longer than that before the request whose reply is late is held back for it.
+const PATIENCE: Duration = Duration::from_secs(1);
+/// No more tries of one write than that are acknowledged late: neither the drive nor what is before it keeps more.
+const KEPT: u32 = 3;
+
+/// Replies that one drive may still send.
+#[derive(Debug, Default)]
+pub struct LateReplies {
+    expected: Vec<LateReply>,
+}
+
+#[derive(Debug)]
+struct LateReply {
+    pdu: RequestPdu,
+    /// When the first of the exchanges that were given up in a row began; `None` once the request was answered.
+    since: Option<Instant>,
+    until: Instant,
+    /// How late the answer was, if it was the older reply.
+    late: Duration,
+    /// Until when the newer reply may come.
+    newer: Option<Instant>,
+    /// Since when a look-alike waits.
+    wanted: Option<Instant>,
+    /// Replies that may still come.
+    count: u32,
+    /// How many of them are of tries before another write, which the drive may have taken.
+    overtaken: u32,
+}
+
+impl LateReply {
+    fn new(pdu: &RequestPdu, began: Instant, until: Instant) -> LateReply {
+        LateReply {
+            pdu: pdu.clone(),
+            since: Some(began),
+            until,
+            late: Duration::ZERO,
+            newer: None,
+            wanted: None,
+            count: 1,
+            overtaken: 0,
+        }
+    }
+
+    fn ends(&self) -> Instant {
+        self.newer.map_or(self.until, |newer| newer.max(self.until))
+    }
+
+    fn blocks(&self, pdu: &RequestPdu, now: Instant) -> bool {
+        if self.pdu == *pdu {
+            self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
+        } else {
+            look_alike(&self.pdu, pdu)
+        }
+    }
+}
+
+impl LateReplies {
+    /// No believable answer to `pdu` came in an exchange from `began` to `now`.
+    pub fn given_up(&mut self, pdu: &RequestPdu, began: Instant, now: Instant) {
+        self.expected.retain(|late| late.ends() > now);
+        self.overtake(pdu);
+        let until = now + FORGOTTEN_AFTER;
+        match self.of(pdu) {
+            Some(late) => {
+                late.until = until;
+                late.since.get_or_insert(began);
+                // Reads tell the truth in any order.
+                if pdu.is_write() {
+                    late.count = (late.count + 1).min(KEPT);
+                }
+            }
+            None => self.expected.push(LateReply::new(pdu, began, until)),
+        }
+    }
+
+    fn of(&mut self, pdu: &RequestPdu) -> Option<&mut LateReply> {
+        self.expected.iter_mut().find(|late| late.pdu == *pdu)
+    }
+
+    /// An answer to `pdu` came.
+    pub fn answered(&mut self, pdu: &RequestPdu, now: Instant) {
+        self.expected.retain(|late| late.ends() > now);
+        for late in &mut self.expected {
+            if late.pdu == *pdu {
+                // The newer reply will be about as late as the older one was, if it was the older one.
+                if let Some(since) = late.since.take() {
+                    late.late = now.saturating_duration_since(since).max(late.late).min(FORGOTTEN_AFTER);
+                }
+                late.newer = Some(now + late.late);
+            }
+        }
+        self.overtake(pdu);
+    }
+
+    /// The drive may have taken `pdu`: an acknowledgement of another write from before does not tell how it is now.
+    fn overtake(&mut self, pdu: &RequestPdu) {
+        let others = self
+            .expected
+            .iter_mut()
+            .filter(|late| late.pdu != *pdu);
+        for late in others.filter(|late| pdu.is_write() && late.pdu.is_write()) {
+            late.overtaken = late.count;
+        }
+    }
+
+    /// Whether the reply to `pdu`, sent at `sent`, may be that to an earlier request: to another one that looks the same,
+    /// or to the same write before another one. To be asked before [`LateReplies::answered`]; true once for each
+    /// late reply, and `pdu`, which is to be sent once more, is expected in its place.
+    pub fn proves_nothing(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) -> bool {
+        let owed = |late: &LateReply| late.ends() > sent;
+        let same = |late: &&mut LateReply| owed(late) && late.pdu == *pdu && late.overtaken > 0;
+        if let Some(late) = self.expected.iter_mut().find(same) {
+            late.overtaken -= 1;
+            return true;
+        }
+        let alike = |late: &LateReply| owed(late) && late.pdu != *pdu && look_alike(&late.pdu, pdu);
+        let Some(index) = self.expected.iter().position(alike) else {
+            return false;
+        };
+        if let Some(late) = self.expected.get_mut(index).filter(|late| late.count > 1) {
+            late.count -= 1;
+        } else {
+            self.expected.swap_remove(index);
+        }
+        self.given_up(pdu, sent, now);
+        true
+    }
+
+    /// Whether any reply may still come.
+    pub fn may_come(&self, now: Instant) -> bool {
+        self.expected.iter().any(|late| late.ends() > now)
+    }
+
+    /// Until when `pdu` must wait because a late reply could pass for its own.
+    pub fn blocks(&mut self, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
+        let mut until = None;
+        for late in self.expected.iter_mut().filter(|late| late.ends() > now) {
+            if late.blocks(pdu, now) {
+                until = until.max(Some(late.ends()));
+                if late.pdu != *pdu {
+                    late.wanted.get_or_insert(now);
+                }
+            }
+        }
+        until
+    }
+}
+
+/// Whether the reply to one of these requests could pass for the reply to the other.
+pub fn look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
+    Look::of(a) == Look::of(b)
+}
+
+/// All that a reply shows of its request.
+#[derive(Debug, PartialEq, Eq)]
+enum Look<'r> {
+    /// Function and length of a read.
+    Read(u8, usize),
+    /// Function, first address and count of a write of several items.
+    Several(u8, u16, usize),
+    /// Everything: the request comes back whole.
+    Whole(&'r RequestPdu),
+}
+
+impl Look<'_> {
+    fn of(pdu: &RequestPdu) -> Look<'_> {
+        match pdu {
+            RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => Look::Read(pdu.function(), pdu.reply_len()),
+            RequestPdu::WriteRegisters { start, values } => Look::Several(16, *start, values.len()),
+            RequestPdu::WriteCoils { start, bits } => Look::Several(15, *start, bits.len()),
+            other => Look::Whole(other),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,262 @@
+//! The bus at work: the only place south that does I/O. One thread owns the line, and does what the [`BusCore`] says.
+
+use std::panic::AssertUnwindSafe;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::mpsc::{SyncSender, sync_channel};
+use std::time::{Duration, Instant};
+
+use super::core::{Action, BusCore};
+use super::supervision::Lease;
+use super::BusOptions;
+use crate::command::{Outcome, WriteStats};
+use crate::event::Events;
+use crate::line::{self, Line, Lost, Names, Woken};
+use crate::plant::BusHandle;
+
+/// First and longest pause between two tries to open the port.
+const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
+/// The thread shows that it is alive at least this often, also while it waits for a reply.
+const BEAT: Duration = Duration::from_millis(100);
+
+/// A bus that runs.
+#[derive(Debug)]
+pub struct BusTask {
+    handle: BusHandle,
+    stop: Arc<AtomicBool>,
+    beats: Arc<AtomicU64>,
+    /// Present until the bus begins.
+    begin: Option<SyncSender<Vec<Lease>>>,
+    thread: Option<std::thread::JoinHandle<Vec<Lease>>>,
+}
+
+impl BusTask {
+    /// Starts the bus in a thread of its own.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(
+        handle: BusHandle,
+        options: BusOptions,
+        writes: Arc<WriteStats>,
+        events: Events,
+    ) -> std::io::Result<BusTask> {
+        let mut task = BusTask::prepare(handle, options, writes, events)?;
+        task.begin(Vec::new());
+        Ok(task)
+    }
+
+    /// Gets all that a bus needs from the system; its thread waits for [`BusTask::begin`] and touches no port before.
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn prepare(
+        handle: BusHandle,
+        options: BusOptions,
+        writes: Arc<WriteStats>,
+        events: Events,
+    ) -> std::io::Result<BusTask> {
+        let stop = Arc::new(AtomicBool::new(false));
+        let beats = Arc::new(AtomicU64::new(0));
+        let worker = Worker {
+            handle: handle.clone(),
+            options,
+            stop: stop.clone(),
+            beats: beats.clone(),
+        };
+        let name = format!("bus-{}", handle.image.spec.name);
+        let (begin, begun) = sync_channel::<Vec<Lease>>(1);
+        let thread = std::thread::Builder::new().name(name).spawn(move || {
+            // A bus that is given up before it began has nothing to end.
+            let Ok(leases) = begun.recv() else {
+                return Vec::new();
+            };
+            or_end_the_process(|| worker.run(events, writes, &leases))
+        })?;
+        Ok(BusTask {
+            handle,
+            stop,
+            beats,
+            begin: Some(begin),
+            thread: Some(thread),
+        })
+    }
+
+    /// Lets a prepared bus open its port; nothing further can fail. `leases` are those that its drives had on the bus
+    /// before, in their order; none where there was no such drive.
+    pub fn begin(&mut self, leases: Vec<Lease>) {
+        if let Some(begin) = self.begin.take() {
+            // Room for one; the thread waits for it.
+            let _ = begin.send(leases);
+        }
+    }
+
+    /// Turns that the bus has taken: it hangs when this stands still for seconds.
+    pub fn beats(&self) -> u64 {
+        self.beats.load(Ordering::Relaxed)
+    }
+
+    /// The bus.
+    pub fn handle(&self) -> &BusHandle {
+        &self.handle
+    }
+
+    /// Ends the bus at once; everything that waits is answered. The leases of its drives, for a bus that comes after.
+    pub fn stop(mut self) -> Vec<Lease> {
+        self.halt()
+    }
+
+    fn halt(&mut self) -> Vec<Lease> {
+        self.stop.store(true, Ordering::Relaxed);
+        self.begin = None;
+        self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
+        self.handle.queue.wake();
+        // Never an error: a panic of the bus has ended the process.
+        let thread = self.thread.take();
+        thread.and_then(|thread| thread.join().ok()).unwrap_or_default()
+    }
+}
+
+impl Drop for BusTask {
+    fn drop(&mut self) {
+        self.halt();
+    }
+}
+
+/// Time for the log to be written before the process ends.
+const LAST_WORDS: Duration = Duration::from_millis(200);
+
+/// A bus that panicked would take commands that nobody serves, and show the last values for ever: a stop would be lost
+/// in it. A process that dies is started again, and its clients see that it is gone.
+fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
+    std::panic::catch_unwind(AssertUnwindSafe(work)).unwrap_or_else(|_| {
+        let bus = std::thread::current().name().unwrap_or_default().to_string();
+        tracing::error!(
+            "the thread {bus} panicked, which is a fault of drivegate; the process ends to be started again"
+        );
+        // Log lines are written by a thread of their own.
+        std::thread::sleep(LAST_WORDS);
+        std::process::abort();
+    })
+}
+
+struct Worker {
+    handle: BusHandle,
+    options: BusOptions,
+    stop: Arc<AtomicBool>,
+    beats: Arc<AtomicU64>,
+}
+
+impl Worker {
+    fn run(self, events: Events, writes: Arc<WriteStats>, leases: &[Lease]) -> Vec<Lease> {
+        let handle = self.handle.clone();
+        let mut core = BusCore::new(handle, &self.options, events, writes, leases, Instant::now());
+        line::sharpen_timers();
+        let mut pause = REOPEN.0;
+        let mut names = Names::default();
+        while !self.stopping() {
+            let spec = &self.handle.image.spec;
+            let go_on = || !self.stopping();
+            match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
+                Ok((line, warnings)) => {
+                    for warning in warnings {
+                        tracing::warn!(bus = %spec.name, "{warning}");
+                    }
+                    let opened = Instant::now();
+                    core.opened(opened);
+                    let why = self.serve(&mut core, &line);
+                    // A port that goes again at once is opened ever less often.
+                    if opened.elapsed() >= REOPEN.1 {
+                        pause = REOPEN.0;
+                    }
+                    if let Err(lost) = why {
+                        core.lost(&lost.to_string(), Instant::now());
+                    }
+                }
+                // Whoever ended the bus ended the try, too.
+                Err(_) if self.stopping() => {}
+                Err(error) => core.lost(&error.to_string(), Instant::now()),
+            }
+            self.rest(pause);
+            pause = (pause * 2).min(REOPEN.1);
+        }
+        core.ended(Instant::now())
+    }
+
+    fn stopping(&self) -> bool {
+        self.beats.fetch_add(1, Ordering::Relaxed);
+        self.stop.load(Ordering::Relaxed)
+    }
+
+    fn rest(&self, pause: Duration) {
+        let until = Instant::now() + pause;
+        while !self.stopping() && Instant::now() < until {
+            line::wait_without_port(until.min(Instant::now() + BEAT), self.handle.queue.wake_fd());
+            self.handle.queue.clear_wake();
+        }
+    }
+
+    fn serve(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
+        let mut buffer = [0u8; 512];
+        while !self.stopping() {
+            let now = Instant::now();
+            let woken = match core.poll(now) {
+                Action::Send => {
+                    // A thread that was held up may not have seen the last bytes.
+                    let count = line.receive(&mut buffer)?;
+                    if count == 0 {
+                        let frame = core.sending(Instant::now());
+                        line.send(&frame)?;
+                    } else {
+                        core.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
+                    }
+                    continue;
+                }
+                Action::Wait {
+                    until,
+                    commands,
+                    precise,
+                } => {
+                    let wake = commands.then(|| self.handle.queue.wake_fd());
+                    line.wait(until.min(now + BEAT), wake, precise)?
+                }
+            };
+            match woken {
+                Woken::Readable => {
+                    let count = line.receive(&mut buffer)?;
+                    core.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
+                }
+                Woken::Command => {
+                    self.handle.queue.clear_wake();
+                    core.command_came();
+                }
+                Woken::Time => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::process::ExitStatusExt;
+    use std::process::Command;
+
+    use super::*;
+
+    /// Set in the process that the test below starts to see it die.
+    const DIES: &str = "DRIVEGATE_TEST_DIES";
+
+    #[test]
+    fn a_bus_that_panics_ends_the_process() {
+        if std::env::var_os(DIES).is_some() {
+            let bus = std::thread::spawn(|| or_end_the_process(|| panic!("as a test wants it")));
+            let _ = bus.join();
+            return;
+        }
+        let test = "bus::line_loop::tests::a_bus_that_panics_ends_the_process";
+        let mut same = Command::new(std::env::current_exe().unwrap());
+        let ended = same.args([test, "--exact"]).env(DIES, "1").output().unwrap();
+        assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
+    }
+}

@@ -1,0 +1,185 @@
+//! The half-duplex line as its one owner knows it: how long it has been silent, and the exchange that is under way. Pure:
+//! bytes and time are arguments; a loop with a port, or a test without one, does the rest.
+
+use std::time::{Duration, Instant};
+
+use super::n2_late_replies::N2LateReplies;
+use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
+use crate::codec::{LineFormat, Protocol, Reply, Request};
+use crate::drive::plan::WireTime;
+
+/// A line that never falls silent is spoken on after this time: a stop must get out.
+pub const BABBLE: Duration = Duration::from_millis(500);
+
+/// How a request is to be sent.
+#[derive(Debug, Clone, Copy)]
+pub struct Sending {
+    /// Time for the first byte of the reply.
+    pub response_timeout: Duration,
+    /// The last reply on the line, if it came once more, could pass for this one's.
+    pub could_be_doubled: bool,
+}
+
+/// An exchange that is over.
+#[derive(Debug)]
+pub struct Exchanged {
+    /// How it ended, and all that came.
+    pub transaction: Transaction,
+    /// How it ended.
+    pub ended: Ended,
+    /// When the request was given to the line.
+    pub began: Instant,
+    /// When the drive knew that the request was over.
+    pub sent: Instant,
+    /// Time on the wire of what came.
+    pub reply_time: Duration,
+    /// How long the line was taken, with the silence behind.
+    pub took: Duration,
+}
+
+/// A line with its settings.
+#[derive(Debug)]
+pub struct LineState {
+    protocol: Protocol,
+    format: LineFormat,
+    silence: Duration,
+    /// End of the last character on the line, either direction.
+    quiet_since: Instant,
+    /// The adapter sends back what it is given.
+    echo: bool,
+    /// Replies come faster than the wire could carry them: a simulation, or another baud rate behind a device server.
+    untimed: bool,
+    underway: Option<Underway>,
+}
+
+#[derive(Debug)]
+struct Underway {
+    transaction: Transaction,
+    began: Instant,
+    sent: Instant,
+    earliest: Instant,
+    doubtful: bool,
+}
+
+impl LineState {
+    /// A line that was opened at `now`.
+    pub fn new(protocol: Protocol, format: LineFormat, silence: Duration, now: Instant) -> LineState {
+        LineState {
+            protocol,
+            format,
+            silence,
+            quiet_since: now,
+            echo: false,
+            untimed: false,
+            underway: None,
+        }
+    }
+
+    /// The port was opened anew.
+    pub fn reset(&mut self, now: Instant) {
+        *self = LineState::new(self.protocol, self.format, self.silence, now);
+    }
+
+    /// End of the last character on the line.
+    pub fn quiet_since(&self) -> Instant {
+        self.quiet_since
+    }
+
+    /// When a request may go out that is wanted since `since`: when the line has been silent long enough, or has babbled
+    /// too long.
+    pub fn clear_at(&self, since: Instant) -> Instant {
+        (self.quiet_since + self.silence).min(since + self.silence + BABBLE)
+    }
+
+    /// Whether the line babbled until then.
+    pub fn babbles(&self, since: Instant) -> bool {
+        self.quiet_since > since + BABBLE
+    }
+
+    /// What an exchange without an answer takes.
+    pub fn patience(&self, request: &Request, response_timeout: Duration) -> Duration {
+        let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
+        self.silence + wire.request + response_timeout + wire.reply
+    }
+
+    /// The frame of a request is given to the line at `now`.
+    pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, late: N2LateReplies, now: Instant) {
+        let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
+        let sent = now + self.format.chars(frame.len());
+        // A reply cannot be whole before its own time on the wire is over; baud rates are off by 2 % at most.
+        let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
+        let earliest = sent + least.mul_f64(0.9);
+        let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
+        let timeout = sending.response_timeout;
+        let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
+        transaction.pass_over(late);
+        if doubtful && !self.untimed {
+            transaction.doubt_before(earliest);
+        }
+        self.quiet_since = sent;
+        self.underway = Some(Underway {
+            transaction,
+            began: now,
+            sent: sent + wire.recognition,
+            earliest,
+            doubtful,
+        });
+    }
+
+    /// Whether an exchange is under way.
+    pub fn is_underway(&self) -> bool {
+        self.underway.is_some()
+    }
+
+    /// Bytes came in at `now`. The exchange, if it is over by them.
+    pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
+        if !bytes.is_empty() {
+            self.quiet_since = now.max(self.quiet_since);
+        }
+        let underway = self.underway.as_mut()?;
+        match underway.transaction.on_bytes(now, bytes) {
+            Step::Wait(_) => None,
+            Step::Done(ended) => self.over(ended, now),
+        }
+    }
+
+    /// Time went by.
+    ///
+    /// # Errors
+    /// The time until which more is waited for, while the exchange is not over; none where there is no exchange.
+    pub fn on_time(&mut self, now: Instant) -> Result<Exchanged, Option<Instant>> {
+        let Some(underway) = self.underway.as_mut() else {
+            return Err(None);
+        };
+        match underway.transaction.on_time(now) {
+            Step::Wait(until) => Err(Some(until)),
+            Step::Done(ended) => self.over(ended, now).ok_or(None),
+        }
+    }
+
+    fn over(&mut self, ended: Ended, now: Instant) -> Option<Exchanged> {
+        let Underway {
+            transaction,
+            began,
+            sent,
+            earliest,
+            doubtful,
+        } = self.underway.take()?;
+        self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
+        self.untimed |= match &ended {
+            Ended::Reply(Reply::Exception(_)) => false,
+            Ended::Reply(_) => !doubtful && now < earliest,
+            Ended::Silent | Ended::Corrupt(_) => transaction.doubted(),
+        };
+        let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
+        let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
+        Some(Exchanged {
+            transaction,
+            ended,
+            began,
+            sent,
+            reply_time,
+            took: now.saturating_duration_since(began) + self.silence,
+        })
+    }
+}

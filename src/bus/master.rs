@@ -1,0 +1,331 @@
+//! The master of a line: what goes on the line next, and what came of it. Pure: time is an argument.
+//!
+//! [`Master::next`] chooses among stops, other commands, forwarded reads and polls; [`Master::done`] takes what became of
+//! an exchange and says what that changes. All that is known of one drive is in its `DriveState`. Choosing is in
+//! `choose`, results are in `results`, the end of the gateway is in `shutdown`.
+
+mod choose;
+mod results;
+mod shutdown;
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use self::choose::Turns;
+use self::shutdown::Shutdown;
+use super::BusOptions;
+use super::command_run::StepPurpose;
+use super::drive_state::{DriveState, FRESH};
+use super::late_replies::look_alike;
+use super::line_state::Sending;
+use super::n2_late_replies::N2LateReplies;
+use super::n2_session::N2Sessions;
+use super::news::News;
+use super::schedule::{Cadence, Poll, Schedule};
+use super::supervision::{Demand, Lease, Orders};
+use super::transaction::Ended;
+use crate::cache::DriveImage;
+use crate::codec::n2::Session;
+use crate::codec::{Protocol, RequestPdu};
+use crate::command::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
+use crate::drive::plan::WireTime;
+use crate::drive::{Plan, PlannedRead};
+use crate::plant::{BusHandle, turn_away};
+
+/// The bus looks around at least this often.
+const LOOK_ROUND: Duration = Duration::from_millis(100);
+/// Time for the first byte of the reply to a probe of a drive that does not answer: probed every 10 s, it costs less than
+/// 2 % of the line by that.
+const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
+/// Every so many probes of a drive one waits as long as any request: the drive may be slow.
+const PATIENT_PROBES: u32 = 6;
+
+/// One exchange: with which drive, what for, and the request.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Turn {
+    /// Place of the drive on the bus.
+    pub drive: usize,
+    /// What for.
+    pub purpose: Purpose,
+    pdu: RequestPdu,
+}
+
+/// What an exchange is for.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Purpose {
+    /// A read of the plan.
+    Poll(Poll),
+    /// A step of the begun command in that slot, competing with that rank.
+    Command {
+        /// Which of the begun commands of the drive.
+        slot: Urgency,
+        /// With which rank it competes for the line.
+        rank: Urgency,
+        /// What the step is for.
+        step: StepPurpose,
+    },
+    /// What N2 needs said before a read of the plan, or before a step of the begun command in that slot.
+    Session(Session, Before),
+}
+
+/// What comes behind a step of an N2 session.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Before {
+    /// A read of the plan.
+    Poll(Poll),
+    /// A step of a begun command: slot and rank.
+    Command(Urgency, Urgency),
+}
+
+impl Turn {
+    /// The request.
+    pub fn pdu(&self) -> &RequestPdu {
+        &self.pdu
+    }
+
+    /// The rank of the command that it is for; none of a poll.
+    pub fn rank(&self) -> Option<Urgency> {
+        match &self.purpose {
+            Purpose::Poll(_) | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Command { rank, .. } | Purpose::Session(_, Before::Command(_, rank)) => Some(*rank),
+        }
+    }
+
+    fn slot(&self) -> Option<Urgency> {
+        match &self.purpose {
+            Purpose::Poll(_) | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Command { slot, .. } | Purpose::Session(_, Before::Command(slot, _)) => Some(*slot),
+        }
+    }
+}
+
+/// How a turn ended.
+#[derive(Debug)]
+pub struct TurnEnd {
+    /// How the exchange ended.
+    pub ended: Ended,
+    /// When its request was given to the line.
+    pub began: Instant,
+    /// How long the line was taken.
+    pub took: Duration,
+    /// What could not be believed was the drive's own reply, mangled.
+    pub mangled: bool,
+}
+
+/// The master of a line.
+#[derive(Debug)]
+pub struct Master {
+    bus: BusHandle,
+    retries: u32,
+    response_timeout: Duration,
+    schedule: Schedule,
+    drives: Vec<DriveState>,
+    /// What N2 says to drives beside reading them.
+    sessions: N2Sessions,
+    n2_late: N2LateReplies,
+    /// What was answered last on the line.
+    last_answered: Option<(usize, RequestPdu)>,
+    turns: Turns,
+    shutdown: Option<Shutdown>,
+    writes: Arc<WriteStats>,
+    /// Probes in a row without an answer, by drive.
+    probes: Vec<u32>,
+    /// A reply may have come late since before the exchange that is on the line.
+    late_before: bool,
+}
+
+impl Master {
+    /// The master of a bus that is not open yet. `silence` is kept before each request.
+    pub fn new(
+        bus: BusHandle,
+        options: &BusOptions,
+        silence: Duration,
+        writes: Arc<WriteStats>,
+        leases: &[Lease],
+        now: Instant,
+    ) -> Master {
+        let spec = &bus.image.spec;
+        let images = &bus.image.drives;
+        let cadence = Cadence {
+            fast: spec.cycle,
+            slow: spec.slow_cycle,
+            retries: options.retries,
+        };
+        let plans: Vec<&Plan> = images.iter().map(|d| &d.plan).collect();
+        let cost = |index: usize, read: &PlannedRead| {
+            let turnaround = images.get(index).map_or(Duration::ZERO, |d| d.spec.turnaround);
+            WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
+        };
+        let schedule = Schedule::new(cadence, &plans, cost, now);
+        let mut drives: Vec<DriveState> = images.iter().map(|_| DriveState::default()).collect();
+        for (drive, lease) in drives.iter_mut().zip(leases) {
+            drive.supervision.take_over(*lease);
+        }
+        let sessions = match spec.protocol {
+            Protocol::N2 => N2Sessions::new(images.iter().map(|d| d.spec.profile.n2)),
+            Protocol::ModbusRtu | Protocol::ModbusAscii => N2Sessions::default(),
+        };
+        Master {
+            retries: options.retries,
+            response_timeout: options.response_timeout,
+            schedule,
+            probes: vec![0; drives.len()],
+            drives,
+            sessions,
+            n2_late: N2LateReplies::default(),
+            last_answered: None,
+            turns: Turns::default(),
+            shutdown: None,
+            writes,
+            late_before: false,
+            bus,
+        }
+    }
+
+    /// The port was opened: every drive is found anew.
+    pub fn opened(&mut self, now: Instant) {
+        self.schedule.reset(now);
+        self.sessions.reset();
+        self.n2_late.clear();
+        self.last_answered = None;
+        self.probes.fill(0);
+    }
+
+    /// The port is gone: everybody whose command was begun is answered.
+    pub fn lost(&mut self, now: Instant) -> Vec<News> {
+        for drive in &mut self.drives {
+            drive.close(&Outcome::BusDown, Interruption::BusDown, now);
+        }
+        (0..self.drives.len()).map(News::Offline).collect()
+    }
+
+    /// The bus ends: everybody whose command was begun is answered. The leases, for the bus that comes after.
+    pub fn ended(&mut self, now: Instant) -> Vec<Lease> {
+        if let Some(shutdown) = &mut self.shutdown {
+            shutdown.end(&self.bus);
+        }
+        let close = |drive: &mut DriveState| {
+            drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
+            drive.supervision.lease()
+        };
+        self.drives.iter_mut().map(close).collect()
+    }
+
+    /// What goes on the line next.
+    ///
+    /// # Errors
+    /// The time until which nothing does, always after `now`.
+    pub fn next(&mut self, now: Instant, news: &mut Vec<News>) -> Result<Turn, Instant> {
+        self.look(now, news);
+        let next = self.choose(now);
+        if let Some(round) = self.schedule.take_round() {
+            news.push(News::FastRound(round.cycle));
+        }
+        next.map_err(|until| until.min(now + LOOK_ROUND))
+    }
+
+    /// Looks at what time and samples have changed: leases, confirmations, drives that N2 wants asked.
+    fn look(&mut self, now: Instant, news: &mut Vec<News>) {
+        let Master { bus, drives, writes, .. } = self;
+        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
+            if !drive.confirmations.is_empty() {
+                if std::mem::take(&mut drive.was_read) {
+                    drive.confirmations.look(&image.reading(now, FRESH), now);
+                }
+                let late = drive.confirmations.expire(&image.spec.profile, now);
+                news.extend(late.into_iter().map(|text| News::NotConfirmed(index, text)));
+            }
+            if image.spec.supervision.is_some() {
+                supervise(bus, index, image, drive, writes, now, news);
+            }
+        }
+        for drive in self.sessions.neglected(now).collect::<Vec<_>>() {
+            self.schedule.ask(drive, now);
+        }
+        self.look_at_shutdown(now);
+    }
+
+    /// The turn goes onto the line at `now`.
+    pub fn sending(&mut self, turn: &Turn, now: Instant) -> Sending {
+        if let Purpose::Command { slot, step, .. } = &turn.purpose
+            && let Some(drive) = self.drives.get_mut(turn.drive)
+        {
+            let step = super::command_run::Step {
+                purpose: *step,
+                pdu: turn.pdu.clone(),
+            };
+            drive.sent(*slot, &step, now);
+        }
+        self.late_before = self.n2_late.may_come(now) || self.drives.iter().any(|drive| drive.late.may_come(now));
+        let last = self.last_answered.as_ref().filter(|(of, _)| *of == turn.drive);
+        Sending {
+            response_timeout: self.timeout_of(turn),
+            could_be_doubled: last.is_some_and(|(_, last)| look_alike(last, &turn.pdu)),
+        }
+    }
+
+    fn timeout_of(&self, turn: &Turn) -> Duration {
+        let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
+        let patient = probes <= self.retries || probes.is_multiple_of(PATIENT_PROBES);
+        if self.schedule.is_online(turn.drive) || patient || turn.slot().is_some() {
+            self.response_timeout
+        } else {
+            self.response_timeout.min(PROBE_TIMEOUT)
+        }
+    }
+
+    /// What may still come late on an N2 line, for the exchange that is about to begin.
+    pub fn take_late(&mut self) -> N2LateReplies {
+        std::mem::take(&mut self.n2_late)
+    }
+
+    /// What that exchange left of it.
+    pub fn put_late(&mut self, late: N2LateReplies) {
+        self.n2_late = late;
+    }
+}
+
+/// Looks at the lease of a drive.
+fn supervise(
+    bus: &BusHandle,
+    index: usize,
+    image: &Arc<DriveImage>,
+    drive: &mut DriveState,
+    writes: &Arc<WriteStats>,
+    now: Instant,
+    news: &mut Vec<News>,
+) {
+    if let Some(at) = image.take_heartbeat() {
+        drive.supervision.renew(at);
+    }
+    let queued = bus.queue.lock().client_waits_until(index);
+    let orders = Orders {
+        held_until: queued.max(drive.client_holds_until()),
+    };
+    let reading = image.reading(now, FRESH);
+    let DriveState { supervision, words, .. } = drive;
+    if image.is_unsupervised() && supervision.was_heard() {
+        image.set_unsupervised(false);
+    }
+    match supervision.look(&reading, words, orders, now, news, index) {
+        Demand::None => {}
+        Demand::Withdraw => {
+            bus.queue.lock().withdraw_supervision(index, now);
+            supervision.withdrawn();
+        }
+        Demand::Write(point, value) => {
+            let origin = Origin::gateway(SourceKind::Supervision, "supervision");
+            let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
+            if let Some(refusal) = supervision.ordered(ordered, now) {
+                let what = format!("{}={value}", point.name());
+                let outcome = Outcome::Refused(refusal.clone());
+                turn_away(writes, &image.spec.name, &what, outcome, origin, now);
+                news.push(News::ActionRefused {
+                    drive: index,
+                    what,
+                    refusal,
+                });
+            }
+        }
+    }
+}

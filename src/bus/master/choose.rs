@@ -1,0 +1,301 @@
+//! What goes on the line next: stops, other commands, forwarded reads, polls.
+
+use std::time::{Duration, Instant};
+
+use super::{Before, Master, Purpose, Turn};
+use crate::bus::command_run::{CommandRun, Step};
+use crate::bus::drive_state::{DriveState, FRESH, Wanted};
+use crate::bus::schedule::{Decision, Poll};
+use crate::codec::RequestPdu;
+use crate::command::{Chosen, Command, Order, Outcome, Urgency};
+
+/// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
+const IN_A_ROW: u32 = 8;
+/// Decisions without an exchange before the rest waits for the next look: commands that end without one are answered.
+const MOST_DECISIONS: usize = 1000;
+
+/// The ranks, the highest first.
+const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
+
+/// How often ranks went before lower ones that waited.
+#[derive(Debug, Default)]
+pub(super) struct Turns([u32; 3]);
+
+impl Turns {
+    /// Which of the ranks that wait has its turn: the highest, unless it had eight in a row.
+    fn rank(&self, waits: impl Fn(Urgency) -> bool) -> Option<Urgency> {
+        let mut waiting = RANKS.into_iter().filter(|rank| waits(*rank)).peekable();
+        while let Some(rank) = waiting.next() {
+            let often = self.0.get(rank as usize).copied().unwrap_or(0);
+            if often < IN_A_ROW || waiting.peek().is_none() {
+                return Some(rank);
+            }
+        }
+        None
+    }
+
+    /// That rank has its turn, before lower ones or not.
+    fn served(&mut self, rank: Urgency, lower_waits: bool) {
+        for (of, count) in RANKS.into_iter().zip(&mut self.0) {
+            if of < rank {
+                *count = 0;
+            } else if of == rank {
+                *count = if lower_waits { *count + 1 } else { 0 };
+            }
+        }
+    }
+}
+
+/// A step of a begun command that can go.
+struct Ready {
+    drive: usize,
+    slot: Urgency,
+    rank: Urgency,
+    step: Step,
+}
+
+/// All that commands want at one time.
+#[derive(Default)]
+struct Commands {
+    /// By rank.
+    ready: [Option<Ready>; 3],
+    queued: [Option<Chosen>; 3],
+    /// When more of them may go.
+    wake_at: Option<Instant>,
+}
+
+impl Commands {
+    fn wait(&mut self, until: Instant) {
+        self.wake_at = Some(self.wake_at.map_or(until, |at| at.min(until)));
+    }
+
+    fn waits(&self, rank: Urgency) -> bool {
+        let index = rank as usize;
+        self.ready.get(index).is_some_and(Option::is_some) || self.queued.get(index).is_some_and(Option::is_some)
+    }
+}
+
+impl Master {
+    /// Chooses until there is something for the line, or nothing to do.
+    ///
+    /// # Errors
+    /// The time until which nothing is to be done, after `now`.
+    pub(super) fn choose(&mut self, now: Instant) -> Result<Turn, Instant> {
+        let soon = now + Duration::from_millis(1);
+        for _ in 0..MOST_DECISIONS {
+            if let Some(decided) = self.decide(now) {
+                return decided.map_err(|until| until.max(soon));
+            }
+        }
+        Err(soon)
+    }
+
+    /// One decision; none where it changed what is to be decided on.
+    fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
+        self.purge(now);
+        let mut commands = self.commands(now);
+        let rank = self.turns.rank(|rank| commands.waits(rank));
+        if self.shutdown.is_some() {
+            // Polls cease: the line belongs to the stops.
+            return match rank {
+                Some(rank) => self.command(rank, &mut commands, now),
+                None => Some(Err(commands.wake_at.unwrap_or(now + super::LOOK_ROUND))),
+            };
+        }
+        match self.schedule.next(now, rank) {
+            Decision::Poll(poll) => self.poll(poll, now),
+            Decision::Idle(until) => Some(Err(commands.wake_at.map_or(until, |at| at.min(until)))),
+            Decision::Command(rank) => self.command(rank, &mut commands, now),
+        }
+    }
+
+    /// Nothing that was begun for a drive goes on behind a stop.
+    fn purge(&mut self, now: Instant) {
+        let stopped = self.bus.queue.lock().take_stopped();
+        for index in stopped {
+            if let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) {
+                drive.purge(image, now);
+            }
+        }
+    }
+
+    fn commands(&mut self, now: Instant) -> Commands {
+        let mut commands = Commands::default();
+        for (index, (drive, image)) in self.drives.iter_mut().zip(&self.bus.image.drives).enumerate() {
+            if !drive.has_runs() {
+                continue;
+            }
+            match drive.wanted(image, now) {
+                Wanted::Step(slot, step) => {
+                    let rank = drive.run(slot).map_or(slot, |run| run.rank);
+                    let place = commands.ready.get_mut(rank as usize);
+                    if let Some(place @ None) = place {
+                        *place = Some(Ready {
+                            drive: index,
+                            slot,
+                            rank,
+                            step,
+                        });
+                    }
+                }
+                Wanted::Wait(until) => commands.wait(until),
+                Wanted::Nothing => {}
+            }
+        }
+        self.queued(&mut commands, now);
+        commands
+    }
+
+    /// The queued commands that can be begun, the next one of each rank.
+    fn queued(&mut self, commands: &mut Commands, now: Instant) {
+        let queue = self.bus.queue.clone();
+        let mut pending = queue.lock();
+        if pending.is_empty() {
+            return;
+        }
+        let Master {
+            drives, schedule, bus, ..
+        } = self;
+        let stands: Vec<bool> = drives
+            .iter()
+            .zip(&bus.image.drives)
+            .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, FRESH)))
+            .collect();
+        let redundant = |drive: usize| stands.get(drive).copied().unwrap_or(false);
+        for rank in RANKS {
+            let mut until: Option<Instant> = None;
+            let chosen = pending.next(
+                rank,
+                now,
+                |command| match drives.get_mut(command.drive) {
+                    Some(drive) => match may_begin(drive, command, schedule.is_online(command.drive), now) {
+                        Ok(may) => may,
+                        Err(at) => {
+                            until = Some(until.map_or(at, |before| before.min(at)));
+                            false
+                        }
+                    },
+                    None => true,
+                },
+                redundant,
+            );
+            if let Some(place) = commands.queued.get_mut(rank as usize) {
+                *place = chosen;
+            }
+            if let Some(until) = until {
+                commands.wait(until);
+            }
+        }
+    }
+
+    /// A command of that rank has its turn: a begun one, or the next one of the queue is begun.
+    fn command(&mut self, rank: Urgency, commands: &mut Commands, now: Instant) -> Option<Result<Turn, Instant>> {
+        let lower_waits = RANKS.into_iter().any(|lower| lower > rank && commands.waits(lower));
+        let ready = commands.ready.get_mut(rank as usize).and_then(Option::take);
+        if let Some(ready) = ready {
+            self.turns.served(rank, lower_waits);
+            return Some(Ok(self.turn(ready, now)));
+        }
+        let chosen = commands.queued.get(rank as usize).copied().flatten()?;
+        let command = self.bus.queue.lock().take(chosen)?;
+        self.begin(command, chosen.rank, now);
+        // What was begun is decided on anew: it may wait, or another one may go first.
+        None
+    }
+
+    /// Begins a command that was taken from the queue. A stop goes to a drive that does not answer too: it is its probe.
+    fn begin(&mut self, command: Command, rank: Urgency, now: Instant) {
+        let online = self.schedule.is_online(command.drive) || command.urgency == Urgency::Stop;
+        let index = command.drive;
+        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
+            command.answer(&Outcome::Offline, now);
+            return;
+        };
+        if !online {
+            command.answer(&Outcome::Offline, now);
+            return;
+        }
+        let mut run = CommandRun::new(command, &image.spec.profile);
+        run.rank = rank;
+        drive.begin(run);
+    }
+
+    fn turn(&mut self, ready: Ready, now: Instant) -> Turn {
+        let Ready {
+            drive,
+            slot,
+            rank,
+            step,
+        } = ready;
+        match self.sessions.before(drive, Some(slot), now) {
+            Some(session) => Turn {
+                drive,
+                purpose: Purpose::Session(session, Before::Command(slot, rank)),
+                pdu: RequestPdu::N2(session),
+            },
+            None => Turn {
+                drive,
+                purpose: Purpose::Command {
+                    slot,
+                    rank,
+                    step: step.purpose,
+                },
+                pdu: step.pdu,
+            },
+        }
+    }
+
+    fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
+        let pdu = poll.read.pdu();
+        let drive = self.drives.get_mut(poll.drive)?;
+        if let Some(until) = drive.late.blocks(&pdu, now) {
+            self.schedule.postpone(&poll, until);
+            return None;
+        }
+        let turn = match self.sessions.before(poll.drive, None, now) {
+            Some(session) => Turn {
+                drive: poll.drive,
+                purpose: Purpose::Session(session, Before::Poll(poll)),
+                pdu: RequestPdu::N2(session),
+            },
+            None => Turn {
+                drive: poll.drive,
+                purpose: Purpose::Poll(poll),
+                pdu,
+            },
+        };
+        Some(Ok(turn))
+    }
+
+    /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.
+    pub fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
+        let Some(slot) = turn.slot() else { return true };
+        let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
+        run.is_some_and(|run| !run.is_late(now))
+    }
+}
+
+/// Whether a queued command can be begun now.
+///
+/// # Errors
+/// When it can be, if it must wait.
+fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Result<bool, Instant> {
+    // Behind a stop that is begun nothing goes before it is over.
+    if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
+        return Ok(false);
+    }
+    if command.urgency == Urgency::Stop {
+        return match drive.silent_until.filter(|until| *until > now) {
+            Some(until) => Err(until),
+            None => Ok(true),
+        };
+    }
+    // A command to a drive that is away is answered at once.
+    if let Order::Read(pdu) | Order::Write(pdu) = &command.order
+        && online
+        && let Some(until) = drive.late.blocks(pdu, now)
+    {
+        return Err(until);
+    }
+    Ok(true)
+}

@@ -1,0 +1,262 @@
+//! What an exchange that is over means: for the drive, its samples, the schedule and the command.
+
+use std::time::{Duration, Instant};
+
+use super::{Before, Master, Purpose, Turn, TurnEnd};
+use crate::bus::command_run::{Step, StepPurpose};
+use crate::bus::n2_session::Progress;
+use crate::bus::news::News;
+use crate::bus::schedule::{Change, Poll, Polled};
+use crate::bus::transaction::Ended;
+use crate::codec::n2::Session;
+use crate::codec::{Exception, Reply, RequestPdu};
+use crate::command::{Command, Outcome, Urgency, written};
+
+/// First wait before a stop is tried again at a drive that did not answer one.
+const STOP_AGAIN: Duration = Duration::from_millis(500);
+/// Share of the line that stops to a drive that does not answer may take.
+const STOPS_IN_VAIN: u32 = 10;
+
+impl Master {
+    /// The exchange of a turn is over; what that changes.
+    pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Vec<News> {
+        let mut news = Vec::new();
+        self.note_late(turn, &end, now);
+        match &turn.purpose {
+            Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, &mut news),
+            Purpose::Poll(poll) => self.polled(poll, end.ended, end.took, now, &mut news),
+            Purpose::Command { slot, rank, step } => {
+                let step = Step {
+                    purpose: *step,
+                    pdu: turn.pdu.clone(),
+                };
+                self.commanded(turn.drive, *slot, *rank, &step, end, now, &mut news);
+            }
+        }
+        news
+    }
+
+    /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
+    /// earlier exchange may have been that.
+    fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
+        let Some(drive) = self.drives.get_mut(turn.drive) else {
+            return;
+        };
+        match &end.ended {
+            Ended::Reply(_) => {
+                drive.silent_until = None;
+                if let Some(probes) = self.probes.get_mut(turn.drive) {
+                    *probes = 0;
+                }
+                self.last_answered = Some((turn.drive, turn.pdu.clone()));
+            }
+            Ended::Corrupt(_) if end.mangled && !self.late_before => {}
+            Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
+                drive.late.given_up(&turn.pdu, end.began, now);
+            }
+            Ended::Silent | Ended::Corrupt(_) => {
+                let device = self.sessions.device(turn.drive);
+                self.n2_late.given_up(&turn.pdu, device, now);
+            }
+        }
+    }
+
+    /// A step that N2 needs before a poll or a command is over: that is chosen anew, or has failed with it.
+    fn session_went_on(
+        &mut self,
+        drive: usize,
+        step: Session,
+        before: &Before,
+        end: TurnEnd,
+        now: Instant,
+        news: &mut Vec<News>,
+    ) {
+        let progress = self.sessions.done(drive, step, &end.ended, now);
+        match progress {
+            Progress::Going | Progress::Failed => {}
+            Progress::Unlike(device) => news.push(News::Unlike(drive, device)),
+            Progress::Changed => self.schedule.read_again(drive, now),
+            Progress::Restarted => self.restarted(drive, now, news),
+        }
+        let failed = progress == Progress::Failed;
+        let ended = match end.ended {
+            Ended::Corrupt(why) => Ended::Corrupt(why),
+            // It has failed, whatever was answered.
+            Ended::Silent | Ended::Reply(_) => Ended::Silent,
+        };
+        match before {
+            Before::Poll(poll) if failed => self.polled(poll, ended, end.took, now, news),
+            Before::Poll(_) => self.schedule.session_done(),
+            Before::Command(slot, rank) => {
+                self.schedule.command_done(*rank, end.took);
+                if failed {
+                    let step = Step {
+                        purpose: StepPurpose::ReadWord,
+                        pdu: RequestPdu::N2(step),
+                    };
+                    self.step_failed(drive, *slot, &step, &ended, end.took, now);
+                }
+            }
+        }
+    }
+
+    /// The drive has started anew: nothing that is known of it holds.
+    fn restarted(&mut self, drive: usize, now: Instant, news: &mut Vec<News>) {
+        if let Some(state) = self.drives.get_mut(drive) {
+            state.restarted();
+        }
+        self.schedule.read_again(drive, now);
+        news.push(News::Restarted(drive));
+    }
+
+    /// What a poll that is over says of the drive.
+    fn polled(&mut self, poll: &Poll, ended: Ended, took: Duration, now: Instant, news: &mut Vec<News>) {
+        // Of a step before the poll this is known already.
+        let heard = self.sessions.heard(poll.drive, &ended);
+        if heard == Progress::Restarted {
+            self.restarted(poll.drive, now, news);
+        }
+        let polled = match &ended {
+            Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
+            Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
+            Ended::Reply(reply) => {
+                self.read(poll, reply, now, news);
+                Polled::Ok
+            }
+            Ended::Silent => Polled::Failed,
+            Ended::Corrupt(_) => Polled::Garbled,
+        };
+        if poll.probe
+            && matches!(polled, Polled::Failed | Polled::Garbled)
+            && let Some(probes) = self.probes.get_mut(poll.drive)
+        {
+            *probes = probes.saturating_add(1);
+        }
+        let change = self.schedule.poll_done(poll, polled, took, now);
+        if let Some(round) = self.schedule.take_slow_round() {
+            news.push(News::SlowRound(round.cycle));
+        }
+        match change {
+            Change::Online => news.push(News::Online(poll.drive)),
+            Change::Offline => self.went_offline(poll.drive, now, news),
+            Change::Unavailable(read, exception) => news.push(News::Unavailable(poll.drive, read, exception)),
+            Change::None => {}
+        }
+    }
+
+    /// The drive does not answer any more: whoever waits for it is answered, but for the stop, which is its probe.
+    fn went_offline(&mut self, index: usize, now: Instant, news: &mut Vec<News>) {
+        if let Some(drive) = self.drives.get_mut(index) {
+            drive.went_offline(now);
+        }
+        self.sessions.gone(index);
+        let gone = |c: &Command| c.drive == index && c.urgency != Urgency::Stop;
+        self.bus.queue.lock().remove(now, &Outcome::Offline, gone);
+        news.push(News::Offline(index));
+    }
+
+    /// The drive answered a read of the plan.
+    fn read(&mut self, poll: &Poll, reply: &Reply, now: Instant, news: &mut Vec<News>) {
+        let read = poll.read;
+        let (Some(drive), Some(image)) = (self.drives.get_mut(poll.drive), self.bus.image.drives.get(poll.drive)) else {
+            return;
+        };
+        drive.late.answered(&read.pdu(), now);
+        drive.was_read = true;
+        let Some(words) = reply.words() else { return };
+        for (address, word) in (read.start..).zip(&words) {
+            let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.covers(read.table, address));
+            if image.spec.profile.points.iter().any(commanded) {
+                drive.words.learn(read.table, address, *word);
+            }
+        }
+        news.push(News::Read {
+            drive: poll.drive,
+            read,
+            words,
+            at: now,
+        });
+    }
+
+    /// What an exchange of a command means for the command.
+    #[allow(clippy::too_many_arguments, reason = "all that a turn of a command is")]
+    fn commanded(
+        &mut self,
+        index: usize,
+        slot: Urgency,
+        rank: Urgency,
+        step: &Step,
+        end: TurnEnd,
+        now: Instant,
+        news: &mut Vec<News>,
+    ) {
+        self.schedule.command_done(rank, end.took);
+        if self.sessions.heard(index, &end.ended) == Progress::Restarted {
+            self.restarted(index, now, news);
+        }
+        let reply = match end.ended {
+            // The drive did not look at it: it is said again, once the drive is identified.
+            Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
+                self.step_failed(index, slot, step, &Ended::Silent, end.took, now);
+                return;
+            }
+            Ended::Reply(reply) => reply,
+            ended => {
+                self.step_failed(index, slot, step, &ended, end.took, now);
+                self.read_back(index, step, now);
+                return;
+            }
+        };
+        self.schedule.seen(index, now);
+        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
+            return;
+        };
+        if !matches!(reply, Reply::Exception(_)) {
+            let believed = !drive.late.proves_nothing(&step.pdu, end.began, now);
+            drive.late.answered(&step.pdu, now);
+            if !believed {
+                if let Some(run) = drive.run(slot).filter(|_| step.pdu.is_write()) {
+                    run.doubted();
+                }
+                return;
+            }
+        }
+        let outcome = drive.answered(slot, step, reply);
+        if let Some(outcome) = outcome {
+            drive.end(slot, &outcome, image, now);
+        }
+        self.read_back(index, step, now);
+    }
+
+    /// A step got no believable answer. A drive that does not answer a stop is left alone for a while, so that repeated
+    /// stops do not take the line from the others.
+    fn step_failed(&mut self, index: usize, slot: Urgency, step: &Step, ended: &Ended, took: Duration, now: Instant) {
+        let online = self.schedule.is_online(index);
+        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
+            return;
+        };
+        let how = match ended {
+            Ended::Corrupt(_) => Outcome::Garbled,
+            _ => Outcome::TimedOut,
+        };
+        let retries = if online { self.retries } else { 0 };
+        let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
+        if let Some(outcome) = outcome {
+            drive.end(slot, &outcome, image, now);
+            if *ended == Ended::Silent {
+                drive.silent_until = Some(now + STOP_AGAIN.max(took * STOPS_IN_VAIN));
+            }
+        }
+        if !online {
+            self.schedule.probed_in_vain(index, took, now);
+        }
+    }
+
+    /// What was written is read back soon.
+    fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
+        if let Some((table, items)) = written(&step.pdu) {
+            let covers = |read: &crate::drive::PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
+            self.schedule.refresh(index, covers, now);
+        }
+    }
+}

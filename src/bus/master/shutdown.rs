@@ -1,0 +1,140 @@
+//! The end of the gateway: polls cease, and each drive that is configured so gets its stop.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot::Receiver;
+use tokio::sync::oneshot::error::TryRecvError;
+
+use super::Master;
+use crate::bus::drive_state::FRESH;
+use crate::cache::{Access, OnShutdown};
+use crate::command::{Answer, Origin, Outcome, SourceKind, Stopping, WriteStats};
+use crate::drive::{ModelPoint, Value};
+use crate::plant::BusHandle;
+
+/// Wait before a stop that was not acknowledged is ordered again.
+const AGAIN: Duration = Duration::from_millis(20);
+
+/// The stops of a shutdown.
+#[derive(Debug)]
+pub(super) struct Shutdown {
+    /// None once it is reported.
+    stopping: Option<Stopping>,
+    stops: Vec<Stop>,
+}
+
+#[derive(Debug)]
+struct Stop {
+    drive: usize,
+    state: State,
+}
+
+#[derive(Debug)]
+enum State {
+    /// It is to be ordered then.
+    Due(Instant),
+    /// Its answer is waited for.
+    Ordered(Receiver<Answer>),
+    /// It was acknowledged.
+    Acknowledged,
+    /// It cannot be ordered.
+    Refused(String),
+}
+
+impl Stop {
+    /// Looks at the answer; `now` is when it is ordered again where it failed.
+    fn look(&mut self, now: Instant) {
+        let State::Ordered(answer) = &mut self.state else { return };
+        self.state = match answer.try_recv() {
+            Err(TryRecvError::Empty) => return,
+            Ok(answer) if answer.outcome.is_ok() => State::Acknowledged,
+            Ok(Answer {
+                outcome: outcome @ Outcome::Refused(_),
+                ..
+            }) => State::Refused(outcome.to_string()),
+            Ok(_) | Err(TryRecvError::Closed) => State::Due(now + AGAIN),
+        };
+    }
+
+    fn is_over(&self) -> bool {
+        matches!(self.state, State::Acknowledged | State::Refused(_))
+    }
+}
+
+impl Shutdown {
+    fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Shutdown {
+        let drives = bus.image.drives.iter().enumerate();
+        let wanted = drives.filter(|(_, image)| {
+            image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control
+        });
+        let stop = |(drive, _)| Stop {
+            drive,
+            state: State::Due(now),
+        };
+        Shutdown {
+            stopping: Some(stopping),
+            stops: wanted.map(stop).collect(),
+        }
+    }
+
+    /// Reports the drives that were not stopped, in words.
+    pub(super) fn end(&mut self, bus: &BusHandle) {
+        let Some(stopping) = self.stopping.take() else { return };
+        let name = |index: usize| bus.image.drives.get(index).map_or("?", |d| d.spec.name.as_str());
+        let missing = self.stops.iter().filter_map(|stop| {
+            let name = name(stop.drive);
+            match &stop.state {
+                State::Acknowledged => None,
+                State::Refused(why) => Some(format!("`{name}` was not told to stop ({why})")),
+                State::Due(_) | State::Ordered(_) => Some(format!("`{name}` did not acknowledge its stop")),
+            }
+        });
+        stopping.report(missing.collect());
+        self.stops.clear();
+    }
+}
+
+impl Master {
+    /// Begins the shutdown when it is asked for; orders what is due, ends when all is done or its time is over.
+    pub(super) fn look_at_shutdown(&mut self, now: Instant) {
+        if let Some(stopping) = self.bus.queue.lock().take_stopping() {
+            self.shutdown = Some(Shutdown::new(stopping, &self.bus, now));
+        }
+        let Master { shutdown, bus, schedule, writes, .. } = self;
+        let Some(shutdown) = shutdown else { return };
+        let Some(deadline) = shutdown.stopping.as_ref().map(Stopping::deadline) else {
+            return;
+        };
+        shutdown.stops.iter_mut().for_each(|stop| stop.look(now));
+        if shutdown.stops.iter().all(Stop::is_over) || now >= deadline {
+            shutdown.end(bus);
+            return;
+        }
+        // Drives that do not answer come last: each of them costs a whole timeout.
+        let online_due = shutdown
+            .stops
+            .iter()
+            .any(|stop| !stop.is_over() && schedule.is_online(stop.drive));
+        for stop in &mut shutdown.stops {
+            let due = matches!(stop.state, State::Due(at) if at <= now);
+            if due && (schedule.is_online(stop.drive) || !online_due) {
+                stop.state = order(bus, stop.drive, deadline, writes, now);
+            }
+        }
+    }
+}
+
+fn order(bus: &BusHandle, drive: usize, deadline: Instant, writes: &Arc<WriteStats>, now: Instant) -> State {
+    let Some(image) = bus.image.drives.get(drive) else {
+        return State::Acknowledged;
+    };
+    let origin = Origin::gateway(SourceKind::Shutdown, "on_shutdown");
+    let reading = image.reading(now, FRESH);
+    let expiry = deadline.saturating_duration_since(now);
+    let stop = Value::Bool(false);
+    match bus.own_order(drive, &reading, (ModelPoint::Run, stop), origin, expiry, writes) {
+        Ok(answer) => State::Ordered(answer),
+        Err(refusal) => State::Refused(refusal.to_string()),
+    }
+}

@@ -1,0 +1,147 @@
+use std::time::Duration;
+
+use super::*;
+
+const IDENTIFY: Session = Session::Identify;
+const POLL: Session = Session::Poll { again: false };
+const AGAIN: Session = Session::Poll { again: true };
+
+struct Bench {
+    sessions: N2Sessions,
+    now: Instant,
+}
+
+fn bench() -> Bench {
+    Bench {
+        sessions: N2Sessions::new([N2Options::DEFAULT]),
+        now: Instant::now(),
+    }
+}
+
+fn changes(digits: &[u8]) -> Ended {
+    Ended::Reply(Reply::Changes(digits.to_vec()))
+}
+
+fn identity() -> Ended {
+    Ended::Reply(Reply::Identified(0x10))
+}
+
+fn value() -> Ended {
+    Ended::Reply(Reply::Registers(vec![0x4248, 0]))
+}
+
+fn restarted() -> Ended {
+    Ended::Reply(Reply::Exception(Exception::N2_RESTARTED))
+}
+
+impl Bench {
+    fn before(&mut self, command: Option<Urgency>) -> Option<Session> {
+        self.sessions.before(0, command, self.now)
+    }
+
+    fn done(&mut self, step: Session, ended: &Ended) -> Progress {
+        self.sessions.done(0, step, ended, self.now)
+    }
+
+    /// Identified, its report taken, and read once.
+    fn ready() -> Bench {
+        let mut bench = bench();
+        bench.done(IDENTIFY, &identity());
+        bench.done(POLL, &changes(b""));
+        bench.sessions.heard(0, &value());
+        assert_eq!(bench.before(None), None);
+        bench
+    }
+}
+
+#[test]
+fn identify_report_read() {
+    let mut bench = bench();
+    assert_eq!(bench.before(None), Some(IDENTIFY));
+    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY), "it would answer N00");
+    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(bench.before(Some(Urgency::Stop)), None, "a stop waits for no report");
+    assert_eq!(bench.before(None), Some(POLL));
+    assert_eq!(bench.done(POLL, &changes(b"102404248")), Progress::Going);
+    assert_eq!(bench.before(None), Some(AGAIN));
+    assert_eq!(bench.done(AGAIN, &changes(b"")), Progress::Changed);
+    assert_eq!(bench.before(None), None);
+    bench.now += N2Options::DEFAULT.poll;
+    assert_eq!(bench.before(Some(Urgency::Command)), None);
+    assert_eq!(
+        bench.before(None),
+        Some(POLL),
+        "a drive that is not polled takes itself for alone"
+    );
+    assert_eq!(bench.done(POLL, &changes(b"")), Progress::Going);
+    assert_eq!(bench.before(None), None);
+}
+
+#[test]
+fn a_report_that_never_ends() {
+    let mut bench = bench();
+    bench.done(IDENTIFY, &identity());
+    let mut polls = 0;
+    while let Some(step) = bench.before(None) {
+        bench.done(step, &changes(b"10240"));
+        polls += 1;
+    }
+    assert_eq!(polls, MOST_POLLS);
+}
+
+#[test]
+fn who_is_not_asked_is_polled_all_the_same() {
+    let now = Instant::now();
+    let mut sessions = two();
+    assert_eq!(sessions.neglected(now).count(), 0);
+    let later = now + N2Options::DEFAULT.poll + Duration::from_secs(1);
+    sessions.gone(0);
+    assert_eq!(sessions.neglected(later).collect::<Vec<_>>(), [1]);
+}
+
+#[test]
+fn a_restart_begins_anew() {
+    let mut bench = Bench::ready();
+    assert_eq!(bench.sessions.heard(0, &restarted()), Progress::Restarted);
+    assert_eq!(bench.before(Some(Urgency::Stop)), Some(IDENTIFY));
+    assert_eq!(bench.done(IDENTIFY, &identity()), Progress::Going);
+    assert_eq!(bench.before(None), Some(POLL));
+    assert_eq!(bench.done(POLL, &restarted()), Progress::Failed, "identified in vain");
+    assert_eq!(bench.before(None), Some(IDENTIFY));
+}
+
+#[test]
+fn a_drive_that_is_no_vendors_device_is_told_once() {
+    let mut bench = bench();
+    let other = Ended::Reply(Reply::Identified(0x11));
+    assert_eq!(bench.done(IDENTIFY, &other), Progress::Unlike(0x11));
+    assert_eq!(bench.done(IDENTIFY, &other), Progress::Going);
+}
+
+#[test]
+fn drives_that_are_not_to_be_identified() {
+    let options = N2Options {
+        identify: false,
+        poll: Duration::from_secs(60),
+        ..N2Options::DEFAULT
+    };
+    let mut bench = Bench {
+        sessions: N2Sessions::new([options]),
+        now: Instant::now(),
+    };
+    assert_eq!(bench.before(None), Some(POLL));
+    bench.done(POLL, &changes(b""));
+    bench.sessions.heard(0, &Ended::Silent);
+    assert_eq!(bench.before(None), None);
+    bench.sessions.heard(0, &value());
+    bench.sessions.heard(0, &restarted());
+    assert_eq!(bench.before(None), Some(IDENTIFY), "it asked for it");
+}
+
+#[test]
+fn other_buses_have_none() {
+    let mut sessions = N2Sessions::default();
+    assert!(sessions.is_empty());
+    assert_eq!(sessions.before(0, None, Instant::now()), None);
+    assert_eq!(sessions.heard(0, &Ended::Silent), Progress::Going);
+}

@@ -1,0 +1,63 @@
+//! What the master has to say of its drives: for the process image, events and the log.
+
+use std::time::{Duration, Instant};
+
+use crate::codec::Exception;
+use crate::command::Refusal;
+use crate::drive::PlannedRead;
+
+/// One piece of news. Drives are named by their place on the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub enum News {
+    /// A round of the fast class was started, so long after the one before.
+    FastRound(Option<Duration>),
+    /// A round of the slow class was started.
+    SlowRound(Option<Duration>),
+    /// The drive answered a read of the plan.
+    Read {
+        /// Which drive.
+        drive: usize,
+        /// What was read.
+        read: PlannedRead,
+        /// What it said, a word for each item.
+        words: Vec<u16>,
+        /// When.
+        at: Instant,
+    },
+    /// The drive answers (again).
+    Online(usize),
+    /// The drive does not answer any more.
+    Offline(usize),
+    /// The drive has started anew: nothing that is known of it holds.
+    Restarted(usize),
+    /// The drive says that it is a device of that N2 type, not the one that its profile expects.
+    Unlike(usize, u8),
+    /// The drive refuses these addresses.
+    Unavailable(usize, PlannedRead, Exception),
+    /// An acknowledged command showed no effect in time; the text is for people.
+    NotConfirmed(usize, String),
+    /// The lease of a drive that runs ran out.
+    LeaseRanOut(usize),
+    /// The action of a lease that ran out cannot be written.
+    ActionRefused {
+        /// Which drive.
+        drive: usize,
+        /// The command in one line.
+        what: String,
+        /// Why not.
+        refusal: Refusal,
+    },
+    /// A drive whose lease ran out does not say whether it runs.
+    RunningUnknown(usize),
+    /// A supervised drive runs, and no client was heard of since the gateway started; whether its lease starts by that.
+    RunsUnsupervised(usize, Adopted),
+}
+
+/// Whether a drive that ran when the gateway started got its lease started.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Adopted {
+    /// Its lease runs from now on.
+    Yes,
+    /// It waits for a client.
+    No,
+}

@@ -1,0 +1,309 @@
+//! Supervision: a gateway that polls keeps a drive's own watchdog content even when nobody commands the drive any more.
+//! So a drive can have a lease, renewed by the orders and heartbeats of a commanding client; when it runs out while the
+//! drive runs, the configured action is written once. Not a safety function. Pure: time is an argument.
+//!
+//! A lease begins when an order reached the wire, and anew when that order ended. An order that waits holds the lease,
+//! no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client that is
+//! back suspends an action that is not on the wire yet; if its order ends without reaching the wire, the action is due again.
+
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot::Receiver;
+use tokio::sync::oneshot::error::TryRecvError;
+
+use super::command_run::KnownWords;
+use super::news::{Adopted, News};
+use crate::cache::{LeaseAction, Reading, Unavailable};
+use crate::command::{Answer, Refusal};
+use crate::drive::profile::Form;
+use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value};
+
+/// How long an action that was not acknowledged waits before it is written again.
+const AGAIN: Duration = Duration::from_secs(1);
+
+/// The lease of a drive, as a bus that starts anew takes it over.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Lease(State);
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+enum State {
+    /// No client was heard of since the gateway started.
+    #[default]
+    Unheard,
+    /// It runs since then.
+    Held(Instant),
+    /// It ran out while the drive ran, and the action is not acknowledged yet.
+    RanOut,
+    /// It ended: the motor stood when it ran out, or the action was acknowledged.
+    Ended,
+}
+
+/// What supervision sees of a drive beside its process data.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Orders {
+    /// Until when an order of a client holds the lease, queued or begun.
+    pub(super) held_until: Option<Instant>,
+}
+
+/// What supervision wants done.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Demand {
+    /// Nothing.
+    None,
+    /// This point of the model written; the answer goes to [`Supervision::ordered`].
+    Write(ModelPoint, Value),
+    /// An action that is queued and not begun taken back.
+    Withdraw,
+}
+
+/// The supervision of one drive.
+#[derive(Debug, Default)]
+pub(super) struct Supervision {
+    lease: Lease,
+    /// The answer to the action that is on its way.
+    answer: Option<Receiver<Answer>>,
+    next_try: Option<Instant>,
+    /// Why it could not be written, as it was reported.
+    refused: Option<Refusal>,
+    /// It was reported that the drive does not say whether it runs.
+    blind_reported: bool,
+    /// A drive that runs without a lease was reported.
+    unsupervised: bool,
+}
+
+impl Supervision {
+    /// Goes on with the lease of the bus before.
+    pub(super) fn take_over(&mut self, lease: Lease) {
+        self.lease = lease;
+    }
+
+    /// The lease, for the bus that comes after.
+    pub(super) fn lease(&self) -> Lease {
+        self.lease
+    }
+
+    /// Whether any client was heard of since the gateway started.
+    pub(super) fn was_heard(&self) -> bool {
+        self.lease.0 != State::Unheard
+    }
+
+    /// A client was heard of: its order reached the wire, or ended, or its heartbeat came.
+    pub(super) fn renew(&mut self, now: Instant) {
+        self.lease = Lease(match self.lease.0 {
+            State::Held(since) => State::Held(since.max(now)),
+            _ => State::Held(now),
+        });
+        self.refused = None;
+        self.next_try = None;
+    }
+
+    /// What is due at `now`.
+    pub(super) fn look(
+        &mut self,
+        reading: &Reading<'_>,
+        words: &KnownWords,
+        orders: Orders,
+        now: Instant,
+        news: &mut Vec<News>,
+        drive: usize,
+    ) -> Demand {
+        let Some(spec) = &reading.spec.supervision else {
+            return Demand::None;
+        };
+        let held = orders.held_until.is_some_and(|until| until > now);
+        match self.lease.0 {
+            State::Unheard => {
+                if !self.unsupervised && !held && reading.is_set(ModelPoint::Running) {
+                    self.unsupervised = true;
+                    news.push(News::RunsUnsupervised(drive, if spec.adopt { Adopted::Yes } else { Adopted::No }));
+                    if spec.adopt {
+                        self.renew(now);
+                    }
+                }
+                Demand::None
+            }
+            State::Ended => Demand::None,
+            State::Held(since) => {
+                if now.saturating_duration_since(since) >= spec.timeout && !held {
+                    self.runs_out(reading, words, news, drive);
+                }
+                match self.lease.0 {
+                    State::RanOut => self.act(reading, now),
+                    _ => Demand::None,
+                }
+            }
+            State::RanOut if held => {
+                // Suspended: whoever is back decides, if the order reaches the wire.
+                match self.answer.is_some() {
+                    true => Demand::Withdraw,
+                    false => Demand::None,
+                }
+            }
+            State::RanOut => self.act(reading, now),
+        }
+    }
+
+    /// The time of the lease is over. Of a drive that does not answer nobody knows whether it runs: its lease stays
+    /// until it is back.
+    fn runs_out(&mut self, reading: &Reading<'_>, words: &KnownWords, news: &mut Vec<News>, drive: usize) {
+        let Some(running) = self.running(reading, words, news, drive) else {
+            return;
+        };
+        if running {
+            let acts = !matches!(reading.spec.supervision.as_ref().map(|s| &s.action), Some(LeaseAction::Hold));
+            self.lease = Lease(if acts { State::RanOut } else { State::Ended });
+            (self.next_try, self.refused) = (None, None);
+            news.push(News::LeaseRanOut(drive));
+        } else if !may_start(reading) {
+            self.lease = Lease(State::Ended);
+        }
+    }
+
+    /// Whether the motor runs. Where the drive answers but does not say, its run command stands for it, and one that
+    /// is not known either is taken to be set.
+    fn running(
+        &mut self,
+        reading: &Reading<'_>,
+        words: &KnownWords,
+        news: &mut Vec<News>,
+        drive: usize,
+    ) -> Option<bool> {
+        if let Some(running) = reading.model(ModelPoint::Running).good() {
+            return Some(running.as_bool());
+        }
+        if !reading.snapshot.link.is_online() || !does_not_say(reading) {
+            return None;
+        }
+        if !std::mem::replace(&mut self.blind_reported, true) {
+            news.push(News::RunningUnknown(drive));
+        }
+        if let Some(run) = reading.model(ModelPoint::Run).good() {
+            return Some(run.as_bool());
+        }
+        let raw = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
+        let word = raw.and_then(|raw| Some((raw, words.get(raw.table, raw.address)?)));
+        Some(word.is_none_or(|(raw, word)| match raw.form {
+            Form::Bit { bit, invert } => ((word >> bit) & 1 == 1) != invert,
+            _ => true,
+        }))
+    }
+
+    /// Writes the action. Nothing reaches a drive that does not answer: it is written when the drive is back.
+    fn act(&mut self, reading: &Reading<'_>, now: Instant) -> Demand {
+        if let Some(answer) = &mut self.answer {
+            match answer.try_recv() {
+                Err(TryRecvError::Empty) => return Demand::None,
+                Ok(answer) if answer.outcome.is_ok() => {
+                    self.answer = None;
+                    self.lease = Lease(State::Ended);
+                    return Demand::None;
+                }
+                Ok(_) | Err(TryRecvError::Closed) => {
+                    self.answer = None;
+                    self.next_try = Some(now + AGAIN);
+                }
+            }
+        }
+        let due = self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
+        match reading.spec.supervision.as_ref().map(|s| &s.action) {
+            Some(LeaseAction::Stop) if due => Demand::Write(ModelPoint::Run, Value::Bool(false)),
+            Some(LeaseAction::SpeedReference(percent)) if due => {
+                Demand::Write(ModelPoint::SpeedReference, Value::Number(*percent))
+            }
+            _ => Demand::None,
+        }
+    }
+
+    /// The action was ordered, or refused. Whether a refusal is to be reported: each is once.
+    pub(super) fn ordered(&mut self, ordered: Result<Receiver<Answer>, Refusal>, now: Instant) -> Option<Refusal> {
+        match ordered {
+            Ok(answer) => {
+                self.answer = Some(answer);
+                None
+            }
+            Err(refusal) => {
+                self.next_try = Some(now + AGAIN);
+                let new = self.refused.as_ref() != Some(&refusal);
+                self.refused = Some(refusal.clone());
+                new.then_some(refusal)
+            }
+        }
+    }
+
+    /// The queued action was taken back.
+    pub(super) fn withdrawn(&mut self) {
+        // One that has begun meanwhile is answered all the same; what it did stands.
+        if let Some(answer) = &mut self.answer
+            && !matches!(answer.try_recv(), Err(TryRecvError::Empty))
+        {
+            self.answer = None;
+        }
+    }
+
+    /// Takes note of what was answered, before a bus ends: what was acknowledged is not due again.
+    pub(super) fn settle(&mut self) {
+        if self.lease.0 == State::RanOut
+            && let Some(answer) = &mut self.answer
+            && answer.try_recv().is_ok_and(|answer| answer.outcome.is_ok())
+        {
+            self.lease = Lease(State::Ended);
+        }
+    }
+}
+
+/// Whether the drive, which answers, does not say whether its motor runs: it refuses the point, or nothing reads it.
+fn does_not_say(reading: &Reading<'_>) -> bool {
+    let Some(point) = reading.spec.profile.model_point(ModelPoint::Running) else {
+        return true;
+    };
+    match point.raw() {
+        Some(_) if point.class == PollClass::Never => true,
+        Some(raw) => matches!(
+            reading.words(raw.table, raw.address, raw.form.items()),
+            Err(Unavailable::Refused(_))
+        ),
+        None => reading.age().is_some() && reading.model(ModelPoint::Running).quality == Quality::Bad,
+    }
+}
+
+/// Whether a motor that stands may start without another command: the run command is set in the drive's word, or is not
+/// read yet. Of a drive that does not tell it, it is taken to be unset.
+fn may_start(reading: &Reading<'_>) -> bool {
+    if let Some(run) = reading.model(ModelPoint::Run).good() {
+        return run.as_bool();
+    }
+    let run = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
+    run.is_some_and(|raw| reading.words(raw.table, raw.address, 1) == Err(Unavailable::Stale))
+}
+
+/// A drive's own response to a silent master, as far as its registers say.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum OwnResponse {
+    /// Not read yet, or the profile knows no point for it.
+    Unknown,
+    /// It has none: the point that says so.
+    Off(&'static str),
+    /// It responds, if what no register tells is set too (such as the timeout of an option board).
+    On,
+}
+
+/// The drive's own response: 0 in any of the points that the profile has is none.
+pub(super) fn own_response(reading: &Reading<'_>) -> OwnResponse {
+    let mut seen = OwnResponse::Unknown;
+    for name in [FIELDBUS_FAULT_RESPONSE, COMMUNICATION_TIMEOUT] {
+        let Some(point) = reading.spec.profile.point_index(name) else {
+            continue;
+        };
+        let Some(value) = reading.sample(point).good() else {
+            return OwnResponse::Unknown;
+        };
+        if value.as_f64() == 0.0 {
+            return OwnResponse::Off(name);
+        }
+        seen = OwnResponse::On;
+    }
+    seen
+}
+
+#[cfg(test)]
+mod tests;
