@@ -286,7 +286,7 @@ impl Master {
 }
 
 /// Looks at the lease of a drive.
-fn supervise(
+pub(super) fn supervise(
     bus: &BusHandle,
     index: usize,
     image: &Arc<DriveImage>,
@@ -329,3 +329,6 @@ fn supervise(
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

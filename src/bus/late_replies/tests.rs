@@ -35,7 +35,8 @@ fn only_what_could_be_mistaken_waits() {
 fn echoes_of_writes() {
     let now = Instant::now();
     let mut late = LateReplies::default();
-    late.given_up(&RequestPdu::WriteRegister {
+    late.given_up(
+        &RequestPdu::WriteRegister {
             address: 2000,
             value: 1,
         },
@@ -43,7 +44,8 @@ fn echoes_of_writes() {
         now,
     );
     assert_eq!(
-        late.blocks(&RequestPdu::WriteRegister {
+        late.blocks(
+            &RequestPdu::WriteRegister {
                 address: 2000,
                 value: 0
             },
@@ -51,7 +53,8 @@ fn echoes_of_writes() {
         ),
         None
     );
-    late.given_up(&RequestPdu::WriteRegisters {
+    late.given_up(
+        &RequestPdu::WriteRegisters {
             start: 2000,
             values: vec![1, 2],
         },
@@ -70,7 +73,7 @@ fn echoes_of_writes() {
 #[test]
 fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
     let (a, b) = (read(2100, 3), read(2104, 3));
-    let late = Duration::from_millis(110);
+    let behind = Duration::from_millis(110);
     let start = Instant::now();
     let (mut now, mut late) = (start, LateReplies::default());
     let mut coming: std::collections::VecDeque<(Instant, RequestPdu)> = std::collections::VecDeque::new();
@@ -86,7 +89,7 @@ fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
         };
         // What came while nobody listened is noise.
         coming.retain(|(at, _)| *at > now);
-        coming.push_back((now + late, asked.clone()));
+        coming.push_back((now + behind, asked.clone()));
         let deadline = now + DEADLINE;
         match coming.front().cloned().filter(|(at, _)| *at <= deadline) {
             Some((at, of)) => {
@@ -107,7 +110,7 @@ fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
 }
 
 #[test]
-fn a_request_in_debt_is_not_held_back_for_ever() {
+fn a_request_whose_reply_is_late_is_not_held_back_for_ever() {
     let start = Instant::now();
     let mut late = LateReplies::default();
     let (a, b) = (read(2100, 3), read(2104, 3));
@@ -128,7 +131,7 @@ fn a_request_in_debt_is_not_held_back_for_ever() {
     }
     assert!(first_b.is_some_and(|at| at < ms(2200)), "{first_b:?}");
     assert!(longest < ms(1200), "{longest:?}");
-    assert!(start + ms(5000) - last_a < ms(20), "the debt is forgotten");
+    assert!(start + ms(5000) - last_a < ms(20), "the late reply is forgotten");
 }
 
 #[test]
@@ -209,9 +212,8 @@ fn a_drive_that_never_answers_does_not_hold_up_a_stop() {
         late.given_up(&write(1), now - DEADLINE, now);
         late.given_up(&read(1500, 1), now - DEADLINE, now);
     }
-    let doubts = |late: &mut Debts, pdu: &RequestPdu| {
-        (0..100).take_while(|_| late.proves_nothing(pdu, now, now)).count()
-    };
+    let doubts =
+        |late: &mut LateReplies, pdu: &RequestPdu| (0..100).take_while(|_| late.proves_nothing(pdu, now, now)).count();
     assert_eq!(doubts(&mut late, &write(0)), 3);
     assert_eq!(doubts(&mut late, &read(2000, 1)), 1);
 }
