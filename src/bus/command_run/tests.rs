@@ -162,7 +162,8 @@ fn a_stop_purges_what_was_begun() {
     assert_eq!(start.purge(), Some(cut_short.clone()));
     // On the wire, and the answer is waited for.
     let (mut start, _a) = bench.begin(&points, Urgency::Command);
-    start.sent(&sends(&bench, &mut start));
+    let sent = sends(&bench, &mut start);
+    start.sent(&sent);
     assert_eq!(start.purge(), Some(cut_short));
     // A read that comes before the write changes nothing at the drive.
     bench.words.forget();

@@ -6,7 +6,6 @@ use tokio::sync::oneshot::Receiver;
 use super::super::ticket::tests::ticket;
 use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, WriteStats};
 use super::*;
-use crate::codec::RequestPdu;
 use crate::drive::Value;
 
 mod stops;
