@@ -219,6 +219,12 @@ impl CommandRun {
         if self.begun { Outcome::Interrupted(why) } else { unbegun }
     }
 
+    /// Its last step was not believed, and is done again then.
+    pub fn wait_until(&mut self, at: Instant) {
+        self.tries.in_doubt = true;
+        self.not_before = Some(at);
+    }
+
     /// It must wait for a late reply: what it has read by then is old.
     pub fn hold_up(&mut self) {
         self.held_up = true;

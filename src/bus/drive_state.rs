@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
+use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use crate::cache::{DriveImage, Reading};
 use crate::codec::Reply;
@@ -80,7 +81,7 @@ impl DriveState {
     }
 
     /// What the begun commands want at `now`: that of the highest rank first. Those that are over are answered.
-    pub(super) fn wanted(&mut self, image: &DriveImage, now: Instant) -> Wanted {
+    pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
         let reading = image.reading(now, FRESH);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
@@ -95,7 +96,7 @@ impl DriveState {
                 match run.next(&self.words, profile, running, now) {
                     Next::Send(step) => {
                         // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
-                        let blocked = self.late.blocks(&step.pdu, now);
+                        let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
                         if let Some(until) = blocked.filter(|_| urgency != Urgency::Stop) {
                             run.hold_up();
                             wait(until.min(run.expires().max(now + Duration::from_millis(1))));

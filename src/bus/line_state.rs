@@ -112,7 +112,7 @@ impl LineState {
         let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
-        transaction.pass_over(late);
+        transaction.expect_late(late);
         if doubtful && !self.untimed {
             transaction.doubt_before(earliest);
         }

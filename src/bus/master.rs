@@ -34,6 +34,8 @@ use crate::plant::{BusHandle, turn_away};
 
 /// The bus looks around at least this often.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
+/// Response timeouts for which an N2 reply may come late.
+const N2_LATE: u32 = 3;
 /// Time for the first byte of the reply to a probe of a drive that does not answer: probed every 10 s, it costs less than
 /// 2 % of the line by that.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);

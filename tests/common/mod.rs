@@ -5,7 +5,6 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::leases::Leases;
 use drivegate::bus::predict::predict;
 use drivegate::bus::{BusOptions, BusTask};
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
@@ -175,8 +174,7 @@ impl Rig {
             },
             rs485: setup.rs485,
         };
-        let leases = Leases::new(events.clone(), writes.clone());
-        let bus = BusTask::start(handle.clone(), options, leases, events.clone()).unwrap();
+        let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
         let plant = Plant {
             gateway: "test".to_string(),
             stale_after: Duration::from_secs(1),

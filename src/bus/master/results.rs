@@ -7,7 +7,7 @@ use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
-use crate::bus::transaction::Ended;
+use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Outcome, Urgency, written};
@@ -56,7 +56,7 @@ impl Master {
             }
             Ended::Silent | Ended::Corrupt(_) => {
                 let device = self.sessions.device(turn.drive);
-                self.n2_late.given_up(&turn.pdu, device, now);
+                self.n2_late.given_up(&turn.pdu, device, super::N2_LATE * self.response_timeout, now);
             }
         }
     }
@@ -235,6 +235,13 @@ impl Master {
         let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
             return;
         };
+        if let (Ended::Corrupt(MAY_BE_LATE), Some(until)) = (ended, self.n2_late.until()) {
+            // It was sent, perhaps in vain: it is sent again when the answer can be believed.
+            if let Some(run) = drive.run(slot) {
+                run.wait_until(until);
+            }
+            return;
+        }
         let how = match ended {
             Ended::Corrupt(_) => Outcome::Garbled,
             _ => Outcome::TimedOut,
