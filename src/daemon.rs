@@ -337,10 +337,7 @@ impl Daemon {
     async fn stop_drive(&self, drive: &DriveHandle, tried: &mut bool) -> Result<(), Refusal> {
         loop {
             if drive.image.snapshot().link.is_online() {
-                let origin = Origin {
-                    kind: SourceKind::Shutdown,
-                    who: "on_shutdown".to_string(),
-                };
+                let origin = Origin::new(SourceKind::Shutdown, "on_shutdown");
                 let (run, reading) = (ModelPoint::Run, drive.reading(Instant::now()));
                 let (bus, stop) = (&drive.bus, Value::Bool(false));
                 let answer = bus.own_order(drive.index, &reading, run, stop, origin, &self.writes)?;

@@ -269,10 +269,7 @@ mod tests {
         }
 
         fn acknowledge(&mut self, order: &Order) {
-            let origin = Origin {
-                kind: SourceKind::Mqtt,
-                who: "t".to_string(),
-            };
+            let origin = Origin::new(SourceKind::Mqtt, "t");
             let (ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
             let receipt = ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now);
             let effects = effects(&self.drive.spec.profile, order);

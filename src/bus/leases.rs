@@ -139,10 +139,7 @@ impl Leases {
             Some(LeaseAction::SpeedReference(percent)) => (ModelPoint::SpeedReference, Value::Number(*percent)),
             Some(LeaseAction::Hold) | None => return,
         };
-        let origin = Origin {
-            kind: SourceKind::Supervision,
-            who: "lease".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Supervision, "lease");
         match bus.own_order(item.drive, &reading, point, value, origin.clone(), &self.stats) {
             Ok(answer) => item.answer = Some(answer),
             Err(refusal) => {
@@ -158,7 +155,14 @@ impl Leases {
                 );
                 self.tell(&drive.spec, text);
                 item.refused = Some(refusal.clone());
-                plant::turn_away(&self.stats, &drive.spec.name, &what, Outcome::Refused(refusal), origin);
+                plant::turn_away(
+                    &self.stats,
+                    &drive.spec.name,
+                    &what,
+                    Outcome::Refused(refusal),
+                    origin,
+                    now,
+                );
             }
         }
     }

@@ -292,10 +292,7 @@ mod tests {
         }
 
         fn push_from(&mut self, who: &str, drive: usize, points: &[usize]) -> Receiver<Answer> {
-            let origin = Origin {
-                kind: SourceKind::Mqtt,
-                who: who.to_string(),
-            };
+            let origin = Origin::new(SourceKind::Mqtt, who);
             let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
             let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
             let command = Command {

@@ -10,7 +10,7 @@ use super::*;
 use crate::bus::schedule::{Cadence, Change, Polled};
 use crate::cache::{Access, DriveSpec, Link};
 use crate::codec::{Exception, Reply, Table};
-use crate::command::{Answer, CommandQueue, Origin, SourceKind, Ticket, WriteStats, admit, written};
+use crate::command::{Answer, Authority, CommandQueue, Origin, SourceKind, Ticket, WriteStats, admit, written};
 use crate::drive::profile::Profiles;
 use crate::drive::{Plan, Profile, Value};
 
@@ -234,10 +234,7 @@ impl Model {
                 count: 1,
             }),
         };
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: client.to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, client.to_string());
         let write = !matches!(order, Order::Read(_));
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), write, self.now, self.stats.clone());
         self.answers.push(answer);
@@ -246,7 +243,7 @@ impl Model {
             self.references.insert(word, expires);
         }
         let reading = self.drives[drive].reading(self.now, Duration::from_secs(1));
-        let admitted = admit(order, &reading, true).unwrap();
+        let admitted = admit(order, &reading, Authority::Write).unwrap();
         let offline = !reading.snapshot.link.is_online();
         match kind {
             _ if offline => {}

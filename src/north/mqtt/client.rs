@@ -12,7 +12,7 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::commands::Commands;
+use super::commands::{Commands, Ended};
 use super::connection::{self, Bounds, Connection, KEEP_ALIVE, News};
 use super::outbox::{Acked, Message, Outbox};
 use super::payload::{self, Topics};
@@ -54,8 +54,8 @@ pub(super) async fn run(
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            news = next(&mut client.link) => client.on_news(news),
-            result = client.commands.finished() => client.outbox.push_result(result),
+            news = next(&mut client.link), if client.commands.has_room() => client.on_news(news),
+            ended = client.commands.finished() => client.on_ended(ended),
             _ = ticks.tick() => client.on_tick().await,
         }
         client.pump();
@@ -300,10 +300,15 @@ impl Client {
         };
         let plant = self.plant.load();
         if self.options.commands
-            && let Some(result) = self.commands.take(incoming, &plant, Instant::now())
+            && let Some(result) = self.commands.take(incoming, &plant, Instant::now(), SystemTime::now())
         {
             self.outbox.push_result(result);
         }
+    }
+
+    fn on_ended(&mut self, ended: Ended) {
+        let result = self.commands.result(ended, SystemTime::now());
+        self.outbox.push_result(result);
     }
 
     async fn on_tick(&mut self) {
@@ -438,9 +443,9 @@ impl Client {
                 break;
             }
             tokio::select! {
-                news = next(&mut self.link) => self.on_news(news),
+                news = next(&mut self.link), if self.commands.has_room() => self.on_news(news),
                 event = self.events.recv() => self.on_event(event),
-                result = self.commands.finished() => self.outbox.push_result(result),
+                ended = self.commands.finished() => self.on_ended(ended),
                 () = tokio::time::sleep_until(last_results), if !offline_put => {}
             }
         }

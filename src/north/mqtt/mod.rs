@@ -20,6 +20,7 @@ mod journal;
 mod outbox;
 mod payload;
 mod publisher;
+mod reply;
 mod request;
 mod store;
 mod tls;
