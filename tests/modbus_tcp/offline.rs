@@ -93,3 +93,23 @@ fn the_next_piece_of_a_read_is_queued_when_the_last_one_is_finished() {
     second.ticket.answer(outcome, bench.now);
     assert_eq!(bench.receive(&[]), frame(7, 1, &[2, 1, 0b0011]));
 }
+
+#[test]
+fn clients_of_one_server_share_the_command_word() {
+    let mut bench = Bench::of(plant());
+    let mut other = bench.client.beside(([10, 0, 0, 10], 4711).into(), Authority::Write);
+    bench.receive(&frame(1, 1, &words(6, &[0x8100, 0])));
+    bench.serve();
+    let reset = frame(2, 1, &words(6, &[0x8100, 4]));
+    bench.receive(&reset);
+    let Order::Points(first) = bench.serve() else {
+        panic!("a command")
+    };
+    assert!(other.receive(&reset, bench.now).is_empty());
+    let second = bench.pop().unwrap();
+    assert_eq!(second.ticket.client(), "modbus_tcp 10.0.0.10");
+    let Order::Points(second) = second.order else {
+        panic!("a command")
+    };
+    assert_eq!(second.len() + 1, first.len(), "the reset was given by the first client");
+}

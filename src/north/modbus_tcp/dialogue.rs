@@ -49,6 +49,10 @@ impl Dialogue {
         }
     }
 
+    pub(super) fn session(&self) -> &Session {
+        &self.session
+    }
+
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
         self.session.who()

@@ -30,9 +30,17 @@ impl Offline {
         peer: SocketAddr,
         authority: Authority,
     ) -> Offline {
-        let view = Arc::new(View::new(plant, None));
+        let (shared, view) = (Shared::new(options, stats), View::new(plant, None));
         let client = Client::new(peer, None, authority);
-        let session = Session::new(Arc::new(Shared::new(options, stats)), view, client);
+        Offline::of(Session::new(Arc::new(shared), Arc::new(view), client))
+    }
+
+    /// Another client of the same server.
+    pub fn beside(&self, peer: SocketAddr, authority: Authority) -> Offline {
+        Offline::of(self.dialogue.session().beside(Client::new(peer, None, authority)))
+    }
+
+    fn of(session: Session) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
             backlog: Vec::new(),

@@ -71,6 +71,11 @@ impl Session {
         }
     }
 
+    /// Another client has connected to the same server.
+    pub(super) fn beside(&self, client: Client) -> Session {
+        Session::new(self.shared.clone(), self.view.clone(), client)
+    }
+
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
         &self.client.who
