@@ -316,7 +316,7 @@ fn supervise(
             supervision.withdrawn();
         }
         Demand::Write(point, value) => {
-            let origin = Origin::gateway(SourceKind::Supervision, "supervision");
+            let origin = Origin::new(SourceKind::Supervision, "supervision");
             let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
             if let Some(refusal) = supervision.ordered(ordered, now) {
                 let what = format!("{}={value}", point.name());

@@ -10,7 +10,7 @@ use drivegate::bus::{BusOptions, BusTask};
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate::command::{CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::command::{Authority, CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::drive::{ModelPoint, Sample, State, Value};
 use drivegate::event::Events;
@@ -228,12 +228,16 @@ impl Rig {
             .iter()
             .map(|(name, value)| (index(name), Value::Number(*value)))
             .collect();
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "test".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "test");
         handle
-            .order(Order::Points(values), origin, true, DEFAULT_EXPIRY)
+            .place(
+                Order::Points(values),
+                origin,
+                Authority::Write,
+                DEFAULT_EXPIRY,
+                Instant::now(),
+            )
+            .answered()
             .await
             .outcome
     }
@@ -245,14 +249,18 @@ impl Rig {
             start,
             count,
         };
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "test".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "test");
         self.plant
             .drive(&name)
             .unwrap()
-            .order(Order::Read(pdu), origin, false, DEFAULT_EXPIRY)
+            .place(
+                Order::Read(pdu),
+                origin,
+                Authority::ReadOnly,
+                DEFAULT_EXPIRY,
+                Instant::now(),
+            )
+            .answered()
             .await
             .outcome
     }

@@ -196,10 +196,7 @@ pub(crate) fn mixed() -> Plant {
 
 /// One command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
-    let origin = Origin {
-        kind: SourceKind::Mqtt,
-        who: "t".to_string(),
-    };
+    let origin = Origin::new(SourceKind::Mqtt, "t");
     let (ticket, _answer) = Ticket::new(
         origin,
         "pump-1",

@@ -25,7 +25,11 @@ fn drive(access: Access) -> DriveImage {
 
 fn try_order(order: Order) -> Result<Admitted, Refusal> {
     let image = drive(Access::Control);
-    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    admit(
+        order,
+        &image.reading(Instant::now(), Duration::from_secs(1)),
+        Authority::Write,
+    )
 }
 
 fn point(name: &str) -> usize {
@@ -46,7 +50,11 @@ fn write(address: u16, value: u16) -> Order {
 fn authority_comes_first() {
     let image = drive(Access::Monitor);
     let reading = image.reading(Instant::now(), Duration::from_secs(1));
-    for (order, may) in [(write(2000, 1), true), (write(9999, 1), true), (write(2000, 1), false)] {
+    for (order, may) in [
+        (write(2000, 1), Authority::Write),
+        (write(9999, 1), Authority::Write),
+        (write(2000, 1), Authority::ReadOnly),
+    ] {
         assert_eq!(
             admit(order, &reading, may).unwrap_err().exception(),
             Exception::FUNCTION
@@ -60,7 +68,7 @@ fn authority_comes_first() {
                 count: 1
             }),
             &reading,
-            false
+            Authority::ReadOnly
         )
         .is_ok()
     );
@@ -169,7 +177,11 @@ fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Orde
         }
     });
     let order = order(&|name| profile.point_index(name).unwrap());
-    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    admit(
+        order,
+        &image.reading(Instant::now(), Duration::from_secs(1)),
+        Authority::Write,
+    )
 }
 
 #[test]
@@ -254,7 +266,7 @@ fn a_write_on_n2_is_one_whole_object() {
         (coils(1, &[true, true]), value),
         (coils(8, &[true]), address),
     ] {
-        let refused = admit(Order::Write(pdu.clone()), &reading, true).err();
+        let refused = admit(Order::Write(pdu.clone()), &reading, Authority::Write).err();
         assert_eq!(refused.map(|refusal| refusal.exception()), wanted, "{pdu:?}");
     }
 }

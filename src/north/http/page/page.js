@@ -325,7 +325,7 @@ function showEvents(news) {
   const anew = news.last.split("-")[0] !== lastEvent.split("-")[0];
   if (anew) $("events").replaceChildren();
   lastEvent = news.last;
-  for (const event of news.events) addEvent(new Date(event.time), event.event, event.drive || event.bus, event.text);
+  for (const event of news.events.slice(-EVENTS_SHOWN)) addEvent(new Date(event.time), event.event, event.drive || event.bus, event.text);
   $("events-note").hidden = $("events").children.length > 0;
 }
 
