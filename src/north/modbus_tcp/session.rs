@@ -278,7 +278,7 @@ impl Session {
     /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
     fn command(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
         let spec = &drive.image.spec;
-        let fault = drive.reading(now).state() == State::Fault;
+        let fault = drive.reading(now).state() == Some(State::Fault);
         let write = self.shared.with_command_word(&spec.name, |last| {
             let before = register_map::Before { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
