@@ -8,6 +8,9 @@ use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
 use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
 
+/// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
+const PARAMETER_AGE: Duration = Duration::from_secs(5);
+
 /// Whether a drive answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
@@ -124,10 +127,10 @@ impl Snapshot {
         });
     }
 
-    /// The drive went away: what is read once may be otherwise when it returns, and is stale until it was read again.
+    /// The drive went away: what is read seldom may be otherwise when it returns, and is stale until it was read again.
     pub fn outlive(&mut self) {
-        let once = self.spans.iter_mut().filter(|span| span.class == PollClass::Once);
-        for cell in once.flat_map(|span| &mut Arc::make_mut(span).cells) {
+        let seldom = self.spans.iter_mut().filter(|span| span.class != PollClass::Fast);
+        for cell in seldom.flat_map(|span| &mut Arc::make_mut(span).cells) {
             cell.outlived = true;
         }
     }
@@ -280,8 +283,32 @@ impl Reading<'_> {
     /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the
     /// profile gives way to the configured one.
     pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| sample.good())
+    }
+
+    /// As [`Reading::band`], for limits and conversions of commands: what the drive said longer than
+    /// [`Reading::parameter_age`] ago is not known.
+    pub fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| {
+            let age = self.now.saturating_duration_since(sample.at?);
+            sample.good().filter(|_| age <= self.parameter_age())
+        })
+    }
+
+    /// Oldest age of a parameter of the drive on which a limit or a conversion of a command may rest: 5 s or, where the
+    /// line is slower, one slow cycle of it, with an eighth for what comes between.
+    pub fn parameter_age(&self) -> Duration {
+        PARAMETER_AGE.max(self.slow_cycle + self.slow_cycle / 8)
+    }
+
+    fn band_of(
+        &self,
+        minimum: Bound,
+        maximum: Bound,
+        known: impl Fn(&Sample) -> Option<Value>,
+    ) -> Option<(f64, f64)> {
         let own = |bound: Bound| match bound {
-            Bound::Point(point) => self.sample(point).good().map(Value::as_f64),
+            Bound::Point(point) => known(&self.sample(point)).map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),
         };
         let configured = self.spec.frequency_range.as_ref();

@@ -206,8 +206,8 @@ mod tests {
                 .collect()
         };
         assert_eq!(of(PollClass::Fast), [(2100, 11)]);
-        assert_eq!(of(PollClass::Slow), [(7, 2), (2000, 3)]);
-        assert_eq!(of(PollClass::Once), [(100, 4), (732, 2)]);
+        assert_eq!(of(PollClass::Slow), [(7, 2), (100, 2), (2000, 3)]);
+        assert_eq!(of(PollClass::Once), [(102, 2), (732, 2)]);
     }
 
     fn profile(range: &str, addresses: &[u16]) -> Profile {
