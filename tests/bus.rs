@@ -146,6 +146,7 @@ async fn a_fault_is_told_and_reset() {
         spec.supervision = Some(Supervision {
             timeout: Duration::from_secs(60),
             action: LeaseAction::Hold,
+            adopt: false,
         });
     })
     .await;
@@ -261,6 +262,7 @@ async fn a_lease_that_runs_out_stops_the_drive_once() {
         spec.supervision = Some(drivegate::cache::Supervision {
             timeout: Duration::from_millis(300),
             action: drivegate::cache::LeaseAction::Stop,
+            adopt: false,
         });
     })
     .await;
@@ -333,6 +335,7 @@ async fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
             spec.supervision = lease.then_some(Supervision {
                 timeout: Duration::from_secs(5),
                 action: LeaseAction::Stop,
+                adopt: false,
             });
         });
         let told = |rig: &Rig| {

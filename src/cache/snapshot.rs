@@ -301,12 +301,7 @@ impl Reading<'_> {
         PARAMETER_AGE.max(self.slow_cycle + self.slow_cycle / 8)
     }
 
-    fn band_of(
-        &self,
-        minimum: Bound,
-        maximum: Bound,
-        known: impl Fn(&Sample) -> Option<Value>,
-    ) -> Option<(f64, f64)> {
+    fn band_of(&self, minimum: Bound, maximum: Bound, known: impl Fn(&Sample) -> Option<Value>) -> Option<(f64, f64)> {
         let own = |bound: Bound| match bound {
             Bound::Point(point) => known(&self.sample(point)).map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),

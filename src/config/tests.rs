@@ -73,7 +73,7 @@ address = 7
 profile = "vacon-nx"
 access = "control"
 limits = { speed_reference = [0, 80.5] }
-supervision = { timeout = "5s", action = "hold" }
+supervision = { timeout = "5s", action = "hold", adopt = true }
 on_shutdown = "stop"
 turnaround = "0.5ms"
 frequency_range = [10, 50]
@@ -117,6 +117,14 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
     assert_eq!(drive.limits["speed_reference"], 0.0..=80.5);
     assert_eq!(drive.turnaround, Duration::from_micros(500));
     assert_eq!(drive.frequency_range, Some(10.0..=50.0));
+    let lease = crate::cache::Supervision {
+        timeout: Duration::from_secs(5),
+        action: crate::cache::LeaseAction::Hold,
+        adopt: true,
+    };
+    assert_eq!(drive.supervision, Some(lease));
+    let usual = settings(&FULL).buses.remove(0).drives.remove(0);
+    assert!(!usual.supervision.unwrap().adopt, "only where it is written");
     let fan = &all.buses[1].drives[0];
     assert_eq!(
         (fan.unit, fan.access, fan.turnaround),

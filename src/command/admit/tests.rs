@@ -198,8 +198,16 @@ fn no_command_rests_on_an_old_parameter() {
     assert_eq!(set(&image, at(22.5), "frequency_reference", 25.0), Ok(50.0));
     assert!(old(set(&image, at(22.6), "frequency_reference", 25.0)));
     let image = of(1, Some(0.0..=40.0));
-    assert_eq!(set(&image, at(3.0), "frequency_reference", 20.0), Ok(40.0), "its own first");
-    assert_eq!(set(&image, at(9.0), "frequency_reference", 20.0), Ok(50.0), "else the configured one");
+    assert_eq!(
+        set(&image, at(3.0), "frequency_reference", 20.0),
+        Ok(40.0),
+        "its own first"
+    );
+    assert_eq!(
+        set(&image, at(9.0), "frequency_reference", 20.0),
+        Ok(50.0),
+        "else the configured one"
+    );
 }
 
 /// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
