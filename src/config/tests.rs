@@ -265,3 +265,23 @@ fn the_environment_overrides_and_is_told_by_name() {
         assert!(told.iter().any(|t| t.contains(name)), "{name} in {told:#?}");
     }
 }
+
+/// Every family that ships tells that it runs, and whether it is there.
+#[test]
+fn every_family_can_be_supervised() {
+    for profile in Profiles::built_in().iter() {
+        for protocol in &profile.protocols {
+            let (family, protocol) = (&profile.name, protocol.name());
+            let source = format!(
+                "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/null\"\nprotocol = \"{protocol}\"\n\
+                 [[bus.drive]]\nname = \"d\"\naddress = 1\nprofile = \"{family}\"\naccess = \"control\"\n\
+                 on_shutdown = \"stop\"\nsupervision = {{ timeout = \"5s\" }}\n"
+            );
+            let time = settings(&source).buses[0].shutdown_time();
+            assert!(
+                time.drives == 1 && time.answered < time.unanswered,
+                "{family}: {time:?}"
+            );
+        }
+    }
+}
