@@ -8,6 +8,9 @@ use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
 use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
 
+/// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
+const PARAMETER_AGE: Duration = Duration::from_secs(5);
+
 /// Whether a drive answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
@@ -124,10 +127,10 @@ impl Snapshot {
         });
     }
 
-    /// The drive went away: what is read once may be otherwise when it returns, and is stale until it was read again.
+    /// The drive went away: what is read seldom may be otherwise when it returns, and is stale until it was read again.
     pub fn outlive(&mut self) {
-        let once = self.spans.iter_mut().filter(|span| span.class == PollClass::Once);
-        for cell in once.flat_map(|span| &mut Arc::make_mut(span).cells) {
+        let seldom = self.spans.iter_mut().filter(|span| span.class != PollClass::Fast);
+        for cell in seldom.flat_map(|span| &mut Arc::make_mut(span).cells) {
             cell.outlived = true;
         }
     }
@@ -280,8 +283,27 @@ impl Reading<'_> {
     /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the
     /// profile gives way to the configured one.
     pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| sample.good())
+    }
+
+    /// As [`Reading::band`], for limits and conversions of commands: what the drive said longer than
+    /// [`Reading::parameter_age`] ago is not known.
+    pub fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| {
+            let age = self.now.saturating_duration_since(sample.at?);
+            sample.good().filter(|_| age <= self.parameter_age())
+        })
+    }
+
+    /// Oldest age of a parameter of the drive on which a limit or a conversion of a command may rest: 5 s or, where the
+    /// line is slower, one slow cycle of it, with an eighth for what comes between.
+    pub fn parameter_age(&self) -> Duration {
+        PARAMETER_AGE.max(self.slow_cycle + self.slow_cycle / 8)
+    }
+
+    fn band_of(&self, minimum: Bound, maximum: Bound, known: impl Fn(&Sample) -> Option<Value>) -> Option<(f64, f64)> {
         let own = |bound: Bound| match bound {
-            Bound::Point(point) => self.sample(point).good().map(Value::as_f64),
+            Bound::Point(point) => known(&self.sample(point)).map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),
         };
         let configured = self.spec.frequency_range.as_ref();
@@ -328,6 +350,14 @@ impl Reading<'_> {
         self.model(point).good().is_some_and(Value::as_bool)
     }
 
+    /// A bit of the model; `None` where the family has it and it is not good. What the family lacks is not set.
+    pub fn bit(&self, point: ModelPoint) -> Option<bool> {
+        match self.spec.profile.model_index(point) {
+            Some(index) => self.sample(index).good().map(Value::as_bool),
+            None => Some(false),
+        }
+    }
+
     /// Age of the process data; `None` if it was never read.
     pub fn age(&self) -> Option<Duration> {
         self.snapshot.fast_at.map(|at| self.now.saturating_duration_since(at))
@@ -338,19 +368,30 @@ impl Reading<'_> {
         !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > self.stale_after)
     }
 
-    /// The drive in one word.
-    pub fn state(&self) -> State {
+    /// The drive in one word; `None` while it answers and a point that decides is not good.
+    pub fn state(&self) -> Option<State> {
         if self.is_stale() {
-            State::Offline
-        } else if self.is_set(ModelPoint::Fault) {
-            State::Fault
-        } else if self.is_set(ModelPoint::Running) {
-            State::Running
-        } else if self.is_set(ModelPoint::Ready) {
-            State::Ready
-        } else {
-            State::NotReady
+            return Some(State::Offline);
         }
+        self.decided().ok()
+    }
+
+    /// What the points say that decide the state, in their order; else the quality of the first that says nothing. A
+    /// point that the family lacks decides nothing.
+    fn decided(&self) -> Result<State, Quality> {
+        const DECIDING: [(ModelPoint, State); 3] = [
+            (ModelPoint::Fault, State::Fault),
+            (ModelPoint::Running, State::Running),
+            (ModelPoint::Ready, State::Ready),
+        ];
+        for (point, state) in DECIDING {
+            match self.bit(point) {
+                Some(true) => return Ok(state),
+                Some(false) => {}
+                None => return Err(self.model(point).quality),
+            }
+        }
+        Ok(State::NotReady)
     }
 
     /// Text of the active fault; empty without a fault.
@@ -361,14 +402,15 @@ impl Reading<'_> {
         }
     }
 
-    /// Quality of the drive as a whole: that of its process data.
+    /// Quality of the drive as a whole: that of its process data and, while its state is not known, that of the point
+    /// for want of which it is not.
     pub fn overall(&self) -> Quality {
         if self.snapshot.fast_at.is_none() {
             Quality::Bad
         } else if self.is_stale() {
             Quality::Stale
         } else {
-            Quality::Good
+            self.decided().err().unwrap_or(Quality::Good)
         }
     }
 }
@@ -407,5 +449,70 @@ mod tests {
         assert_eq!((sample().value, sample().quality), expected(Quality::Stale));
         store("maximum_frequency", 10.0);
         assert_eq!(sample(), Sample::NONE, "an empty range");
+    }
+
+    /// The state rests on fault, running and ready, in that order, as far as it needs them.
+    #[test]
+    fn a_state_is_known_only_when_what_decides_it_is() {
+        let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
+        let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx), Duration::from_secs(1));
+        let now = Instant::now();
+        let seen = || {
+            let reading = image.reading(now, Duration::from_secs(1));
+            (reading.state(), reading.overall())
+        };
+        let bit = |address, word| image.update(|s| s.store(Table::DiscreteInput, address, &[word], now));
+        let refuse = |address| image.update(|s| s.refuse(Table::DiscreteInput, address, 1, Exception::ADDRESS));
+        let (ready, running, fault) = (1, 2, 4);
+        assert_eq!(seen(), (Some(State::Offline), Quality::Bad));
+        image.update(|s| (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now)));
+        assert_eq!(seen(), (None, Quality::Bad), "nothing is read yet");
+        bit(ready, 1);
+        bit(fault, 0);
+        assert_eq!(seen(), (None, Quality::Bad), "running is not");
+        bit(running, 0);
+        assert_eq!(seen(), (Some(State::Ready), Quality::Good));
+        refuse(running);
+        assert_eq!(seen(), (None, Quality::Bad), "it may run");
+        bit(fault, 1);
+        assert_eq!(seen(), (Some(State::Fault), Quality::Good), "whether it runs or not");
+        refuse(fault);
+        bit(running, 1);
+        assert_eq!(seen(), (None, Quality::Bad), "it may have a fault");
+        bit(fault, 0);
+        refuse(ready);
+        assert_eq!(seen(), (Some(State::Running), Quality::Good), "needs no word of ready");
+        let late = now + Duration::from_millis(900);
+        image.update(|s| {
+            s.fast_at = Some(late);
+            s.store(Table::DiscreteInput, fault, &[0], late);
+        });
+        let reading = image.reading(now + Duration::from_millis(1100), Duration::from_secs(1));
+        assert_eq!(
+            (reading.state(), reading.overall()),
+            (None, Quality::Stale),
+            "running is old"
+        );
+    }
+
+    /// A family without a bit is not asked for it.
+    #[test]
+    fn what_a_family_lacks_decides_nothing() {
+        let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
+             [[point]]\nname = \"running\"\nat = \"holding 1.0\"\nclass = \"fast\"\n";
+        let profile = crate::drive::Profile::parse("m.toml", source, false).unwrap();
+        let image = DriveImage::new(
+            DriveSpec::new("m", "line1", 1, Arc::new(profile)),
+            Duration::from_secs(1),
+        );
+        let now = Instant::now();
+        for (word, state) in [(1, State::Running), (0, State::NotReady)] {
+            image.update(|s| {
+                (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now));
+                s.store(Table::Holding, 1, &[word], now);
+            });
+            let reading = image.reading(now, Duration::from_secs(1));
+            assert_eq!((reading.state(), reading.overall()), (Some(state), Quality::Good));
+        }
     }
 }

@@ -164,7 +164,7 @@ fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<
             _ if point.write_to == Some(index) => Some(value),
             Source::Derived(derived) => match derived.band().filter(|(of, ..)| taken_by(*of) == index) {
                 Some((_, minimum, maximum)) => drive
-                    .band(minimum, maximum)
+                    .band_for_commands(minimum, maximum)
                     .and_then(|band| derived.value(&[value], Some(band))),
                 None => continue,
             },
@@ -172,9 +172,10 @@ fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<
         };
         let Some(figure) = figure.map(Value::as_f64) else {
             return Err(Refusal::NotKnown(format!(
-                "the limits of `{}` cannot be kept while the drive's frequency range is not known; set frequency_range \
-                 for the drive",
-                point.name
+                "the limits of `{}` cannot be kept while the drive's frequency range is not known, or was not read for \
+                 {:.0} s; set frequency_range for the drive",
+                point.name,
+                drive.parameter_age().as_secs_f64()
             )));
         };
         if !limits.contains(&figure) {
@@ -210,9 +211,11 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                     "`{name}` is made of other points and cannot be written"
                 )));
             };
-            let band = drive.band(minimum, maximum).ok_or_else(|| {
+            let band = drive.band_for_commands(minimum, maximum).ok_or_else(|| {
                 Refusal::NotKnown(format!(
-                    "`{name}` needs the drive's frequency range, which is not known; set frequency_range for the drive"
+                    "`{name}` needs the drive's frequency range, which is not known, or was not read for {:.0} s; set \
+                     frequency_range for the drive",
+                    drive.parameter_age().as_secs_f64()
                 ))
             })?;
             let base = drive.spec.profile.points.get(of);

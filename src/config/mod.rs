@@ -10,10 +10,12 @@ mod modbus_tcp;
 mod mqtt;
 mod north;
 pub mod schema;
+mod shutdown;
 mod unique;
 mod values;
 
 pub use log::{LogFormat, LogSettings};
+pub use shutdown::{OTHER_STOP_TIME, ShutdownTime, UNIT_STOP_TIME};
 
 pub(crate) use bus::{check_port, default_format};
 pub(crate) use drive::{addresses, unknown_profile};
@@ -25,7 +27,7 @@ use std::time::Duration;
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
 use crate::cache::{Access, BusSpec, DriveSpec};
-use crate::document::{self, Document, Place, Problem, Reader};
+use crate::document::{self, Document, Place, Problem, Reader, format_duration};
 use crate::drive::profile::Profiles;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 
@@ -243,6 +245,7 @@ fn judge(
     if reader.document().is_sound() {
         // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
         warn_of_idle_stops(reader, buses);
+        warn_of_long_shutdowns(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
         warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
     }
@@ -331,6 +334,33 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
             );
             reader.document().warning(place, text);
         }
+    }
+}
+
+/// Stops at shutdown that the service manager may not wait for.
+fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for found in buses {
+        let stops = found.drives.iter().find_map(|drive| drive.shutdown_stop.as_ref());
+        let (Some(settings), Some(place)) = (&found.settings, stops) else {
+            continue;
+        };
+        let time = settings.shutdown_time();
+        if !time.exceeds_unit() {
+            continue;
+        }
+        let seconds = |time: Duration| time.as_secs_f64().ceil();
+        let text = format!(
+            "stopping {} drives of bus `{}` with the gateway takes {:.1} s, and {:.0} s where they do not answer, longer than \
+             TimeoutStopSec={} of drivegate.service leaves for it; raise it to {:.0}s or more in the unit (stop_grace_period in \
+             compose.yaml), lower response_timeout or retries, or split the bus",
+            time.drives,
+            settings.spec.name,
+            time.answered.as_secs_f64(),
+            seconds(time.unanswered),
+            format_duration(UNIT_STOP_TIME),
+            seconds(time.unanswered + OTHER_STOP_TIME),
+        );
+        reader.document().warning(place, text);
     }
 }
 

@@ -204,8 +204,10 @@ impl Rig {
         self.plant.drive(&drive(address)).unwrap()
     }
 
+    /// One that is not known yet counts as offline.
     pub fn state(&self, address: u8) -> State {
-        self.handle(address).reading(Instant::now()).state()
+        let state = self.handle(address).reading(Instant::now()).state();
+        state.unwrap_or(State::Offline)
     }
 
     pub fn sample(&self, address: u8, point: ModelPoint) -> Sample {

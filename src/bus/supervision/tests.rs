@@ -31,6 +31,7 @@ impl Bench {
             supervision: Some(Supervision {
                 timeout: Duration::from_secs(5),
                 action,
+                adopt: false,
             }),
             turnaround: Duration::ZERO,
             ..DriveSpec::new("d", "b", 1, profile.clone())

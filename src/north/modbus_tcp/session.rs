@@ -302,7 +302,7 @@ impl Session {
         now: Instant,
     ) -> Decision {
         let spec = &drive.image.spec;
-        let fault = drive.reading(now).state() == State::Fault;
+        let fault = drive.reading(now).state() == Some(State::Fault);
         let write = self.shared.with_command_word(&spec.name, |last| {
             let before = register_map::Before { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
