@@ -150,6 +150,11 @@ impl Snapshot {
         }
     }
 
+    /// When the word at an address was last read.
+    pub fn read_at(&self, table: Table, address: u16) -> Option<Instant> {
+        self.cell(table, address).and_then(|(_, cell)| cell.at)
+    }
+
     /// The last word read at an address, whatever its age.
     pub fn word(&self, table: Table, address: u16) -> Option<u16> {
         self.cell(table, address)
