@@ -27,7 +27,7 @@ use std::time::Duration;
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
 use crate::cache::{Access, BusSpec, DriveSpec};
-use crate::document::{self, Document, Place, Problem, Reader, format_duration};
+use crate::document::{self, Document, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 
@@ -344,23 +344,9 @@ fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
         let (Some(settings), Some(place)) = (&found.settings, stops) else {
             continue;
         };
-        let time = settings.shutdown_time();
-        if !time.exceeds_unit() {
-            continue;
+        if let Some(text) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
+            reader.document().warning(place, text);
         }
-        let seconds = |time: Duration| time.as_secs_f64().ceil();
-        let text = format!(
-            "stopping {} drives of bus `{}` with the gateway takes {:.1} s, and {:.0} s where they do not answer, longer than \
-             TimeoutStopSec={} of drivegate.service leaves for it; raise it to {:.0}s or more in the unit (stop_grace_period in \
-             compose.yaml), lower response_timeout or retries, or split the bus",
-            time.drives,
-            settings.spec.name,
-            time.answered.as_secs_f64(),
-            seconds(time.unanswered),
-            format_duration(UNIT_STOP_TIME),
-            seconds(time.unanswered + OTHER_STOP_TIME),
-        );
-        reader.document().warning(place, text);
     }
 }
 

@@ -24,9 +24,22 @@ pub struct ShutdownTime {
 }
 
 impl ShutdownTime {
-    /// Whether the service manager may end the gateway before every drive had its stop.
-    pub fn exceeds_unit(&self) -> bool {
-        self.drives > 0 && self.unanswered + OTHER_STOP_TIME > UNIT_STOP_TIME
+    /// What to tell of that bus where the service manager may end the gateway before every drive had its stop.
+    pub fn beyond_unit(&self, bus: &str) -> Option<String> {
+        let wanted = self.unanswered + OTHER_STOP_TIME;
+        let seconds = |time: Duration| time.as_secs_f64().ceil();
+        (self.drives > 0 && wanted > UNIT_STOP_TIME).then(|| {
+            format!(
+                "stopping {} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s where they do not answer, longer \
+                 than TimeoutStopSec={}s of drivegate.service leaves for it; raise it to {:.0}s or more in the unit \
+                 (stop_grace_period in compose.yaml), lower response_timeout or retries, or split the bus",
+                if self.drives == 1 { "1 drive".to_string() } else { format!("{} drives", self.drives) },
+                self.answered.as_secs_f64(),
+                seconds(self.unanswered),
+                UNIT_STOP_TIME.as_secs(),
+                seconds(wanted),
+            )
+        })
     }
 }
 

@@ -51,16 +51,16 @@ fn nothing_to_stop_takes_no_time() {
         drive.access = Access::Monitor;
     }
     assert_eq!(bus.shutdown_time(), ShutdownTime::default());
-    assert!(!bus.shutdown_time().exceeds_unit());
+    assert_eq!(bus.shutdown_time().beyond_unit("b"), None);
 }
 
 #[test]
 fn a_large_slow_line_takes_longer_than_the_unit_gives() {
     let sixty = bus("protocol = \"n2\"", "vacon-nx-n2", 120).shutdown_time();
     assert_eq!(sixty.drives, 60);
-    assert!(!sixty.exceeds_unit(), "{sixty:?}");
+    assert_eq!(sixty.beyond_unit("b"), None, "{sixty:?}");
     let slow = bus("protocol = \"n2\"\nresponse_timeout = \"1s\"", "vacon-nx-n2", 120).shutdown_time();
-    assert!(slow.exceeds_unit(), "{slow:?}");
+    assert!(slow.beyond_unit("b").is_some(), "{slow:?}");
 }
 
 /// The figure that `check` compares with is that of the files that ship.
