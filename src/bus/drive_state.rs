@@ -97,7 +97,7 @@ impl DriveState {
                     Next::Send(step) => {
                         // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
                         let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
-                        if let Some(until) = blocked.filter(|_| urgency != Urgency::Stop) {
+                        if let Some(until) = blocked.filter(|_| run.waits_for_late()) {
                             run.hold_up();
                             wait(until.min(run.expires().max(now + Duration::from_millis(1))));
                             break;
@@ -136,7 +136,7 @@ impl DriveState {
             // A bit of another command must not bring back what an unanswered stop took away.
             self.words.forget();
         }
-        if run.is_of_client() && run.has_begun() {
+        if run.is_of_client() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
         if urgency == Urgency::Stop && outcome.is_ok() {
@@ -156,13 +156,11 @@ impl DriveState {
             return;
         };
         run.sent(step);
-        if step.pdu.is_write() {
-            if !run.is_reference_only() {
-                self.stopped = None;
-            }
-            if run.is_of_client() {
-                self.supervision.renew(now);
-            }
+        if step.pdu.is_write() && !run.is_reference_only() {
+            self.stopped = None;
+        }
+        if run.is_of_client() {
+            self.supervision.renew(now);
         }
     }
 
@@ -190,12 +188,24 @@ impl DriveState {
         }
     }
 
+    /// What supervision wants and was begun, but not sent, is taken back: a client commands the drive again.
+    pub(super) fn withdraw_supervision(&mut self, now: Instant) {
+        for run in &mut self.runs {
+            if let Some(run) = run.take_if(|run| run.is_of_supervision() && !run.has_begun()) {
+                run.finish(&Outcome::Withdrawn, now);
+            }
+        }
+    }
+
     /// The drive does not answer any more. A stop is tried on; what else was begun has failed.
     pub(super) fn went_offline(&mut self, now: Instant) {
         self.words.forget();
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
             if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
+                if run.is_of_client() && run.reached_the_wire() {
+                    self.supervision.renew(now);
+                }
                 run.abandon(Outcome::Offline, Interruption::Offline, now);
             }
         }
@@ -210,7 +220,7 @@ impl DriveState {
     /// Everything that was begun is answered; what was acknowledged stays so.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
         for run in self.runs.iter_mut().filter_map(Option::take) {
-            if run.is_of_client() && run.has_begun() {
+            if run.is_of_client() && run.reached_the_wire() {
                 self.supervision.renew(now);
             }
             run.abandon(unbegun.clone(), why, now);
@@ -220,6 +230,6 @@ impl DriveState {
         self.late = LateReplies::default();
         self.stopped = None;
         self.silent_until = None;
-        self.supervision.settle();
+        self.supervision.settle(now);
     }
 }

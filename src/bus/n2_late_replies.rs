@@ -34,7 +34,7 @@ pub enum Taken {
     Reply,
     /// It is a late reply: so many bytes are to be dropped.
     Late(usize),
-    /// It may be the reply or a late one.
+    /// It may be the reply or a late one. As many are to come as before, perhaps the reply itself.
     Doubtful,
 }
 
@@ -69,18 +69,10 @@ impl N2LateReplies {
         self.0.iter().filter(alike).map(|late| late.until).max()
     }
 
-    /// Until when any late reply may come.
-    pub fn until(&self) -> Option<Instant> {
-        self.0.iter().map(|late| late.until).max()
-    }
-
     /// What the whole frame at the beginning of `bytes` is, received at `now` in the exchange of `pdu`.
     pub fn take(&mut self, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
         self.0.retain(|late| late.until > now);
-        if self.0.is_empty() {
-            return Taken::Reply;
-        }
-        let Some((used, answer)) = frame(bytes) else {
+        let Some((used, answer)) = frame(bytes).filter(|_| !self.0.is_empty()) else {
             return Taken::Reply;
         };
         let Some(index) = self.0.iter().position(|late| late.could_be(&answer)) else {
@@ -92,6 +84,21 @@ impl N2LateReplies {
         self.0.remove(index);
         Taken::Late(used)
     }
+
+    /// The answer to `pdu` was doubtful: if it was the late one, the reply itself may still come.
+    pub fn doubted(&mut self, pdu: &RequestPdu, window: Duration, now: Instant) {
+        let Some(wanted) = form(pdu) else { return };
+        let until = now + window;
+        if let Some(late) = self.0.iter_mut().find(|late| late.form.is_like(wanted)) {
+            late.until = late.until.max(until);
+        }
+    }
+}
+
+/// Whether the reply to one of these requests could pass for the reply to the other.
+pub fn n2_look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
+    let forms = form(a).zip(form(b));
+    forms.is_none_or(|(a, b)| a.is_like(b) || b.is_like(a))
 }
 
 /// The first whole and sound frame, and the bytes up to its end.

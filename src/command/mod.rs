@@ -274,7 +274,7 @@ impl fmt::Display for Outcome {
             Outcome::Expired => {
                 f.write_str("its time ran out before its turn came; it was not sent")
             }
-            Outcome::Replaced => f.write_str("a newer reference took its place; it was not sent"),
+            Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
             Outcome::Interrupted(why) => {

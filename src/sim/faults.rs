@@ -351,7 +351,8 @@ fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
         Foreign::Address => address = if address >= 247 { 1 } else { address + 1 },
         Foreign::Function => {
             if let Some(function) = pdu.first_mut() {
-                *function = if *function == 3 { 4 } else { 3 };
+                // Also of an exception: the function that was asked for would be an answer.
+                *function = if *function & 0x7F == 3 { 4 } else { 3 };
             }
             // Whatever it was, it becomes a reply of one register unless it has registers already.
             if !registers {

@@ -31,6 +31,8 @@ pub struct Asked {
     pub pdu: RequestPdu,
     pub at: Instant,
     pub is_poll: bool,
+    /// When the image had the first word of a read from, before.
+    pub last_read: Option<Instant>,
     /// What the drive answered, if it acted upon the request.
     pub reply: Option<Reply>,
 }
@@ -42,6 +44,8 @@ pub enum Seen {
     Acted(Asked),
     /// The exchange before ended.
     Over(Asked),
+    /// Bytes came to the gateway.
+    Heard(Vec<u8>),
 }
 
 pub struct WorldBus {
@@ -191,6 +195,13 @@ impl WorldBus {
             pdu: turn.pdu().clone(),
             at: now,
             is_poll: matches!(turn.purpose, Purpose::Poll(_)),
+            last_read: match turn.pdu() {
+                RequestPdu::Read { table, start, .. } => {
+                    let image = &self.handle.image.drives[turn.drive];
+                    image.snapshot().read_at(*table, *start)
+                }
+                _ => None,
+            },
             reply: None,
         };
         seen.push(Seen::Sent(asked.clone()));
@@ -207,6 +218,7 @@ impl WorldBus {
         let mut bytes = Vec::new();
         while self.wire.take_due(sim, &mut bytes).is_some() {}
         if self.open && !bytes.is_empty() {
+            seen.push(Seen::Heard(bytes.clone()));
             self.core.heard(&bytes, now);
             self.note_over(seen);
         }
