@@ -10,7 +10,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::cache::Direction;
 use drivegate::codec::LineFormat;
-use drivegate::command::{DEFAULT_EXPIRY, Order, Origin, SourceKind};
+use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind};
 use drivegate::config::Settings;
 use drivegate::daemon::Daemon;
 use drivegate::drive::Value;
@@ -67,14 +67,12 @@ fn measure(arguments: &[String]) -> Result<(), Box<dyn Error>> {
                 .profile
                 .point_index("speed_reference")
                 .ok_or("no point")?;
-            let origin = Origin {
-                kind: SourceKind::Mqtt,
-                who: "bench".to_string(),
-            };
+            let origin = Origin::new(SourceKind::Mqtt, "bench");
             let order = Order::Points(vec![(point, Value::Number(f64::from(value) / 100.0))]);
             while frames.try_recv().is_ok() {}
             let queued = SystemTime::now();
-            if !drive.order(order, origin, true, DEFAULT_EXPIRY).await.outcome.is_ok() {
+            let mut placed = drive.place(order, origin, Authority::Write, DEFAULT_EXPIRY, Instant::now());
+            if !placed.answered().await.outcome.is_ok() {
                 failed += 1;
                 continue;
             }

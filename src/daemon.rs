@@ -297,7 +297,7 @@ impl Daemon {
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
-            let time = Duration::from_secs(10);
+            let time = settings.shutdown_time().unanswered;
             let missing = task.handle().queue.begin_shutdown(now + time, now);
             async move {
                 // A bus whose port is closed cannot say what became of its drives.

@@ -7,8 +7,10 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::Serialize;
 use tokio::sync::broadcast;
 
-/// Events kept for late readers, and in flight for each subscriber.
-const KEPT: usize = 256;
+/// Events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
+pub const BURST: usize = 16_384;
+/// Events kept for late readers.
+const KEPT: usize = 4096;
 /// Refused commands told of one drive within [`REFUSALS_IN`]: a client without authority can send them at any rate.
 const REFUSALS: u32 = 10;
 /// The time for which refused commands are counted.
@@ -146,7 +148,7 @@ impl Refusals {
 impl Default for Events {
     fn default() -> Self {
         Events {
-            sender: broadcast::channel(KEPT).0,
+            sender: broadcast::channel(BURST).0,
             kept: Arc::default(),
             refusals: Arc::default(),
         }
@@ -201,12 +203,12 @@ impl Events {
         });
     }
 
-    /// Hears all events from now on; a listener that is 256 behind loses the oldest.
+    /// Hears all events from now on; a listener that is more than [`BURST`] behind loses the oldest.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
         self.sender.subscribe()
     }
 
-    /// The last events, oldest first.
+    /// The last 4,096 events, oldest first.
     pub fn recent(&self) -> Vec<Arc<Event>> {
         self.kept
             .lock()
@@ -221,6 +223,30 @@ impl Events {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    fn event(text: String) -> Event {
+        Event {
+            id: 0,
+            time: SystemTime::UNIX_EPOCH,
+            kind: EventKind::Offline,
+            bus: "line1".to_string(),
+            drive: None,
+            fault_code: None,
+            text,
+        }
+    }
+
+    #[test]
+    fn a_burst_of_all_drives_reaches_who_is_busy_and_who_comes_late() {
+        let events = Events::default();
+        let mut busy = events.subscribe();
+        (0..BURST).for_each(|n| events.tell(event(n.to_string())));
+        let heard = std::iter::from_fn(|| busy.try_recv().ok());
+        assert!(heard.map(|e| e.id).eq(1..=BURST as u64));
+        let kept = events.recent();
+        assert_eq!(kept.len(), KEPT);
+        assert_eq!(kept.last().map(|e| e.id), Some(BURST as u64));
+    }
 
     #[test]
     fn a_flood_of_refusals_is_counted_not_told() {

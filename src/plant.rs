@@ -1,4 +1,6 @@
-//! What the north sides see: images to read from, queues to write into.
+//! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
+
+mod placed;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -9,11 +11,13 @@ use tokio::sync::oneshot;
 use crate::cache::{BusImage, DriveImage, Reading};
 use crate::codec::{Table, describe};
 use crate::command::{
-    self, Answer, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
+    self, Answer, Authority, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
     WriteStats,
 };
 use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
+
+pub use self::placed::Placed;
 
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
@@ -54,22 +58,6 @@ pub struct DriveHandle {
     stale_after: Duration,
     events: Events,
     writes: Arc<WriteStats>,
-}
-
-/// An order that was given.
-struct Placed {
-    accepted: Instant,
-    answer: oneshot::Receiver<Answer>,
-}
-
-impl Placed {
-    async fn answered(self) -> Answer {
-        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
-        self.answer.await.unwrap_or(Answer {
-            outcome: Outcome::ShuttingDown,
-            latency: self.accepted.elapsed(),
-        })
-    }
 }
 
 /// What an order sets, with the values that are known before it.
@@ -144,7 +132,7 @@ impl BusHandle {
         })?;
         let order = Order::Points(vec![(index, value)]);
         let changes = changes(reading, &order);
-        let mut admitted = command::admit(order, reading, true)?;
+        let mut admitted = command::admit(order, reading, Authority::Write)?;
         admitted.reference_only = false;
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
@@ -156,15 +144,9 @@ impl BusHandle {
 
 impl Plant {
     /// Refuses a command to a drive that there is not; audited and counted. `why` names the nearest one.
-    pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin) -> Answer {
-        turn_away(
-            &self.writes,
-            drive,
-            what,
-            Outcome::Refused(Refusal::UnknownDrive(why)),
-            origin,
-            Instant::now(),
-        )
+    pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin, now: Instant) -> Answer {
+        let outcome = Outcome::Refused(Refusal::UnknownDrive(why));
+        turn_away(&self.writes, drive, what, outcome, origin, now)
     }
 
     /// All drives, bus by bus in the order of the file.
@@ -209,93 +191,52 @@ impl DriveHandle {
         self.bus.image.is_up()
     }
 
-    /// Gives an order to the drive and waits for its one answer.
+    /// Gives an order to the drive, at `now`. When this returns it is in the queue of the bus, behind all that was placed
+    /// before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
     ///
-    /// `may_write` says whether the client may write at all; the order is refused at once when it is not
-    /// admitted, the bus is down or the drive is offline. Refused writes are audited and told as an event.
-    pub async fn order(&self, order: Order, origin: Origin, may_write: bool, expiry: Duration) -> Answer {
-        self.begin(order, origin, may_write, expiry).0.answered().await
-    }
-
-    /// As [`DriveHandle::order`], and waits further for the read that shows the effect: the time from acceptance to
-    /// it, or `None` when no read showed it within the time that the profile gives.
-    pub async fn order_confirmed(
-        &self,
-        order: Order,
-        origin: Origin,
-        may_write: bool,
-        expiry: Duration,
-    ) -> (Answer, Option<Duration>) {
-        let (placed, confirmation) = self.begin(order, origin, may_write, expiry);
-        let answer = placed.answered().await;
-        let confirmed = if answer.outcome.is_ok() {
-            confirmation.await.ok()
-        } else {
-            None
-        };
-        (answer, confirmed)
-    }
-
-    fn begin(
-        &self,
-        order: Order,
-        origin: Origin,
-        may_write: bool,
-        expiry: Duration,
-    ) -> (Placed, oneshot::Receiver<Duration>) {
-        let accepted = Instant::now();
-        let reading = self.reading(accepted);
+    /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused writes
+    /// are audited and told as an event.
+    pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
+        let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
-        let (ticket, answer) = Ticket::new(
-            origin,
-            &self.image.spec.name,
-            what.clone(),
-            write,
-            accepted,
-            self.writes.clone(),
-        );
+        let name = &self.image.spec.name;
+        let (ticket, answer) = Ticket::new(origin, name, what.clone(), write, now, self.writes.clone());
         let mut ticket = ticket.with_changes(changes(&reading, &order));
-        let confirmation = ticket.confirmation();
-        match command::admit(order, &reading, may_write) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, accepted),
-            Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => {
-                ticket.answer(Outcome::Offline, accepted)
-            }
+        let placed = Placed::new(now, answer, ticket.confirmation());
+        match command::admit(order, &reading, authority) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
+            Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, now),
             Err(refusal) => {
-                self.tell_refusal(&what, &refusal.to_string(), ticket.origin());
-                ticket.answer(Outcome::Refused(refusal), accepted);
+                self.tell_refusal(&what, &refusal.to_string(), ticket.origin(), now);
+                ticket.answer(Outcome::Refused(refusal), now);
             }
-            Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, accepted),
+            Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
             // A stop goes to a drive that does not answer too: it may be back.
             Ok(admitted) if !reading.snapshot.link.is_online() && admitted.urgency != Urgency::Stop => {
-                ticket.answer(Outcome::Offline, accepted);
+                ticket.answer(Outcome::Offline, now);
             }
             Ok(admitted) => {
-                let command = Command::new(self.index, admitted, accepted + expiry, ticket);
-                self.bus.queue.submit(command, accepted);
+                let command = Command::new(self.index, admitted, now + expiry, ticket);
+                self.bus.queue.submit(command, now);
             }
         }
-        (Placed { accepted, answer }, confirmation)
+        placed
     }
 
     /// Refuses a command before it became an order; audited, counted and told like any other refusal.
-    pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin) -> Answer {
-        self.tell_refusal(what, &refusal.to_string(), &origin);
-        self.turn_away(what, Outcome::Refused(refusal), origin)
-    }
-
-    /// Answers a command that is not taken, for a reason that is not the client's fault; audited and counted.
-    pub fn turn_away(&self, what: &str, outcome: Outcome, origin: Origin) -> Answer {
-        turn_away(&self.writes, &self.image.spec.name, what, outcome, origin, Instant::now())
+    pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
+        self.tell_refusal(what, &refusal.to_string(), &origin, now);
+        let name = &self.image.spec.name;
+        turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
     }
 
     /// Tells that a command was refused; a flood of them is counted, not told.
-    pub fn tell_refusal(&self, what: &str, why: &str, origin: &Origin) {
+    fn tell_refusal(&self, what: &str, why: &str, origin: &Origin, now: Instant) {
         let what = if what.is_empty() { "an empty command" } else { what };
         let text = format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who);
         let spec = &self.image.spec;
-        self.events.tell_refusal(&spec.bus, &spec.name, text, Instant::now());
+        self.events.tell_refusal(&spec.bus, &spec.name, text, now);
     }
 
     fn describe(&self, order: &Order) -> String {

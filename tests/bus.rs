@@ -38,7 +38,7 @@ fn a_reply_of_impossible_length_ends_the_exchange_before_its_deadline() {
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
     let (now, ms) = (Instant::now(), Duration::from_millis);
-    let begin = || Transaction::new(Protocol::ModbusRtu, &request, &frame, now, ms(100), ms(7), false);
+    let begin = || Transaction::new(Protocol::ModbusRtu, request.clone(), frame.clone(), now, ms(100), ms(7), false);
     let mut transaction = begin();
     let Step::Wait(until) = transaction.on_bytes(now, &[1, 3, 0xFF]) else {
         panic!("the rest may still be on the line")
@@ -146,6 +146,7 @@ async fn a_fault_is_told_and_reset() {
         spec.supervision = Some(Supervision {
             timeout: Duration::from_secs(60),
             action: LeaseAction::Hold,
+            adopt: false,
         });
     })
     .await;
@@ -261,6 +262,7 @@ async fn a_lease_that_runs_out_stops_the_drive_once() {
         spec.supervision = Some(drivegate::cache::Supervision {
             timeout: Duration::from_millis(300),
             action: drivegate::cache::LeaseAction::Stop,
+            adopt: false,
         });
     })
     .await;
@@ -333,6 +335,7 @@ async fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
             spec.supervision = lease.then_some(Supervision {
                 timeout: Duration::from_secs(5),
                 action: LeaseAction::Stop,
+                adopt: false,
             });
         });
         let told = |rig: &Rig| {

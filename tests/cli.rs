@@ -165,7 +165,15 @@ fn the_report_of_a_sound_configuration() {
     let bus = &report["buses"][0];
     assert_eq!(
         keys(bus),
-        ["fast_cycle_ms", "load_ratio", "name", "requests", "slow_cycle_ms"]
+        [
+            "fast_cycle_ms",
+            "load_ratio",
+            "name",
+            "requests",
+            "shutdown_ms",
+            "shutdown_worst_ms",
+            "slow_cycle_ms"
+        ]
     );
     assert_eq!(
         (&bus["name"], &bus["fast_cycle_ms"], &bus["slow_cycle_ms"]),
@@ -234,7 +242,8 @@ fn the_tables_name_every_request() {
     let wanted = [
         "Bus line1: /dev/ttyUSB9 (not there now), modbus-rtu, 38400 8N1, silence 0.91 ms",
         " pump-1  fast   03 read holding     2100     11    11.44",
-        " pump-2  once   03 read holding      100      4",
+        " pump-2  slow   03 read holding      100      2",
+        " pump-2  once   03 read holding      102      2",
         "  fast cycle  50.0 ms (aimed at 50.0 ms)",
         "  line load   ",
         "drivegate.toml: ok, 1 bus, 2 drives, no warnings",
@@ -242,6 +251,23 @@ fn the_tables_name_every_request() {
     for wanted in wanted {
         assert!(ran.out.contains(wanted), "{wanted}\nis not in\n{}", ran.out);
     }
+}
+
+#[test]
+fn stops_at_shutdown_are_told_with_their_time() {
+    let (_dir, path) = sound();
+    assert!(
+        !run(&["check", "--config", &path]).out.contains("shutdown"),
+        "no drive is stopped"
+    );
+    let path = "tests/doubtful/shutdown.toml";
+    let ran = run(&["check", "--config", path]);
+    let wanted = "  shutdown    3 drives stopped in 0.15 s, 108.86 s where none answers\n";
+    assert!(ran.out.contains(wanted), "{}", ran.out);
+    let bus = &json(&run(&["check", "--json", "--config", path]))["buses"][0];
+    let seconds = |key: &str| bus[key].as_f64().unwrap() / 1e3;
+    assert!((seconds("shutdown_ms") - 0.15).abs() < 0.01, "{bus}");
+    assert!((seconds("shutdown_worst_ms") - 108.86).abs() < 0.01, "{bus}");
 }
 
 #[test]

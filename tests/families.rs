@@ -85,7 +85,8 @@ fn rig(family: &Family, protocol: Protocol) -> Rig {
     };
     Rig::of(setup, |spec| {
         // Families that do not tell their frequencies.
-        spec.frequency_range = Some(0.0..=60.0);
+        let told = spec.profile.point_index("maximum_frequency").is_some();
+        spec.frequency_range = (!told).then_some(0.0..=60.0);
     })
 }
 

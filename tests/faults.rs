@@ -15,7 +15,7 @@ use std::time::{Duration, Instant};
 use common::{Rig, Setup};
 use drivegate::cache::Outcome as Counted;
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
+use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
 use drivegate::drive::profile::Profile;
 use drivegate::plant::DriveHandle;
 use drivegate::sim::faults::{Fault, FaultPlan};
@@ -230,11 +230,10 @@ async fn write_on(rig: &Rig, address: u8, until: Instant) -> (usize, usize, Vec<
         writes += 1;
         let value = 1 + (writes as u16 % 9000);
         let order = Order::Write(RequestPdu::WriteRegister { address: 2002, value });
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "test".to_string(),
-        };
-        let answer = rig.handle(address).order(order, origin, true, DEFAULT_EXPIRY).await;
+        let origin = Origin::new(SourceKind::Mqtt, "test");
+        let handle = rig.handle(address);
+        let mut placed = handle.place(order, origin, Authority::Write, DEFAULT_EXPIRY, Instant::now());
+        let answer = placed.answered().await;
         if matches!(answer.outcome, Outcome::Acknowledged(_)) {
             acknowledged += 1;
             let has = rig

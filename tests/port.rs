@@ -103,7 +103,11 @@ async fn a_command_that_loses_its_port_is_answered_once() {
             assert!(
                 matches!(
                     outcome,
-                    Outcome::BusDown | Outcome::TimedOut | Outcome::Replaced | Outcome::Offline
+                    Outcome::BusDown
+                        | Outcome::TimedOut
+                        | Outcome::Replaced
+                        | Outcome::Offline
+                        | Outcome::Interrupted(_)
                 ),
                 "{outcome:?}"
             );

@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::cache::{BusImage, DriveImage, Link};
 use drivegate::codec::{Exception, Reply, RequestPdu, Table};
-use drivegate::command::{Command, CommandQueue, Order, Outcome, Urgency};
+use drivegate::command::{Authority, Command, CommandQueue, Order, Outcome, Urgency};
 use drivegate::config::Settings;
 use drivegate::north::modbus_tcp::{Offline, Options, Uncached};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
@@ -118,7 +118,8 @@ fuzz_target!(|data: &[u8]| {
         options.uncached = Uncached::Refuse;
     }
     let plant = PLANT.clone();
-    let mut client = Offline::new(options, plant.clone(), Arc::default(), "fuzz", flags & 1 == 0);
+    let authority = if flags & 1 == 0 { Authority::Write } else { Authority::ReadOnly };
+    let mut client = Offline::new(options, plant.clone(), Arc::default(), ([127, 0, 0, 1], 502).into(), authority);
     let (mut sent, mut answers) = (Vec::new(), Vec::new());
     let mut transaction = 0u16;
     while let [kind, length, rest @ ..] = data {

@@ -66,8 +66,10 @@ pub struct CommandRun {
     /// Nothing is left but the end of a pulse, which is sent whatever happens.
     only_ends: bool,
     reply: Reply,
-    /// It, or a part of it, was on the wire.
+    /// It, or a part of it, was on the wire; a read of what the drive has before it is none of it.
     begun: bool,
+    /// Any step of it was on the wire.
+    reached_the_wire: bool,
     /// What the drive last said of its motor.
     running: bool,
     check: Check,
@@ -75,6 +77,8 @@ pub struct CommandRun {
     blind: bool,
     /// It waited for a late reply since its last step was chosen.
     held_up: bool,
+    /// A stop whose acknowledgement may have been a late reply.
+    waits_for_late: bool,
 }
 
 impl CommandRun {
@@ -127,10 +131,12 @@ impl CommandRun {
             only_ends: false,
             reply: Reply::Written,
             begun: false,
+            reached_the_wire: false,
             running: true,
             check: Check::NotYet,
             blind: false,
             held_up: false,
+            waits_for_late: false,
         }
     }
 
@@ -154,6 +160,12 @@ impl CommandRun {
         let own = [SourceKind::Supervision, SourceKind::Shutdown];
         let kind = |ticket: &Ticket| ticket.origin().kind;
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| !own.contains(&kind(ticket)))
+    }
+
+    /// Whether only supervision wants it.
+    pub fn is_of_supervision(&self) -> bool {
+        let kind = |ticket: &Ticket| ticket.origin().kind;
+        self.tickets.iter().all(|ticket| kind(ticket) == SourceKind::Supervision)
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -209,14 +221,31 @@ impl CommandRun {
         self.begun
     }
 
+    /// Whether any step of it was on the wire.
+    pub fn reached_the_wire(&self) -> bool {
+        self.reached_the_wire
+    }
+
     /// A step of it is on the wire.
     pub fn sent(&mut self, step: &Step) {
+        self.reached_the_wire = true;
         self.begun |= step.pdu.is_write() || self.urgency == Urgency::Read;
     }
 
     /// `unbegun` where nothing of it was sent; else that it was cut short, its end being unknown.
     fn unless_begun(&self, unbegun: Outcome, why: Interruption) -> Outcome {
         if self.begun { Outcome::Interrupted(why) } else { unbegun }
+    }
+
+    /// The answer to its last step may have been a late reply: the step is done again when none can come any more.
+    pub fn wait_for_late_replies(&mut self) {
+        self.tries.in_doubt = true;
+        self.waits_for_late = true;
+    }
+
+    /// Whether it waits while a late reply could pass for the answer to its step. A stop does only when it was sent once.
+    pub fn waits_for_late(&self) -> bool {
+        self.urgency != Urgency::Stop || self.waits_for_late
     }
 
     /// It must wait for a late reply: what it has read by then is old.

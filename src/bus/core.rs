@@ -160,6 +160,11 @@ impl BusCore {
         None
     }
 
+    /// The turn whose exchange is on the line.
+    pub fn asked(&self) -> Option<&Turn> {
+        self.asked.as_ref()
+    }
+
     /// A command came in while nothing was on the line: what goes next is chosen anew, but for a stop.
     pub fn command_came(&mut self) {
         if self.chosen.as_ref().is_some_and(|chosen| !chosen.turn.is_stop()) {

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant};
 use super::command_run::{CommandRun, KnownWords, Next, Step};
 use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
+use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use crate::cache::{DriveImage, Reading};
 use crate::codec::Reply;
@@ -80,7 +81,7 @@ impl DriveState {
     }
 
     /// What the begun commands want at `now`: that of the highest rank first. Those that are over are answered.
-    pub(super) fn wanted(&mut self, image: &DriveImage, now: Instant) -> Wanted {
+    pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
         let reading = image.reading(now, FRESH);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
@@ -95,8 +96,8 @@ impl DriveState {
                 match run.next(&self.words, profile, running, now) {
                     Next::Send(step) => {
                         // A stop waits for nobody: its bits are on the wire at once, whatever may still come back.
-                        let blocked = self.late.blocks(&step.pdu, now);
-                        if let Some(until) = blocked.filter(|_| urgency != Urgency::Stop) {
+                        let blocked = self.late.blocks(&step.pdu, now).max(n2_late.blocks(&step.pdu, now));
+                        if let Some(until) = blocked.filter(|_| run.waits_for_late()) {
                             run.hold_up();
                             wait(until.min(run.expires().max(now + Duration::from_millis(1))));
                             break;
@@ -135,7 +136,7 @@ impl DriveState {
             // A bit of another command must not bring back what an unanswered stop took away.
             self.words.forget();
         }
-        if run.is_of_client() && run.has_begun() {
+        if run.is_of_client() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
         if urgency == Urgency::Stop && outcome.is_ok() {
@@ -155,13 +156,11 @@ impl DriveState {
             return;
         };
         run.sent(step);
-        if step.pdu.is_write() {
-            if !run.is_reference_only() {
-                self.stopped = None;
-            }
-            if run.is_of_client() {
-                self.supervision.renew(now);
-            }
+        if step.pdu.is_write() && !run.is_reference_only() {
+            self.stopped = None;
+        }
+        if run.is_of_client() {
+            self.supervision.renew(now);
         }
     }
 
@@ -189,12 +188,24 @@ impl DriveState {
         }
     }
 
+    /// What supervision wants and was begun, but not sent, is taken back: a client commands the drive again.
+    pub(super) fn withdraw_supervision(&mut self, now: Instant) {
+        for run in &mut self.runs {
+            if let Some(run) = run.take_if(|run| run.is_of_supervision() && !run.has_begun()) {
+                run.finish(&Outcome::Withdrawn, now);
+            }
+        }
+    }
+
     /// The drive does not answer any more. A stop is tried on; what else was begun has failed.
     pub(super) fn went_offline(&mut self, now: Instant) {
         self.words.forget();
         self.stopped = None;
         for urgency in [Urgency::Command, Urgency::Read] {
             if let Some(run) = self.runs.get_mut(slot(urgency)).and_then(Option::take) {
+                if run.is_of_client() && run.reached_the_wire() {
+                    self.supervision.renew(now);
+                }
                 run.abandon(Outcome::Offline, Interruption::Offline, now);
             }
         }
@@ -209,7 +220,7 @@ impl DriveState {
     /// Everything that was begun is answered; what was acknowledged stays so.
     pub(super) fn close(&mut self, unbegun: &Outcome, why: Interruption, now: Instant) {
         for run in self.runs.iter_mut().filter_map(Option::take) {
-            if run.is_of_client() && run.has_begun() {
+            if run.is_of_client() && run.reached_the_wire() {
                 self.supervision.renew(now);
             }
             run.abandon(unbegun.clone(), why, now);
@@ -219,6 +230,6 @@ impl DriveState {
         self.late = LateReplies::default();
         self.stopped = None;
         self.silent_until = None;
-        self.supervision.settle();
+        self.supervision.settle(now);
     }
 }

@@ -153,6 +153,16 @@ impl LateReplies {
         true
     }
 
+    /// When the request was sent at the latest whose reply an answer to `pdu` at `now` may be: earlier than this one while a
+    /// late reply to the same request may come. To be asked before [`LateReplies::answered`].
+    pub fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
+        let same = self.expected.iter().find(|late| late.pdu == *pdu && late.ends() > now);
+        same.map_or(now, |late| {
+            late.since
+                .unwrap_or_else(|| now.checked_sub(late.late).unwrap_or(now))
+        })
+    }
+
     /// Whether any reply may still come.
     pub fn may_come(&self, now: Instant) -> bool {
         self.expected.iter().any(|late| late.ends() > now)

@@ -101,7 +101,7 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus at once; everything that waits is answered. The leases of its drives, for a bus that comes after.
+    /// Ends the bus after the exchange that is on the line; everything that waits is answered. The leases of its drives, for a bus that comes after.
     pub fn stop(mut self) -> Vec<Lease> {
         self.halt()
     }
@@ -198,9 +198,11 @@ impl Worker {
 
     fn serve(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
-        while !self.stopping() {
+        // The exchange on the line is ended first: whoever comes after would talk into its reply.
+        while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
             let woken = match core.poll(now) {
+                Action::Send if self.stopping() => return Ok(()),
                 Action::Send => {
                     // A thread that was held up may not have seen the last bytes.
                     let count = line.receive(&mut buffer)?;

@@ -11,6 +11,10 @@ use crate::drive::plan::WireTime;
 /// A line that never falls silent is spoken on after this time: a stop must get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
 
+/// After so many replies in a row that came faster than the wire could carry them the line has no wire time: a simulation, or
+/// another baud rate behind a device server. A single one may be a late reply, or one that came twice.
+const UNTIMED: u32 = 3;
+
 /// How a request is to be sent.
 #[derive(Debug, Clone, Copy)]
 pub struct Sending {
@@ -47,8 +51,8 @@ pub struct LineState {
     quiet_since: Instant,
     /// The adapter sends back what it is given.
     echo: bool,
-    /// Replies come faster than the wire could carry them: a simulation, or another baud rate behind a device server.
-    untimed: bool,
+    /// Replies in a row that came faster than the wire could carry them.
+    early_replies: u32,
     underway: Option<Underway>,
 }
 
@@ -70,7 +74,7 @@ impl LineState {
             silence,
             quiet_since: now,
             echo: false,
-            untimed: false,
+            early_replies: 0,
             underway: None,
         }
     }
@@ -112,8 +116,8 @@ impl LineState {
         let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
-        transaction.pass_over(late);
-        if doubtful && !self.untimed {
+        transaction.expect_late(late);
+        if doubtful && self.early_replies < UNTIMED {
             transaction.doubt_before(earliest);
         }
         self.quiet_since = sent;
@@ -166,11 +170,13 @@ impl LineState {
             doubtful,
         } = self.underway.take()?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
-        self.untimed |= match &ended {
-            Ended::Reply(Reply::Exception(_)) => false,
-            Ended::Reply(_) => !doubtful && now < earliest,
-            Ended::Silent | Ended::Corrupt(_) => transaction.doubted(),
-        };
+        match &ended {
+            Ended::Reply(Reply::Exception(_)) => {}
+            Ended::Reply(_) if now >= earliest => self.early_replies = 0,
+            Ended::Reply(_) if doubtful => {}
+            Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
+            _ => self.early_replies = self.early_replies.saturating_add(1),
+        }
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
         Some(Exchanged {

@@ -18,7 +18,7 @@ use super::command_run::StepPurpose;
 use super::drive_state::{DriveState, FRESH};
 use super::late_replies::look_alike;
 use super::line_state::Sending;
-use super::n2_late_replies::N2LateReplies;
+use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
 use super::schedule::{Cadence, Poll, Schedule};
@@ -34,6 +34,8 @@ use crate::plant::{BusHandle, turn_away};
 
 /// The bus looks around at least this often.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
+/// Response timeouts for which an N2 reply may come late.
+const N2_LATE: u32 = 3;
 /// Time for the first byte of the reply to a probe of a drive that does not answer: probed every 10 s, it costs less than
 /// 2 % of the line by that.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
@@ -257,10 +259,15 @@ impl Master {
             drive.sent(*slot, &step, now);
         }
         self.late_before = self.n2_late.may_come(now) || self.drives.iter().any(|drive| drive.late.may_come(now));
-        let last = self.last_answered.as_ref().filter(|(of, _)| *of == turn.drive);
+        let last = self.last_answered.as_ref();
+        let n2 = !self.sessions.is_empty();
         Sending {
             response_timeout: self.timeout_of(turn),
-            could_be_doubled: last.is_some_and(|(_, last)| look_alike(last, &turn.pdu)),
+            // An N2 reply does not even show whose it is.
+            could_be_doubled: last.is_some_and(|(of, last)| match n2 {
+                true => n2_look_alike(last, &turn.pdu),
+                false => *of == turn.drive && look_alike(last, &turn.pdu),
+            }),
         }
     }
 
@@ -311,10 +318,11 @@ pub(super) fn supervise(
         Demand::None => {}
         Demand::Withdraw => {
             bus.queue.lock().withdraw_supervision(index, now);
-            supervision.withdrawn();
+            drive.withdraw_supervision(now);
+            drive.supervision.withdrawn(now);
         }
         Demand::Write(point, value) => {
-            let origin = Origin::gateway(SourceKind::Supervision, "supervision");
+            let origin = Origin::new(SourceKind::Supervision, "supervision");
             let ordered = bus.own_order(index, &reading, (point, value), origin.clone(), DEFAULT_EXPIRY, writes);
             if let Some(refusal) = supervision.ordered(ordered, now) {
                 let what = format!("{}={value}", point.name());

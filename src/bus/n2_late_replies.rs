@@ -1,9 +1,10 @@
 //! Late replies on an N2 line. Pure: time is an argument.
 //!
 //! An N2 reply names neither drive nor request; it shows only its form. After an exchange without a believable answer,
-//! the reply may come during a later exchange, of whichever drive. So the line remembers which forms may still come.
-//! The first frame that could be one of them is passed over as nobody's, and the exchange goes on until its deadline: if it
-//! was the late one, the true reply follows; if not, the exchange fails and the request is sent again. No request has to wait.
+//! the reply may come during a later exchange, of whichever drive. So the line remembers which forms may still come, and
+//! for how long. Meanwhile no request goes out whose reply has such a form; others go on. A frame of a form that cannot be
+//! the reply of the present exchange is the late one, which is not expected any more from then on. What a reply shares
+//! with a late one by chance, such as a refusal, is not believed.
 
 use std::time::{Duration, Instant};
 
@@ -11,13 +12,11 @@ use crate::codec::RequestPdu;
 use crate::codec::n2::command::Answer;
 use crate::codec::n2::{Form, form};
 
-/// A reply that has not come by then will not come.
-const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
 /// Late replies remembered; beyond that the oldest is forgotten.
 const KEPT: usize = 16;
 
 /// The replies that may still come on one line.
-#[derive(Debug, Default)]
+#[derive(Debug, Clone, Default)]
 pub struct N2LateReplies(Vec<Late>);
 
 #[derive(Debug, Clone, Copy)]
@@ -28,15 +27,27 @@ struct Late {
     until: Instant,
 }
 
+/// What a sound frame is in an exchange.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Taken {
+    /// As far as late replies are concerned it may be the reply.
+    Reply,
+    /// It is a late reply: so many bytes are to be dropped.
+    Late(usize),
+    /// It may be the reply or a late one. As many are to come as before, perhaps the reply itself.
+    Doubtful,
+}
+
 impl N2LateReplies {
-    /// No believable answer to `pdu` came until `now`. `device` is the type by which the drive identifies itself.
-    pub fn given_up(&mut self, pdu: &RequestPdu, device: u8, now: Instant) {
+    /// No believable answer to `pdu` came until `now`, and none will later than in the time of `window`. `device` is the
+    /// type by which the drive identifies itself.
+    pub fn given_up(&mut self, pdu: &RequestPdu, device: u8, window: Duration, now: Instant) {
         self.0.retain(|late| late.until > now);
         if self.0.len() >= KEPT {
             self.0.remove(0);
         }
         if let Some(form) = form(pdu) {
-            let until = now + FORGOTTEN_AFTER;
+            let until = now + window;
             self.0.push(Late { form, device, until });
         }
     }
@@ -51,39 +62,93 @@ impl N2LateReplies {
         self.0.clear();
     }
 
-    /// The length of the frame at the beginning of `bytes`, if it could be a late reply, which is then not expected any
-    /// more.
-    pub fn pass_over(&mut self, bytes: &[u8], now: Instant) -> Option<usize> {
+    /// Until when a request must wait because a late reply could pass for its own.
+    pub fn blocks(&self, pdu: &RequestPdu, now: Instant) -> Option<Instant> {
+        let wanted = form(pdu)?;
+        let alike = |late: &&Late| late.until > now && late.form.is_like(wanted);
+        self.0.iter().filter(alike).map(|late| late.until).max()
+    }
+
+    /// What the whole frame at the beginning of `bytes` is, received at `now` in the exchange of `pdu`.
+    pub fn take(&mut self, pdu: &RequestPdu, bytes: &[u8], now: Instant) -> Taken {
         self.0.retain(|late| late.until > now);
-        if self.0.is_empty() {
-            return None;
+        let Some((used, answer)) = frame(bytes).filter(|_| !self.0.is_empty()) else {
+            return Taken::Reply;
+        };
+        let Some(index) = self.0.iter().position(|late| late.could_be(&answer)) else {
+            return Taken::Reply;
+        };
+        if form(pdu).is_some_and(|form| has_form(form, &answer)) || matches!(answer, Answer::Nak(_)) {
+            return Taken::Doubtful;
         }
-        let begin = bytes.iter().position(u8::is_ascii_graphic)?;
-        let frame = bytes.get(begin..)?;
-        let length = frame.iter().position(|byte| *byte == b'\r')?;
-        let answer = Answer::decode(frame.get(..length)?).ok()?;
-        let index = self.0.iter().position(|late| late.could_be(&answer))?;
         self.0.remove(index);
-        Some(begin + length + 1)
+        Taken::Late(used)
+    }
+
+    /// The answer to `pdu` was doubtful: if it was the late one, the reply itself may still come.
+    pub fn doubted(&mut self, pdu: &RequestPdu, window: Duration, now: Instant) {
+        let Some(wanted) = form(pdu) else { return };
+        let until = now + window;
+        if let Some(late) = self.0.iter_mut().find(|late| late.form.is_like(wanted)) {
+            late.until = late.until.max(until);
+        }
+    }
+}
+
+/// Whether the reply to one of these requests could pass for the reply to the other.
+pub fn n2_look_alike(a: &RequestPdu, b: &RequestPdu) -> bool {
+    let forms = form(a).zip(form(b));
+    forms.is_none_or(|(a, b)| a.is_like(b) || b.is_like(a))
+}
+
+/// The first whole and sound frame, and the bytes up to its end.
+fn frame(bytes: &[u8]) -> Option<(usize, Answer)> {
+    let begin = bytes.iter().position(u8::is_ascii_graphic)?;
+    let frame = bytes.get(begin..)?;
+    let length = frame.iter().position(|byte| *byte == b'\r')?;
+    let answer = Answer::decode(frame.get(..length)?).ok()?;
+    Some((begin + length + 1, answer))
+}
+
+fn has_form(form: Form, answer: &Answer) -> bool {
+    let digits = match answer {
+        Answer::Nak(_) => return false,
+        Answer::Ack => 0,
+        Answer::Data(digits) => digits.len(),
+    };
+    match form {
+        Form::Acknowledgement => digits == 0,
+        Form::State | Form::Identity => digits == 2,
+        Form::Integer => matches!(digits, 4 | 6),
+        Form::Float => matches!(digits, 8 | 10),
+        // Records have five digits or thirteen.
+        Form::Changes => digits == 0 || digits >= 5,
     }
 }
 
 impl Late {
     fn could_be(&self, answer: &Answer) -> bool {
-        let digits = match answer {
+        match (self.form, answer) {
             // Whatever was asked may have been refused.
-            Answer::Nak(_) => return true,
-            Answer::Ack => &[][..],
-            Answer::Data(digits) => digits.as_slice(),
-        };
-        match self.form {
-            Form::Acknowledgement => digits.is_empty(),
-            Form::State => digits.len() == 2,
-            Form::Identity => digits.eq_ignore_ascii_case(format!("{:02X}", self.device).as_bytes()),
-            Form::Integer => matches!(digits.len(), 4 | 6),
-            Form::Float => matches!(digits.len(), 8 | 10),
-            // Records have five digits or thirteen.
-            Form::Changes => digits.is_empty() || digits.len() >= 5,
+            (_, Answer::Nak(_)) => true,
+            (Form::Identity, Answer::Data(digits)) => {
+                digits.eq_ignore_ascii_case(format!("{:02X}", self.device).as_bytes())
+            }
+            (form, answer) => has_form(form, answer),
+        }
+    }
+}
+
+impl Form {
+    /// Whether a late reply of this form could pass for one of that. A late identity is told from a state by its value.
+    fn is_like(self, wanted: Form) -> bool {
+        use Form::{Acknowledgement, Changes, Float, Identity, Integer, State};
+        match (self, wanted) {
+            (Acknowledgement | Changes, Acknowledgement | Changes) => true,
+            (Changes, Float | Integer) | (Float | Integer, Changes) => true,
+            (State, State | Identity) | (Identity, Identity) => true,
+            (Integer, Integer) | (Float, Float) => true,
+            _ => false,
         }
     }
 }
@@ -94,36 +159,45 @@ mod tests {
     use crate::codec::Table;
     use crate::codec::n2::Session;
 
+    const WINDOW: Duration = Duration::from_millis(750);
+
     fn read(table: Table, start: u16, count: u16) -> RequestPdu {
         RequestPdu::Read { table, start, count }
     }
 
     #[test]
-    fn the_first_frame_of_that_form_is_passed_over_once() {
+    fn what_could_be_mistaken_waits_and_another_form_settles_it() {
         let now = Instant::now();
+        let float = read(Table::Input, 0, 2);
+        let state = read(Table::DiscreteInput, 0, 1);
         let mut late = N2LateReplies::default();
-        assert_eq!(late.pass_over(b"A4248000092\r", now), None);
-        late.given_up(&read(Table::Input, 0, 2), 0x10, now);
-        assert_eq!(late.pass_over(b"A0060\r", now), None, "a byte is no float");
-        assert_eq!(late.pass_over(b"A424800", now), None, "not whole");
-        assert_eq!(late.pass_over(b"A4248000093\r", now), None, "a wrong checksum");
-        assert_eq!(late.pass_over(b"A4248000092\r", now), Some(12));
-        assert_eq!(late.pass_over(b"A4248000092\r", now), None, "it came");
-        late.given_up(&read(Table::Input, 0, 2), 0x10, now);
-        assert_eq!(late.pass_over(b"N01\r", now), Some(4), "a refusal may be that of any request");
-        late.given_up(&read(Table::Input, 0, 2), 0x10, now);
-        assert!(late.may_come(now) && !late.may_come(now + FORGOTTEN_AFTER));
-        assert_eq!(late.pass_over(b"A4248000092\r", now + FORGOTTEN_AFTER), None, "forgotten");
+        assert_eq!(late.take(&float, b"A4248000092\r", now), Taken::Reply);
+        late.given_up(&float, 0x10, WINDOW, now);
+        assert_eq!(late.blocks(&read(Table::Input, 8, 2), now), Some(now + WINDOW));
+        assert_eq!(late.blocks(&state, now), None);
+        assert_eq!(late.take(&state, b"A0060\r", now), Taken::Reply, "a byte is no float");
+        assert_eq!(late.take(&state, b"A424800", now), Taken::Reply, "not whole");
+        assert_eq!(late.take(&state, b"A4248000093\r", now), Taken::Reply, "a wrong checksum");
+        assert_eq!(late.take(&state, b"N01\r", now), Taken::Doubtful, "whose refusal is it?");
+        assert_eq!(late.take(&float, b"A4248000092\r", now), Taken::Doubtful);
+        assert_eq!(late.take(&state, b"A4248000092\r", now), Taken::Late(12));
+        assert_eq!(late.blocks(&float, now), None, "it came");
+        late.given_up(&float, 0x10, WINDOW, now);
+        assert!(late.may_come(now) && !late.may_come(now + WINDOW));
+        assert_eq!(late.take(&float, b"A4248000092\r", now + WINDOW), Taken::Reply, "forgotten");
     }
 
     #[test]
     fn the_late_identity_of_a_dead_drive_costs_the_others_nothing() {
         let now = Instant::now();
+        let state = read(Table::DiscreteInput, 0, 1);
         let mut late = N2LateReplies::default();
-        late.given_up(&RequestPdu::N2(Session::Identify), 0x10, now);
-        for reply in [&b"A0060\r"[..], b"A4064\r", b"A4248000092\r", b"A\r"] {
-            assert_eq!(late.pass_over(reply, now), None);
+        late.given_up(&RequestPdu::N2(Session::Identify), 0x10, WINDOW, now);
+        for pdu in [read(Table::Input, 0, 2), state.clone(), read(Table::Input, 0x4000, 1)] {
+            assert_eq!(late.blocks(&pdu, now), None);
         }
-        assert_eq!(late.pass_over(b"A1061\r", now), Some(6));
+        assert_eq!(late.take(&state, b"A4064\r", now), Taken::Reply);
+        assert_eq!(late.take(&state, b"A1061\r", now), Taken::Doubtful);
+        assert_eq!(late.take(&read(Table::Input, 0, 2), b"A1061\r", now), Taken::Late(6));
     }
 }

@@ -21,7 +21,7 @@ pub enum News {
         read: PlannedRead,
         /// What it said, a word for each item.
         words: Vec<u16>,
-        /// When.
+        /// When, at the latest: earlier than now where it may have been the reply to an earlier try.
         at: Instant,
     },
     /// The drive answers (again).

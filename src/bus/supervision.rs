@@ -30,6 +30,8 @@ enum State {
     /// No client was heard of since the gateway started.
     #[default]
     Unheard,
+    /// Neither, and it was reported that the drive runs.
+    RunsUnheard,
     /// It runs since then.
     Held(Instant),
     /// It ran out while the drive ran, and the action is not acknowledged yet.
@@ -67,8 +69,6 @@ pub(super) struct Supervision {
     refused: Option<Refusal>,
     /// It was reported that the drive does not say whether it runs.
     blind_reported: bool,
-    /// A drive that runs without a lease was reported.
-    unsupervised: bool,
 }
 
 impl Supervision {
@@ -84,7 +84,7 @@ impl Supervision {
 
     /// Whether any client was heard of since the gateway started.
     pub(super) fn was_heard(&self) -> bool {
-        self.lease.0 != State::Unheard
+        !matches!(self.lease.0, State::Unheard | State::RunsUnheard)
     }
 
     /// A client was heard of: its order reached the wire, or ended, or its heartbeat came.
@@ -113,8 +113,8 @@ impl Supervision {
         let held = orders.held_until.is_some_and(|until| until > now);
         match self.lease.0 {
             State::Unheard => {
-                if !self.unsupervised && !held && reading.is_set(ModelPoint::Running) {
-                    self.unsupervised = true;
+                if !held && reading.is_set(ModelPoint::Running) {
+                    self.lease = Lease(State::RunsUnheard);
                     news.push(News::RunsUnsupervised(drive, if spec.adopt { Adopted::Yes } else { Adopted::No }));
                     if spec.adopt {
                         self.renew(now);
@@ -122,7 +122,9 @@ impl Supervision {
                 }
                 Demand::None
             }
-            State::Ended => Demand::None,
+            State::Ended | State::RunsUnheard => Demand::None,
+            // The action of the lease before, which a client that is back has suspended for good.
+            State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
                 if now.saturating_duration_since(since) >= spec.timeout && !held {
                     self.runs_out(reading, words, news, drive);
@@ -132,14 +134,15 @@ impl Supervision {
                     _ => Demand::None,
                 }
             }
-            State::RanOut if held => {
-                // Suspended: whoever is back decides, if the order reaches the wire.
-                match self.answer.is_some() {
-                    true => Demand::Withdraw,
-                    false => Demand::None,
+            State::RanOut => {
+                self.note_answer(now);
+                match self.lease.0 {
+                    // Suspended: whoever is back decides, if the order reaches the wire.
+                    State::RanOut if held && self.answer.is_some() => Demand::Withdraw,
+                    State::RanOut if !held => self.act(reading, now),
+                    _ => Demand::None,
                 }
             }
-            State::RanOut => self.act(reading, now),
         }
     }
 
@@ -188,23 +191,21 @@ impl Supervision {
         }))
     }
 
+    /// Takes note of what became of the action that is on its way.
+    fn note_answer(&mut self, now: Instant) {
+        let Some(answer) = &mut self.answer else { return };
+        match answer.try_recv() {
+            Err(TryRecvError::Empty) => return,
+            Ok(answer) if answer.outcome.is_ok() => self.lease = Lease(State::Ended),
+            Ok(_) | Err(TryRecvError::Closed) => self.next_try = Some(now + AGAIN),
+        }
+        self.answer = None;
+    }
+
     /// Writes the action. Nothing reaches a drive that does not answer: it is written when the drive is back.
     fn act(&mut self, reading: &Reading<'_>, now: Instant) -> Demand {
-        if let Some(answer) = &mut self.answer {
-            match answer.try_recv() {
-                Err(TryRecvError::Empty) => return Demand::None,
-                Ok(answer) if answer.outcome.is_ok() => {
-                    self.answer = None;
-                    self.lease = Lease(State::Ended);
-                    return Demand::None;
-                }
-                Ok(_) | Err(TryRecvError::Closed) => {
-                    self.answer = None;
-                    self.next_try = Some(now + AGAIN);
-                }
-            }
-        }
-        let due = self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
+        let waits = self.answer.is_some();
+        let due = !waits && self.next_try.is_none_or(|at| at <= now) && reading.snapshot.link.is_online();
         match reading.spec.supervision.as_ref().map(|s| &s.action) {
             Some(LeaseAction::Stop) if due => Demand::Write(ModelPoint::Run, Value::Bool(false)),
             Some(LeaseAction::SpeedReference(percent)) if due => {
@@ -230,23 +231,23 @@ impl Supervision {
         }
     }
 
-    /// The queued action was taken back.
-    pub(super) fn withdrawn(&mut self) {
-        // One that has begun meanwhile is answered all the same; what it did stands.
-        if let Some(answer) = &mut self.answer
-            && !matches!(answer.try_recv(), Err(TryRecvError::Empty))
-        {
-            self.answer = None;
+    /// The action was taken back, unless it is on the wire: then it is answered all the same, and what it did stands.
+    pub(super) fn withdrawn(&mut self, now: Instant) {
+        match self.lease.0 {
+            State::RanOut => {
+                self.note_answer(now);
+                if self.answer.is_none() {
+                    self.next_try = None;
+                }
+            }
+            _ => self.answer = None,
         }
     }
 
     /// Takes note of what was answered, before a bus ends: what was acknowledged is not due again.
-    pub(super) fn settle(&mut self) {
-        if self.lease.0 == State::RanOut
-            && let Some(answer) = &mut self.answer
-            && answer.try_recv().is_ok_and(|answer| answer.outcome.is_ok())
-        {
-            self.lease = Lease(State::Ended);
+    pub(super) fn settle(&mut self, now: Instant) {
+        if self.lease.0 == State::RanOut {
+            self.note_answer(now);
         }
     }
 }

@@ -10,13 +10,16 @@
 
 use std::time::{Duration, Instant};
 
-use super::n2_late_replies::N2LateReplies;
+use super::n2_late_replies::{N2LateReplies, Taken};
 use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
 
 /// Most bytes looked at in one exchange: more is babble, whatever it says.
 const MOST_BYTES: usize = 1024;
 /// Silence, in characters, behind garbage after which no more of it is expected.
 const GARBAGE_GAP: u32 = 4;
+
+/// Why the answer of an exchange is not believed that may be a late one to an earlier request.
+pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
 /// How an exchange ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -103,8 +106,8 @@ impl Transaction {
         self.doubted
     }
 
-    /// Frames that could be late replies of earlier exchanges are passed over.
-    pub fn pass_over(&mut self, late: N2LateReplies) {
+    /// What may still come of earlier exchanges on an N2 line.
+    pub fn expect_late(&mut self, late: N2LateReplies) {
         self.late = late;
     }
 
@@ -142,12 +145,16 @@ impl Transaction {
             if self.strip_echo() {
                 continue;
             }
-            if let Some(used) = self.late.pass_over(&self.received, now) {
-                self.foreign += 1;
-                self.received.drain(..used.min(self.received.len()));
-                self.first_byte = (!self.received.is_empty()).then_some(now);
-                self.garbage = None;
-                continue;
+            match self.late.take(&self.request.pdu, &self.received, now) {
+                Taken::Reply => {}
+                Taken::Late(used) => {
+                    self.foreign += 1;
+                    self.received.drain(..used.min(self.received.len()));
+                    self.first_byte = (!self.received.is_empty()).then_some(now);
+                    self.garbage = None;
+                    continue;
+                }
+                Taken::Doubtful => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
             }
             match self.protocol.decode(&self.request, &self.received) {
                 Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => return self.replied(used, reply),

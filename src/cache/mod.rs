@@ -49,7 +49,7 @@ pub struct Supervision {
     pub timeout: Duration,
     /// What is done then, once.
     pub action: LeaseAction,
-    /// A drive that runs when the gateway starts gets its lease started then.
+    /// A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.
     pub adopt: bool,
 }
 

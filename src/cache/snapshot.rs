@@ -8,6 +8,9 @@ use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
 use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
 
+/// Oldest age of a parameter of the drive on which a command may rest, where the line can renew it faster.
+const PARAMETER_AGE: Duration = Duration::from_secs(5);
+
 /// Whether a drive answers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Link {
@@ -124,10 +127,10 @@ impl Snapshot {
         });
     }
 
-    /// The drive went away: what is read once may be otherwise when it returns, and is stale until it was read again.
+    /// The drive went away: what is read seldom may be otherwise when it returns, and is stale until it was read again.
     pub fn outlive(&mut self) {
-        let once = self.spans.iter_mut().filter(|span| span.class == PollClass::Once);
-        for cell in once.flat_map(|span| &mut Arc::make_mut(span).cells) {
+        let seldom = self.spans.iter_mut().filter(|span| span.class != PollClass::Fast);
+        for cell in seldom.flat_map(|span| &mut Arc::make_mut(span).cells) {
             cell.outlived = true;
         }
     }
@@ -145,6 +148,11 @@ impl Snapshot {
                 }
             }
         }
+    }
+
+    /// When the word at an address was last read.
+    pub fn read_at(&self, table: Table, address: u16) -> Option<Instant> {
+        self.cell(table, address).and_then(|(_, cell)| cell.at)
     }
 
     /// The last word read at an address, whatever its age.
@@ -280,8 +288,27 @@ impl Reading<'_> {
     /// The ends of a band: the drive's own, else the configured frequencies. A maximum that is a figure of the
     /// profile gives way to the configured one.
     pub fn band(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| sample.good())
+    }
+
+    /// As [`Reading::band`], for limits and conversions of commands: what the drive said longer than
+    /// [`Reading::parameter_age`] ago is not known.
+    pub fn band_for_commands(&self, minimum: Bound, maximum: Bound) -> Option<(f64, f64)> {
+        self.band_of(minimum, maximum, |sample| {
+            let age = self.now.saturating_duration_since(sample.at?);
+            sample.good().filter(|_| age <= self.parameter_age())
+        })
+    }
+
+    /// Oldest age of a parameter of the drive on which a limit or a conversion of a command may rest: 5 s or, where the
+    /// line is slower, one slow cycle of it, with an eighth for what comes between.
+    pub fn parameter_age(&self) -> Duration {
+        PARAMETER_AGE.max(self.slow_cycle + self.slow_cycle / 8)
+    }
+
+    fn band_of(&self, minimum: Bound, maximum: Bound, known: impl Fn(&Sample) -> Option<Value>) -> Option<(f64, f64)> {
         let own = |bound: Bound| match bound {
-            Bound::Point(point) => self.sample(point).good().map(Value::as_f64),
+            Bound::Point(point) => known(&self.sample(point)).map(Value::as_f64),
             Bound::Fixed(figure) => Some(figure),
         };
         let configured = self.spec.frequency_range.as_ref();
@@ -328,6 +355,14 @@ impl Reading<'_> {
         self.model(point).good().is_some_and(Value::as_bool)
     }
 
+    /// A bit of the model; `None` where the family has it and it is not good. What the family lacks is not set.
+    pub fn bit(&self, point: ModelPoint) -> Option<bool> {
+        match self.spec.profile.model_index(point) {
+            Some(index) => self.sample(index).good().map(Value::as_bool),
+            None => Some(false),
+        }
+    }
+
     /// Age of the process data; `None` if it was never read.
     pub fn age(&self) -> Option<Duration> {
         self.snapshot.fast_at.map(|at| self.now.saturating_duration_since(at))
@@ -338,19 +373,30 @@ impl Reading<'_> {
         !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > self.stale_after)
     }
 
-    /// The drive in one word.
-    pub fn state(&self) -> State {
+    /// The drive in one word; `None` while it answers and a point that decides is not good.
+    pub fn state(&self) -> Option<State> {
         if self.is_stale() {
-            State::Offline
-        } else if self.is_set(ModelPoint::Fault) {
-            State::Fault
-        } else if self.is_set(ModelPoint::Running) {
-            State::Running
-        } else if self.is_set(ModelPoint::Ready) {
-            State::Ready
-        } else {
-            State::NotReady
+            return Some(State::Offline);
         }
+        self.decided().ok()
+    }
+
+    /// What the points say that decide the state, in their order; else the quality of the first that says nothing. A
+    /// point that the family lacks decides nothing.
+    fn decided(&self) -> Result<State, Quality> {
+        const DECIDING: [(ModelPoint, State); 3] = [
+            (ModelPoint::Fault, State::Fault),
+            (ModelPoint::Running, State::Running),
+            (ModelPoint::Ready, State::Ready),
+        ];
+        for (point, state) in DECIDING {
+            match self.bit(point) {
+                Some(true) => return Ok(state),
+                Some(false) => {}
+                None => return Err(self.model(point).quality),
+            }
+        }
+        Ok(State::NotReady)
     }
 
     /// Text of the active fault; empty without a fault.
@@ -361,51 +407,18 @@ impl Reading<'_> {
         }
     }
 
-    /// Quality of the drive as a whole: that of its process data.
+    /// Quality of the drive as a whole: that of its process data and, while its state is not known, that of the point
+    /// for want of which it is not.
     pub fn overall(&self) -> Quality {
         if self.snapshot.fast_at.is_none() {
             Quality::Bad
         } else if self.is_stale() {
             Quality::Stale
         } else {
-            Quality::Good
+            self.decided().err().unwrap_or(Quality::Good)
         }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-    use crate::cache::DriveImage;
-    use crate::drive::profile::Profiles;
-
-    /// What rests on the drive's frequency range is no worse than the figures that it rests on.
-    #[test]
-    fn a_value_within_a_band_is_as_good_as_the_band() {
-        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
-        let index = |name: &str| profile.point_index(name).unwrap();
-        let reference = index("frequency_reference");
-        let image = DriveImage::new(
-            DriveSpec::new("pump-1", "line1", 1, profile.clone()),
-            Duration::from_secs(1),
-        );
-        let now = Instant::now();
-        let sample = || image.reading(now, Duration::from_secs(1)).sample(reference);
-        let store = |name: &str, value: f64| {
-            let raw = profile.points[index(name)].raw().unwrap().clone();
-            let words = raw.encode(Value::Number(value), 0).unwrap();
-            image.update(|s| s.store(raw.table, raw.address, &words, now));
-        };
-        image.update(|s| s.link = Link::Online(SystemTime::now()));
-        store("speed_reference", 50.0);
-        assert_eq!(sample(), Sample::NONE, "no range is known");
-        store("minimum_frequency", 10.0);
-        store("maximum_frequency", 50.0);
-        let expected = |quality| (Some(Value::Number(30.0)), quality);
-        assert_eq!((sample().value, sample().quality), expected(Quality::Good));
-        image.update(|s| s.link = Link::Offline(SystemTime::now()));
-        assert_eq!((sample().value, sample().quality), expected(Quality::Stale));
-        store("maximum_frequency", 10.0);
-        assert_eq!(sample(), Sample::NONE, "an empty range");
-    }
-}
+mod tests;

@@ -44,6 +44,9 @@ struct Bus<'a> {
     load_ratio: f64,
     fast_cycle_ms: Option<f64>,
     slow_cycle_ms: Option<f64>,
+    /// What the stops take at shutdown when all drives answer, and when none does.
+    shutdown_ms: f64,
+    shutdown_worst_ms: f64,
     requests: Vec<Request<'a>>,
 }
 
@@ -88,7 +91,7 @@ fn json(loaded: &Loaded) -> String {
 }
 
 fn bus_report(bus: &BusSettings) -> Bus<'_> {
-    let prediction = bus.predict();
+    let (prediction, shutdown) = (bus.predict(), bus.shutdown_time());
     let request = |request: &PredictedRequest| Request {
         drive: drive_name(bus, request),
         class: request.read.class.name(),
@@ -102,6 +105,8 @@ fn bus_report(bus: &BusSettings) -> Bus<'_> {
         load_ratio: prediction.load,
         fast_cycle_ms: prediction.fast_cycle.map(milliseconds),
         slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
+        shutdown_ms: milliseconds(shutdown.answered),
+        shutdown_worst_ms: milliseconds(shutdown.unanswered),
         requests: prediction.requests.iter().map(request).collect(),
     }
 }
@@ -193,4 +198,19 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
     cycle("fast", prediction.fast_cycle, bus.spec.cycle)
         + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)
         + &format!("  line load   {:.1} %{wanted}\n", prediction.load * 100.0)
+        + &shutdown(bus)
+}
+
+/// How long the stops take that the gateway writes at its end; nothing where it writes none.
+fn shutdown(bus: &BusSettings) -> String {
+    let time = bus.shutdown_time();
+    if time.drives == 0 {
+        return String::new();
+    }
+    format!(
+        "  shutdown    {} in {:.2} s, {:.2} s where none answers\n",
+        counted(time.drives, "drive stopped", "drives stopped"),
+        time.answered.as_secs_f64(),
+        time.unanswered.as_secs_f64()
+    )
 }

@@ -145,7 +145,7 @@ fn table(drives: &Value) -> String {
             text(at(drive, "/name")),
             text(at(drive, "/unit")),
             text(at(drive, "/profile")),
-            text(at(drive, "/state")),
+            at(drive, "/state").as_str().unwrap_or("unknown").to_string(),
             text(at(drive, "/age_ms")),
             good("output_frequency", 2),
             good("motor_speed", 0),
@@ -197,6 +197,8 @@ mod tests {
             row.contains("pump-1") && row.contains("25.00") && !row.contains("4.2"),
             "{text}"
         );
+        let unknown = json!([{"name": "fan-1", "state": null}]);
+        assert!(table(&unknown).contains("unknown"), "a state that is not known");
     }
 
     #[test]

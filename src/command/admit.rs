@@ -1,6 +1,6 @@
 //! Which commands are let through: authority first, then address, then value. Pure.
 
-use super::{Order, Refusal, Urgency};
+use super::{Authority, Order, Refusal, Urgency};
 use crate::cache::{Access, Reading};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
@@ -20,11 +20,11 @@ pub struct Admitted {
 
 /// Checks an order against what client and drive allow, the profile and the limits.
 ///
-/// `may_write` says whether the client may write at all.
+/// `client` says what the client may do at all.
 ///
 /// # Errors
 /// The refusal, in the order authority, address, value; nothing is clamped.
-pub fn admit(order: Order, drive: &Reading<'_>, may_write: bool) -> Result<Admitted, Refusal> {
+pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Admitted, Refusal> {
     match order {
         Order::Read(pdu) => Ok(Admitted {
             order: Order::Read(pdu),
@@ -32,7 +32,7 @@ pub fn admit(order: Order, drive: &Reading<'_>, may_write: bool) -> Result<Admit
             reference_only: false,
         }),
         Order::Write(pdu) => {
-            authority(drive, may_write)?;
+            authority(drive, client)?;
             raw_write(drive, &pdu)?;
             let urgency = if stops(drive, &pdu) {
                 Urgency::Stop
@@ -46,14 +46,14 @@ pub fn admit(order: Order, drive: &Reading<'_>, may_write: bool) -> Result<Admit
             })
         }
         Order::Points(values) => {
-            authority(drive, may_write)?;
+            authority(drive, client)?;
             points(drive, values)
         }
     }
 }
 
-fn authority(drive: &Reading<'_>, may_write: bool) -> Result<(), Refusal> {
-    if !may_write {
+fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> {
+    if client == Authority::ReadOnly {
         return Err(Refusal::NotAllowed(
             "this client may not write: its address is not in `write`, or, with TLS, its certificate has no role that \
              `roles` maps to \"control\""
@@ -164,7 +164,7 @@ fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<
             _ if point.write_to == Some(index) => Some(value),
             Source::Derived(derived) => match derived.band().filter(|(of, ..)| taken_by(*of) == index) {
                 Some((_, minimum, maximum)) => drive
-                    .band(minimum, maximum)
+                    .band_for_commands(minimum, maximum)
                     .and_then(|band| derived.value(&[value], Some(band))),
                 None => continue,
             },
@@ -172,9 +172,10 @@ fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<
         };
         let Some(figure) = figure.map(Value::as_f64) else {
             return Err(Refusal::NotKnown(format!(
-                "the limits of `{}` cannot be kept while the drive's frequency range is not known; set frequency_range \
-                 for the drive",
-                point.name
+                "the limits of `{}` cannot be kept while the drive's frequency range is not known, or was not read for \
+                 {:.0} s; set frequency_range for the drive",
+                point.name,
+                drive.parameter_age().as_secs_f64()
             )));
         };
         if !limits.contains(&figure) {
@@ -210,9 +211,11 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                     "`{name}` is made of other points and cannot be written"
                 )));
             };
-            let band = drive.band(minimum, maximum).ok_or_else(|| {
+            let band = drive.band_for_commands(minimum, maximum).ok_or_else(|| {
                 Refusal::NotKnown(format!(
-                    "`{name}` needs the drive's frequency range, which is not known; set frequency_range for the drive"
+                    "`{name}` needs the drive's frequency range, which is not known, or was not read for {:.0} s; set \
+                     frequency_range for the drive",
+                    drive.parameter_age().as_secs_f64()
                 ))
             })?;
             let base = drive.spec.profile.points.get(of);

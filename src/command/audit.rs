@@ -6,7 +6,6 @@ use std::time::{Duration, SystemTime};
 
 use serde::{Serialize, Serializer};
 
-use super::Origin;
 use crate::drive::Value;
 
 /// Records kept.
@@ -53,9 +52,9 @@ pub struct AuditRecord {
     /// From acceptance to the read that showed the effect, ms.
     #[serde(rename = "confirmed_ms", serialize_with = "milliseconds_or_null")]
     pub confirmed: Option<Duration>,
-    /// The client, apart from its connection: see [`Origin::client`].
+    /// The client among others: see [`super::Origin::client`].
     #[serde(skip)]
-    pub(super) share: String,
+    pub(super) share: Arc<str>,
 }
 
 fn bare<S: Serializer>(value: &Value, serializer: S) -> Result<S::Ok, S::Error> {
@@ -135,19 +134,9 @@ impl Audit {
     }
 }
 
-impl Origin {
-    /// The client apart from its connection: an address without its port; else as it is. Shares are reckoned by it,
-    /// so that a client gains nothing by opening more connections.
-    pub fn client(&self) -> String {
-        let address = self.who.parse::<std::net::SocketAddr>().map(|a| a.ip().to_string());
-        format!("{} {}", self.kind.name(), address.unwrap_or_else(|_| self.who.clone()))
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::command::SourceKind;
 
     fn record(share: &str, command: usize) -> AuditRecord {
         AuditRecord {
@@ -165,7 +154,7 @@ mod tests {
             text: String::new(),
             latency: Duration::from_micros(1500),
             confirmed: None,
-            share: share.to_string(),
+            share: share.into(),
         }
     }
 
@@ -197,17 +186,5 @@ mod tests {
         );
         assert_eq!(json["time"], "1970-01-01T00:00:00.000Z");
         assert!(json.get("share").is_none());
-    }
-
-    #[test]
-    fn more_connections_are_one_client() {
-        let origin = |who: &str| Origin {
-            kind: SourceKind::ModbusTcp,
-            who: who.to_string(),
-        };
-        assert_eq!(origin("127.0.0.1:4711").client(), origin("127.0.0.1:4712").client());
-        assert_ne!(origin("127.0.0.1:4711").client(), origin("127.0.0.2:4711").client());
-        assert_eq!(origin("[::1]:5").client(), "modbus_tcp ::1");
-        assert_eq!(origin("operator").client(), "modbus_tcp operator");
     }
 }

@@ -15,6 +15,7 @@ pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
 use std::fmt;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Exception, Reply, RequestPdu};
@@ -63,22 +64,43 @@ impl SourceKind {
     }
 }
 
-/// Who commands, for the audit.
+/// What a client may do at all; the drive may allow less.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Authority {
+    /// Read and write.
+    Write,
+    /// Read; every write is refused.
+    ReadOnly,
+}
+
+/// Who commands: for the audit, and as a client among others.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Origin {
     /// Kind of the source.
     pub kind: SourceKind,
-    /// Address, topic or certificate name.
+    /// Address, topic or certificate name, as the audit tells it.
     pub who: String,
+    client: Arc<str>,
 }
 
 impl Origin {
-    /// The gateway itself.
-    pub fn gateway(kind: SourceKind, who: &str) -> Origin {
-        Origin {
-            kind,
-            who: who.to_string(),
-        }
+    /// One that is a client by itself.
+    pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
+        let who = who.into();
+        let client = format!("{} {who}", kind.name()).into();
+        Origin { kind, who, client }
+    }
+
+    /// One that is `client` in all that is shared among clients: turns and places in the queue, records of the audit. A
+    /// client gains nothing there by more connections or topics, as long as they all name the same `client`.
+    pub fn of(client: Arc<str>, kind: SourceKind, who: impl Into<String>) -> Origin {
+        let who = who.into();
+        Origin { kind, who, client }
+    }
+
+    /// The client, whatever connection or topic it uses.
+    pub fn client(&self) -> &Arc<str> {
+        &self.client
     }
 }
 
@@ -252,7 +274,7 @@ impl fmt::Display for Outcome {
             Outcome::Expired => {
                 f.write_str("its time ran out before its turn came; it was not sent")
             }
-            Outcome::Replaced => f.write_str("a newer reference took its place; it was not sent"),
+            Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
             Outcome::Interrupted(why) => {

@@ -11,7 +11,7 @@ use tokio::sync::oneshot;
 
 use super::{Command, Order, Outcome, SourceKind, Urgency};
 
-/// Commands and forwarded reads that may wait on one bus, besides one stop for each drive.
+/// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
 pub const CAPACITY: usize = 64;
 /// Clients and drives whose turns are remembered.
 const SERVED_KEPT: usize = 4 * CAPACITY;
@@ -101,32 +101,24 @@ impl Pending {
         self.waiting.push_back(command);
     }
 
-    /// One stop of a drive waits. What joins it must not ask for more than is sent: the stop that does nothing else
-    /// gives way to one that does, and of two that do different things the newer one is sent.
-    fn push_stop(&mut self, mut stop: Command, now: Instant) {
+    /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for the
+    /// same, and are answered with it; of two that do different things besides the newer one is sent.
+    fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
         self.remove(now, &Outcome::Purged, |c| c.drive == drive && c.urgency == Urgency::Command);
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
         }
-        let waits = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop;
-        let Some(waiting) = self.waiting.iter_mut().find(waits) else {
-            self.waiting.push_back(stop);
-            return;
-        };
-        let expires = waiting.expires.max(stop.expires);
-        if stop.order == waiting.order || stop.is_bare_stop() {
-            waiting.joined.push(stop.ticket);
-        } else if waiting.is_bare_stop() {
-            stop.joined.append(&mut waiting.joined);
-            stop.overtaken = waiting.overtaken;
-            let bare = std::mem::replace(waiting, stop);
-            waiting.joined.push(bare.ticket);
-        } else {
-            std::mem::replace(waiting, stop).answer(&Outcome::Replaced, now);
-            return;
+        let bare = stop.is_bare_stop();
+        let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;
+        match self.waiting.iter_mut().find(alike) {
+            Some(waiting) if waiting.order == stop.order => {
+                waiting.expires = waiting.expires.max(stop.expires);
+                waiting.joined.push(stop.ticket);
+            }
+            Some(waiting) => std::mem::replace(waiting, stop).answer(&Outcome::Replaced, now),
+            None => self.waiting.push_back(stop),
         }
-        waiting.expires = expires;
     }
 
     /// The queued reference whose place a newer one takes.

@@ -46,7 +46,6 @@ impl WriteStats {
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
-    client: String,
     drive: String,
     what: String,
     changes: Vec<Change>,
@@ -72,7 +71,6 @@ impl Ticket {
     ) -> (Ticket, oneshot::Receiver<Answer>) {
         let (sender, receiver) = oneshot::channel();
         let ticket = Ticket {
-            client: origin.client(),
             origin,
             drive: drive.to_string(),
             what,
@@ -109,7 +107,7 @@ impl Ticket {
 
     /// The client, as shares are reckoned: see [`Origin::client`].
     pub fn client(&self) -> &str {
-        &self.client
+        self.origin.client()
     }
 
     /// Answers the command; nothing more is to be told of it.
@@ -146,7 +144,7 @@ impl Ticket {
         let record = AuditRecord {
             time: SystemTime::now(),
             source: self.origin.kind.name(),
-            share: std::mem::take(&mut self.client),
+            share: self.origin.client().clone(),
             client: std::mem::take(&mut self.origin.who),
             drive: std::mem::take(&mut self.drive),
             command: std::mem::take(&mut self.what),
@@ -196,10 +194,7 @@ pub(super) mod tests {
     use super::*;
 
     pub(crate) fn ticket(stats: &Arc<WriteStats>, now: Instant) -> (Ticket, oneshot::Receiver<Answer>) {
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "t".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "t");
         Ticket::new(origin, "d", "run=true".to_string(), true, now, stats.clone())
     }
 

@@ -11,7 +11,7 @@ use crate::codec::Protocol;
 use crate::document::{Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
-use crate::drive::{ModelPoint, Point, Profile, Value};
+use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
 
 /// Words of `access`.
 pub(super) const ACCESS: [(&str, Access); 2] = [("monitor", Access::Monitor), ("control", Access::Control)];
@@ -174,6 +174,16 @@ fn read_profile(reader: &Reader<'_>, around: &Surroundings<'_>, address: Option<
             format!("a drive of profile `{name}` cannot have address {address}; write {least} to {most}"),
         );
     }
+    let polled = |read: &PlannedRead| matches!(read.class, PollClass::Fast | PollClass::Slow);
+    if !Plan::of(profile).reads.iter().any(polled) {
+        reader.problem(
+            "profile",
+            format!(
+                "profile `{name}` has no point that is polled, so nobody could tell whether the drive answers; give a point of \
+                 it class = \"fast\" or \"slow\""
+            ),
+        );
+    }
     Some(profile.clone())
 }
 
@@ -321,12 +331,34 @@ fn read_supervision(
     }
     let timeout = values::optional_duration(&table, "timeout", &LEASE);
     let action = read_action(&table, profile, limits);
+    let adopt = table.or("adopt", false);
     table.finish();
+    if let Some(profile) = profile.filter(|profile| !tells_whether_it_runs(profile)) {
+        reader.problem(
+            "supervision",
+            format!(
+                "profile `{}` has neither `running` nor a run command that is read, so nobody could tell whether a drive whose \
+                 lease ran out is to be stopped; add one of them to the profile, or leave supervision out",
+                profile.name
+            ),
+        );
+    }
     Some(Supervision {
         timeout: timeout?,
         action: action?,
-        adopt: false,
+        adopt,
     })
+}
+
+/// Whether drives of that profile tell that they run, or at least that they were told to.
+fn tells_whether_it_runs(profile: &Profile) -> bool {
+    let plan = Plan::of(profile);
+    let is_told = |point| {
+        profile
+            .model_index(point)
+            .is_some_and(|index| plan.tells(profile, index))
+    };
+    is_told(ModelPoint::Running) || is_told(ModelPoint::Run)
 }
 
 fn read_action(

@@ -10,10 +10,12 @@ mod modbus_tcp;
 mod mqtt;
 mod north;
 pub mod schema;
+mod shutdown;
 mod unique;
 mod values;
 
 pub use log::{LogFormat, LogSettings};
+pub use shutdown::{OTHER_STOP_TIME, ShutdownTime, UNIT_STOP_TIME};
 
 pub(crate) use bus::{check_port, default_format};
 pub(crate) use drive::{addresses, unknown_profile};
@@ -243,6 +245,7 @@ fn judge(
     if reader.document().is_sound() {
         // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
         warn_of_idle_stops(reader, buses);
+        warn_of_long_shutdowns(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
         warn_of_cadence(reader, buses, written.map(|m| (m.stale_after, &m.stale_place)));
     }
@@ -329,6 +332,19 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
                  stale_after, leave it out, or lighten the bus",
                 settings.spec.name
             );
+            reader.document().warning(place, text);
+        }
+    }
+}
+
+/// Stops at shutdown that the service manager may not wait for.
+fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
+    for found in buses {
+        let stops = found.drives.iter().find_map(|drive| drive.shutdown_stop.as_ref());
+        let (Some(settings), Some(place)) = (&found.settings, stops) else {
+            continue;
+        };
+        if let Some(text) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
             reader.document().warning(place, text);
         }
     }

@@ -73,7 +73,7 @@ address = 7
 profile = "vacon-nx"
 access = "control"
 limits = { speed_reference = [0, 80.5] }
-supervision = { timeout = "5s", action = "hold" }
+supervision = { timeout = "5s", action = "hold", adopt = true }
 on_shutdown = "stop"
 turnaround = "0.5ms"
 frequency_range = [10, 50]
@@ -117,6 +117,14 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
     assert_eq!(drive.limits["speed_reference"], 0.0..=80.5);
     assert_eq!(drive.turnaround, Duration::from_micros(500));
     assert_eq!(drive.frequency_range, Some(10.0..=50.0));
+    let lease = crate::cache::Supervision {
+        timeout: Duration::from_secs(5),
+        action: crate::cache::LeaseAction::Hold,
+        adopt: true,
+    };
+    assert_eq!(drive.supervision, Some(lease));
+    let usual = settings(&FULL).buses.remove(0).drives.remove(0);
+    assert!(!usual.supervision.unwrap().adopt, "only where it is written");
     let fan = &all.buses[1].drives[0];
     assert_eq!(
         (fan.unit, fan.access, fan.turnaround),
@@ -255,5 +263,25 @@ fn the_environment_overrides_and_is_told_by_name() {
         "DRIVEGATE__BUSS__0__BAUD",
     ] {
         assert!(told.iter().any(|t| t.contains(name)), "{name} in {told:#?}");
+    }
+}
+
+/// Every family that ships tells that it runs, and whether it is there.
+#[test]
+fn every_family_can_be_supervised() {
+    for profile in Profiles::built_in().iter() {
+        for protocol in &profile.protocols {
+            let (family, protocol) = (&profile.name, protocol.name());
+            let source = format!(
+                "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/null\"\nprotocol = \"{protocol}\"\n\
+                 [[bus.drive]]\nname = \"d\"\naddress = 1\nprofile = \"{family}\"\naccess = \"control\"\n\
+                 on_shutdown = \"stop\"\nsupervision = {{ timeout = \"5s\" }}\n"
+            );
+            let time = settings(&source).buses[0].shutdown_time();
+            assert!(
+                time.drives == 1 && time.answered < time.unanswered,
+                "{family}: {time:?}"
+            );
+        }
     }
 }

@@ -99,12 +99,17 @@ impl Derived {
     /// All points that it rests on, the ends of a band among them.
     pub fn rests_on(&self) -> Vec<usize> {
         let mut points = self.sources();
+        points.extend(self.ends());
+        points
+    }
+
+    /// The points that are ends of its band.
+    pub fn ends(&self) -> impl Iterator<Item = usize> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
-        points.extend(ends.into_iter().flatten().filter_map(|bound| match bound {
+        ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
             Bound::Fixed(_) => None,
-        }));
-        points
+        })
     }
 
     /// The value in the unit of this point that `value` of its source means; `None` where there is none.

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use super::profile::{PollClass, Profile};
+use super::profile::{PollClass, Profile, Source};
 use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 
 /// One request of the plan.
@@ -68,6 +68,18 @@ impl Plan {
             reads.extend(merged);
         }
         Plan { reads }
+    }
+
+    /// Whether these requests tell a point of that profile: all that it lies in or rests on.
+    pub fn tells(&self, profile: &Profile, point: usize) -> bool {
+        match profile.points.get(point).map(|point| &point.source) {
+            Some(Source::Raw(raw)) => {
+                let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
+                raw.addresses().all(is_read)
+            }
+            Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(|of| self.tells(profile, of)),
+            None => false,
+        }
     }
 
     /// Splits a refused request in two halves, never within a value; a single value cannot be split.
@@ -206,8 +218,8 @@ mod tests {
                 .collect()
         };
         assert_eq!(of(PollClass::Fast), [(2100, 11)]);
-        assert_eq!(of(PollClass::Slow), [(7, 2), (2000, 3)]);
-        assert_eq!(of(PollClass::Once), [(100, 4), (732, 2)]);
+        assert_eq!(of(PollClass::Slow), [(7, 2), (100, 2), (2000, 3)]);
+        assert_eq!(of(PollClass::Once), [(102, 2), (732, 2)]);
     }
 
     fn profile(range: &str, addresses: &[u16]) -> Profile {

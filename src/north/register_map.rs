@@ -222,7 +222,7 @@ impl Entry {
     fn registers(&self, look: &Look<'_>) -> [u16; 2] {
         match self.content {
             Content::Status => [look.status(), 0],
-            Content::State => [look.state().code(), 0],
+            Content::State => [look.state().map_or(NO_U16, State::code), 0],
             Content::Age => [look.age_ms(), 0],
             Content::Point(point) => self.form.registers_of(look.good(point), self.per_unit),
             Content::Command => [look.command(), 0],
@@ -273,20 +273,24 @@ impl<'r> Look<'r> {
         self.reading.model(point).good().map(Value::as_f64)
     }
 
-    fn is_set(&self, point: ModelPoint) -> bool {
-        self.good(point).is_some_and(|v| v != 0.0)
+    /// A bit of the model; `None` where the family has it and it is not good.
+    fn bit(&self, point: ModelPoint) -> Option<bool> {
+        self.reading.bit(point).filter(|_| !self.stale)
     }
 
+    /// A bit that is not good is 0, and the word says so: it is stale as soon as one of its bits is not known.
     fn status(&self) -> u16 {
-        let bits = (0u16..).zip(STATUS_BITS).filter(|(_, point)| self.is_set(*point));
-        let bits = bits.fold(0, |word, (bit, _)| word | (1 << bit));
+        let mut word = if self.stale { STALE } else { 0 };
+        for (bit, point) in (0u16..).zip(STATUS_BITS) {
+            word |= self.bit(point).map_or(STALE, |set| u16::from(set) << bit);
+        }
         let online = self.bus_up && self.reading.snapshot.link.is_online();
-        bits | if self.stale { STALE } else { 0 } | if online { ONLINE } else { 0 }
+        word | if online { ONLINE } else { 0 }
     }
 
-    fn state(&self) -> State {
+    fn state(&self) -> Option<State> {
         if self.stale {
-            State::Offline
+            Some(State::Offline)
         } else {
             self.reading.state()
         }
@@ -300,11 +304,11 @@ impl<'r> Look<'r> {
 
     /// "Not available" has bits set that a command may not have, so that it cannot be written back unnoticed.
     fn command(&self) -> u16 {
-        let Some(run) = self.good(ModelPoint::Run) else {
+        let (Some(run), Some(reverse)) = (self.good(ModelPoint::Run), self.bit(ModelPoint::Reverse)) else {
             return NO_U16;
         };
         let run = if run != 0.0 { RUN } else { 0 };
-        run | if self.is_set(ModelPoint::Reverse) { REVERSE } else { 0 }
+        run | if reverse { REVERSE } else { 0 }
     }
 }
 

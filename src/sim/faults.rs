@@ -2,7 +2,7 @@
 
 use super::framing;
 use super::random::Random;
-use crate::codec::Protocol;
+use crate::codec::{Protocol, RequestPdu, Table};
 use crate::document::parse_duration;
 use std::collections::BTreeMap;
 use std::str::FromStr;
@@ -133,6 +133,8 @@ pub struct FaultPlan {
     rates: Rates,
     script: BTreeMap<u64, Fault>,
     only: Vec<u8>,
+    /// A register that one drive refuses to tell: address, table, register.
+    refused: Option<(u8, Table, u16)>,
     random: Random,
     asked: u64,
 }
@@ -150,6 +152,7 @@ impl FaultPlan {
             rates,
             script: BTreeMap::new(),
             only: Vec::new(),
+            refused: None,
             random: Random::new(seed),
             asked: 0,
         }
@@ -168,6 +171,25 @@ impl FaultPlan {
     pub fn only(mut self, addresses: &[u8]) -> FaultPlan {
         self.only = addresses.to_vec();
         self
+    }
+
+    /// Makes the drive at `address` refuse every read of that register with exception 02.
+    #[must_use]
+    pub fn refusing(mut self, address: u8, table: Table, register: u16) -> FaultPlan {
+        self.refused = Some((address, table, register));
+        self
+    }
+
+    /// Whether the drive at `address` refuses that request for what it reads.
+    pub fn refuses(&self, address: u8, request: &RequestPdu) -> bool {
+        let RequestPdu::Read { table, start, count } = request else {
+            return false;
+        };
+        let reads = |(of, refused, register): (u8, Table, u16)| {
+            let end = u32::from(*start) + u32::from(*count);
+            of == address && refused == *table && register >= *start && u32::from(register) < end
+        };
+        self.refused.is_some_and(reads)
     }
 
     /// The fault that the next request, one to `address`, meets.
@@ -329,7 +351,8 @@ fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
         Foreign::Address => address = if address >= 247 { 1 } else { address + 1 },
         Foreign::Function => {
             if let Some(function) = pdu.first_mut() {
-                *function = if *function == 3 { 4 } else { 3 };
+                // Also of an exception: the function that was asked for would be an answer.
+                *function = if *function & 0x7F == 3 { 4 } else { 3 };
             }
             // Whatever it was, it becomes a reply of one register unless it has registers already.
             if !registers {

@@ -120,6 +120,17 @@ pub struct Wake {
     pub delivery: bool,
 }
 
+/// A request that a drive acted upon, whatever became of its reply on the line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Act {
+    /// When the request was whole.
+    pub at: SimTime,
+    /// The drive.
+    pub address: u8,
+    /// The frame of its reply, as the drive made it.
+    pub reply: Vec<u8>,
+}
+
 /// A half-duplex line with its drives.
 #[derive(Debug)]
 pub struct HalfDuplex {
@@ -137,6 +148,8 @@ pub struct HalfDuplex {
     statistics: Statistics,
     lateness: Lateness,
     transcript: Transcript,
+    /// What the drives did since it was last asked, where somebody watches.
+    acts: Option<Vec<Act>>,
 }
 
 impl HalfDuplex {
@@ -154,7 +167,13 @@ impl HalfDuplex {
             statistics: Statistics::default(),
             lateness: Lateness::default(),
             transcript,
+            acts: None,
         }
+    }
+
+    /// What the drives did since the last call; from the first call on.
+    pub fn take_acts(&mut self) -> Vec<Act> {
+        self.acts.replace(Vec::new()).unwrap_or_default()
     }
 
     /// How the line behaves.
@@ -372,12 +391,21 @@ impl HalfDuplex {
         let fault = self.faults.next(asked.address);
         self.statistics.faults += u64::from(fault.is_some());
         let mut reply = Vec::with_capacity(64);
+        let refused = asked.request.as_ref().is_ok_and(|pdu| self.faults.refuses(asked.address, pdu));
         match fault {
+            None if refused => refuse(asked, Exception::ADDRESS, &mut reply),
             Some(Fault::Deaf) => return,
             Some(Fault::DeafEcho) => {}
             Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
             _ => {
                 self.slaves.answer(asked, now, &mut reply);
+                if let Some(acts) = &mut self.acts {
+                    acts.push(Act {
+                        at: now,
+                        address: asked.address,
+                        reply: reply.clone(),
+                    });
+                }
                 if reply.is_empty() {
                     return;
                 }

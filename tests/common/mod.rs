@@ -5,13 +5,12 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::leases::Leases;
 use drivegate::bus::predict::predict;
 use drivegate::bus::{BusOptions, BusTask};
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol, RequestPdu, Table};
-use drivegate::command::{CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::command::{Authority, CommandQueue, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::drive::{ModelPoint, Sample, State, Value};
 use drivegate::event::Events;
@@ -175,8 +174,7 @@ impl Rig {
             },
             rs485: setup.rs485,
         };
-        let leases = Leases::new(events.clone(), writes.clone());
-        let bus = BusTask::start(handle.clone(), options, leases, events.clone()).unwrap();
+        let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
         let plant = Plant {
             gateway: "test".to_string(),
             stale_after: Duration::from_secs(1),
@@ -206,8 +204,10 @@ impl Rig {
         self.plant.drive(&drive(address)).unwrap()
     }
 
+    /// One that is not known yet counts as offline.
     pub fn state(&self, address: u8) -> State {
-        self.handle(address).reading(Instant::now()).state()
+        let state = self.handle(address).reading(Instant::now()).state();
+        state.unwrap_or(State::Offline)
     }
 
     pub fn sample(&self, address: u8, point: ModelPoint) -> Sample {
@@ -230,12 +230,16 @@ impl Rig {
             .iter()
             .map(|(name, value)| (index(name), Value::Number(*value)))
             .collect();
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "test".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "test");
         handle
-            .order(Order::Points(values), origin, true, DEFAULT_EXPIRY)
+            .place(
+                Order::Points(values),
+                origin,
+                Authority::Write,
+                DEFAULT_EXPIRY,
+                Instant::now(),
+            )
+            .answered()
             .await
             .outcome
     }
@@ -247,14 +251,18 @@ impl Rig {
             start,
             count,
         };
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "test".to_string(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "test");
         self.plant
             .drive(&name)
             .unwrap()
-            .order(Order::Read(pdu), origin, false, DEFAULT_EXPIRY)
+            .place(
+                Order::Read(pdu),
+                origin,
+                Authority::ReadOnly,
+                DEFAULT_EXPIRY,
+                Instant::now(),
+            )
+            .answered()
             .await
             .outcome
     }

@@ -227,6 +227,20 @@ async fn values_that_are_not_good_say_so() {
 }
 
 #[tokio::test]
+async fn a_state_that_is_not_known_is_no_state() {
+    let server = Server::of(plant::plant(vec![plant::bus("line1", vec![plant::secretive()])])).await;
+    let drive = get(server.address, "/api/v1/drives/fan-1").await.json();
+    assert_eq!(
+        (&drive["state"], &drive["quality"], &drive["online"]),
+        (&Value::Null, &json!("bad"), &json!(true))
+    );
+    assert_eq!(drive["points"]["ready"]["value"], json!(true));
+    let page = get(server.address, "/").await.body;
+    assert!(page.contains("<td>fan-1<td>unknown<td>"), "{page}");
+    assert!(page.contains("<td>bad, "), "{page}");
+}
+
+#[tokio::test]
 async fn the_list_of_drives_is_in_the_order_of_the_file() {
     let server = Server::of(plant::mixed()).await;
     let list = get(server.address, "/api/v1/drives").await.json();

@@ -326,6 +326,19 @@ async fn what_is_not_good_has_no_sample() {
 }
 
 #[tokio::test]
+async fn a_state_that_is_not_known_has_no_sample() {
+    let server = Server::of(plant::plant(vec![plant::bus("line1", vec![plant::secretive()])])).await;
+    let text = scrape(&server).await;
+    assert!(!text.contains("drivegate_drive_state{"), "{text}");
+    assert_eq!(value(&text, "drivegate_drive_up", "bus=line1,drive=fan-1"), Some(1.0));
+    assert_eq!(
+        value(&text, "drivegate_drive_ready", "bus=line1,drive=fan-1"),
+        Some(1.0)
+    );
+    assert_eq!(value(&text, "drivegate_drive_running", "bus=line1,drive=fan-1"), None);
+}
+
+#[tokio::test]
 async fn open_metrics_for_those_that_ask() {
     let server = everything().await;
     let reply = request(

@@ -72,7 +72,7 @@ async fn the_page_shows_the_plant() {
         ">saw-4<",
         "▲ fault",
         "F7 saturation trip",
-        "1 of 2</dd>",
+        "1 of 3</dd>",
         "12.5 ms (aim 10 ms)",
         "43.8 %",
         "the adapter is gone",

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::cache::{BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PollCycle};
-use drivegate::codec::{LineFormat, Protocol, Table};
+use drivegate::codec::{Exception, LineFormat, Protocol, Table};
 use drivegate::command::{self, CommandQueue, Origin, SourceKind, Ticket, WriteStats};
 use drivegate::drive::model::Kind;
 use drivegate::drive::profile::Profiles;
@@ -194,12 +194,18 @@ pub(crate) fn mixed() -> Plant {
     plant(buses)
 }
 
+/// A drive that answers, ready and without a fault, and refuses to say whether it runs.
+pub(crate) fn secretive() -> Arc<DriveImage> {
+    let cx = Profiles::built_in().get("vacon-cx").expect("built in").clone();
+    let image = drive("line1", "fan-1", 1, &cx);
+    answer(&image, Instant::now(), |address| u16::from(address == 1));
+    image.update(|s| s.refuse(Table::DiscreteInput, 2, 1, Exception::ADDRESS));
+    image
+}
+
 /// One command that was answered.
 pub(crate) fn count_a_write(plant: &Plant) {
-    let origin = Origin {
-        kind: SourceKind::Mqtt,
-        who: "t".to_string(),
-    };
+    let origin = Origin::new(SourceKind::Mqtt, "t");
     let (ticket, _answer) = Ticket::new(
         origin,
         "pump-1",

@@ -52,6 +52,33 @@ async fn events_kept_and_new() {
 }
 
 #[tokio::test]
+async fn a_burst_of_all_drives_is_not_lost() {
+    let server = served().await;
+    let mut stream = EventStream::open(server.address, "/api/v1/events", "")
+        .await
+        .opened()
+        .await;
+    // Nothing of it is sent before all are told: the server has one thread, this one.
+    for _ in 0..1000 {
+        server
+            .plant()
+            .events
+            .tell(event(EventKind::Offline, "pump-1", "pump-1 does not answer"));
+    }
+    for id in 1..=1002 {
+        let heard = next(&mut stream).await;
+        assert_eq!((heard.event.as_str(), &heard.json()["id"]), ("", &json!(id)));
+    }
+    let headers = "Accept: application/json\r\n";
+    let kept = request(server.address, "GET", "/api/v1/events", headers).await.json();
+    assert_eq!(
+        kept["events"].as_array().unwrap().len(),
+        1002,
+        "and for those that come later"
+    );
+}
+
+#[tokio::test]
 async fn a_client_goes_on_where_it_stopped() {
     let server = served().await;
     let mut stream = EventStream::open(server.address, "/api/v1/events", "").await;

@@ -8,6 +8,7 @@ mod commands;
 mod connections;
 mod load;
 mod map;
+mod offline;
 mod peers;
 #[path = "../gateway/process.rs"]
 #[allow(dead_code, reason = "the tests of the whole gateway take the rest")]

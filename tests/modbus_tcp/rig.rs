@@ -192,6 +192,7 @@ fn spec(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: Access)
         supervision: Some(Supervision {
             timeout: Duration::from_secs(3600),
             action: LeaseAction::Hold,
+            adopt: false,
         }),
         turnaround: Duration::from_millis(2),
         ..DriveSpec::new(name, bus, unit, profile.clone())

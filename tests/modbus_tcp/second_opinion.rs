@@ -7,6 +7,7 @@ use std::time::Instant;
 use arc_swap::ArcSwap;
 use drivegate::codec::RequestPdu;
 use drivegate::codec::Table;
+use drivegate::command::Authority;
 use drivegate::north::modbus_tcp::{Offline, Uncached};
 use proptest::prelude::*;
 use tokio_modbus::{Request, Response};
@@ -122,7 +123,13 @@ fn answer(pdu: &[u8]) -> Vec<u8> {
     let mut options = options();
     options.uncached = Uncached::Refuse;
     let plant = Arc::new(ArcSwap::from_pointee(plant()));
-    let mut client = Offline::new(options, plant, Arc::default(), "test", false);
+    let mut client = Offline::new(
+        options,
+        plant,
+        Arc::default(),
+        ([127, 0, 0, 1], 502).into(),
+        Authority::ReadOnly,
+    );
     let answer = client.receive(&frame(7, 1, pdu), Instant::now());
     assert_eq!(answer[..4], [0, 7, 0, 0]);
     answer[7..].to_vec()

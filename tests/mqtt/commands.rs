@@ -76,6 +76,57 @@ fn bare_values_set_one_point() {
 }
 
 #[test]
+fn messages_of_a_topic_keep_their_order() {
+    let bench = bench();
+    let run = format!("{SET}/run");
+    let pairs = ["true", "false"].repeat(40);
+    bench.gateway.while_held(|| bench.broker.publish_all(&run, &pairs));
+    bench.watcher.wait_count(RESULT, 80);
+    let orders: Vec<bool> = bench
+        .gateway
+        .ordered()
+        .iter()
+        .map(|order| order.1[0].1.as_bool())
+        .collect();
+    assert_eq!(
+        orders.last(),
+        Some(&false),
+        "the last one published was a stop: {orders:?}"
+    );
+    assert!(
+        !orders.windows(2).any(|pair| pair == [true, true]),
+        "each run had its stop: {orders:?}"
+    );
+    bench.gateway.stop();
+}
+
+#[test]
+fn references_of_a_topic_keep_their_order() {
+    let bench = bench();
+    let values: Vec<String> = (1..=79).map(|percent| percent.to_string()).collect();
+    let payloads: Vec<&str> = values.iter().map(String::as_str).collect();
+    let topic = format!("{SET}/speed_reference");
+    bench.gateway.while_held(|| bench.broker.publish_all(&topic, &payloads));
+    bench.watcher.wait_count(RESULT, 79);
+    let written: Vec<f64> = bench
+        .gateway
+        .ordered()
+        .iter()
+        .filter_map(|order| match order.1[0].1 {
+            Value::Number(percent) => Some(percent),
+            _ => None,
+        })
+        .collect();
+    assert!(written.is_sorted(), "{written:?}");
+    assert_eq!(
+        written.last(),
+        Some(&79.0),
+        "the last one published is the last one written"
+    );
+    bench.gateway.stop();
+}
+
+#[test]
 fn a_response_topic_gets_the_result_with_its_correlation() {
     let bench = bench();
     let output = bench.broker.run(

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
-use std::io::{BufRead, BufReader};
+use std::io::{BufRead, BufReader, Write as _};
 use std::net::{SocketAddr, TcpListener as StdListener, TcpStream as StdStream};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
@@ -162,6 +162,19 @@ impl Broker {
             &[&["-q", "1", "-t", topic, "-m", payload], more].concat(),
         );
         assert!(output.status.success(), "{output:?}");
+    }
+
+    /// Publishes each of `payloads` on one topic over one connection, QoS 1, as fast as it goes.
+    pub(crate) fn publish_all(&self, topic: &str, payloads: &[&str]) {
+        let port = self.port.to_string();
+        let mut command = program("mosquitto_pub");
+        command
+            .args(["-V", "5", "-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", topic, "-l"])
+            .stdin(Stdio::piped());
+        let mut client = installed("mosquitto_pub", command.spawn());
+        let lines = payloads.join("\n") + "\n";
+        client.stdin.take().unwrap().write_all(lines.as_bytes()).unwrap();
+        assert!(client.wait().unwrap().success());
     }
 
     /// Runs a client to its end.
@@ -389,9 +402,12 @@ impl CutLine {
     }
 }
 
+/// Threads of the gateway.
+const THREADS: usize = 2;
+
 pub(crate) fn runtime() -> Runtime {
     let mut builder = tokio::runtime::Builder::new_multi_thread();
-    builder.worker_threads(2).enable_all().build().unwrap()
+    builder.worker_threads(THREADS).enable_all().build().unwrap()
 }
 
 /// An order that reached the bus: drive, what, time to live.
@@ -458,6 +474,25 @@ impl Gateway {
             text: text.to_string(),
         });
         time
+    }
+
+    /// While `act` goes on the client gets no processor: all that comes meanwhile it finds at once.
+    pub(crate) fn while_held<T>(&self, act: impl FnOnce() -> T) -> T {
+        let (release, held) = std::sync::mpsc::channel::<()>();
+        let held = Arc::new(Mutex::new(held));
+        let holding = Arc::new(AtomicU64::new(0));
+        for _ in 0..THREADS {
+            let (held, holding) = (held.clone(), holding.clone());
+            self.runtime.spawn(async move {
+                holding.fetch_add(1, Ordering::SeqCst);
+                let _ = held.lock().unwrap().recv();
+            });
+        }
+        let all = THREADS as u64;
+        wait_for("the hold", || (holding.load(Ordering::SeqCst) == all).then_some(()));
+        let done = act();
+        drop(release);
+        done
     }
 
     pub(crate) fn ordered(&self) -> Vec<Ordered> {

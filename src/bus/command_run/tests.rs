@@ -50,10 +50,7 @@ impl Bench {
                 )
             })
             .collect();
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "t".into(),
-        };
+        let origin = Origin::new(SourceKind::Mqtt, "t");
         let stats = Arc::new(WriteStats::default());
         let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
         let expires = self.now + Duration::from_secs(1);

@@ -125,7 +125,7 @@ impl Master {
             if !drive.has_runs() {
                 continue;
             }
-            match drive.wanted(image, now) {
+            match drive.wanted(image, &self.n2_late, now) {
                 Wanted::Step(slot, step) => {
                     let rank = drive.run(slot).map_or(slot, |run| run.rank);
                     let place = commands.ready.get_mut(rank as usize);
@@ -248,11 +248,13 @@ impl Master {
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
         let pdu = poll.read.pdu();
         let drive = self.drives.get_mut(poll.drive)?;
-        if let Some(until) = drive.late.blocks(&pdu, now) {
+        let session = self.sessions.before(poll.drive, None, now);
+        let next = session.map_or_else(|| pdu.clone(), RequestPdu::N2);
+        if let Some(until) = drive.late.blocks(&pdu, now).max(self.n2_late.blocks(&next, now)) {
             self.schedule.postpone(&poll, until);
             return None;
         }
-        let turn = match self.sessions.before(poll.drive, None, now) {
+        let turn = match session {
             Some(session) => Turn {
                 drive: poll.drive,
                 purpose: Purpose::Session(session, Before::Poll(poll)),

@@ -7,7 +7,7 @@ use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
-use crate::bus::transaction::Ended;
+use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Outcome, Urgency, written};
@@ -54,9 +54,13 @@ impl Master {
             Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
                 drive.late.given_up(&turn.pdu, end.began, now);
             }
+            Ended::Corrupt(MAY_BE_LATE) => {
+                let window = super::N2_LATE * self.response_timeout;
+                self.n2_late.doubted(&turn.pdu, window, now);
+            }
             Ended::Silent | Ended::Corrupt(_) => {
                 let device = self.sessions.device(turn.drive);
-                self.n2_late.given_up(&turn.pdu, device, now);
+                self.n2_late.given_up(&turn.pdu, device, super::N2_LATE * self.response_timeout, now);
             }
         }
     }
@@ -90,11 +94,7 @@ impl Master {
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
                 if failed {
-                    let step = Step {
-                        purpose: StepPurpose::ReadWord,
-                        pdu: RequestPdu::N2(step),
-                    };
-                    self.step_failed(drive, *slot, &step, &ended, end.took, now);
+                    self.step_failed(drive, *slot, &unheard(step), &ended, end.took, now);
                 }
             }
         }
@@ -157,11 +157,12 @@ impl Master {
 
     /// The drive answered a read of the plan.
     fn read(&mut self, poll: &Poll, reply: &Reply, now: Instant, news: &mut Vec<News>) {
-        let read = poll.read;
+        let (read, pdu) = (poll.read, poll.read.pdu());
         let (Some(drive), Some(image)) = (self.drives.get_mut(poll.drive), self.bus.image.drives.get(poll.drive)) else {
             return;
         };
-        drive.late.answered(&read.pdu(), now);
+        let at = drive.late.asked_by(&pdu, now);
+        drive.late.answered(&pdu, now);
         drive.was_read = true;
         let Some(words) = reply.words() else { return };
         for (address, word) in (read.start..).zip(&words) {
@@ -174,7 +175,7 @@ impl Master {
             drive: poll.drive,
             read,
             words,
-            at: now,
+            at,
         });
     }
 
@@ -197,7 +198,7 @@ impl Master {
         let reply = match end.ended {
             // The drive did not look at it: it is said again, once the drive is identified.
             Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => {
-                self.step_failed(index, slot, step, &Ended::Silent, end.took, now);
+                self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, end.took, now);
                 return;
             }
             Ended::Reply(reply) => reply,
@@ -235,6 +236,13 @@ impl Master {
         let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
             return;
         };
+        if *ended == Ended::Corrupt(MAY_BE_LATE) {
+            // It was sent, perhaps in vain: it is sent again when the answer can be believed.
+            if let Some(run) = drive.run(slot) {
+                run.wait_for_late_replies();
+            }
+            return;
+        }
         let how = match ended {
             Ended::Corrupt(_) => Outcome::Garbled,
             _ => Outcome::TimedOut,
@@ -258,5 +266,13 @@ impl Master {
             let covers = |read: &crate::drive::PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
             self.schedule.refresh(index, covers, now);
         }
+    }
+}
+
+/// A step of a command that the drive did not look at, since it wants this first.
+fn unheard(session: Session) -> Step {
+    Step {
+        purpose: StepPurpose::Execute,
+        pdu: RequestPdu::N2(session),
     }
 }

@@ -129,7 +129,7 @@ fn order(bus: &BusHandle, drive: usize, deadline: Instant, writes: &Arc<WriteSta
     let Some(image) = bus.image.drives.get(drive) else {
         return State::Acknowledged;
     };
-    let origin = Origin::gateway(SourceKind::Shutdown, "on_shutdown");
+    let origin = Origin::new(SourceKind::Shutdown, "on_shutdown");
     let reading = image.reading(now, FRESH);
     let expiry = deadline.saturating_duration_since(now);
     let stop = Value::Bool(false);

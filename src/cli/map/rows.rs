@@ -88,9 +88,13 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
             "status",
             "",
             "bits: 0 ready, 1 running, 2 reversed, 3 fault, 4 warning, 5 at_reference, 6 zero_speed, 7 remote, \
-             14 stale, 15 online",
+             14 stale (or a bit not known), 15 online",
         ),
-        Content::State => ("state", "", "0 offline, 1 not_ready, 2 ready, 3 running, 4 fault"),
+        Content::State => (
+            "state",
+            "",
+            "0 offline, 1 not_ready, 2 ready, 3 running, 4 fault; 0xFFFF not known",
+        ),
         Content::Age => ("age", "ms", "of the process data; 65534 at most; 0xFFFF never read"),
         Content::Command => ("command", "", "bits: 0 run, 1 reverse, 2 fault_reset (0 to 1)"),
         Content::Heartbeat => ("heartbeat", "", "any write renews the supervision; reads 0"),
@@ -123,8 +127,8 @@ fn entry_row(profile: &Profile, plan: &Plan, entry: &Entry, access: Access) -> R
         scale: format!("{}", 1.0 / entry.per_unit),
         unit: unit.to_string(),
         not_available: match entry.content {
-            Content::Status | Content::State | Content::Heartbeat => "",
-            Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
+            Content::Status | Content::Heartbeat => "",
+            Content::State | Content::Age | Content::Command | Content::Point(_) => entry.form.not_available(),
         },
         access: if writable { "read, write" } else { "read" },
         source: match entry.content {

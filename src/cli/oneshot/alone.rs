@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 use super::{Row, Target};
 use crate::cache::{OnShutdown, Reading};
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{Answer, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
+use crate::command::{Answer, Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind};
 use crate::config::{BusSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{Point, PollClass, Profile, Quality, Sample, Value};
-use crate::plant::DriveHandle;
+use crate::plant::{DriveHandle, Placed};
 
 /// Time to open the port.
 const OPEN: Duration = Duration::from_millis(1500);
@@ -136,7 +136,12 @@ impl Alone {
     }
 
     async fn order(&self, order: Order) -> Answer {
-        self.drive.order(order, origin(), true, READ).await
+        self.place(order, READ).answered().await
+    }
+
+    fn place(&self, order: Order, expiry: Duration) -> Placed {
+        self.drive
+            .place(order, origin(), Authority::Write, expiry, Instant::now())
     }
 
     /// Commands the points as one command.
@@ -144,8 +149,8 @@ impl Alone {
         let points: Vec<usize> = values.iter().map(|(index, _)| *index).collect();
         // What a command is turned into, and whether it is needed at all, depends on what the drive has.
         self.read_bases(&points).await;
-        let order = Order::Points(values);
-        self.drive.order_confirmed(order, origin(), true, DEFAULT_EXPIRY).await
+        let mut placed = self.place(Order::Points(values), DEFAULT_EXPIRY);
+        (placed.answered().await, placed.confirmed().await)
     }
 
     /// Waits for what derived points rest on, such as the frequency range.
@@ -189,10 +194,7 @@ fn through_the_gateway(target: &Target) -> String {
 
 fn origin() -> Origin {
     let user = std::env::var("SUDO_USER").or_else(|_| std::env::var("USER"));
-    Origin {
-        kind: SourceKind::CommandLine,
-        who: user.unwrap_or_else(|_| "unknown".to_string()),
-    }
+    Origin::new(SourceKind::CommandLine, user.unwrap_or_else(|_| "unknown".to_string()))
 }
 
 /// Whether the plan reads the point, or all that a derived one rests on.

@@ -25,7 +25,11 @@ fn drive(access: Access) -> DriveImage {
 
 fn try_order(order: Order) -> Result<Admitted, Refusal> {
     let image = drive(Access::Control);
-    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    admit(
+        order,
+        &image.reading(Instant::now(), Duration::from_secs(1)),
+        Authority::Write,
+    )
 }
 
 fn point(name: &str) -> usize {
@@ -46,7 +50,11 @@ fn write(address: u16, value: u16) -> Order {
 fn authority_comes_first() {
     let image = drive(Access::Monitor);
     let reading = image.reading(Instant::now(), Duration::from_secs(1));
-    for (order, may) in [(write(2000, 1), true), (write(9999, 1), true), (write(2000, 1), false)] {
+    for (order, may) in [
+        (write(2000, 1), Authority::Write),
+        (write(9999, 1), Authority::Write),
+        (write(2000, 1), Authority::ReadOnly),
+    ] {
         assert_eq!(
             admit(order, &reading, may).unwrap_err().exception(),
             Exception::FUNCTION
@@ -60,7 +68,7 @@ fn authority_comes_first() {
                 count: 1
             }),
             &reading,
-            false
+            Authority::ReadOnly
         )
         .is_ok()
     );
@@ -156,6 +164,60 @@ fn addresses_and_counts() {
     );
 }
 
+/// Limits in Hz and what 50 Hz are in percent rest on the drive's maximum frequency, which may change at its panel.
+#[test]
+fn no_command_rests_on_an_old_parameter() {
+    let start = Instant::now();
+    let at = |seconds: f64| start + Duration::from_secs_f64(seconds);
+    let of = |slow_cycle: u64, frequency_range| {
+        let spec = DriveSpec {
+            limits: BTreeMap::from([("frequency_reference".to_string(), 0.0..=50.0)]),
+            frequency_range,
+            ..drive(Access::Control).spec
+        };
+        let image = DriveImage::new(spec, Duration::from_secs(slow_cycle));
+        image.update(|s| {
+            s.link = Link::Online(std::time::SystemTime::now());
+            s.store(Table::Holding, 100, &[0, 5000], start);
+        });
+        image
+    };
+    let set = |image: &DriveImage, now, name: &str, value| {
+        let order = Order::Points(vec![(point(name), Value::Number(value))]);
+        let admitted = admit(order, &image.reading(now, Duration::from_secs(60)), true)?;
+        match admitted.order {
+            Order::Points(values) => Ok(values[0].1.as_f64()),
+            other => panic!("{other:?}"),
+        }
+    };
+    let old = |result| matches!(result, Err(Refusal::NotKnown(_)));
+    let image = of(1, None);
+    assert_eq!(set(&image, at(5.0), "frequency_reference", 50.0), Ok(100.0));
+    assert!(old(set(&image, at(5.1), "frequency_reference", 50.0)));
+    assert!(old(set(&image, at(5.1), "speed_reference", 10.0)), "its limit is in Hz");
+    image.update(|s| s.store(Table::Holding, 100, &[0, 10_000], at(5.1)));
+    assert_eq!(set(&image, at(6.0), "frequency_reference", 50.0), Ok(50.0));
+    for name in ["frequency_reference", "speed_reference"] {
+        let refusal = set(&image, at(6.0), name, 50.5).unwrap_err();
+        assert_eq!(refusal.exception(), Exception::VALUE, "{name}");
+    }
+    // A line that cannot be faster.
+    let image = of(20, None);
+    assert_eq!(set(&image, at(22.5), "frequency_reference", 25.0), Ok(50.0));
+    assert!(old(set(&image, at(22.6), "frequency_reference", 25.0)));
+    let image = of(1, Some(0.0..=40.0));
+    assert_eq!(
+        set(&image, at(3.0), "frequency_reference", 20.0),
+        Ok(40.0),
+        "its own first"
+    );
+    assert_eq!(
+        set(&image, at(9.0), "frequency_reference", 20.0),
+        Ok(50.0),
+        "else the configured one"
+    );
+}
+
 /// A TECO drive, whose reference is a frequency, written elsewhere than it is read, with a limit in percent.
 fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Order) -> Result<Admitted, Refusal> {
     let profile = Profiles::built_in().get("teco-7300pa").unwrap().clone();
@@ -169,7 +231,11 @@ fn in_hertz(maximum: Option<u16>, order: impl Fn(&dyn Fn(&str) -> usize) -> Orde
         }
     });
     let order = order(&|name| profile.point_index(name).unwrap());
-    admit(order, &image.reading(Instant::now(), Duration::from_secs(1)), true)
+    admit(
+        order,
+        &image.reading(Instant::now(), Duration::from_secs(1)),
+        Authority::Write,
+    )
 }
 
 #[test]
@@ -254,7 +320,7 @@ fn a_write_on_n2_is_one_whole_object() {
         (coils(1, &[true, true]), value),
         (coils(8, &[true]), address),
     ] {
-        let refused = admit(Order::Write(pdu.clone()), &reading, true).err();
+        let refused = admit(Order::Write(pdu.clone()), &reading, Authority::Write).err();
         assert_eq!(refused.map(|refusal| refusal.exception()), wanted, "{pdu:?}");
     }
 }

@@ -2,7 +2,7 @@
 
 use serde_json::{Value, json};
 
-use super::forms::{DURATION, duration, name, number, pattern, table, tables, text, with_default, words};
+use super::forms::{DURATION, duration, flag, name, number, pattern, table, tables, text, with_default, words};
 use crate::codec::Protocol;
 use crate::config::{bus, drive};
 use crate::drive::ModelPoint;
@@ -192,6 +192,15 @@ fn supervision() -> Value {
             (
                 "action",
                 json!({ "anyOf": [words, reference], "default": "stop", "description": "What is done then, while the drive runs." }),
+            ),
+            (
+                "adopt",
+                with_default(
+                    flag(
+                        "A drive that runs when the gateway starts gets its lease started: the clock only, nothing is written.",
+                    ),
+                    false,
+                ),
             ),
         ],
     )

@@ -74,6 +74,24 @@ fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<
     }
 }
 
+/// The ends of a band are read again and again: commands are converted and limited by them, and somebody may change them at
+/// the drive.
+pub(super) fn keep_ends_fresh(points: &mut [Point]) {
+    let ends: Vec<usize> = points
+        .iter()
+        .filter_map(|point| match &point.source {
+            Source::Derived(derived) => Some(derived.ends()),
+            Source::Raw(_) => None,
+        })
+        .flatten()
+        .collect();
+    for end in ends {
+        if let Some(point) = points.get_mut(end).filter(|p| p.class == PollClass::Once) {
+            point.class = PollClass::Slow;
+        }
+    }
+}
+
 /// What is told of derived points: they rest on points that the drive tells itself.
 pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {

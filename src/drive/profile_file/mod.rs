@@ -18,7 +18,7 @@ use super::model::ModelPoint;
 use super::profile::{AddressRange, Digest, FaultText, Point, Profile, Profiles};
 use crate::codec::Protocol;
 use crate::document::{self, Document, Node, Problem, Reader};
-use derived::check_derived;
+use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_range};
 
@@ -212,6 +212,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         n2::write_on_change(&tables, &mut points);
     }
     reference::apply(reader, &mut points);
+    keep_ends_fresh(&mut points);
     for (index, table) in tables.iter().enumerate() {
         check_derived(table, index, &points);
         check_target(table, index, &points);

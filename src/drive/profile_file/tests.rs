@@ -3,7 +3,7 @@
 use tempfile::TempDir;
 
 use super::super::derive::{Bound, Derived};
-use super::super::profile::{Form, Source};
+use super::super::profile::{Form, PollClass, Source};
 use super::*;
 use crate::drive::Value;
 use crate::drive::model::Kind;
@@ -364,6 +364,28 @@ fn choices_of_the_reference() {
     assert_eq!(of(&cx, "running").raw().unwrap().address, 3);
     assert_eq!(of(&cx, "output_frequency").raw().unwrap().address, 0);
     assert_eq!(cx.ranges.last().unwrap().addresses, 9901..=9999);
+}
+
+/// What commands are converted by is read again and again, whatever the file says.
+#[test]
+fn ends_of_a_band_are_never_read_once_only() {
+    let source = HEAD.to_string()
+        + "[[point]]\nname = \"speed_reference\"\nat = \"holding 1\"\n\
+           [[point]]\nname = \"frequency_reference\"\nderive = \"band\"\nof = \"speed_reference\"\n\
+           minimum = \"least\"\nmaximum = \"most\"\n\
+           [[point]]\nname = \"least\"\nat = \"holding 2\"\nclass = \"fast\"\n\
+           [[point]]\nname = \"most\"\nat = \"holding 3\"\nclass = \"once\"\n\
+           [[point]]\nname = \"other\"\nat = \"holding 4\"\nclass = \"once\"\n";
+    let profile = Profile::parse("m", &source, false).unwrap();
+    let class = |profile: &Profile, name: &str| profile.points[profile.point_index(name).unwrap()].class;
+    let of = |name| class(&profile, name);
+    assert_eq!(
+        (of("least"), of("most"), of("other")),
+        (PollClass::Fast, PollClass::Slow, PollClass::Once)
+    );
+    let source = "name = \"x\"\nbase = \"eaton-hvx\"\nspeed_reference = { signed = true, base = \"min_max\" }\n";
+    let hvx = Profile::parse("x", source, false).unwrap();
+    assert_eq!(class(&hvx, "minimum_frequency"), PollClass::Slow, "it counts here");
 }
 
 #[test]

@@ -51,7 +51,8 @@ pub(super) struct Drive<'d> {
     unit: u8,
     profile: &'d str,
     access: &'static str,
-    state: State,
+    /// Absent (`null`) while it is not known.
+    state: Option<State>,
     quality: Quality,
     online: bool,
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -87,7 +87,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     );
     let mut state = gauge(
         "drivegate_drive_state",
-        "State of the drive: 1 for the state it is in, 0 for the others.",
+        "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
     );
     let mut age = gauge(
         "drivegate_drive_sample_age_seconds",
@@ -118,9 +118,10 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         let reading = drive.reading(now);
         supervision.add(labels.clone(), Figure::Count(image.supervisions()));
         up.add(labels.clone(), yes(reading.snapshot.link.is_online()));
-        let current = reading.state();
-        for one in State::ALL {
-            state.add(with(&labels, "state", one.name()), yes(one == current));
+        if let Some(current) = reading.state() {
+            for one in State::ALL {
+                state.add(with(&labels, "state", one.name()), yes(one == current));
+            }
         }
         if let Some(time) = reading.age() {
             age.add(labels.clone(), Figure::Value(time.as_secs_f64()));

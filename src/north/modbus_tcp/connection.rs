@@ -13,7 +13,7 @@ use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
-use super::errand::Finished;
+use super::errand::Answered;
 use super::frame::NotModbus;
 use super::lookout::{Lookout, Turns};
 use super::session::Session;
@@ -98,7 +98,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
             let worked = self.dialogue.work(self.now.into_std());
-            self.dialogue.collect();
+            self.dialogue.collect(self.now.into_std());
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
                     biased;
@@ -135,8 +135,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             };
             self.now = Instant::now();
             match event {
-                Event::Answer(finished) => {
-                    self.dialogue.finish(&finished);
+                Event::Answer(answered) => {
+                    self.dialogue.finish(answered, self.now.into_std());
                     self.touch();
                 }
                 Event::Input(0, _) => client_done = true,
@@ -172,7 +172,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             Some(count) => count?,
             None => tokio::select! {
                 biased;
-                Some(finished) = waiting.next() => return Ok(Event::Answer(finished)),
+                Some(answered) = waiting.next() => return Ok(Event::Answer(answered)),
                 count = self.stream.read(space), if reads => count?,
                 () = expired(half_frame_since) => return Err(End::HalfFrame),
                 timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
@@ -201,8 +201,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn farewell(&mut self) {
         let answered = async {
             flush(&mut self.stream, &mut self.dialogue).await?;
-            while let Some(finished) = self.dialogue.parts().1.next().await {
-                self.dialogue.finish(&finished);
+            while let Some(answered) = self.dialogue.parts().1.next().await {
+                self.dialogue.finish(answered, Instant::now().into_std());
                 flush(&mut self.stream, &mut self.dialogue).await?;
             }
             Ok::<(), End>(())
@@ -215,7 +215,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 /// What a connection waits for.
 enum Event {
     /// An answer from the bus.
-    Answer(Finished),
+    Answer(Answered),
     /// So many bytes from the client, 0 at its end; whether they were looked out for.
     Input(usize, bool),
 }

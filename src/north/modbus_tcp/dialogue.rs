@@ -6,7 +6,7 @@ use std::time::Instant;
 use futures_util::FutureExt;
 use futures_util::stream::{FuturesUnordered, StreamExt};
 
-use super::errand::{Finished, Waiting};
+use super::errand::{Answered, Waiting};
 use super::frame::{self, MAX_FRAME, NotModbus};
 use super::session::Session;
 
@@ -49,6 +49,10 @@ impl Dialogue {
         }
     }
 
+    pub(super) fn session(&self) -> &Session {
+        &self.session
+    }
+
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
         self.session.who()
@@ -60,9 +64,10 @@ impl Dialogue {
         (self.input.get_mut(self.filled..).unwrap_or_default(), &mut self.waiting)
     }
 
-    /// Answers a request that has waited.
-    pub(super) fn finish(&mut self, finished: &Finished) {
-        self.session.finish(finished, &mut self.output);
+    /// The bus has answered: so the request is answered, or waits for the next piece of what it reads.
+    pub(super) fn finish(&mut self, answered: Answered, now: Instant) {
+        self.waiting
+            .extend(self.session.finish(answered, now, &mut self.output));
     }
 
     /// So many bytes were put into the space.
@@ -125,9 +130,9 @@ impl Dialogue {
     }
 
     /// Takes the answers that have come in the meantime, to send them together.
-    pub(super) fn collect(&mut self) {
-        while let Some(Some(finished)) = self.waiting.next().now_or_never() {
-            self.session.finish(&finished, &mut self.output);
+    pub(super) fn collect(&mut self, now: Instant) {
+        while let Some(Some(answered)) = self.waiting.next().now_or_never() {
+            self.finish(answered, now);
         }
     }
 }

@@ -12,9 +12,10 @@ use tokio_util::task::TaskTracker;
 
 use super::places::{Full, Place, Places};
 use super::session::Session;
-use super::shared::{Authority, Shared, View};
+use super::shared::{Client, Shared, View};
 use super::tls::{Gatekeeper, Role};
 use super::{Seldom, connection};
+use crate::command::Authority;
 use crate::north::Turned;
 
 /// Pause after a failed accept: the usual reason, too many open files, does not go away at once.
@@ -121,11 +122,12 @@ impl Door {
         let cancel = self.cancel.child_token();
         match &self.admission {
             Admission::ByAddress(write) => {
-                let authority = Authority {
-                    may_write: contains(write, peer.ip()),
-                    who: peer.to_string(),
+                let authority = if contains(write, peer.ip()) {
+                    Authority::Write
+                } else {
+                    Authority::ReadOnly
                 };
-                self.converse(stream, authority, cancel).await;
+                self.converse(stream, Client::new(peer, None, authority), cancel).await;
             }
             Admission::ByCertificate(gatekeeper) => {
                 let admitted = tokio::select! {
@@ -134,12 +136,12 @@ impl Door {
                 };
                 match admitted {
                     Ok((stream, known)) => {
-                        let may_write = known.role == Role::Control;
-                        let authority = Authority {
-                            may_write,
-                            who: format!("{} at {peer}", known.name),
+                        let authority = match known.role {
+                            Role::Control => Authority::Write,
+                            Role::Monitor => Authority::ReadOnly,
                         };
-                        self.converse(stream, authority, cancel).await;
+                        let client = Client::new(peer, Some(&known.name), authority);
+                        self.converse(stream, client, cancel).await;
                     }
                     Err(why) => {
                         self.shared.stats.modbus_tcp.turned_away(Turned::Tls);
@@ -153,11 +155,11 @@ impl Door {
         drop(place);
     }
 
-    async fn converse<S>(&self, stream: S, authority: Authority, cancel: CancellationToken)
+    async fn converse<S>(&self, stream: S, client: Client, cancel: CancellationToken)
     where
         S: tokio::io::AsyncRead + tokio::io::AsyncWrite + Unpin,
     {
-        let session = Session::new(self.shared.clone(), self.view.clone(), authority);
+        let session = Session::new(self.shared.clone(), self.view.clone(), client);
         connection::serve(stream, session, self.shared.options.idle_timeout, cancel).await;
     }
 }

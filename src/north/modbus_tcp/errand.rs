@@ -2,39 +2,30 @@
 
 use std::future::Future;
 use std::pin::Pin;
-use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::Instant;
 
 use super::frame::Header;
-use super::shared::{Authority, Shared};
+use super::shared::Client;
 use crate::cache::{Reading, Unavailable};
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
-use crate::command::{DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
-use crate::north::register_map;
-use crate::plant::DriveHandle;
-
-/// A request that waits for the bus.
-pub(super) type Waiting = Pin<Box<dyn Future<Output = Finished> + Send>>;
-
-/// A request whose answer is known.
-#[derive(Debug)]
-pub(super) struct Finished {
-    pub(super) header: Header,
-    pub(super) request: RequestPdu,
-    pub(super) drive: String,
-    pub(super) outcome: Outcome,
-}
+use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
+use crate::plant::{DriveHandle, Placed};
 
 /// A request on its way to a drive.
+#[derive(Debug)]
 pub(super) struct Errand {
+    pub(super) header: Header,
     pub(super) drive: DriveHandle,
     pub(super) request: RequestPdu,
-    pub(super) work: Work,
     /// The order carries a fault reset that came by 0x8100.
     pub(super) resets: bool,
+    read: Option<PiecewiseRead>,
 }
 
 /// What there is to do.
+#[derive(Debug)]
 pub(super) enum Work {
     Order(Order),
     /// There is no order; it is refused, which the audit shows.
@@ -52,59 +43,141 @@ pub(super) enum Piece {
     Ask { pdu: RequestPdu, skip: usize, take: usize },
 }
 
-impl Errand {
-    /// Sends it; the first poll queues its order, or its first one.
-    pub(super) fn send(self, header: Header, shared: &Arc<Shared>, authority: &Authority) -> Waiting {
-        let origin = Origin {
-            kind: SourceKind::ModbusTcp,
-            who: authority.who.clone(),
-        };
-        let may_write = authority.may_write;
-        let shared = shared.clone();
-        Box::pin(async move {
-            let drive = &self.drive;
-            let outcome = match self.work {
-                Work::Order(order) => drive.order(order, origin, may_write, DEFAULT_EXPIRY).await.outcome,
-                Work::Refused(refusal) => drive.refuse(&describe::request(&self.request), refusal, origin).outcome,
-                Work::Pieces(pieces) => read(drive, pieces, &origin, &self.request).await,
-            };
-            let name = self.drive.image.spec.name.clone();
-            if self.resets && !outcome.is_ok() {
-                shared.with_command_word(&name, |word| *word = word.map(register_map::without_reset));
-            }
-            Finished {
-                header,
-                request: self.request,
-                drive: name,
-                outcome,
-            }
-        })
-    }
+/// How far a read object by object has come.
+#[derive(Debug)]
+struct PiecewiseRead {
+    words: Vec<u16>,
+    left: std::vec::IntoIter<Piece>,
+    /// Of the object that the drive is asked for now: so many items are left out, so many taken.
+    asked: (usize, usize),
 }
 
-/// Reads piece by piece; the first one that fails ends it.
-async fn read(drive: &DriveHandle, pieces: Vec<Piece>, origin: &Origin, request: &RequestPdu) -> Outcome {
-    let mut words = Vec::new();
-    for piece in pieces {
-        match piece {
-            Piece::Known(known) => words.extend(known),
-            Piece::Ask { pdu, skip, take } => {
-                let order = Order::Read(pdu);
-                match drive.order(order, origin.clone(), false, DEFAULT_EXPIRY).await.outcome {
-                    Outcome::Acknowledged(Reply::Registers(got)) => words.extend(got.iter().skip(skip).take(take)),
-                    Outcome::Acknowledged(Reply::Bits(got)) => {
-                        words.extend(got.iter().skip(skip).take(take).map(|bit| u16::from(*bit)));
-                    }
-                    Outcome::Acknowledged(_) => return Outcome::Exception(Exception::DEVICE_FAILURE),
-                    outcome => return outcome,
-                }
+/// What becomes of an errand.
+#[derive(Debug)]
+pub(super) enum Step {
+    /// An order of it is in the queue.
+    Waits(Waiting),
+    /// Its answer is known.
+    Done(Box<Errand>, Outcome),
+}
+
+/// An errand that waits for the bus. Its order is in the queue; waiting is all that is left.
+#[derive(Debug)]
+pub(super) struct Waiting {
+    /// Gone once it is answered.
+    errand: Option<Box<Errand>>,
+    placed: Placed,
+}
+
+/// The bus has answered an order of the errand.
+#[derive(Debug)]
+pub(super) struct Answered {
+    errand: Box<Errand>,
+    outcome: Outcome,
+}
+
+impl Future for Waiting {
+    type Output = Answered;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Answered> {
+        match (self.placed.poll_answer(cx), self.errand.take()) {
+            (Poll::Ready(answer), Some(errand)) => Poll::Ready(Answered {
+                errand,
+                outcome: answer.outcome,
+            }),
+            (_, errand) => {
+                self.errand = errand;
+                Poll::Pending
             }
         }
     }
-    Outcome::Acknowledged(match request {
-        RequestPdu::Read { table, .. } if table.is_bits() => Reply::Bits(words.iter().map(|word| *word != 0).collect()),
-        _ => Reply::Registers(words),
-    })
+}
+
+impl Errand {
+    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu, resets: bool) -> Errand {
+        Errand {
+            header,
+            drive: drive.clone(),
+            request,
+            resets,
+            read: None,
+        }
+    }
+
+    /// Sends it: its order, or its first one, is in the queue when this returns.
+    pub(super) fn send(self, work: Work, client: &Client, now: Instant) -> Step {
+        let mut errand = Box::new(self);
+        match work {
+            Work::Order(order) => errand.place(order, client, client.authority, now),
+            Work::Refused(refusal) => {
+                let what = describe::request(&errand.request);
+                let answer = errand.drive.refuse(&what, refusal, client.origin(), now);
+                Step::Done(errand, answer.outcome)
+            }
+            Work::Pieces(pieces) => {
+                errand.read = Some(PiecewiseRead {
+                    words: Vec::new(),
+                    left: pieces.into_iter(),
+                    asked: (0, 0),
+                });
+                errand.read_on(client, now)
+            }
+        }
+    }
+
+    fn place(self: Box<Self>, order: Order, client: &Client, authority: Authority, now: Instant) -> Step {
+        let placed = self.drive.place(order, client.origin(), authority, DEFAULT_EXPIRY, now);
+        Step::Waits(Waiting {
+            errand: Some(self),
+            placed,
+        })
+    }
+
+    /// Asks for the next object of a read, if any is left.
+    fn read_on(mut self: Box<Self>, client: &Client, now: Instant) -> Step {
+        let Some(read) = &mut self.read else {
+            return Step::Done(self, Outcome::Exception(Exception::DEVICE_FAILURE));
+        };
+        for piece in read.left.by_ref() {
+            match piece {
+                Piece::Known(known) => read.words.extend(known),
+                Piece::Ask { pdu, skip, take } => {
+                    read.asked = (skip, take);
+                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now);
+                }
+            }
+        }
+        let words = std::mem::take(&mut read.words);
+        let reply = match &self.request {
+            RequestPdu::Read { table, .. } if table.is_bits() => {
+                Reply::Bits(words.iter().map(|word| *word != 0).collect())
+            }
+            _ => Reply::Registers(words),
+        };
+        Step::Done(self, Outcome::Acknowledged(reply))
+    }
+}
+
+impl Answered {
+    /// What comes of the errand now: a read object by object asks for the next one, until one fails.
+    pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Step {
+        let Some(read) = &mut self.errand.read else {
+            return Step::Done(self.errand, self.outcome);
+        };
+        let (skip, take) = read.asked;
+        match self.outcome {
+            Outcome::Acknowledged(Reply::Registers(got)) => read.words.extend(got.iter().skip(skip).take(take)),
+            Outcome::Acknowledged(Reply::Bits(got)) => {
+                read.words
+                    .extend(got.iter().skip(skip).take(take).map(|bit| u16::from(*bit)));
+            }
+            Outcome::Acknowledged(_) => {
+                return Step::Done(self.errand, Outcome::Exception(Exception::DEVICE_FAILURE));
+            }
+            outcome => return Step::Done(self.errand, outcome),
+        }
+        self.errand.read_on(client, now)
+    }
 }
 
 /// A read that the cache cannot answer as a whole, object by object, where it is objects that the drive reads (N2: one in

@@ -1,16 +1,18 @@
-//! The server without sockets, for whoever has bytes instead of a connection: tests and fuzz targets.
+//! The server without sockets and runtime, for whoever has bytes instead of a connection: tests, fuzz targets, virtual time.
 
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
 use super::Options;
 use super::dialogue::Dialogue;
 use super::session::Session;
-use super::shared::{Authority, Shared, View};
+use super::shared::{Client, Shared, View};
+use crate::command::Authority;
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
 
-/// One client of a server that has no sockets.
+/// One client of a server that has no sockets. Time is what [`Offline::receive`] is told.
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
@@ -20,14 +22,25 @@ pub struct Offline {
 }
 
 impl Offline {
-    /// A client named `who` that sees the whole plant and may write or not. Of the options only `uncached` matters.
-    pub fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, who: &str, may_write: bool) -> Offline {
-        let view = Arc::new(View::new(plant, None));
-        let authority = Authority {
-            may_write,
-            who: who.to_string(),
-        };
-        let session = Session::new(Arc::new(Shared::new(options, stats)), view, authority);
+    /// A client at `peer` that sees the whole plant. Of the options only `uncached` matters.
+    pub fn new(
+        options: Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        peer: SocketAddr,
+        authority: Authority,
+    ) -> Offline {
+        let (shared, view) = (Shared::new(options, stats), View::new(plant, None));
+        let client = Client::new(peer, None, authority);
+        Offline::of(Session::new(Arc::new(shared), Arc::new(view), client))
+    }
+
+    /// Another client of the same server.
+    pub fn beside(&self, peer: SocketAddr, authority: Authority) -> Offline {
+        Offline::of(self.dialogue.session().beside(Client::new(peer, None, authority)))
+    }
+
+    fn of(session: Session) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
             backlog: Vec::new(),
@@ -35,7 +48,8 @@ impl Offline {
         }
     }
 
-    /// The bytes that are answered to `bytes` so far; requests that wait for the bus are answered by a later call.
+    /// The bytes that are answered to `bytes` so far; requests that wait for the bus are answered by a later call, with
+    /// or without further bytes. Orders are in the queue of their bus when this returns.
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         self.backlog.extend_from_slice(bytes);
         let mut answers = Vec::new();
@@ -49,7 +63,7 @@ impl Offline {
                 self.dialogue.received(count);
             }
             self.closed = self.dialogue.work(now).is_err();
-            self.dialogue.collect();
+            self.dialogue.collect(now);
             answers.append(&mut self.dialogue.output);
             if self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
                 break;

@@ -5,16 +5,16 @@ use std::time::Instant;
 
 use futures_util::FutureExt;
 
-use super::errand::{Errand, Finished, Waiting, Work, pieces};
+use super::errand::{Answered, Errand, Step, Waiting, Work, pieces};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
 use super::lookout::Turns;
-use super::shared::{Authority, Routes, Shared, View};
+use super::shared::{Client, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Order, Outcome};
+use crate::command::{Authority, Order, Outcome};
 use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
 use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
@@ -32,7 +32,7 @@ enum Decision {
     /// Refused at once.
     Exception(Exception),
     /// The drive is asked, or a command refused on the way to it.
-    Drive(Box<Errand>),
+    Drive(Errand, Work),
 }
 
 impl From<Exception> for Decision {
@@ -46,7 +46,7 @@ impl From<Exception> for Decision {
 pub(super) struct Session {
     shared: Arc<Shared>,
     view: Arc<View>,
-    authority: Authority,
+    client: Client,
     routes: Arc<Routes>,
     foreign_codes: Seldom,
 }
@@ -59,21 +59,26 @@ impl Drop for Session {
 
 impl Session {
     /// A client has connected; it has left when the session is dropped.
-    pub(super) fn new(shared: Arc<Shared>, view: Arc<View>, authority: Authority) -> Session {
+    pub(super) fn new(shared: Arc<Shared>, view: Arc<View>, client: Client) -> Session {
         shared.stats.modbus_tcp.connected();
         let routes = view.routes();
         Session {
             shared,
             view,
-            authority,
+            client,
             routes,
             foreign_codes: Seldom::default(),
         }
     }
 
+    /// Another client has connected to the same server.
+    pub(super) fn beside(&self, client: Client) -> Session {
+        Session::new(self.shared.clone(), self.view.clone(), client)
+    }
+
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
-        &self.authority.who
+        &self.client.who
     }
 
     /// The turns of all connections.
@@ -100,33 +105,51 @@ impl Session {
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
                 let drive = self.routes.drive(frame.header.unit);
                 let name = drive.map_or_else(String::new, |d| d.image.spec.name.clone());
-                self.tell_foreign_code(&name, code);
+                self.tell_foreign_code(&name, code, now);
                 self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
-            Decision::Drive(errand) => {
-                let mut waiting = errand.send(frame.header, &self.shared, &self.authority);
-                match (&mut waiting).now_or_never() {
-                    Some(finished) => self.finish(&finished, out),
-                    None => return Some(waiting),
-                }
+            Decision::Drive(errand, work) => {
+                let step = errand.send(work, &self.client, now);
+                return self.follow(step, now, out);
             }
         }
         None
     }
 
-    /// Appends the answer to a request that waited.
-    pub(super) fn finish(&mut self, finished: &Finished, out: &mut Vec<u8>) {
-        let Finished {
-            header,
-            request,
-            drive,
-            outcome,
-        } = finished;
+    /// The bus has answered: appends the answer to the request, or gives what it waits for next. A read piece by piece
+    /// has its next order in the queue when this returns.
+    pub(super) fn finish(&mut self, answered: Answered, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+        let step = answered.go_on(&self.client, now);
+        self.follow(step, now, out)
+    }
+
+    fn follow(&mut self, mut step: Step, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+        loop {
+            match step {
+                Step::Done(errand, outcome) => {
+                    self.answer(&errand, &outcome, now, out);
+                    return None;
+                }
+                Step::Waits(mut waiting) => match (&mut waiting).now_or_never() {
+                    Some(answered) => step = answered.go_on(&self.client, now),
+                    None => return Some(waiting),
+                },
+            }
+        }
+    }
+
+    fn answer(&mut self, errand: &Errand, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
+        let Errand { header, request, .. } = errand;
+        let drive = &errand.drive.image.spec.name;
+        if errand.resets && !outcome.is_ok() {
+            self.shared
+                .with_command_word(drive, |word| *word = word.map(register_map::without_reset));
+        }
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET
         {
-            self.tell_foreign_code(drive, *code);
+            self.tell_foreign_code(drive, *code, now);
         }
         let exception = outcome.exception();
         match (outcome, exception) {
@@ -147,9 +170,9 @@ impl Session {
     }
 
     /// A drive's own code is answered as 04; what it means is told here.
-    fn tell_foreign_code(&mut self, drive: &str, code: Exception) {
-        if let Some(more) = self.foreign_codes.tell(Instant::now()) {
-            tracing::warn!(drive, client = %self.authority.who, more,
+    fn tell_foreign_code(&mut self, drive: &str, code: Exception, now: Instant) {
+        if let Some(more) = self.foreign_codes.tell(now) {
+            tracing::warn!(drive, client = %self.client.who, more,
                 "Modbus TCP: the drive answered {code}; the client was told 04");
         }
     }
@@ -166,7 +189,7 @@ impl Session {
         // Authority comes before everything that the request could be wrong in.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
-                Ok(request) => errand(drive, request.clone(), Work::Order(Order::Write(request))),
+                Ok(request) => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
                 Err(_) => Exception::FUNCTION.into(),
             };
         }
@@ -183,11 +206,11 @@ impl Session {
                 common(drive, request, start, count, now)
             }
             RequestPdu::WriteRegister { address, value } if address >= FIRST => {
-                self.command(drive, request, address, &[value], now)
+                self.command(frame.header, drive, request, address, &[value], now)
             }
             RequestPdu::WriteRegisters { start, ref values } if start >= FIRST => {
                 let values = values.clone();
-                self.command(drive, request, start, &values, now)
+                self.command(frame.header, drive, request, start, &values, now)
             }
             RequestPdu::DeviceIdentification { code, object } => {
                 let identity = Identity {
@@ -200,16 +223,14 @@ impl Session {
                     .reply(code, object)
                     .map_or_else(Decision::from, |reply| Decision::Reply(request, reply))
             }
-            RequestPdu::Read { table, start, count } if has_function => {
-                self.raw_read(drive, request, table, start, count, now)
-            }
-            _ if has_function => errand(drive, request.clone(), Work::Order(Order::Write(request))),
+            RequestPdu::Read { .. } if has_function => self.raw_read(frame.header, drive, request, now),
+            _ if has_function => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
             _ => Exception::FUNCTION.into(),
         }
     }
 
     fn may_write(&self, drive: &DriveHandle) -> bool {
-        self.authority.may_write && drive.image.spec.access == Access::Control
+        self.client.authority == Authority::Write && drive.image.spec.access == Access::Control
     }
 
     /// Unit 255: input registers; holding registers alike, since many clients read nothing else.
@@ -238,15 +259,10 @@ impl Session {
         Ok(Decision::Reply(request, reply))
     }
 
-    fn raw_read(
-        &self,
-        drive: &DriveHandle,
-        request: RequestPdu,
-        table: Table,
-        start: u16,
-        count: u16,
-        now: Instant,
-    ) -> Decision {
+    fn raw_read(&self, header: Header, drive: &DriveHandle, request: RequestPdu, now: Instant) -> Decision {
+        let RequestPdu::Read { table, start, count } = request else {
+            return Exception::FUNCTION.into();
+        };
         let profile = &drive.image.spec.profile;
         let beyond = !table.is_bits() && u32::from(start) + u32::from(count) > u32::from(FIRST);
         if beyond {
@@ -268,17 +284,25 @@ impl Session {
             }
             Err(Unavailable::NotPolled) => match pieces(drive.bus.image.spec.protocol, &reading, table, start, count) {
                 Err(code) => code.into(),
-                Ok(Some(pieces)) => errand(drive, request, Work::Pieces(pieces)),
+                Ok(Some(pieces)) => errand(header, drive, request, Work::Pieces(pieces)),
                 Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
-                Ok(None) => errand(drive, request.clone(), Work::Order(Order::Read(request))),
+                Ok(None) => errand(header, drive, request.clone(), Work::Order(Order::Read(request))),
             },
         }
     }
 
     /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
-    fn command(&self, drive: &DriveHandle, request: RequestPdu, start: u16, values: &[u16], now: Instant) -> Decision {
+    fn command(
+        &self,
+        header: Header,
+        drive: &DriveHandle,
+        request: RequestPdu,
+        start: u16,
+        values: &[u16],
+        now: Instant,
+    ) -> Decision {
         let spec = &drive.image.spec;
-        let fault = drive.reading(now).state() == State::Fault;
+        let fault = drive.reading(now).state() == Some(State::Fault);
         let write = self.shared.with_command_word(&spec.name, |last| {
             let before = register_map::Before { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
@@ -295,22 +319,12 @@ impl Session {
             Ok((CommandWrite { points, .. }, resets)) => (Work::Order(Order::Points(points)), resets),
             Err(refusal) => (Work::Refused(refusal), false),
         };
-        Decision::Drive(Box::new(Errand {
-            drive: drive.clone(),
-            request,
-            work,
-            resets,
-        }))
+        Decision::Drive(Errand::new(header, drive, request, resets), work)
     }
 }
 
-fn errand(drive: &DriveHandle, request: RequestPdu, work: Work) -> Decision {
-    Decision::Drive(Box::new(Errand {
-        drive: drive.clone(),
-        request,
-        work,
-        resets: false,
-    }))
+fn errand(header: Header, drive: &DriveHandle, request: RequestPdu, work: Work) -> Decision {
+    Decision::Drive(Errand::new(header, drive, request, false), work)
 }
 
 fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {

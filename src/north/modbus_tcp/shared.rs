@@ -1,6 +1,7 @@
 //! What connections share, and what each knows beforehand: who the client is, which drive a unit id means.
 
 use std::collections::HashMap;
+use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -8,6 +9,7 @@ use arc_swap::ArcSwap;
 
 use super::lookout::Turns;
 use super::{Options, Seldom};
+use crate::command::{Authority, Origin, SourceKind};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 
@@ -48,13 +50,35 @@ impl Shared {
     }
 }
 
-/// What a client may do, and its name in the audit.
+/// Who a client is and what it may do.
 #[derive(Debug, Clone)]
-pub(super) struct Authority {
-    /// Whether it may write at all.
-    pub(super) may_write: bool,
-    /// Its address, with the name in its certificate if it has shown one.
+pub(super) struct Client {
+    pub(super) authority: Authority,
+    /// Its address, with the name in its certificate if it has shown one: its name in the audit.
     pub(super) who: String,
+    /// The same without the port: all its connections are one client.
+    client: Arc<str>,
+}
+
+impl Client {
+    /// The client at `peer`, by the `name` in its certificate if it has shown one.
+    pub(super) fn new(peer: SocketAddr, name: Option<&str>, authority: Authority) -> Client {
+        let (kind, ip) = (SourceKind::ModbusTcp.name(), peer.ip());
+        let (who, client) = match name {
+            Some(name) => (format!("{name} at {peer}"), format!("{kind} {name} at {ip}")),
+            None => (peer.to_string(), format!("{kind} {ip}")),
+        };
+        Client {
+            authority,
+            who,
+            client: client.into(),
+        }
+    }
+
+    /// Who gives an order.
+    pub(super) fn origin(&self) -> Origin {
+        Origin::of(self.client.clone(), SourceKind::ModbusTcp, self.who.as_str())
+    }
 }
 
 /// What the clients of one listener see of the plant.
@@ -127,5 +151,38 @@ impl Routes {
     pub(super) fn bus(&self, place: usize) -> Option<&BusHandle> {
         let shown = self.shown.get(place).copied().unwrap_or_default();
         self.plant.buses.get(place).filter(|_| shown)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn connections_are_one_client_and_clients_are_told_apart() {
+        let client = |peer: &str, name: Option<&str>| {
+            let client = Client::new(peer.parse().unwrap(), name, Authority::ReadOnly);
+            client.origin().client().to_string()
+        };
+        assert_eq!(client("127.0.0.1:4711", None), client("127.0.0.1:4712", None));
+        assert_ne!(client("127.0.0.1:4711", None), client("127.0.0.2:4711", None));
+        assert_eq!(client("[::1]:5", None), "modbus_tcp ::1");
+        let op = Some("op");
+        assert_eq!(client("127.0.0.1:4711", op), client("127.0.0.1:4712", op));
+        assert_ne!(
+            client("127.0.0.1:4711", op),
+            client("127.0.0.2:4711", op),
+            "one certificate, two places"
+        );
+        assert_ne!(
+            client("127.0.0.1:4711", op),
+            client("127.0.0.1:4711", Some("vi")),
+            "one place, two certificates"
+        );
+        assert_ne!(client("127.0.0.1:4711", op), client("127.0.0.1:4711", None));
+        let who = Client::new("127.0.0.1:4711".parse().unwrap(), op, Authority::Write)
+            .origin()
+            .who;
+        assert_eq!(who, "op at 127.0.0.1:4711", "the audit names the connection");
     }
 }

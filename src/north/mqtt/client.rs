@@ -12,7 +12,7 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::commands::Commands;
+use super::commands::{Commands, Ended};
 use super::connection::{self, Bounds, Connection, KEEP_ALIVE, News};
 use super::outbox::{Acked, Message, Outbox};
 use super::payload::{self, Topics};
@@ -54,8 +54,8 @@ pub(super) async fn run(
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            news = next(&mut client.link) => client.on_news(news),
-            result = client.commands.finished() => client.outbox.push_result(result),
+            news = next(&mut client.link), if client.commands.has_room() => client.on_news(news),
+            ended = client.commands.finished() => client.on_ended(ended),
             _ = ticks.tick() => client.on_tick().await,
         }
         client.pump();
@@ -111,6 +111,8 @@ struct Client {
     back_off: Duration,
     /// Why there is no connection, as it was last logged.
     trouble: Option<String>,
+    /// Events that came too fast.
+    missed: u64,
     dropped_told: u64,
     /// Topics on which the broker took no messages, as far as they were logged.
     refused_told: BTreeSet<Arc<str>>,
@@ -130,6 +132,7 @@ impl Client {
             link: Link::Away { until: now },
             back_off: BACK_OFF.0,
             trouble: None,
+            missed: 0,
             dropped_told: 0,
             refused_told: BTreeSet::new(),
             options,
@@ -149,16 +152,31 @@ impl Client {
 
     fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
         match event {
-            Ok(event) => {
-                self.take_event(&event);
-                // A burst is taken in at once: who falls behind loses events.
-                let rest: Vec<_> = drain(&mut self.events).collect();
-                rest.iter().for_each(|event| self.take_event(event));
-            }
-            Err(RecvError::Lagged(lost)) => tracing::warn!("{lost} events came too fast and are not published"),
+            Ok(event) => self.take_event(&event),
+            Err(RecvError::Lagged(lost)) => self.missed(lost),
             // The plant that told them is gone; there is a new one.
             Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
         }
+        self.take_told();
+    }
+
+    /// Takes in at once what was told: who falls behind loses events.
+    fn take_told(&mut self) {
+        loop {
+            match self.events.try_recv() {
+                Ok(event) => self.take_event(&event),
+                Err(TryRecvError::Lagged(lost)) => self.missed(lost),
+                Err(TryRecvError::Empty | TryRecvError::Closed) => return,
+            }
+        }
+    }
+
+    fn missed(&mut self, lost: u64) {
+        self.missed += lost;
+        tracing::error!(
+            "{lost} events came faster than they could be taken and are lost, {} since the start; the log has them",
+            self.missed
+        );
     }
 
     fn take_event(&mut self, event: &Event) {
@@ -300,10 +318,15 @@ impl Client {
         };
         let plant = self.plant.load();
         if self.options.commands
-            && let Some(result) = self.commands.take(incoming, &plant, Instant::now())
+            && let Some(result) = self.commands.take(incoming, &plant, Instant::now(), SystemTime::now())
         {
             self.outbox.push_result(result);
         }
+    }
+
+    fn on_ended(&mut self, ended: Ended) {
+        let result = self.commands.result(ended, SystemTime::now());
+        self.outbox.push_result(result);
     }
 
     async fn on_tick(&mut self) {
@@ -339,8 +362,8 @@ impl Client {
         }
         let events = plant.events.subscribe();
         if !events.same_channel(&self.events) {
-            let mut old = std::mem::replace(&mut self.events, events);
-            drain(&mut old).for_each(|event| self.take_event(&event));
+            self.take_told();
+            self.events = events;
         }
         self.publisher.adopt(&plant);
         self.watched = plant;
@@ -410,8 +433,7 @@ impl Client {
 
     /// Sends what waits, then `offline`, then says good-bye; all within half a second.
     async fn farewell(mut self) {
-        let rest: Vec<_> = drain(&mut self.events).collect();
-        rest.iter().for_each(|event| self.take_event(event));
+        self.take_told();
         let begun = tokio::time::Instant::now();
         // When the time is over the connection is cut, and the broker publishes the last will.
         let in_time = tokio::time::timeout_at(begun + FAREWELL, self.say_goodbye(begun + LAST_RESULTS)).await;
@@ -438,9 +460,9 @@ impl Client {
                 break;
             }
             tokio::select! {
-                news = next(&mut self.link) => self.on_news(news),
+                news = next(&mut self.link), if self.commands.has_room() => self.on_news(news),
                 event = self.events.recv() => self.on_event(event),
-                result = self.commands.finished() => self.outbox.push_result(result),
+                ended = self.commands.finished() => self.on_ended(ended),
                 () = tokio::time::sleep_until(last_results), if !offline_put => {}
             }
         }
@@ -453,20 +475,10 @@ impl Client {
     }
 }
 
-/// What was told and not heard yet.
-fn drain(events: &mut Receiver<Arc<Event>>) -> impl Iterator<Item = Arc<Event>> {
-    std::iter::from_fn(|| {
-        loop {
-            match events.try_recv() {
-                Ok(event) => return Some(event),
-                Err(TryRecvError::Lagged(_)) => {}
-                Err(TryRecvError::Empty | TryRecvError::Closed) => return None,
-            }
-        }
-    })
-}
-
 /// Three quarters to all of `wait`, by a random number: gateways that lost one broker do not come back in step.
 fn jittered(wait: Duration, random: u64) -> Duration {
     wait.mul_f64(0.75 + 0.25 * (random as f64 / u64::MAX as f64))
 }
+
+#[cfg(test)]
+mod tests;

@@ -1,26 +1,35 @@
-//! The set topics: from a message to one order, and from its answer to one result.
+//! The set topics: from a message to one order, and from its answer to one result. Pure: time is an argument, and
+//! waiting is all that is left to a task.
 
 use std::collections::VecDeque;
+use std::future::poll_fn;
 use std::hash::{BuildHasher, RandomState};
+use std::sync::Arc;
+use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant, SystemTime};
 
-use serde::Serialize;
 use serde_json::Value as Json;
-use tokio::task::JoinSet;
 
-use super::connection::is_topic;
 use super::outbox::Message;
-use super::payload::{self, Topics};
+use super::payload::Topics;
+use super::reply::Reply;
 use super::request::{self, Incoming, MAX_NAME, excerpt};
-use crate::command::{Answer, CONFIRMED, Order, Origin, Outcome, SourceKind};
+use crate::command::{Answer, Authority, Order, Origin, SourceKind};
 use crate::document::nearest;
 use crate::drive::ModelPoint;
-use crate::plant::Plant;
+use crate::plant::{Placed, Plant};
 
-/// Commands that wait for their answer.
-const MAX_RUNNING: usize = 64;
-/// Commands that wait for their answer besides, if they are stops.
-const MAX_STOPS: usize = 64;
+/// Commands that wait for their answer from the bus, and bytes that are kept for their results. Only stops can be so many:
+/// of all else the queues of the buses take fewer.
+const WAITING: Bound = Bound {
+    most: 4096,
+    bytes: 8 << 20,
+};
+/// The same of commands that the drive acknowledged and that wait for the read that shows their effect.
+const CONFIRMING: Bound = Bound {
+    most: 1024,
+    bytes: 8 << 20,
+};
 /// Messages remembered to recognise a repetition.
 const REMEMBERED: usize = 256;
 /// Time for which a command with an `id` is recognised when it comes again.
@@ -30,12 +39,36 @@ const REPLAYED: Duration = Duration::from_secs(60);
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
-    running: JoinSet<(u64, Message)>,
+    /// All that comes over the connection to the broker is one client.
+    client: Arc<str>,
+    /// In the order in which they were taken.
+    waiting: Row,
+    /// In the order in which they were acknowledged.
+    confirming: Row,
     hasher: RandomState,
     /// Commands taken, oldest first.
     recent: VecDeque<Taken>,
     /// Commands taken so far: their numbers.
     taken: u64,
+}
+
+/// A command under way.
+#[derive(Debug)]
+struct Running {
+    number: u64,
+    id: Option<Json>,
+    reply: Reply,
+    placed: Placed,
+}
+
+/// A command of which all is known that its result tells.
+#[derive(Debug)]
+pub(super) struct Ended {
+    number: u64,
+    id: Option<Json>,
+    reply: Reply,
+    answer: Answer,
+    confirmed: Option<Duration>,
 }
 
 /// A command that was taken.
@@ -55,37 +88,52 @@ impl Commands {
     pub(super) fn new(topics: Topics) -> Commands {
         Commands {
             topics,
-            running: JoinSet::new(),
+            client: SourceKind::Mqtt.name().into(),
+            waiting: Row::default(),
+            confirming: Row::default(),
             hasher: RandomState::new(),
             recent: VecDeque::new(),
             taken: 0,
         }
     }
 
-    /// Takes a message; returns its result if it is there at once. A repetition of a command is answered from memory
-    /// and not carried out again: one that the broker marks as such, or the same message with the same `id` within a
-    /// minute. A stop is carried out whenever it comes.
-    pub(super) fn take(&mut self, incoming: Incoming, plant: &Plant, now: Instant) -> Option<Message> {
+    /// Whether more may be taken. While not, messages stay with the broker, whoever sends them: no stop is refused for
+    /// want of room here.
+    pub(super) fn has_room(&self) -> bool {
+        !self.waiting.is_full(WAITING)
+    }
+
+    /// Takes a message at `now`, which is `time` on the calendar; returns its result if it is there at once, else its
+    /// order is in the queue of the bus. A repetition of a command is answered from memory and not carried out again: one
+    /// that the broker marks as such, or the same message with the same `id` within a minute. A stop is carried out
+    /// whenever it comes.
+    pub(super) fn take(
+        &mut self,
+        incoming: Incoming,
+        plant: &Plant,
+        now: Instant,
+        time: SystemTime,
+    ) -> Option<Message> {
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
             return None; // somebody takes a retained message away
         }
         let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: incoming.topic.clone(),
-        };
+        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, incoming.topic.as_str());
         let what = || excerpt(&incoming.payload);
         let Some(drive) = plant.drive(target.drive) else {
             let name = excerpt(target.drive.as_bytes());
             let why = unknown_drive(target.drive, plant);
-            let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin);
-            return Some(reply.answer(request::id(&incoming, target.point), &answer, None));
+            let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
+            return Some(reply.message(request::id(&incoming, target.point), &answer, None, time));
         };
         let profile = &drive.image.spec.profile;
         let request = request::read(&incoming, target.point, profile);
         let (points, expiry) = match request.order {
-            Err(refusal) => return Some(reply.answer(request.id, &drive.refuse(&what(), refusal, origin), None)),
+            Err(refusal) => {
+                let answer = drive.refuse(&what(), refusal, origin, now);
+                return Some(reply.message(request.id, &answer, None, time));
+            }
             Ok(order) => order,
         };
         let run = profile.model_index(ModelPoint::Run);
@@ -96,18 +144,24 @@ impl Commands {
         if !stop && let Some(known) = self.repeated(&incoming, fingerprint, identity, now) {
             return known.result.clone();
         }
-        let most = if stop { MAX_RUNNING + MAX_STOPS } else { MAX_RUNNING };
-        if self.running.len() >= most {
-            let answer = drive.turn_away(&what(), Outcome::QueueFull, origin);
-            return Some(reply.answer(request.id, &answer, None));
+        let running = Running {
+            number: self.remember(fingerprint, &incoming, identity, now),
+            id: request.id,
+            reply,
+            placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
+        };
+        self.follow(running, time)
+    }
+
+    /// What was refused has its result at once; all else waits.
+    fn follow(&mut self, mut running: Running, time: SystemTime) -> Option<Message> {
+        match running.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            Some(answer) => Some(self.result(running.end(answer, None), time)),
+            None => {
+                self.waiting.push(running);
+                None
+            }
         }
-        let number = self.remember(fingerprint, &incoming, identity, now);
-        self.running.spawn(async move {
-            let order = Order::Points(points);
-            let (answer, confirmed) = drive.order_confirmed(order, origin, true, expiry).await;
-            (number, reply.answer(request.id, &answer, confirmed))
-        });
-        None
     }
 
     fn fingerprint(&self, incoming: &Incoming) -> u64 {
@@ -149,25 +203,106 @@ impl Commands {
         self.taken
     }
 
-    /// The next result; waits for ever when no command is running. May be cancelled without loss.
-    pub(super) async fn finished(&mut self) -> Message {
-        loop {
-            match self.running.join_next().await {
-                Some(Ok((number, message))) => {
-                    if let Some(known) = self.recent.iter_mut().find(|known| known.number == number) {
-                        known.result = Some(message.clone());
-                    }
-                    return message;
-                }
-                Some(Err(error)) => tracing::error!("a command ended unexpectedly: {error}"),
-                None => std::future::pending().await,
-            }
+    /// The next command that ends; waits for ever when none is under way. May be cancelled without loss.
+    pub(super) async fn finished(&mut self) -> Ended {
+        poll_fn(|cx| self.poll_finished(cx)).await
+    }
+
+    /// The next command that has ended, if there is one.
+    pub(super) fn try_finished(&mut self) -> Option<Ended> {
+        match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
+            Poll::Ready(ended) => Some(ended),
+            Poll::Pending => None,
         }
     }
 
-    /// Whether no command waits for its answer.
+    /// Those that the drive acknowledged make room for those that wait for the bus; if too many wait for the read that
+    /// shows their effect, the oldest stays "acknowledged".
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Ended> {
+        while let Some(mut running) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
+            match running.placed.answer() {
+                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(running.end(answer, None)),
+                _ => self.confirming.push(running),
+            }
+        }
+        let settled = |running: &mut Running| running.placed.poll_confirmation(cx).is_ready();
+        let next = self.confirming.take(settled).or_else(|| {
+            let full = self.confirming.is_full(CONFIRMING);
+            full.then(|| self.confirming.take(|_| true)).flatten()
+        });
+        let ended = next.and_then(|mut running| {
+            let (answer, confirmed) = (running.placed.answer()?, running.placed.confirmation().flatten());
+            Some(running.end(answer, confirmed))
+        });
+        ended.map_or(Poll::Pending, Poll::Ready)
+    }
+
+    /// The one result of a command that ended, at `time`.
+    pub(super) fn result(&mut self, ended: Ended, time: SystemTime) -> Message {
+        let message = ended.reply.message(ended.id, &ended.answer, ended.confirmed, time);
+        if let Some(known) = self.recent.iter_mut().find(|known| known.number == ended.number) {
+            known.result = Some(message.clone());
+        }
+        message
+    }
+
+    /// Whether no command is under way.
     pub(super) fn is_idle(&self) -> bool {
-        self.running.is_empty()
+        self.waiting.is_empty() && self.confirming.is_empty()
+    }
+}
+
+impl Running {
+    fn end(self, answer: Answer, confirmed: Option<Duration>) -> Ended {
+        Ended {
+            number: self.number,
+            id: self.id,
+            reply: self.reply,
+            answer,
+            confirmed,
+        }
+    }
+
+    /// Bytes that a client may make long.
+    fn bytes(&self) -> usize {
+        self.reply.bytes() + self.id.as_ref().and_then(Json::as_str).map_or(0, str::len)
+    }
+}
+
+/// How much a row may hold.
+#[derive(Debug, Clone, Copy)]
+struct Bound {
+    most: usize,
+    bytes: usize,
+}
+
+/// Commands in their order.
+#[derive(Debug, Default)]
+struct Row {
+    commands: VecDeque<Running>,
+    bytes: usize,
+}
+
+impl Row {
+    fn push(&mut self, running: Running) {
+        self.bytes += running.bytes();
+        self.commands.push_back(running);
+    }
+
+    /// Takes out the first one that `is_it`.
+    fn take(&mut self, is_it: impl FnMut(&mut Running) -> bool) -> Option<Running> {
+        let place = self.commands.iter_mut().position(is_it)?;
+        let running = self.commands.remove(place)?;
+        self.bytes -= running.bytes();
+        Some(running)
+    }
+
+    fn is_full(&self, bound: Bound) -> bool {
+        self.commands.len() >= bound.most || self.bytes >= bound.bytes
+    }
+
+    fn is_empty(&self) -> bool {
+        self.commands.is_empty()
     }
 }
 
@@ -180,308 +315,5 @@ fn unknown_drive(name: &str, plant: &Plant) -> String {
     format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
 }
 
-/// Where a result goes.
-#[derive(Debug, Clone)]
-struct Reply {
-    topic: String,
-    correlation: Option<Vec<u8>>,
-    drive: String,
-}
-
-#[derive(Serialize)]
-struct ResultObject<'r> {
-    id: Option<Json>,
-    drive: &'r str,
-    ok: bool,
-    result: &'r str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    error: Option<ErrorObject<'r>>,
-    latency_ms: f64,
-    /// From acceptance to the read that showed the effect.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    confirmed_ms: Option<f64>,
-    time: String,
-}
-
-#[derive(Serialize)]
-struct ErrorObject<'r> {
-    code: &'r str,
-    message: String,
-}
-
-impl Reply {
-    /// To the response topic of a request that names one, else to the result topic of the drive.
-    fn to(incoming: &Incoming, result: String, drive: &str) -> Reply {
-        let asked = incoming.response_topic.clone().filter(|topic| is_topic(topic));
-        Reply {
-            correlation: incoming.correlation.clone().filter(|_| asked.is_some()),
-            topic: asked.unwrap_or(result),
-            drive: drive.to_string(),
-        }
-    }
-
-    /// The one result: `confirmed` when a read showed the effect in time, else how the bus answered.
-    fn answer(&self, id: Option<Json>, answer: &Answer, confirmed: Option<Duration>) -> Message {
-        let text = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
-        let code = match confirmed {
-            Some(_) => CONFIRMED,
-            None => answer.outcome.code(),
-        };
-        self.put(id, code, text, answer.latency, confirmed)
-    }
-
-    fn put(
-        &self,
-        id: Option<Json>,
-        code: &str,
-        error: Option<String>,
-        latency: Duration,
-        confirmed: Option<Duration>,
-    ) -> Message {
-        let object = ResultObject {
-            id,
-            drive: &self.drive,
-            ok: error.is_none(),
-            result: code,
-            error: error.map(|message| ErrorObject { code, message }),
-            latency_ms: payload::milliseconds(latency),
-            confirmed_ms: confirmed.map(payload::milliseconds),
-            time: payload::rfc3339(SystemTime::now()),
-        };
-        // Strings, figures and what was JSON before: this cannot fail.
-        let payload = serde_json::to_vec(&object).unwrap_or_default();
-        Message {
-            correlation: self.correlation.clone(),
-            ..Message::passing(self.topic.as_str(), payload)
-        }
-    }
-}
-
 #[cfg(test)]
-mod tests {
-    use super::super::fixture;
-    use super::*;
-    use crate::codec::Reply as BusReply;
-    use crate::command::Urgency;
-    struct Bench {
-        plant: Plant,
-        commands: Commands,
-        now: Instant,
-        events: tokio::sync::broadcast::Receiver<std::sync::Arc<crate::event::Event>>,
-    }
-
-    impl Bench {
-        fn new() -> Bench {
-            let plant = fixture::plant(&["p1"]);
-            fixture::read(&plant, "p1", 1, 0, Instant::now());
-            Bench {
-                events: plant.events.subscribe(),
-                commands: Commands::new(Topics::new("drivegate", "hall")),
-                now: Instant::now(),
-                plant,
-            }
-        }
-
-        fn take(&mut self, incoming: Incoming) -> Option<Message> {
-            self.commands.take(incoming, &self.plant, self.now)
-        }
-
-        fn queued(&self) -> usize {
-            self.plant.buses[0].queue.lock().len()
-        }
-
-        /// Lets the spawned commands get as far as they can, then acknowledges one.
-        async fn acknowledge(&mut self) -> Json {
-            loop {
-                let command = self.plant.buses[0].queue.lock().pop(Urgency::Read, Instant::now());
-                if let Some(command) = command {
-                    let outcome = Outcome::Acknowledged(BusReply::Written);
-                    command.ticket.answer(outcome, Instant::now());
-                    return json(&self.commands.finished().await);
-                }
-                tokio::task::yield_now().await;
-            }
-        }
-    }
-
-    fn json(message: &Message) -> Json {
-        serde_json::from_slice(&message.payload).unwrap()
-    }
-
-    fn set(topic: &str, payload: &str) -> Incoming {
-        Incoming {
-            topic: format!("drivegate/hall/drive/{topic}"),
-            payload: payload.into(),
-            packet: 1,
-            ..Incoming::default()
-        }
-    }
-
-    #[tokio::test]
-    async fn a_command_is_carried_out_and_answered() {
-        let mut bench = Bench::new();
-        assert_eq!(bench.take(set("p1/set", r#"{"id": 5, "run": true}"#)), None);
-        let result = bench.acknowledge().await;
-        assert_eq!(result["id"], 5);
-        assert_eq!(
-            (&result["ok"], &result["result"]),
-            (&true.into(), &"acknowledged".into())
-        );
-        assert!(result["latency_ms"].is_number() && result.get("error").is_none());
-        assert!(bench.commands.is_idle());
-    }
-
-    #[tokio::test]
-    async fn a_response_topic_gets_the_result_and_the_correlation() {
-        let mut bench = Bench::new();
-        let request = Incoming {
-            response_topic: Some("client/7".to_string()),
-            correlation: Some(vec![1, 0, 255]),
-            ..set("p1/set", "no")
-        };
-        let result = bench.take(request.clone()).unwrap();
-        assert_eq!(
-            (result.topic.as_ref(), result.correlation),
-            ("client/7", Some(vec![1, 0, 255]))
-        );
-        for bad in ["", "a/+", "#", "a\0b"] {
-            let request = Incoming {
-                response_topic: Some(bad.to_string()),
-                ..request.clone()
-            };
-            let result = bench.take(request).unwrap();
-            assert_eq!(result.topic.as_ref(), "drivegate/hall/drive/p1/result", "{bad:?}");
-            assert_eq!(result.correlation, None);
-        }
-    }
-
-    #[tokio::test]
-    async fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
-        let mut bench = Bench::new();
-        for (incoming, code) in [
-            (set("p1/set", "{"), "bad_value"),
-            (set("p1/set", r#"{"ready": true}"#), "not_writable"),
-            (
-                Incoming {
-                    retain: true,
-                    ..set("p1/set", r#"{"run": true}"#)
-                },
-                "not_allowed",
-            ),
-        ] {
-            let result = json(&bench.take(incoming).unwrap());
-            assert_eq!((&result["ok"], &result["error"]["code"]), (&false.into(), &code.into()));
-            assert!(!result["error"]["message"].as_str().unwrap().is_empty());
-            let event = bench.events.try_recv().unwrap();
-            assert_eq!(event.kind, crate::event::EventKind::RefusedCommand);
-        }
-        assert_eq!(bench.queued(), 0);
-        assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
-        let result = json(&bench.take(set("p11/set", r#"{"id": 21, "run": true}"#)).unwrap());
-        assert_eq!(
-            (&result["error"]["code"], &result["id"]),
-            (&"unknown_drive".into(), &21.into())
-        );
-        let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
-        assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
-        let record = bench.plant.writes.audit().recent().pop().unwrap();
-        assert_eq!((record.result, record.drive.as_str()), ("unknown_drive", "p11"));
-        assert!(
-            result["error"]["message"]
-                .as_str()
-                .unwrap()
-                .contains("did you mean `p1`?")
-        );
-        let cleared = Incoming {
-            retain: true,
-            ..set("p1/set", "")
-        };
-        assert_eq!(bench.take(cleared), None, "somebody cleans up");
-        assert!(bench.events.try_recv().is_err());
-    }
-
-    #[tokio::test]
-    async fn limits_are_refused_where_all_orders_are() {
-        let mut bench = Bench::new();
-        assert_eq!(bench.take(set("p1/set/speed_reference", "101")), None);
-        let result = json(&bench.commands.finished().await);
-        assert_eq!(result["error"]["code"], "bad_value");
-        assert_eq!(bench.take(set("p1/set", "{}")), None);
-        let result = json(&bench.commands.finished().await);
-        assert!(result["error"]["message"].as_str().unwrap().contains("names no point"));
-        assert_eq!(bench.queued(), 0);
-    }
-
-    #[tokio::test]
-    async fn a_repetition_is_answered_from_memory() {
-        let mut bench = Bench::new();
-        let first = set("p1/set", r#"{"id": 1, "run": true}"#);
-        assert_eq!(bench.take(first.clone()), None);
-        let repeated = Incoming {
-            dup: true,
-            ..first.clone()
-        };
-        assert_eq!(
-            bench.take(repeated.clone()),
-            None,
-            "still running: its result comes once"
-        );
-        let result = bench.acknowledge().await;
-        assert_eq!(json(&bench.take(repeated.clone()).unwrap()), result);
-        assert!(bench.commands.is_idle() && bench.queued() == 0);
-        // Published again by a client that did not see the acknowledgement: the same id, not marked by the broker.
-        let again = Incoming {
-            packet: 2,
-            ..first.clone()
-        };
-        assert_eq!(json(&bench.take(again.clone()).unwrap()), result);
-        // Another order under the same id, and the same one a minute later, are new commands.
-        assert_eq!(
-            bench.take(set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#)),
-            None
-        );
-        bench.acknowledge().await;
-        assert_eq!(
-            bench.take(again.clone()),
-            None,
-            "the id was used for something else since"
-        );
-        bench.acknowledge().await;
-        assert!(bench.take(again.clone()).is_some());
-        bench.now += REPLAYED;
-        assert_eq!(bench.take(again), None);
-        bench.acknowledge().await;
-        // Without an id only the broker's mark tells a repetition.
-        let bare = set("p1/set", r#"{"speed_reference": 5}"#);
-        for _ in 0..2 {
-            assert_eq!(bench.take(bare.clone()), None);
-            bench.acknowledge().await;
-        }
-        assert!(bench.take(Incoming { dup: true, ..bare }).is_some());
-    }
-
-    #[tokio::test]
-    async fn a_stop_is_carried_out_whenever_it_comes() {
-        let mut bench = Bench::new();
-        let stop = set("p1/set", r#"{"id": 2, "run": false}"#);
-        for _ in 0..2 {
-            assert_eq!(bench.take(stop.clone()), None);
-            bench.acknowledge().await;
-        }
-        for _ in 0..MAX_RUNNING {
-            assert_eq!(bench.take(set("p1/set/run", "1")), None);
-        }
-        assert!(bench.take(set("p1/set/run", "1")).is_some(), "full");
-        assert_eq!(bench.take(stop), None, "a stop still gets in");
-    }
-
-    #[tokio::test]
-    async fn too_many_commands_at_one_time_are_refused() {
-        let mut bench = Bench::new();
-        for _ in 0..MAX_RUNNING {
-            assert_eq!(bench.take(set("p1/set/run", "1")), None);
-        }
-        let result = json(&bench.take(set("p1/set/run", "1")).unwrap());
-        assert_eq!(result["error"]["code"], "queue_full");
-    }
-}
+mod tests;

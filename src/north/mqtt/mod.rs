@@ -7,8 +7,8 @@
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher` and `outbox` are pure: what is said, when, and in which order. `client` is the one
-//! task that owns them; `connection` wraps rumqttc, which keeps nothing for us: every connection is a new
+//! `payload`, `publisher`, `commands`, `reply` and `outbox` are pure: what is said, when, and in which order; `offline` is
+//! `commands` for whoever has no broker. `client` is the one task that owns them; `connection` wraps rumqttc, which keeps nothing for us: every connection is a new
 //! client with a clean session, and what the broker did not acknowledge is sent again from the outbox.
 
 mod client;
@@ -17,9 +17,11 @@ mod connection;
 #[cfg(test)]
 mod fixture;
 mod journal;
+mod offline;
 mod outbox;
 mod payload;
 mod publisher;
+mod reply;
 mod request;
 mod store;
 mod tls;
@@ -34,6 +36,9 @@ use tokio_util::sync::CancellationToken;
 
 use super::NorthStats;
 use crate::plant::SharedPlant;
+
+pub use self::offline::{Offline, Published};
+pub use self::request::Incoming;
 
 /// A secret that does not show in logs.
 #[derive(Clone, PartialEq, Eq)]

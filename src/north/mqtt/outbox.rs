@@ -9,10 +9,11 @@ use std::sync::Arc;
 
 use super::journal::RecordId;
 
-/// Results that may wait; the oldest is dropped.
-const RESULTS: usize = 256;
+/// Results that may wait, as many as commands may, and their bytes; the oldest is dropped.
+const RESULTS: usize = 4096;
+const RESULT_BYTES: usize = 32 << 20;
 /// Events that may wait in memory; with a buffer on disk the rest waits there.
-const EVENTS: usize = 1024;
+const EVENTS: usize = crate::event::BURST;
 /// Events loaded from the disk at one time.
 const LOADED: usize = 64;
 /// Connections that may break under a result before it is given up: its response topic may be the cause.
@@ -37,6 +38,10 @@ impl Message {
             retain: false,
             correlation: None,
         }
+    }
+
+    fn bytes(&self) -> usize {
+        self.topic.len() + self.payload.len() + self.correlation.as_ref().map_or(0, Vec::len)
     }
 }
 
@@ -116,13 +121,18 @@ impl Outbox {
     /// A result; when too many wait the oldest is dropped.
     pub(super) fn push_result(&mut self, message: Message) {
         self.serial += 1;
-        self.dropped += push(&mut self.results, self.serial, message, None, RESULTS);
+        let full = |results: &VecDeque<Entry>| {
+            let bytes = results.iter().map(|entry| entry.message.bytes());
+            results.len() >= RESULTS || bytes.sum::<usize>() >= RESULT_BYTES
+        };
+        self.dropped += push(&mut self.results, self.serial, message, None, full);
     }
 
     /// An event, with its record when it is on disk; when too many wait the oldest is dropped.
     pub(super) fn push_event(&mut self, message: Message, record: Option<RecordId>) {
         self.serial += 1;
-        self.dropped += push(&mut self.events, self.serial, message, record, EVENTS);
+        let full = |events: &VecDeque<Entry>| events.len() >= EVENTS;
+        self.dropped += push(&mut self.events, self.serial, message, record, full);
     }
 
     /// How many events may be loaded from the disk now.
@@ -285,9 +295,15 @@ impl Outbox {
 
 /// Appends an entry; returns how many were dropped to make room. One that is under way is dropped last: it is
 /// probably delivered.
-fn push(queue: &mut VecDeque<Entry>, serial: u64, message: Message, record: Option<RecordId>, most: usize) -> u64 {
+fn push(
+    queue: &mut VecDeque<Entry>,
+    serial: u64,
+    message: Message,
+    record: Option<RecordId>,
+    is_full: impl Fn(&VecDeque<Entry>) -> bool,
+) -> u64 {
     let mut dropped = 0;
-    while queue.len() >= most {
+    while is_full(queue) {
         let victim = queue.iter().position(|e| !e.under_way).unwrap_or(0);
         queue.remove(victim);
         dropped += 1;
@@ -439,6 +455,19 @@ mod tests {
             outbox.give_up(key);
         }
         assert_eq!(outbox.next(1).unwrap().1.topic.as_ref(), "e2");
+    }
+
+    #[test]
+    fn long_results_are_fewer() {
+        let mut outbox = Outbox::default();
+        let long = Message {
+            correlation: Some(vec![0; 60_000]),
+            ..event("r")
+        };
+        for _ in 0..1000 {
+            outbox.push_result(long.clone());
+        }
+        assert_eq!(outbox.waiting(), RESULT_BYTES / 60_001 + 1);
     }
 
     #[test]

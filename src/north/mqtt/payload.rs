@@ -75,7 +75,8 @@ pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
 /// What the state object of a drive tells, its times apart: a change of it is worth a message.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct Shown {
-    pub(super) state: State,
+    /// `None` while it is not known.
+    pub(super) state: Option<State>,
     pub(super) quality: Quality,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,
@@ -118,7 +119,7 @@ pub(super) struct StateObject<'s> {
 impl Serialize for StateObject<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
-        map.serialize_entry("state", self.shown.state.name())?;
+        map.serialize_entry("state", &self.shown.state.map(State::name))?;
         map.serialize_entry("quality", self.shown.quality.name())?;
         let read_at = self.age.and_then(|age| self.wall.checked_sub(age));
         map.serialize_entry("time", &read_at.map(rfc3339))?;
@@ -170,6 +171,11 @@ impl Bare {
     /// The value, if it is good.
     pub(super) fn of(value: Option<Value>) -> Bare {
         value.map_or(Bare::Nothing, Bare::Value)
+    }
+
+    /// The drive in one word, if that is known.
+    pub(super) fn state(state: Option<State>) -> Bare {
+        state.map_or(Bare::Nothing, Bare::State)
     }
 
     /// The text of the active fault, if the fault code is good.
@@ -280,7 +286,11 @@ fn rounded(value: f64, steps: f64) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use std::time::Instant;
+
     use super::*;
+    use crate::cache::{DriveImage, DriveSpec, Link};
+    use crate::codec::Table;
 
     #[test]
     fn set_topics_are_recognised() {
@@ -333,7 +343,7 @@ mod tests {
         let profile = Profile::parse("m.toml", source, false).unwrap();
         let state = |value: Option<i64>| {
             let shown = Shown {
-                state: State::NotReady,
+                state: Some(State::NotReady),
                 quality: Quality::Good,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
             };
@@ -357,6 +367,48 @@ mod tests {
             (&told["mode"], &told["mode_text"]),
             (&serde_json::Value::Null, &"".into())
         );
+    }
+
+    #[test]
+    fn a_state_that_is_not_known_is_null_and_not_good() {
+        let cx = crate::drive::profile::Profiles::built_in()
+            .get("vacon-cx")
+            .unwrap()
+            .clone();
+        let second = Duration::from_secs(1);
+        let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx.clone()), second);
+        let now = Instant::now();
+        image.update(|s| {
+            (s.link, s.fast_at) = (Link::Online(SystemTime::UNIX_EPOCH), Some(now));
+            s.store(Table::DiscreteInput, 1, &[1], now);
+            s.store(Table::DiscreteInput, 4, &[0], now);
+        });
+        let running = cx.point_index("running").unwrap();
+        let ready = cx.point_index("ready").unwrap();
+        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        let object = StateObject {
+            shown: &shown,
+            names: &["running".to_string(), "ready".to_string()],
+            indices: &[running, ready],
+            profile: &cx,
+            fault_text: String::new(),
+            age: None,
+            wall: SystemTime::UNIX_EPOCH,
+        };
+        let told = serde_json::to_value(&object).unwrap();
+        assert_eq!(
+            (&told["state"], &told["quality"]),
+            (&serde_json::Value::Null, &"bad".into())
+        );
+        assert_eq!(
+            (&told["running"], &told["ready"]),
+            (&serde_json::Value::Null, &true.into())
+        );
+        assert_eq!(told["point_quality"], serde_json::json!({"ready": "good"}));
+        assert_eq!(Bare::state(shown.state), Bare::Nothing);
+        image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
+        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 
     #[test]

@@ -183,7 +183,7 @@ impl DriveTopics {
         for point in &mut self.points {
             let bare = match point.what {
                 What::Point(place) => Bare::of(shown.points.get(place).and_then(|(value, _)| *value)),
-                What::State => Bare::State(shown.state),
+                What::State => Bare::state(shown.state),
                 What::FaultText => Bare::fault_text(&reading),
             };
             if point.due(pace, now, bare) {

@@ -24,17 +24,23 @@ pub(super) const MAX_NAME: usize = 64;
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Incoming {
-    pub(super) topic: String,
-    pub(super) payload: Vec<u8>,
-    pub(super) retain: bool,
+pub struct Incoming {
+    /// Where it was published.
+    pub topic: String,
+    /// A JSON object, or a bare value.
+    pub payload: Vec<u8>,
+    /// It was or is retained, so it is no command.
+    pub retain: bool,
     /// The broker sends it again.
-    pub(super) dup: bool,
-    pub(super) packet: u16,
-    pub(super) response_topic: Option<String>,
-    pub(super) correlation: Option<Vec<u8>>,
+    pub dup: bool,
+    /// Packet id, by which the broker's repetition is known.
+    pub packet: u16,
+    /// Where the client wants its result.
+    pub response_topic: Option<String>,
+    /// What the client knows its result by.
+    pub correlation: Option<Vec<u8>>,
     /// What is left of the message's life, s.
-    pub(super) expiry: Option<u32>,
+    pub expiry: Option<u32>,
 }
 
 /// The payload for people: what can be printed, not too long.

@@ -1,7 +1,7 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
-use crate::cache::{Access, DriveImage, DriveSpec, Link};
+use crate::cache::{Access, DriveImage, DriveSpec, Link, Snapshot};
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
@@ -190,6 +190,49 @@ fn states_and_status_bits() {
         "-50 % of 0 to 50 Hz is below 0 Hz, which 0x8102 cannot say"
     );
     assert_eq!(read(&image, now, 0x8012, 1), Ok(vec![(-2500i16) as u16]));
+}
+
+/// Not known is neither set nor not set: the word is stale, the state not available.
+#[test]
+fn bits_that_are_not_known() {
+    let now = Instant::now();
+    let cx = Profile::clone(Profiles::built_in().get("vacon-cx").unwrap());
+    let image = image(cx);
+    image.update(|s| {
+        (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now));
+        for (address, bit) in [(0, 1), (1, 1), (2, 1), (3, 0), (4, 0)] {
+            s.store(Table::DiscreteInput, address, &[bit], now);
+        }
+        s.store(Table::Input, 0, &[2500], now);
+        s.store(Table::Holding, 0, &[2500], now);
+        s.store(Table::Coil, 0, &[1], now);
+        s.store(Table::Coil, 1, &[0], now);
+    });
+    // Ready, running, at reference, remote; the family has no warning.
+    let all = 0x80A3;
+    assert_eq!(read(&image, now, 0x8000, 2), Ok(vec![all, 3]));
+    assert_eq!(read(&image, now, 0x8100, 1), Ok(vec![1]));
+    let without = |address, status, state| {
+        let known = image.snapshot();
+        image.update(|s| s.refuse(Table::DiscreteInput, address, 1, Exception::ADDRESS));
+        assert_eq!(
+            read(&image, now, 0x8000, 2),
+            Ok(vec![status, state]),
+            "discrete input {address}"
+        );
+        image.update(|s| *s = Snapshot::clone(&known));
+    };
+    without(2, all & !0x0002 | STALE, 0xFFFF);
+    without(4, all | STALE, 0xFFFF);
+    without(3, all | STALE, 3);
+    without(0, all & !0x0080 | STALE, 3);
+    image.update(|s| s.refuse(Table::Coil, 1, 1, Exception::ADDRESS));
+    assert_eq!(
+        read(&image, now, 0x8100, 1),
+        Ok(vec![0xFFFF]),
+        "it may be told to turn the other way"
+    );
+    assert_eq!(read(&image, now, 0x8000, 2), Ok(vec![all, 3]));
 }
 
 #[test]

@@ -68,6 +68,8 @@ pub struct Board {
     reported: BTreeMap<Object, u8>,
     /// Records that are not acknowledged yet, a reply each.
     reports: VecDeque<Vec<u8>>,
+    /// The first of them was told.
+    told: bool,
     polled: SimTime,
     /// Power cycles of the drive that the board has gone through with it.
     power_cycles: u32,
@@ -84,6 +86,7 @@ impl Board {
             overridden: BTreeMap::new(),
             reported: BTreeMap::new(),
             reports: VecDeque::new(),
+            told: false,
             polled: now,
             power_cycles: 0,
         }
@@ -142,19 +145,19 @@ impl Board {
     fn act(&mut self, command: &Command, now: SimTime, model: Model<'_>) -> Result<Option<Answer>, u8> {
         match command {
             Command::Identify => {
-                if self.waiting {
-                    self.waiting = false;
+                if std::mem::take(&mut self.waiting) {
                     self.polled = now;
-                    self.full_report(model);
                 }
+                self.full_report(model);
                 Ok(Some(Answer::bytes(&[self.options.device_type])))
             }
             Command::Poll { again } => {
                 self.polled = now;
-                if *again {
+                if *again && std::mem::take(&mut self.told) {
                     self.reports.pop_front();
                 }
                 self.note_changes(model);
+                self.told = !self.reports.is_empty();
                 Ok(Some(self.reports.front().cloned().map_or(Answer::Ack, Answer::Data)))
             }
             Command::WarmReset if self.map.warm_reset => {
@@ -317,9 +320,10 @@ impl Board {
         store(address, count, model)
     }
 
-    /// All AI, AO, BI and BO, as after Identify.
+    /// All AI, AO, BI and BO, as after each Identify, whatever of it was reported before.
     fn full_report(&mut self, model: Model<'_>) {
         self.reports.clear();
+        self.told = false;
         self.reported.clear();
         self.collect(true, model);
     }

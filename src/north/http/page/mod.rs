@@ -7,7 +7,7 @@ use std::fmt::{self, Write as _};
 use std::time::Instant;
 
 use crate::cache::Reading;
-use crate::drive::{ModelPoint, Quality};
+use crate::drive::{ModelPoint, Quality, State};
 use crate::plant::Plant;
 
 const DOCUMENT: &str = include_str!("index.html");
@@ -81,7 +81,7 @@ fn drives(out: &mut String, plant: &Plant, now: Instant) -> fmt::Result {
             out,
             "<tr><td>{}<td>{}{gap}{}",
             Escaped(&reading.spec.name),
-            reading.state().name().replace('_', " "),
+            reading.state().map_or("unknown", State::name).replace('_', " "),
             Escaped(&fault)
         )?;
         for (point, _) in COLUMNS {

@@ -57,6 +57,7 @@ const STATES = {
   not_ready: ["amber", "◌ not ready"],
   fault: ["red", "▲ fault"],
   offline: ["", "✕ offline"],
+  unknown: ["amber", "? unknown"],
 };
 
 const COLUMNS = [
@@ -118,8 +119,9 @@ function driveRow(name) {
 
 function showDrive(row, drive) {
   row.drive = drive;
-  const [colour, word] = STATES[drive.state] || ["", drive.state];
-  className(row.body, drive.state);
+  const state = drive.state || "unknown";
+  const [colour, word] = STATES[state] || ["", state];
+  className(row.body, state);
   className(row.badge, `badge ${colour}`);
   text(row.badge, word);
   const warning = drive.points.warning;
@@ -325,7 +327,7 @@ function showEvents(news) {
   const anew = news.last.split("-")[0] !== lastEvent.split("-")[0];
   if (anew) $("events").replaceChildren();
   lastEvent = news.last;
-  for (const event of news.events) addEvent(new Date(event.time), event.event, event.drive || event.bus, event.text);
+  for (const event of news.events.slice(-EVENTS_SHOWN)) addEvent(new Date(event.time), event.event, event.drive || event.bus, event.text);
   $("events-note").hidden = $("events").children.length > 0;
 }
 

@@ -4,9 +4,10 @@ use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
 
-use super::super::shared::{Authority, Shared, View};
+use super::super::shared::{Client, Shared, View};
 use super::super::{Options, Uncached};
 use super::*;
+use crate::command::Authority;
 use crate::north::NorthStats;
 use crate::plant::Plant;
 
@@ -45,11 +46,8 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
     let stats = Arc::new(NorthStats::default());
     let shared = Shared::new(options, stats.clone());
     let view = View::new(Arc::new(ArcSwap::from_pointee(plant)), None);
-    let authority = Authority {
-        may_write: false,
-        who: "test".to_string(),
-    };
-    let session = Session::new(Arc::new(shared), Arc::new(view), authority);
+    let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);
+    let session = Session::new(Arc::new(shared), Arc::new(view), client);
     let (client, end) = tokio::io::duplex(pipe);
     let cancel = CancellationToken::new();
     let server = tokio::spawn(serve(end, session, idle_timeout, cancel.clone()));

@@ -1,0 +1,123 @@
+use super::*;
+use crate::cache::DriveImage;
+use crate::drive::profile::Profiles;
+
+/// What rests on the drive's frequency range is no worse than the figures that it rests on.
+#[test]
+fn a_value_within_a_band_is_as_good_as_the_band() {
+    let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let index = |name: &str| profile.point_index(name).unwrap();
+    let reference = index("frequency_reference");
+    let image = DriveImage::new(
+        DriveSpec::new("pump-1", "line1", 1, profile.clone()),
+        Duration::from_secs(1),
+    );
+    let now = Instant::now();
+    let sample = || image.reading(now, Duration::from_secs(1)).sample(reference);
+    let store = |name: &str, value: f64| {
+        let raw = profile.points[index(name)].raw().unwrap().clone();
+        let words = raw.encode(Value::Number(value), 0).unwrap();
+        image.update(|s| s.store(raw.table, raw.address, &words, now));
+    };
+    image.update(|s| s.link = Link::Online(SystemTime::now()));
+    store("speed_reference", 50.0);
+    assert_eq!(sample(), Sample::NONE, "no range is known");
+    store("minimum_frequency", 10.0);
+    store("maximum_frequency", 50.0);
+    let expected = |quality| (Some(Value::Number(30.0)), quality);
+    assert_eq!((sample().value, sample().quality), expected(Quality::Good));
+    image.update(|s| s.link = Link::Offline(SystemTime::now()));
+    assert_eq!((sample().value, sample().quality), expected(Quality::Stale));
+    store("maximum_frequency", 10.0);
+    assert_eq!(sample(), Sample::NONE, "an empty range");
+}
+
+/// The state rests on fault, running and ready, in that order, as far as it needs them.
+#[test]
+fn a_state_is_known_only_when_what_decides_it_is() {
+    let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
+    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx), Duration::from_secs(1));
+    let now = Instant::now();
+    let seen = || {
+        let reading = image.reading(now, Duration::from_secs(1));
+        (reading.state(), reading.overall())
+    };
+    let bit = |address, word| image.update(|s| s.store(Table::DiscreteInput, address, &[word], now));
+    let refuse = |address| image.update(|s| s.refuse(Table::DiscreteInput, address, 1, Exception::ADDRESS));
+    let (ready, running, fault) = (1, 2, 4);
+    assert_eq!(seen(), (Some(State::Offline), Quality::Bad));
+    image.update(|s| (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now)));
+    assert_eq!(seen(), (None, Quality::Bad), "nothing is read yet");
+    bit(ready, 1);
+    bit(fault, 0);
+    assert_eq!(seen(), (None, Quality::Bad), "running is not");
+    bit(running, 0);
+    assert_eq!(seen(), (Some(State::Ready), Quality::Good));
+    refuse(running);
+    assert_eq!(seen(), (None, Quality::Bad), "it may run");
+    bit(fault, 1);
+    assert_eq!(seen(), (Some(State::Fault), Quality::Good), "whether it runs or not");
+    refuse(fault);
+    bit(running, 1);
+    assert_eq!(seen(), (None, Quality::Bad), "it may have a fault");
+    bit(fault, 0);
+    refuse(ready);
+    assert_eq!(seen(), (Some(State::Running), Quality::Good), "needs no word of ready");
+    let late = now + Duration::from_millis(900);
+    image.update(|s| {
+        s.fast_at = Some(late);
+        s.store(Table::DiscreteInput, fault, &[0], late);
+    });
+    let reading = image.reading(now + Duration::from_millis(1100), Duration::from_secs(1));
+    assert_eq!(
+        (reading.state(), reading.overall()),
+        (None, Quality::Stale),
+        "running is old"
+    );
+}
+
+/// Somebody may have changed them while it was away.
+#[test]
+fn parameters_from_before_a_drive_went_away_are_not_believed() {
+    let cx = Profiles::built_in().get("vacon-cx").unwrap().clone();
+    let maximum = cx.point_index("maximum_frequency").unwrap();
+    let program = cx.point_index("control_program").unwrap();
+    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, cx), Duration::from_secs(1));
+    let now = Instant::now();
+    let seen = || {
+        let reading = image.reading(now, Duration::from_secs(1));
+        let band = reading.band_for_commands(Bound::Fixed(0.0), Bound::Point(maximum));
+        (reading.sample(maximum).quality, reading.sample(program).quality, band)
+    };
+    image.update(|s| {
+        s.link = Link::Online(SystemTime::now());
+        s.store(Table::Holding, 101, &[50], now);
+        s.store(Table::Input, 17, &[1], now);
+    });
+    assert_eq!(seen(), (Quality::Good, Quality::Good, Some((0.0, 50.0))));
+    image.update(Snapshot::outlive);
+    assert_eq!(seen(), (Quality::Stale, Quality::Stale, None));
+    image.update(|s| s.store(Table::Holding, 101, &[100], now));
+    assert_eq!(seen(), (Quality::Good, Quality::Stale, Some((0.0, 100.0))));
+}
+
+/// A family without a bit is not asked for it.
+#[test]
+fn what_a_family_lacks_decides_nothing() {
+    let source = "name = \"m\"\nprotocols = [\"modbus-rtu\"]\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
+         [[point]]\nname = \"running\"\nat = \"holding 1.0\"\nclass = \"fast\"\n";
+    let profile = crate::drive::Profile::parse("m.toml", source, false).unwrap();
+    let image = DriveImage::new(
+        DriveSpec::new("m", "line1", 1, Arc::new(profile)),
+        Duration::from_secs(1),
+    );
+    let now = Instant::now();
+    for (word, state) in [(1, State::Running), (0, State::NotReady)] {
+        image.update(|s| {
+            (s.link, s.fast_at) = (Link::Online(SystemTime::now()), Some(now));
+            s.store(Table::Holding, 1, &[word], now);
+        });
+        let reading = image.reading(now, Duration::from_secs(1));
+        assert_eq!((reading.state(), reading.overall()), (Some(state), Quality::Good));
+    }
+}

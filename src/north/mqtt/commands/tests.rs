@@ -1,0 +1,346 @@
+use super::super::fixture;
+use super::*;
+use crate::codec::Reply as BusReply;
+use crate::command::{Outcome, Receipt, Urgency};
+
+struct Bench {
+    plant: Plant,
+    commands: Commands,
+    now: Instant,
+    events: tokio::sync::broadcast::Receiver<Arc<crate::event::Event>>,
+}
+
+impl Bench {
+    fn new() -> Bench {
+        let plant = fixture::plant(&["p1"]);
+        fixture::read(&plant, "p1", 1, 0, Instant::now());
+        Bench {
+            events: plant.events.subscribe(),
+            commands: Commands::new(Topics::new("drivegate", "hall")),
+            now: Instant::now(),
+            plant,
+        }
+    }
+
+    fn take(&mut self, incoming: Incoming) -> Option<Message> {
+        self.commands
+            .take(incoming, &self.plant, self.now, SystemTime::UNIX_EPOCH)
+    }
+
+    fn queued(&self) -> usize {
+        self.plant.buses.iter().map(|bus| bus.queue.lock().len()).sum()
+    }
+
+    fn finished(&mut self) -> Option<Json> {
+        let ended = self.commands.try_finished()?;
+        Some(json(&self.commands.result(ended, SystemTime::UNIX_EPOCH)))
+    }
+
+    /// The drive takes the next order; whether it shows its effect is not known yet.
+    fn take_order(&self) -> Option<(Order, Receipt)> {
+        let pop = |bus: &crate::plant::BusHandle| bus.queue.lock().pop(Urgency::Read, self.now);
+        let command = self.plant.buses.iter().find_map(pop)?;
+        let outcome = Outcome::Acknowledged(BusReply::Written);
+        Some((command.order, command.ticket.acknowledge(outcome, self.now)))
+    }
+
+    /// The drive takes the next order and never shows it; its result.
+    fn acknowledge(&mut self) -> Json {
+        drop(self.take_order().unwrap());
+        self.finished().unwrap()
+    }
+}
+
+fn json(message: &Message) -> Json {
+    serde_json::from_slice(&message.payload).unwrap()
+}
+
+fn set(topic: &str, payload: &str) -> Incoming {
+    Incoming {
+        topic: format!("drivegate/hall/drive/{topic}"),
+        payload: payload.into(),
+        packet: 1,
+        ..Incoming::default()
+    }
+}
+
+#[test]
+fn a_command_is_carried_out_and_answered() {
+    let mut bench = Bench::new();
+    assert_eq!(bench.take(set("p1/set", r#"{"id": 5, "run": true}"#)), None);
+    let result = bench.acknowledge();
+    assert_eq!(result["id"], 5);
+    assert_eq!(
+        (&result["ok"], &result["result"]),
+        (&true.into(), &"acknowledged".into())
+    );
+    assert!(result["latency_ms"].is_number() && result.get("error").is_none());
+    assert!(bench.commands.is_idle());
+}
+
+#[test]
+fn a_response_topic_gets_the_result_and_the_correlation() {
+    let mut bench = Bench::new();
+    let request = Incoming {
+        response_topic: Some("client/7".to_string()),
+        correlation: Some(vec![1, 0, 255]),
+        ..set("p1/set", "no")
+    };
+    let result = bench.take(request.clone()).unwrap();
+    assert_eq!(
+        (result.topic.as_ref(), result.correlation),
+        ("client/7", Some(vec![1, 0, 255]))
+    );
+    for bad in ["", "a/+", "#", "a\0b"] {
+        let request = Incoming {
+            response_topic: Some(bad.to_string()),
+            ..request.clone()
+        };
+        let result = bench.take(request).unwrap();
+        assert_eq!(result.topic.as_ref(), "drivegate/hall/drive/p1/result", "{bad:?}");
+        assert_eq!(result.correlation, None);
+    }
+}
+
+#[test]
+fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
+    let mut bench = Bench::new();
+    for (incoming, code) in [
+        (set("p1/set", "{"), "bad_value"),
+        (set("p1/set", r#"{"ready": true}"#), "not_writable"),
+        (
+            Incoming {
+                retain: true,
+                ..set("p1/set", r#"{"run": true}"#)
+            },
+            "not_allowed",
+        ),
+    ] {
+        let result = json(&bench.take(incoming).unwrap());
+        assert_eq!((&result["ok"], &result["error"]["code"]), (&false.into(), &code.into()));
+        assert!(!result["error"]["message"].as_str().unwrap().is_empty());
+        let event = bench.events.try_recv().unwrap();
+        assert_eq!(event.kind, crate::event::EventKind::RefusedCommand);
+    }
+    assert_eq!(bench.queued(), 0);
+    assert_eq!(bench.plant.writes.results().values().sum::<u64>(), 3);
+    let result = json(&bench.take(set("p11/set", r#"{"id": 21, "run": true}"#)).unwrap());
+    assert_eq!(
+        (&result["error"]["code"], &result["id"]),
+        (&"unknown_drive".into(), &21.into())
+    );
+    let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
+    assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
+    let record = bench.plant.writes.audit().recent().pop().unwrap();
+    assert_eq!((record.result, record.drive.as_str()), ("unknown_drive", "p11"));
+    assert!(
+        result["error"]["message"]
+            .as_str()
+            .unwrap()
+            .contains("did you mean `p1`?")
+    );
+    let cleared = Incoming {
+        retain: true,
+        ..set("p1/set", "")
+    };
+    assert_eq!(bench.take(cleared), None, "somebody cleans up");
+    assert!(bench.events.try_recv().is_err());
+}
+
+#[test]
+fn limits_are_refused_where_all_orders_are() {
+    let mut bench = Bench::new();
+    let result = json(&bench.take(set("p1/set/speed_reference", "101")).unwrap());
+    assert_eq!(result["error"]["code"], "bad_value");
+    let result = json(&bench.take(set("p1/set", "{}")).unwrap());
+    assert!(result["error"]["message"].as_str().unwrap().contains("names no point"));
+    assert!(bench.commands.is_idle());
+    assert_eq!(bench.queued(), 0);
+}
+
+#[test]
+fn a_repetition_is_answered_from_memory() {
+    let mut bench = Bench::new();
+    let first = set("p1/set", r#"{"id": 1, "run": true}"#);
+    assert_eq!(bench.take(first.clone()), None);
+    let repeated = Incoming {
+        dup: true,
+        ..first.clone()
+    };
+    assert_eq!(
+        bench.take(repeated.clone()),
+        None,
+        "still running: its result comes once"
+    );
+    let result = bench.acknowledge();
+    assert_eq!(json(&bench.take(repeated.clone()).unwrap()), result);
+    assert!(bench.commands.is_idle() && bench.queued() == 0);
+    // Published again by a client that did not see the acknowledgement: the same id, not marked by the broker.
+    let again = Incoming {
+        packet: 2,
+        ..first.clone()
+    };
+    assert_eq!(json(&bench.take(again.clone()).unwrap()), result);
+    // Another order under the same id, and the same one a minute later, are new commands.
+    assert_eq!(
+        bench.take(set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#)),
+        None
+    );
+    bench.acknowledge();
+    assert_eq!(
+        bench.take(again.clone()),
+        None,
+        "the id was used for something else since"
+    );
+    bench.acknowledge();
+    assert!(bench.take(again.clone()).is_some());
+    bench.now += REPLAYED;
+    assert_eq!(bench.take(again), None);
+    bench.acknowledge();
+    // Without an id only the broker's mark tells a repetition.
+    let bare = set("p1/set", r#"{"speed_reference": 5}"#);
+    for _ in 0..2 {
+        assert_eq!(bench.take(bare.clone()), None);
+        bench.acknowledge();
+    }
+    assert!(bench.take(Incoming { dup: true, ..bare }).is_some());
+}
+
+#[test]
+fn a_stop_is_carried_out_whenever_it_comes() {
+    let mut bench = Bench::new();
+    let stop = set("p1/set", r#"{"id": 2, "run": false}"#);
+    for _ in 0..2 {
+        assert_eq!(bench.take(stop.clone()), None);
+        bench.acknowledge();
+    }
+}
+
+#[test]
+fn orders_are_queued_as_the_messages_came() {
+    let mut bench = Bench::new();
+    let set_points = [
+        ("run", "1"),
+        ("reverse", "0"),
+        ("run", "0"),
+        ("run", "true"),
+        ("fault_reset", "1"),
+    ];
+    let taken = |bench: &Bench| bench.take_order().map(|(order, _)| order);
+    for (point, value) in set_points {
+        assert_eq!(bench.take(set(&format!("p1/set/{point}"), value)), None);
+    }
+    let index = |name: &str| {
+        let drive = bench.plant.drive("p1").unwrap();
+        drive.image.spec.profile.point_index(name).unwrap()
+    };
+    let bool_of = |name, on| Order::Points(vec![(index(name), crate::drive::Value::Bool(on))]);
+    // The stop goes first and has removed what came before it; nothing was polled in between.
+    assert_eq!(taken(&bench), Some(bool_of("run", false)));
+    assert_eq!(taken(&bench), Some(bool_of("run", true)));
+    assert_eq!(taken(&bench), Some(bool_of("fault_reset", true)));
+    assert_eq!(taken(&bench), None);
+}
+
+#[test]
+fn topics_of_one_broker_are_one_client() {
+    let mut bench = Bench::new();
+    for point in ["speed_reference", "run"] {
+        bench.take(set(&format!("p1/set/{point}"), "1"));
+        let command = bench.plant.buses[0].queue.lock().pop(Urgency::Read, bench.now).unwrap();
+        assert_eq!(command.ticket.client(), "mqtt");
+        assert_eq!(
+            command.ticket.origin().who,
+            format!("drivegate/hall/drive/p1/set/{point}")
+        );
+    }
+}
+
+/// `buses` lines with 40 drives each that were read.
+fn halls(buses: usize) -> (Bench, Vec<String>) {
+    let names: Vec<String> = (0..buses * 40).map(|i| format!("d{i}")).collect();
+    let mut bench = Bench::new();
+    bench.plant.buses = names
+        .chunks(40)
+        .flat_map(|chunk| fixture::plant(&chunk.iter().map(String::as_str).collect::<Vec<_>>()).buses)
+        .collect();
+    for name in &names {
+        fixture::read(&bench.plant, name, 1, 0, bench.now);
+    }
+    (bench, names)
+}
+
+#[test]
+fn a_thousand_drives_are_stopped_at_once() {
+    let (mut bench, names) = halls(25);
+    for name in &names {
+        assert_eq!(bench.take(set(&format!("{name}/set/run"), "false")), None, "{name}");
+    }
+    assert_eq!(bench.queued(), 1000);
+    while bench.take_order().is_some() {}
+    for _ in 0..1000 {
+        assert_eq!(bench.finished().unwrap()["result"], "acknowledged");
+    }
+    assert!(bench.finished().is_none() && bench.commands.is_idle());
+}
+
+#[test]
+fn who_waits_for_confirmation_is_in_nobodys_way() {
+    let (mut bench, names) = halls(10);
+    let mut receipts = VecDeque::new();
+    let mut early = Vec::new();
+    for round in 0..4 {
+        for (i, name) in names.iter().enumerate() {
+            let payload = format!(r#"{{"id": {}, "run": true}}"#, round * names.len() + i);
+            assert_eq!(bench.take(set(&format!("{name}/set"), &payload)), None);
+            receipts.extend(bench.take_order().map(|(_, receipt)| receipt));
+            early.extend(bench.finished());
+        }
+    }
+    assert!(bench.commands.has_room());
+    let surplus = 4 * names.len() - CONFIRMING.most + 1;
+    assert_eq!(early.len(), surplus, "only what goes beyond the bound");
+    for (id, result) in early.iter().enumerate() {
+        assert_eq!((&result["id"], &result["result"]), (&id.into(), &"acknowledged".into()));
+    }
+    receipts.drain(..surplus);
+    receipts.into_iter().for_each(|receipt| receipt.confirm(bench.now));
+    for id in surplus..4 * names.len() {
+        let result = bench.finished().unwrap();
+        assert_eq!((&result["id"], &result["result"]), (&id.into(), &"confirmed".into()));
+    }
+    assert!(bench.commands.is_idle());
+}
+
+#[test]
+fn what_cannot_be_kept_stays_with_the_broker() {
+    let (mut bench, names) = halls(25);
+    let mut taken = 0;
+    while bench.commands.has_room() {
+        let long = Incoming {
+            response_topic: Some("a".repeat(60_000)),
+            correlation: Some(vec![0; 60_000]),
+            ..set(&format!("{}/set/run", names[taken]), "false")
+        };
+        assert_eq!(bench.take(long), None);
+        taken += 1;
+    }
+    assert!((50..100).contains(&taken), "{taken}");
+    while bench.take_order().is_some() {}
+    while bench.finished().is_some() {}
+    assert!(bench.commands.has_room() && bench.commands.is_idle());
+}
+
+#[test]
+fn a_refusal_of_the_queue_tells_its_reason() {
+    let mut bench = Bench::new();
+    let results: Vec<Json> = (0..crate::command::CAPACITY + 2)
+        .filter_map(|_| bench.take(set("p1/set/run", "1")))
+        .map(|message| json(&message))
+        .collect();
+    assert_eq!(results.len(), 2);
+    assert_eq!(results[0]["error"]["code"], "queue_full");
+    let text = results[0]["error"]["message"].as_str().unwrap();
+    assert!(text.starts_with("64 commands wait already"), "{text}");
+    assert_eq!(bench.queued(), crate::command::CAPACITY);
+}

@@ -1,0 +1,141 @@
+//! An order that was given: where its answer and its confirmation arrive.
+
+use std::future::poll_fn;
+use std::pin::Pin;
+use std::task::{Context, Poll, Waker};
+use std::time::{Duration, Instant};
+
+use tokio::sync::oneshot;
+
+use crate::command::{Answer, Outcome};
+
+/// An order that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task waits
+/// with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing back.
+#[derive(Debug)]
+pub struct Placed {
+    accepted: Instant,
+    answer: Told<Answer>,
+    confirmation: Told<Duration>,
+}
+
+impl Placed {
+    pub(super) fn new(
+        accepted: Instant,
+        answer: oneshot::Receiver<Answer>,
+        confirmation: oneshot::Receiver<Duration>,
+    ) -> Placed {
+        Placed {
+            accepted,
+            answer: Told::Awaited(answer),
+            confirmation: Told::Awaited(confirmation),
+        }
+    }
+
+    /// When the order was taken.
+    pub fn accepted(&self) -> Instant {
+        self.accepted
+    }
+
+    /// The one answer, if it is there.
+    pub fn answer(&mut self) -> Option<Answer> {
+        now(|cx| self.poll_answer(cx))
+    }
+
+    /// Waits for the one answer.
+    pub async fn answered(&mut self) -> Answer {
+        poll_fn(|cx| self.poll_answer(cx)).await
+    }
+
+    /// As [`Placed::answered`], for whoever waits for several things.
+    pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
+        self.answer.poll(cx).map(|answer| {
+            // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+            answer.unwrap_or(Answer {
+                outcome: Outcome::ShuttingDown,
+                latency: Duration::ZERO,
+            })
+        })
+    }
+
+    /// Waits further for the read that shows the effect: the time from acceptance to it, or `None` when the order was
+    /// refused, or no read showed it within the time that the profile gives.
+    pub async fn confirmed(&mut self) -> Option<Duration> {
+        match self.answered().await.outcome.is_ok() {
+            true => poll_fn(|cx| self.poll_confirmation(cx)).await,
+            false => None,
+        }
+    }
+
+    /// Whether the effect was shown, once that is settled: as [`Placed::confirmed`].
+    pub fn confirmation(&mut self) -> Option<Option<Duration>> {
+        now(|cx| self.poll_confirmation(cx))
+    }
+
+    /// As [`Placed::confirmation`], for whoever waits for several things.
+    pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
+        self.confirmation.poll(cx)
+    }
+}
+
+/// What is told once, as often as it is asked for.
+#[derive(Debug)]
+enum Told<T> {
+    Awaited(oneshot::Receiver<T>),
+    /// `None`: it will never be told.
+    Known(Option<T>),
+}
+
+impl<T: Clone> Told<T> {
+    fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<T>> {
+        if let Told::Awaited(receiver) = self {
+            match Pin::new(receiver).poll(cx) {
+                Poll::Pending => return Poll::Pending,
+                Poll::Ready(told) => *self = Told::Known(told.ok()),
+            }
+        }
+        match self {
+            Told::Known(told) => Poll::Ready(told.clone()),
+            Told::Awaited(_) => Poll::Pending,
+        }
+    }
+}
+
+/// What a poll gives at once.
+fn now<T>(poll: impl FnOnce(&mut Context<'_>) -> Poll<T>) -> Option<T> {
+    match poll(&mut Context::from_waker(Waker::noop())) {
+        Poll::Ready(ready) => Some(ready),
+        Poll::Pending => None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::Reply;
+
+    #[test]
+    fn asked_without_a_runtime_and_as_often_as_one_likes() {
+        let (tell, answer) = oneshot::channel();
+        let (confirm, confirmation) = oneshot::channel();
+        let mut placed = Placed::new(Instant::now(), answer, confirmation);
+        assert_eq!((placed.answer(), placed.confirmation()), (None, None));
+        let acknowledged = Answer {
+            outcome: Outcome::Acknowledged(Reply::Written),
+            latency: Duration::from_millis(3),
+        };
+        tell.send(acknowledged.clone()).unwrap();
+        assert_eq!(placed.answer().as_ref(), Some(&acknowledged));
+        assert_eq!(placed.answer(), Some(acknowledged));
+        assert_eq!(placed.confirmation(), None);
+        confirm.send(Duration::from_millis(9)).unwrap();
+        let confirmed = Some(Some(Duration::from_millis(9)));
+        assert_eq!((placed.confirmation(), placed.confirmation()), (confirmed, confirmed));
+    }
+
+    #[test]
+    fn a_sender_that_is_gone_is_an_answer_too() {
+        let mut placed = Placed::new(Instant::now(), oneshot::channel().1, oneshot::channel().1);
+        assert_eq!(placed.answer().unwrap().outcome, Outcome::ShuttingDown);
+        assert_eq!(placed.confirmation(), Some(None));
+    }
+}

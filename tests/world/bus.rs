@@ -1,0 +1,280 @@
+//! One bus of a world: the real core, and a simulated line where the port would be.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use drivegate::bus::BusOptions;
+use drivegate::bus::core::{Action, BusCore};
+use drivegate::bus::master::Purpose;
+use drivegate::bus::supervision::Lease;
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate::codec::wire::Silence;
+use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
+use drivegate::command::{CommandQueue, WriteStats};
+use drivegate::drive::Profile;
+use drivegate::drive::profile::Profiles;
+use drivegate::event::Events;
+use drivegate::line::Rs485;
+use drivegate::plant::BusHandle;
+use drivegate::sim::drive::{DriveOptions, ModelOptions};
+use drivegate::sim::faults::FaultPlan;
+use drivegate::sim::half_duplex::{HalfDuplex, LineRules};
+use drivegate::sim::slave::Slaves;
+use drivegate::sim::statistics::Transcript;
+
+use super::scenario::Line;
+
+/// What went over the line last.
+#[derive(Debug, Clone)]
+pub struct Asked {
+    pub drive: usize,
+    pub pdu: RequestPdu,
+    pub at: Instant,
+    pub is_poll: bool,
+    /// When the image had the first word of a read from, before.
+    pub last_read: Option<Instant>,
+    /// What the drive answered, if it acted upon the request.
+    pub reply: Option<Reply>,
+}
+
+/// Something that happened on the line.
+#[derive(Debug, Clone)]
+pub enum Seen {
+    Sent(Asked),
+    Acted(Asked),
+    /// The exchange before ended.
+    Over(Asked),
+    /// Bytes came to the gateway.
+    Heard(Vec<u8>),
+}
+
+pub struct WorldBus {
+    pub line: Line,
+    pub handle: BusHandle,
+    pub core: BusCore,
+    pub wire: HalfDuplex,
+    pub options: BusOptions,
+    pub profile: Arc<Profile>,
+    pub open: bool,
+    pub exchanges: u64,
+    began: Instant,
+    until: Instant,
+    commands: bool,
+    asked: Option<Asked>,
+}
+
+impl WorldBus {
+    pub fn new(
+        index: usize,
+        line: &Line,
+        seed: u64,
+        events: &Events,
+        writes: &Arc<WriteStats>,
+        now: Instant,
+    ) -> WorldBus {
+        let mut profile = Profiles::built_in().get(line.family).unwrap().clone();
+        let own = Arc::make_mut(&mut profile);
+        own.turnaround = line.turnaround;
+        let format = LineFormat::new(line.baud, line.format).unwrap();
+        let options = BusOptions {
+            response_timeout: line.response_timeout,
+            retries: line.retries,
+            silence: Silence::Spec,
+            rs485: Rs485::Off,
+        };
+        let handle = handle(index, line, &profile, format);
+        let mut rules = LineRules::of(line.protocol, format);
+        rules.turnaround = line.turnaround;
+        let drives = (1..=line.drives).filter(|address| !line.dead.contains(address));
+        let drives = drives.map(|address| {
+            let mut model = ModelOptions::by_name(profile.simulator.as_deref().unwrap()).unwrap();
+            model.take_turnaround_of_line();
+            DriveOptions::new(address, model)
+        });
+        let mut faults = FaultPlan::new(line.faults.parse().unwrap(), seed ^ 0xFA17 ^ index as u64);
+        if let Some(point) = line.refuses
+            && let Some(raw) = profile.points[profile.point_index(point).unwrap()].raw()
+        {
+            faults = faults.refusing(1, raw.table, raw.address);
+        }
+        let slaves = Slaves::new(drives, Duration::ZERO);
+        let mut wire = HalfDuplex::new(rules, slaves, faults, Transcript::new(0));
+        wire.take_acts();
+        let mut core = BusCore::new(handle.clone(), &options, events.clone(), writes.clone(), &[], now);
+        core.opened(now);
+        WorldBus {
+            line: line.clone(),
+            handle,
+            core,
+            wire,
+            options,
+            profile,
+            open: true,
+            exchanges: 0,
+            began: now,
+            until: now,
+            commands: true,
+            asked: None,
+        }
+    }
+
+    /// The bus as a reload starts it anew, with the same drives on the same line.
+    pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
+        self.handle.queue.close(drivegate::command::Outcome::ShuttingDown, now);
+        let leases: Vec<Lease> = self.core.ended(now);
+        let format = self.handle.image.spec.format;
+        self.handle = handle(index, &self.line, &self.profile, format);
+        let (bus, options) = (self.handle.clone(), &self.options);
+        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &leases, now);
+        if self.open {
+            self.core.opened(now);
+        }
+        self.asked = None;
+        (self.until, self.commands) = (now, true);
+    }
+
+    fn sim(&self, now: Instant) -> Duration {
+        now - self.began
+    }
+
+    /// When the bus wants to be looked at next.
+    pub fn wake_at(&self) -> Instant {
+        let wire = self.wire.wake().map(|wake| self.began + wake.at);
+        let core = self.open.then_some(self.until);
+        let wake = [wire, core].into_iter().flatten().min();
+        wake.unwrap_or(self.began + Duration::from_secs(1_000_000))
+    }
+
+    /// A client gave an order.
+    pub fn command_came(&mut self, now: Instant) {
+        if self.open && self.commands {
+            self.core.command_came();
+            self.until = now;
+        }
+    }
+
+    /// The port goes, or comes back.
+    pub fn set_open(&mut self, open: bool, now: Instant) {
+        if open == self.open {
+            return;
+        }
+        self.open = open;
+        self.asked = None;
+        if open {
+            self.core.opened(now);
+            (self.until, self.commands) = (now, true);
+        } else {
+            self.wire.cut();
+            self.core.lost("the adapter is gone", now);
+        }
+    }
+
+    /// Lets the bus go on as far as it can at `now`.
+    pub fn step(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+        self.deliver(now, seen);
+        while self.open {
+            match self.core.poll(now) {
+                Action::Send => self.send(now, seen),
+                Action::Wait { until, commands, .. } => {
+                    self.note_over(seen);
+                    assert!(until > now, "idle until a time that is past");
+                    (self.until, self.commands) = (until, commands);
+                    return;
+                }
+            }
+        }
+    }
+
+    fn send(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+        self.note_over(seen);
+        let frame = self.core.sending(now);
+        self.exchanges += 1;
+        let turn = self.core.asked().expect("a turn is on the line");
+        let asked = Asked {
+            drive: turn.drive,
+            pdu: turn.pdu().clone(),
+            at: now,
+            is_poll: matches!(turn.purpose, Purpose::Poll(_)),
+            last_read: match turn.pdu() {
+                RequestPdu::Read { table, start, .. } => {
+                    let image = &self.handle.image.drives[turn.drive];
+                    image.snapshot().read_at(*table, *start)
+                }
+                _ => None,
+            },
+            reply: None,
+        };
+        seen.push(Seen::Sent(asked.clone()));
+        self.asked = Some(asked);
+        self.wire.on_bytes(&frame, self.sim(now));
+        self.note_acts(seen);
+    }
+
+    /// What is due on the wire reaches the drives, and the gateway.
+    fn deliver(&mut self, now: Instant, seen: &mut Vec<Seen>) {
+        let sim = self.sim(now);
+        self.wire.on_time(sim);
+        self.note_acts(seen);
+        let mut bytes = Vec::new();
+        while self.wire.take_due(sim, &mut bytes).is_some() {}
+        if self.open && !bytes.is_empty() {
+            seen.push(Seen::Heard(bytes.clone()));
+            self.core.heard(&bytes, now);
+            self.note_over(seen);
+        }
+    }
+
+    fn note_acts(&mut self, seen: &mut Vec<Seen>) {
+        for act in self.wire.take_acts() {
+            let Some(asked) = &mut self.asked else { continue };
+            let spec = &self.handle.image.drives[asked.drive].spec;
+            assert_eq!(spec.address, act.address, "a drive acted that was not asked");
+            let request = Request {
+                address: spec.address,
+                pdu: asked.pdu.clone(),
+                n2: spec.profile.n2,
+            };
+            if let Decoded::Reply { reply, .. } = self.line.protocol.decode(&request, &act.reply) {
+                asked.reply = Some(reply);
+                seen.push(Seen::Acted(asked.clone()));
+            }
+        }
+    }
+
+    /// The exchange is over when the core has nothing on the line any more.
+    fn note_over(&mut self, seen: &mut Vec<Seen>) {
+        if self.core.asked().is_none()
+            && let Some(asked) = self.asked.take()
+        {
+            seen.push(Seen::Over(asked));
+        }
+    }
+}
+
+fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat) -> BusHandle {
+    let name = format!("line{index}");
+    let spec = BusSpec {
+        name: name.clone(),
+        port: "none".to_string(),
+        protocol: line.protocol,
+        format,
+        cycle: line.cycle,
+        slow_cycle: Duration::from_secs(1),
+    };
+    let drive = |address: u8| {
+        let spec = DriveSpec {
+            access: Access::Control,
+            unit: index as u8 * 40 + address,
+            supervision: line.supervision.clone(),
+            on_shutdown: line.on_shutdown,
+            turnaround: line.turnaround,
+            frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
+            ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
+        };
+        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+    };
+    BusHandle {
+        image: Arc::new(BusImage::new(spec, (1..=line.drives).map(drive).collect())),
+        queue: Arc::new(CommandQueue::new().unwrap()),
+    }
+}

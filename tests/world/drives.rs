@@ -1,0 +1,89 @@
+//! What is true of a drive, as seen on its line and inside it, and what must follow from that.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use drivegate::codec::RequestPdu;
+
+/// Acts of a drive that are remembered.
+const KEPT: usize = 400;
+
+/// One drive of a world.
+#[derive(Debug)]
+pub struct Truth {
+    /// The run command, as the drive has it.
+    pub run: bool,
+    /// Until when a run may go onto the wire; none behind a stop.
+    pub may_run: Option<Instant>,
+    /// Open orders that may change the run command the other way: stops, resets.
+    pub last_stop_over: Option<Instant>,
+    /// Place of the last order that went onto the wire, stops apart.
+    pub last_place: usize,
+    /// What the drive did, with the words that it answered.
+    pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
+    /// The latest time at which a client was heard of for certain, and the latest at which it may have been.
+    pub heard: (Option<Instant>, Option<Instant>),
+    /// The motor runs since.
+    pub running_since: Option<Instant>,
+    pub ran_at: Option<Instant>,
+    /// The image has had it online since.
+    pub online_since: Option<Instant>,
+    /// Supervision last acted.
+    pub supervised: Option<Instant>,
+    /// A drive that is dead, or befell something: until then its answers excuse much.
+    pub troubled_until: Option<Instant>,
+    /// The word of the control register was changed by something else than the line.
+    pub lost_word: Option<Instant>,
+}
+
+impl Truth {
+    pub fn new() -> Truth {
+        Truth {
+            run: false,
+            may_run: None,
+            last_stop_over: None,
+            last_place: 0,
+            acts: VecDeque::new(),
+            heard: (None, None),
+            running_since: None,
+            ran_at: None,
+            online_since: None,
+            supervised: None,
+            troubled_until: None,
+            lost_word: None,
+        }
+    }
+
+    pub fn act(&mut self, at: Instant, pdu: RequestPdu, words: Option<Vec<u16>>) {
+        if self.acts.len() == KEPT {
+            self.acts.pop_front();
+        }
+        self.acts.push_back((at, pdu, words));
+    }
+
+    /// Whether the drive did since `since` what `which` looks for.
+    pub fn did(&self, since: Instant, which: impl Fn(&RequestPdu, Option<&Vec<u16>>) -> bool) -> bool {
+        let forgotten = self.acts.len() == KEPT && self.acts.front().is_some_and(|(at, ..)| *at > since);
+        forgotten || self.acts.iter().rev().take_while(|(at, ..)| *at >= since).any(|(_, pdu, words)| which(pdu, words.as_ref()))
+    }
+
+    pub fn trouble(&mut self, until: Instant) {
+        self.troubled_until = self.troubled_until.max(Some(until));
+    }
+
+    pub fn is_troubled(&self, since: Instant) -> bool {
+        self.troubled_until.is_some_and(|until| until >= since)
+    }
+
+    pub fn heard_for_certain(&mut self, at: Instant) {
+        self.heard.0 = self.heard.0.max(Some(at));
+        self.heard.1 = self.heard.1.max(Some(at));
+    }
+
+    pub fn maybe_heard(&mut self, at: Instant) {
+        self.heard.1 = self.heard.1.max(Some(at));
+    }
+}
+
+/// Time for what an incident leaves behind.
+pub const AFTERMATH: Duration = Duration::from_secs(12);

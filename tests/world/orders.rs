@@ -1,0 +1,159 @@
+//! The orders of a world: what each asks for, how far it got, and what became of it.
+
+use std::time::Instant;
+
+use drivegate::codec::{RequestPdu, Table};
+use drivegate::command::{Order, written};
+use drivegate::drive::{ModelPoint, Point, Profile, Value};
+use drivegate::sim::random::Random;
+
+/// What an order wants.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Wish {
+    Reference,
+    Run,
+    RunAtReference,
+    Stop,
+    StopAtReference,
+    RawStop,
+    RawRun,
+    /// By function 16, several registers of the control block (Vacon NX).
+    RawBlock(bool),
+    Reset,
+    Reverse,
+    RawRead,
+}
+
+impl Wish {
+    pub fn is_stop(self) -> bool {
+        matches!(
+            self,
+            Wish::Stop | Wish::StopAtReference | Wish::RawStop | Wish::RawBlock(false)
+        )
+    }
+
+    pub fn is_run(self) -> bool {
+        matches!(
+            self,
+            Wish::Run | Wish::RunAtReference | Wish::RawRun | Wish::RawBlock(true)
+        )
+    }
+
+    /// One that the dice choose.
+    pub fn of(dice: &mut Random) -> Wish {
+        match dice.within(0..=99) {
+            0..=29 => Wish::Reference,
+            30..=41 => Wish::Run,
+            42..=51 => Wish::RunAtReference,
+            52..=68 => Wish::Stop,
+            69..=73 => Wish::StopAtReference,
+            74..=77 => Wish::RawStop,
+            78..=80 => Wish::RawRun,
+            81..=82 => Wish::RawBlock(true),
+            83..=85 => Wish::RawBlock(false),
+            86..=91 => Wish::Reset,
+            92..=94 => Wish::Reverse,
+            _ => Wish::RawRead,
+        }
+    }
+}
+
+/// Words that only one order writes.
+pub type Unique = (Table, u16, Vec<u16>);
+
+/// One order.
+#[derive(Debug, Clone)]
+pub struct Record {
+    pub client: usize,
+    pub bus: usize,
+    pub drive: usize,
+    pub wish: Wish,
+    pub accepted: Instant,
+    pub expires: Instant,
+    pub unique: Option<Unique>,
+    /// Place in the order of acceptance; a newer reference takes that of the one it replaces.
+    pub place: usize,
+    pub sent: Option<Instant>,
+    pub answer: Option<(String, Instant)>,
+    pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
+    /// Orders of the bus that waited when it was accepted.
+    pub before: usize,
+    /// The drive was silent, away or blocked, or the line was faulty, while it waited.
+    pub excused: bool,
+}
+
+/// The writable register with a figure of its own that sets the speed, and the values that it takes.
+pub fn reference_point(profile: &Profile) -> (usize, &Point) {
+    let names = ["speed_reference", "frequency_reference", "frequency_command"];
+    let index = names.iter().find_map(|name| {
+        let index = profile.point_index(name)?;
+        let point = &profile.points[index];
+        (point.write && point.write_to.is_none() && point.raw().is_some()).then_some(index)
+    });
+    let index = index.unwrap_or_else(|| panic!("{} has no reference", profile.name));
+    (index, &profile.points[index])
+}
+
+/// A value of the reference that no order had for a long time, and the words that it is.
+pub fn unique_reference(profile: &Profile, number: usize) -> (usize, Value, Unique) {
+    let (index, point) = reference_point(profile);
+    let raw = point.raw().unwrap();
+    // 0 to 40 in hundredths: within what every family takes.
+    let value = Value::Number((number % 4_000) as f64 / 100.0);
+    let words = raw.encode(value, 0).unwrap();
+    (index, value, (raw.table, raw.address, words))
+}
+
+/// The order that a wish is, with the words that only it writes; none where the family has no such thing.
+pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, Option<Unique>)> {
+    let run = |on: bool| (profile.model_index(ModelPoint::Run).unwrap(), Value::Bool(on));
+    let (reference, value, unique) = unique_reference(profile, number);
+    let (raw, bit, _) = profile.run_bit().unwrap();
+    let raw_run = |on: bool| match raw.table {
+        Table::Coil => RequestPdu::WriteCoil { address: raw.address, on },
+        _ => RequestPdu::WriteRegister { address: raw.address, value: u16::from(on) << bit },
+    };
+    let model = |point: ModelPoint, value: Value| Some((Order::Points(vec![(profile.model_index(point)?, value)]), None));
+    match wish {
+        Wish::Reference => Some((Order::Points(vec![(reference, value)]), Some(unique))),
+        Wish::Run => Some((Order::Points(vec![run(true)]), None)),
+        Wish::RunAtReference => Some((Order::Points(vec![run(true), (reference, value)]), Some(unique))),
+        Wish::Stop => Some((Order::Points(vec![run(false)]), None)),
+        Wish::StopAtReference => Some((Order::Points(vec![run(false), (reference, value)]), Some(unique))),
+        Wish::RawStop => Some((Order::Write(raw_run(false)), None)),
+        Wish::RawRun => Some((Order::Write(raw_run(true)), None)),
+        Wish::RawBlock(on) => {
+            let values = vec![u16::from(on), 0, unique.2[0]];
+            (profile.name == "vacon-nx").then_some((
+                Order::Write(RequestPdu::WriteRegisters { start: raw.address, values }),
+                Some(unique),
+            ))
+        }
+        Wish::Reset => model(ModelPoint::FaultReset, Value::Bool(true)),
+        Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number % 2 == 0)),
+        Wish::RawRead => {
+            let (table, start, count) = match profile.name.as_str() {
+                "vacon-nx" => (Table::Holding, 1500, 1),
+                "vacon-cx" => (Table::Holding, 100, 1),
+                _ => return None,
+            };
+            Some((Order::Read(RequestPdu::Read { table, start, count }), None))
+        }
+    }
+}
+
+/// Whether a write sets just these words.
+pub fn sets(pdu: &RequestPdu, (table, address, words): &Unique) -> bool {
+    written(pdu).is_some_and(|(of, items)| {
+        let has = |(offset, word): (usize, &u16)| items.contains(&(address + offset as u16, *word));
+        of == *table && words.iter().enumerate().all(has)
+    })
+}
+
+/// What a write does to the run command: sets it, takes it away, or nothing.
+pub fn run_command(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
+    let (raw, ..) = profile.run_bit()?;
+    let (table, items) = written(pdu)?;
+    let (address, word) = items.into_iter().find(|(at, _)| table == raw.table && *at == raw.address)?;
+    Some(!profile.is_stop(table, address, word))
+}

@@ -1,0 +1,176 @@
+//! What a seed decides beforehand: lines, drives, faults, clients.
+
+use std::time::Duration;
+
+use drivegate::cache::{LeaseAction, OnShutdown, Supervision};
+use drivegate::codec::Protocol;
+use drivegate::sim::random::Random;
+
+/// One world.
+#[derive(Debug, Clone)]
+pub struct Scenario {
+    pub seed: u64,
+    /// How long it goes on before the gateway stops.
+    pub time: Duration,
+    pub buses: Vec<Line>,
+    pub clients: Vec<Habit>,
+    /// Mean time between two incidents (a drive that trips, restarts, vanishes ...); none in a calm world.
+    pub incidents: Option<Duration>,
+    /// Whether the gateway takes a new configuration now and then.
+    pub reloads: bool,
+}
+
+/// One line with its drives.
+#[derive(Debug, Clone)]
+pub struct Line {
+    pub family: &'static str,
+    pub protocol: Protocol,
+    pub baud: u32,
+    pub format: &'static str,
+    pub drives: u8,
+    pub turnaround: Duration,
+    pub response_timeout: Duration,
+    pub retries: u32,
+    pub cycle: Duration,
+    /// Of the wire, as `simulate --faults` takes them; empty for a sound one.
+    pub faults: String,
+    pub supervision: Option<Supervision>,
+    pub on_shutdown: OnShutdown,
+    /// Addresses where nobody answers.
+    pub dead: Vec<u8>,
+    /// A register that the first drive refuses to tell.
+    pub refuses: Option<&'static str>,
+}
+
+/// What a client is like.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Habit {
+    /// By MQTT: single points and whole objects, often two at once.
+    Mqtt,
+    /// By Modbus TCP: words of the common model, requests in one segment.
+    ModbusTcp,
+    /// Orders of all kinds by the function that all north sides use.
+    Plain,
+    /// By Modbus TCP: writes 0 to the command word of one drive without end.
+    StopsInALoop,
+    /// Commands one drive as fast as it is answered.
+    Floods,
+    /// One reference every half second to its own drive; it must always be served.
+    Steady,
+}
+
+const FAMILIES: [(&str, Protocol); 8] = [
+    ("vacon-nx", Protocol::ModbusRtu),
+    ("vacon-nx", Protocol::ModbusRtu),
+    ("eaton-svx", Protocol::ModbusRtu),
+    ("eaton-hvx", Protocol::ModbusRtu),
+    ("vacon-cx", Protocol::ModbusRtu),
+    ("teco-7300pa", Protocol::ModbusAscii),
+    ("vacon-nx-n2", Protocol::N2),
+    ("teco-7300pa-n2", Protocol::N2),
+];
+
+const FAULTS: [&str; 15] = [
+    "drop", "truncate", "corrupt", "deaf", "noise-before", "noise-after", "foreign-address", "foreign-length",
+    "stray-function", "split", "busy", "exception:4", "double", "late", "corrupt",
+];
+
+impl Scenario {
+    pub fn of(seed: u64) -> Scenario {
+        let mut dice = Random::new(seed);
+        let calm = dice.chance(0.35);
+        let buses = (0..dice.within(1..=3)).map(|_| Line::of(&mut dice, calm)).collect();
+        let mut clients = vec![Habit::Plain];
+        for habit in [
+            Habit::Mqtt,
+            Habit::ModbusTcp,
+            Habit::Plain,
+            Habit::StopsInALoop,
+            Habit::StopsInALoop,
+            Habit::Floods,
+        ] {
+            if dice.chance(0.35) {
+                clients.push(habit);
+            }
+        }
+        if calm {
+            clients.push(Habit::Steady);
+        }
+        Scenario {
+            seed,
+            time: Duration::from_millis(dice.within(8_000..=40_000)),
+            buses,
+            clients,
+            incidents: (!calm).then(|| Duration::from_millis(dice.within(700..=8_000))),
+            reloads: !calm && dice.chance(0.3),
+        }
+    }
+}
+
+impl Line {
+    fn of(dice: &mut Random, calm: bool) -> Line {
+        let (family, protocol) = FAMILIES[dice.within(0..=FAMILIES.len() as u64 - 1) as usize];
+        let ms = Duration::from_millis;
+        let (baud, format) = match protocol {
+            Protocol::N2 => (9600, "8N1"),
+            Protocol::ModbusAscii => ([9600, 19_200][dice.within(0..=1) as usize], "7E1"),
+            Protocol::ModbusRtu => ([9600, 19_200, 38_400, 115_200][dice.within(0..=3) as usize], "8N1"),
+        };
+        let most = if protocol == Protocol::N2 { 3 } else { 6 };
+        let crowd = protocol == Protocol::ModbusRtu && dice.chance(0.06);
+        let drives = if crowd { 30 } else { dice.within(1..=most) as u8 };
+        let turnaround = Duration::from_micros(dice.within(500..=12_000));
+        let response_timeout = match protocol {
+            Protocol::N2 => ms(250),
+            _ => [ms(30), ms(60), ms(100)][dice.within(0..=2) as usize],
+        };
+        let timeout = ms(dice.within(300..=3_000));
+        let action = match dice.within(0..=9) {
+            0..=6 => LeaseAction::Stop,
+            7 => LeaseAction::Hold,
+            _ => LeaseAction::SpeedReference(20.0),
+        };
+        let supervised = dice.chance(0.6);
+        Line {
+            family,
+            protocol,
+            baud,
+            format,
+            drives,
+            turnaround,
+            response_timeout,
+            retries: dice.within(0..=2) as u32,
+            cycle: ms([10, 50, 200][dice.within(0..=2) as usize]),
+            faults: if calm || dice.chance(0.25) { String::new() } else { faults(dice, response_timeout) },
+            supervision: supervised.then_some(Supervision {
+                timeout,
+                action,
+                adopt: dice.chance(0.3),
+            }),
+            on_shutdown: if dice.chance(0.6) { OnShutdown::Stop } else { OnShutdown::Hold },
+            dead: if dice.chance(0.2) && drives > 1 { vec![drives] } else { Vec::new() },
+            refuses: (!calm && dice.chance(0.15)).then_some("running"),
+        }
+    }
+
+    /// Whether replies may come when they are not expected any more, or twice.
+    pub fn is_late(&self) -> bool {
+        ["late", "double", "stray"].iter().any(|fault| self.faults.contains(fault))
+    }
+}
+
+/// Up to four kinds of faults, seldom or often.
+fn faults(dice: &mut Random, response_timeout: Duration) -> String {
+    let mut kinds: Vec<String> = Vec::new();
+    for _ in 0..dice.within(1..=4) {
+        let fault = FAULTS[dice.within(0..=FAULTS.len() as u64 - 1) as usize];
+        let rate = [0.005, 0.02, 0.08, 0.2][dice.within(0..=3) as usize] / 1.2;
+        let fault = match fault {
+            // From just behind the timeout to where a reply is forgotten.
+            "late" => format!("late:{}ms", response_timeout.as_millis() as u64 * dice.within(105..=290) / 100),
+            other => other.to_string(),
+        };
+        kinds.push(format!("{fault}={rate}"));
+    }
+    kinds.join(",")
+}
