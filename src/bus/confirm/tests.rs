@@ -35,7 +35,7 @@ impl Bench {
     }
 
     fn receipt(&self) -> Receipt {
-        let origin = Origin::gateway(SourceKind::Mqtt, "t");
+        let origin = Origin::new(SourceKind::Mqtt, "t");
         let (ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
         ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now)
     }

@@ -5,12 +5,13 @@ use super::*;
 use crate::bus::command_run::{CommandRun, Next, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::master::supervise;
+use crate::bus::n2_late_replies::N2LateReplies;
 use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
 use crate::command::{
-    Command, CommandQueue, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket, Urgency,
-    WriteStats, admit, written,
+    Authority, Command, CommandQueue, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket,
+    Urgency, WriteStats, admit, written,
 };
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
@@ -174,8 +175,8 @@ impl Bench {
         let image = self.image();
         let reading = image.reading(self.now, DEFAULT_EXPIRY);
         let index = image.spec.profile.model_index(point).unwrap();
-        let admitted = admit(Order::Points(vec![(index, value)]), &reading, true).unwrap();
-        let origin = Origin::gateway(SourceKind::Mqtt, "client");
+        let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, "client");
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
         let command = Command::new(0, admitted, self.now + DEFAULT_EXPIRY, ticket);
         self.bus.queue.submit(command, self.now);
@@ -190,7 +191,7 @@ impl Bench {
 
     /// The next step of what was begun is on the wire.
     fn send(&mut self) -> (Urgency, Step) {
-        let Wanted::Step(urgency, step) = self.drive.wanted(&self.image(), self.now) else {
+        let Wanted::Step(urgency, step) = self.drive.wanted(&self.image(), &N2LateReplies::default(), self.now) else {
             panic!("nothing to send")
         };
         self.drive.sent(urgency, &step, self.now);

@@ -52,7 +52,7 @@ impl Bench {
         order: Order,
         reference_only: bool,
     ) -> Receiver<Answer> {
-        let origin = Origin::gateway(kind, who);
+        let origin = Origin::new(kind, who);
         let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
         let admitted = Admitted {
             order,

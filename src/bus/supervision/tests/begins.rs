@@ -112,8 +112,13 @@ fn a_read_renews_nothing_and_holds_nothing() {
         count: 1,
     };
     let image = bench.image();
-    let admitted = admit(Order::Read(pdu), &image.reading(bench.now, DEFAULT_EXPIRY), true).unwrap();
-    let origin = Origin::gateway(SourceKind::ModbusTcp, "10.0.0.1:1");
+    let admitted = admit(
+        Order::Read(pdu),
+        &image.reading(bench.now, DEFAULT_EXPIRY),
+        Authority::Write,
+    )
+    .unwrap();
+    let origin = Origin::new(SourceKind::ModbusTcp, "10.0.0.1:1");
     let (ticket, _answer) = Ticket::new(origin, "d", String::new(), false, bench.now, bench.stats.clone());
     let command = Command::new(0, admitted, bench.now + DEFAULT_EXPIRY, ticket);
     bench.bus.queue.submit(command, bench.now);

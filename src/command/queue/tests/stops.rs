@@ -1,4 +1,4 @@
-//! Stops: one of a drive waits, none is refused, and one that tells a drive nothing new has no precedence.
+//! Stops: two of a drive wait at most, none is refused, and one that tells a drive nothing new has no precedence.
 
 use super::*;
 use crate::codec::{Reply, RequestPdu};
@@ -36,30 +36,34 @@ fn acknowledged() -> Outcome {
 }
 
 #[test]
-fn equal_and_bare_stops_join_the_one_that_waits() {
-    let bare = || points(&[1]);
-    let more = || points(&[1, 2]);
-    for (first, second, sent) in [
-        (bare(), bare(), bare()),
-        (raw(0), raw(0), raw(0)),
-        (more(), more(), more()),
-        // What does more than to take the run command away is sent, whichever came first.
-        (raw(0), bare(), raw(0)),
-        (bare(), raw(0), raw(0)),
-        (more(), bare(), more()),
-        (bare(), more(), more()),
-    ] {
+fn equal_stops_join_the_one_that_waits() {
+    for order in [points(&[1]), raw(0), points(&[1, 2])] {
         let mut bench = Bench::new();
-        let (mut a, mut b) = (bench.stop(1, first), bench.stop(1, second));
+        let (mut a, mut b) = (bench.stop(1, order.clone()), bench.stop(1, order.clone()));
         assert_eq!(bench.pending.len(), 1);
         assert_eq!((outcome(&mut a), outcome(&mut b)), (None, None));
-        assert_eq!(bench.sent(), sent);
+        assert_eq!(bench.sent(), order);
         assert_eq!(
             (outcome(&mut a), outcome(&mut b)),
             (Some(acknowledged()), Some(acknowledged())),
             "they share its answer"
         );
     }
+}
+
+#[test]
+fn a_bare_stop_and_one_that_does_more_are_both_sent_however_many_come() {
+    let mut bench = Bench::new();
+    let mut stops: Vec<_> = (0..100)
+        .map(|k| bench.stop(1, if k % 2 == 0 { points(&[1]) } else { raw(0) }))
+        .collect();
+    assert_eq!(bench.pending.len(), 2);
+    for sent in [points(&[1]), raw(0)] {
+        let stop = bench.take().unwrap();
+        assert_eq!(stop.order, sent);
+        stop.answer(&acknowledged(), bench.now);
+    }
+    assert!(stops.iter_mut().all(|stop| outcome(stop) == Some(acknowledged())));
 }
 
 #[test]
