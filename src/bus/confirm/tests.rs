@@ -264,8 +264,8 @@ fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
 }
 
 proptest! {
-    /// Whatever a drive shows after a stop: it is confirmed only by a read in time that showed it standing or near zero,
-    /// else it stays acknowledged, told at most once; and nothing is waited for without an end.
+    /// Whatever a drive shows after a stop: it is confirmed only by a read that showed it standing or near zero, and by any
+    /// such read in time; else it stays acknowledged, told at most once; and nothing is waited for without an end.
     #[test]
     fn a_stop_is_confirmed_or_told_or_neither(
         reads in proptest::collection::vec((1u64..900, any::<bool>(), 0u16..10_000), 1..60),
@@ -274,18 +274,20 @@ proptest! {
         bench.speed(100.0);
         bench.set("run", Value::Bool(false));
         let since = bench.now;
-        let (mut stood_in_time, mut told) = (false, Vec::new());
+        let (mut stood, mut stood_in_time, mut told) = (false, false, Vec::new());
         for (pause, runs, speed) in reads {
             bench.now += Duration::from_millis(pause);
             bench.read(2100, &[if runs { 2 } else { 0 }, 0, speed]);
             let shows = !runs || speed < 100;
+            stood |= shows;
             stood_in_time |= shows && bench.now - since < Duration::from_secs(2);
             told.append(&mut bench.expired());
             if shows {
                 prop_assert!(bench.confirmations.is_empty());
             }
             let confirmed = bench.results() == ["confirmed"];
-            prop_assert_eq!(confirmed, stood_in_time);
+            prop_assert!(confirmed || !stood_in_time);
+            prop_assert!(stood || !confirmed);
             prop_assert!(told.is_empty() || (told.len() == 1 && !confirmed));
         }
         // A fall ends some day.

@@ -349,7 +349,8 @@ fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
         }
         longest = longest.max(rig.now - begin);
     }
-    assert!(longest < COST * 8, "{longest:?}");
+    // At most eight stops in a row, then polls for as long as those took.
+    assert!(longest < COST * 32, "{longest:?}");
 }
 
 #[test]

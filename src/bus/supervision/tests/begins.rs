@@ -15,7 +15,7 @@ fn an_order_that_waits_holds_the_lease_no_longer_than_it_may_wait() {
     bench.look(100, true);
     assert_eq!(bench.told(), 1, "its time is over, and it never reached the wire");
     assert!(is_action(&bench.take().expect("the stop")));
-    assert_eq!(order.try_recv().unwrap().outcome, Outcome::Expired);
+    assert_eq!(order.try_recv().unwrap().outcome, Outcome::Purged);
 }
 
 #[test]
