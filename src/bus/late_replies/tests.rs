@@ -35,7 +35,8 @@ fn only_what_could_be_mistaken_waits() {
 fn echoes_of_writes() {
     let now = Instant::now();
     let mut late = LateReplies::default();
-    late.given_up(&RequestPdu::WriteRegister {
+    late.given_up(
+        &RequestPdu::WriteRegister {
             address: 2000,
             value: 1,
         },
@@ -43,7 +44,8 @@ fn echoes_of_writes() {
         now,
     );
     assert_eq!(
-        late.blocks(&RequestPdu::WriteRegister {
+        late.blocks(
+            &RequestPdu::WriteRegister {
                 address: 2000,
                 value: 0
             },
@@ -51,7 +53,8 @@ fn echoes_of_writes() {
         ),
         None
     );
-    late.given_up(&RequestPdu::WriteRegisters {
+    late.given_up(
+        &RequestPdu::WriteRegisters {
             start: 2000,
             values: vec![1, 2],
         },
@@ -209,9 +212,8 @@ fn a_drive_that_never_answers_does_not_hold_up_a_stop() {
         late.given_up(&write(1), now - DEADLINE, now);
         late.given_up(&read(1500, 1), now - DEADLINE, now);
     }
-    let doubts = |late: &mut Debts, pdu: &RequestPdu| {
-        (0..100).take_while(|_| late.proves_nothing(pdu, now, now)).count()
-    };
+    let doubts =
+        |late: &mut Debts, pdu: &RequestPdu| (0..100).take_while(|_| late.proves_nothing(pdu, now, now)).count();
     assert_eq!(doubts(&mut late, &write(0)), 3);
     assert_eq!(doubts(&mut late, &read(2000, 1)), 1);
 }

@@ -90,10 +90,7 @@ fn a_release_is_behind_the_override_and_may_fail() {
         changed(&mut bench);
         let mut command = reference(&bench);
         assert_eq!(sends(&bench, &mut command), override_ao());
-        assert_eq!(
-            command.answered(&override_ao(), Reply::Written, &mut bench.words),
-            None
-        );
+        assert_eq!(command.answered(&override_ao(), Reply::Written, &mut bench.words), None);
         assert_eq!(sends(&bench, &mut command), release());
         let ended = match answer {
             Some(reply) => command.answered(&release(), reply, &mut bench.words),
