@@ -160,7 +160,11 @@ impl Daemon {
             tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
             let lease = |d: &DriveSpec| {
                 let before = leases.get(&(d.name.clone(), d.address)).copied().unwrap_or_default();
-                if d.access == Access::Control { before } else { Lease::default() }
+                if d.access == Access::Control {
+                    before
+                } else {
+                    Lease::default()
+                }
             };
             task.begin(bus.drives.iter().map(lease).collect());
             kept.push((bus, task));
@@ -309,7 +313,11 @@ impl Daemon {
                 })
             }
         });
-        let missing: Vec<String> = futures_util::future::join_all(stops).await.into_iter().flatten().collect();
+        let missing: Vec<String> = futures_util::future::join_all(stops)
+            .await
+            .into_iter()
+            .flatten()
+            .collect();
         if !missing.is_empty() {
             tracing::error!(
                 "not every drive acknowledged its stop in time; the gateway stops all the same: {}",

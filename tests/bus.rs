@@ -38,7 +38,17 @@ fn a_reply_of_impossible_length_ends_the_exchange_before_its_deadline() {
     let mut frame = Vec::new();
     rtu::encode_request(&request, &mut frame);
     let (now, ms) = (Instant::now(), Duration::from_millis);
-    let begin = || Transaction::new(Protocol::ModbusRtu, request.clone(), frame.clone(), now, ms(100), ms(7), false);
+    let begin = || {
+        Transaction::new(
+            Protocol::ModbusRtu,
+            request.clone(),
+            frame.clone(),
+            now,
+            ms(100),
+            ms(7),
+            false,
+        )
+    };
     let mut transaction = begin();
     let Step::Wait(until) = transaction.on_bytes(now, &[1, 3, 0xFF]) else {
         panic!("the rest may still be on the line")

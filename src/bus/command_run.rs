@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::time::Instant;
 
 pub use self::known_words::KnownWords;
-pub use self::steps::{StepPurpose, Step};
+pub use self::steps::{Step, StepPurpose};
 
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
@@ -165,7 +165,9 @@ impl CommandRun {
     /// Whether only supervision wants it.
     pub fn is_of_supervision(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;
-        self.tickets.iter().all(|ticket| kind(ticket) == SourceKind::Supervision)
+        self.tickets
+            .iter()
+            .all(|ticket| kind(ticket) == SourceKind::Supervision)
     }
 
     /// What the command needs next. `running` is what the drive last said. Once its time ran out nothing of it is
@@ -431,7 +433,9 @@ impl CommandRun {
     /// Answers a command that the drive took; what a read must show, and the receipts of those who wait for that.
     pub fn acknowledge(self, outcome: &Outcome, now: Instant) -> (Vec<Effect>, Vec<Receipt>) {
         let receipts = self.tickets.into_iter();
-        let receipts = receipts.map(|ticket| ticket.acknowledge(outcome.clone(), now)).collect();
+        let receipts = receipts
+            .map(|ticket| ticket.acknowledge(outcome.clone(), now))
+            .collect();
         (self.effects, receipts)
     }
 

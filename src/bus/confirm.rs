@@ -187,7 +187,10 @@ impl Confirmations {
             within: reading.spec.profile.confirm_within,
             slowest: reading.model(ModelPoint::ActualSpeed).good().map(|v| v.as_f64().abs()),
             fell_at: now,
-            what: receipts.first().map(|receipt| receipt.what().to_string()).unwrap_or_default(),
+            what: receipts
+                .first()
+                .map(|receipt| receipt.what().to_string())
+                .unwrap_or_default(),
             receipts,
         });
     }

@@ -222,9 +222,7 @@ impl BusCore {
         }
         self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
-        let Exchanged {
-            ended, began, took, ..
-        } = exchanged;
+        let Exchanged { ended, began, took, .. } = exchanged;
         self.done(&turn, ended, began, now, took, mangled);
     }
 

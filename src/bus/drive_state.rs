@@ -12,12 +12,14 @@ use crate::codec::Reply;
 use crate::command::{Interruption, Outcome, Urgency};
 use crate::drive::ModelPoint;
 
-/// A status older than this does not tell whether the motor runs.
+/// A status older than this, or than three rounds of the line, does not tell whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);
 
 /// One drive.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub(super) struct DriveState {
+    /// A status older than that does not tell whether the motor runs.
+    pub(super) fresh: Duration,
     /// Its own command words.
     pub(super) words: KnownWords,
     /// Replies that it may still send.
@@ -52,6 +54,21 @@ fn slot(urgency: Urgency) -> usize {
 }
 
 impl DriveState {
+    /// A drive of which nothing is known; its status is read every `round` at best.
+    pub(super) fn new(round: Duration) -> DriveState {
+        DriveState {
+            fresh: FRESH.max(3 * round),
+            words: KnownWords::default(),
+            late: LateReplies::default(),
+            supervision: Supervision::default(),
+            confirmations: Confirmations::default(),
+            runs: [None, None, None],
+            stopped: None,
+            silent_until: None,
+            was_read: false,
+        }
+    }
+
     /// The begun command of that rank.
     pub(super) fn run(&mut self, urgency: Urgency) -> Option<&mut CommandRun> {
         self.runs.get_mut(slot(urgency))?.as_mut()
@@ -82,7 +99,7 @@ impl DriveState {
 
     /// What the begun commands want at `now`: that of the highest rank first. Those that are over are answered.
     pub(super) fn wanted(&mut self, image: &DriveImage, n2_late: &N2LateReplies, now: Instant) -> Wanted {
-        let reading = image.reading(now, FRESH);
+        let reading = image.reading(now, self.fresh);
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
         let mut wait = |until: Instant| wake_at = Some(wake_at.map_or(until, |at: Instant| at.min(until)));
@@ -144,7 +161,8 @@ impl DriveState {
         }
         if outcome.is_ok() {
             let (effects, receipts) = run.acknowledge(outcome, now);
-            self.confirmations.watch(effects, receipts, &image.reading(now, FRESH), now);
+            self.confirmations
+                .watch(effects, receipts, &image.reading(now, self.fresh), now);
         } else {
             run.finish(outcome, now);
         }
@@ -177,7 +195,9 @@ impl DriveState {
         let stands = running.good().is_some_and(|running| !running.as_bool());
         begun.is_none_or(CommandRun::is_reference_only)
             && stands
-            && self.stopped.is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
+            && self
+                .stopped
+                .is_some_and(|stopped| running.at.is_some_and(|at| at > stopped))
     }
 
     /// A stop came in: nothing that was begun goes on, but a reset bit that is set is taken away.

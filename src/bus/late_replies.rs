@@ -121,10 +121,7 @@ impl LateReplies {
 
     /// The drive may have taken `pdu`: an acknowledgement of another write from before does not tell how it is now.
     fn overtake(&mut self, pdu: &RequestPdu) {
-        let others = self
-            .expected
-            .iter_mut()
-            .filter(|late| late.pdu != *pdu);
+        let others = self.expected.iter_mut().filter(|late| late.pdu != *pdu);
         for late in others.filter(|late| pdu.is_write() && late.pdu.is_write()) {
             late.overtaken = late.count;
         }
@@ -158,8 +155,7 @@ impl LateReplies {
     pub fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
         let same = self.expected.iter().find(|late| late.pdu == *pdu && late.ends() > now);
         same.map_or(now, |late| {
-            late.since
-                .unwrap_or_else(|| now.checked_sub(late.late).unwrap_or(now))
+            late.since.unwrap_or_else(|| now.checked_sub(late.late).unwrap_or(now))
         })
     }
 

@@ -6,9 +6,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
+use super::BusOptions;
 use super::core::{Action, BusCore};
 use super::supervision::Lease;
-use super::BusOptions;
 use crate::command::{Outcome, WriteStats};
 use crate::event::Events;
 use crate::line::{self, Line, Lost, Names, Woken};

@@ -15,7 +15,7 @@ use self::choose::Turns;
 use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
-use super::drive_state::{DriveState, FRESH};
+use super::drive_state::DriveState;
 use super::late_replies::look_alike;
 use super::line_state::Sending;
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
@@ -29,7 +29,7 @@ use crate::codec::n2::Session;
 use crate::codec::{Protocol, RequestPdu};
 use crate::command::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::drive::plan::WireTime;
-use crate::drive::{Plan, PlannedRead};
+use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::plant::{BusHandle, turn_away};
 
 /// The bus looks around at least this often.
@@ -158,8 +158,13 @@ impl Master {
             let turnaround = images.get(index).map_or(Duration::ZERO, |d| d.spec.turnaround);
             WireTime::of(spec.protocol, &spec.format, &read.pdu()).total(turnaround, silence)
         };
+        let fast = |(index, plan): (usize, &&Plan)| -> Duration {
+            let reads = plan.reads.iter().filter(|read| read.class == PollClass::Fast);
+            reads.map(|read| cost(index, read)).sum()
+        };
+        let round = spec.cycle.max(plans.iter().enumerate().map(fast).sum());
         let schedule = Schedule::new(cadence, &plans, cost, now);
-        let mut drives: Vec<DriveState> = images.iter().map(|_| DriveState::default()).collect();
+        let mut drives: Vec<DriveState> = images.iter().map(|_| DriveState::new(round)).collect();
         for (drive, lease) in drives.iter_mut().zip(leases) {
             drive.supervision.take_over(*lease);
         }
@@ -228,11 +233,13 @@ impl Master {
 
     /// Looks at what time and samples have changed: leases, confirmations, drives that N2 wants asked.
     fn look(&mut self, now: Instant, news: &mut Vec<News>) {
-        let Master { bus, drives, writes, .. } = self;
+        let Master {
+            bus, drives, writes, ..
+        } = self;
         for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
             if !drive.confirmations.is_empty() {
                 if std::mem::take(&mut drive.was_read) {
-                    drive.confirmations.look(&image.reading(now, FRESH), now);
+                    drive.confirmations.look(&image.reading(now, drive.fresh), now);
                 }
                 let late = drive.confirmations.expire(&image.spec.profile, now);
                 news.extend(late.into_iter().map(|text| News::NotConfirmed(index, text)));
@@ -309,7 +316,7 @@ pub(super) fn supervise(
     let orders = Orders {
         held_until: queued.max(drive.client_holds_until()),
     };
-    let reading = image.reading(now, FRESH);
+    let reading = image.reading(now, drive.fresh);
     let DriveState { supervision, words, .. } = drive;
     if image.is_unsupervised() && supervision.was_heard() {
         image.set_unsupervised(false);

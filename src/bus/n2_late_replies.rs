@@ -177,14 +177,26 @@ mod tests {
         assert_eq!(late.blocks(&state, now), None);
         assert_eq!(late.take(&state, b"A0060\r", now), Taken::Reply, "a byte is no float");
         assert_eq!(late.take(&state, b"A424800", now), Taken::Reply, "not whole");
-        assert_eq!(late.take(&state, b"A4248000093\r", now), Taken::Reply, "a wrong checksum");
-        assert_eq!(late.take(&state, b"N01\r", now), Taken::Doubtful, "whose refusal is it?");
+        assert_eq!(
+            late.take(&state, b"A4248000093\r", now),
+            Taken::Reply,
+            "a wrong checksum"
+        );
+        assert_eq!(
+            late.take(&state, b"N01\r", now),
+            Taken::Doubtful,
+            "whose refusal is it?"
+        );
         assert_eq!(late.take(&float, b"A4248000092\r", now), Taken::Doubtful);
         assert_eq!(late.take(&state, b"A4248000092\r", now), Taken::Late(12));
         assert_eq!(late.blocks(&float, now), None, "it came");
         late.given_up(&float, 0x10, WINDOW, now);
         assert!(late.may_come(now) && !late.may_come(now + WINDOW));
-        assert_eq!(late.take(&float, b"A4248000092\r", now + WINDOW), Taken::Reply, "forgotten");
+        assert_eq!(
+            late.take(&float, b"A4248000092\r", now + WINDOW),
+            Taken::Reply,
+            "forgotten"
+        );
     }
 
     #[test]

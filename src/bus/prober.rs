@@ -19,7 +19,13 @@ pub struct Prober<'l> {
 
 impl Prober<'_> {
     /// Speaks `protocol` on an open line; `timeout` is the time for the first byte of a reply.
-    pub fn new(line: &Line, protocol: Protocol, format: LineFormat, silence: Duration, timeout: Duration) -> Prober<'_> {
+    pub fn new(
+        line: &Line,
+        protocol: Protocol,
+        format: LineFormat,
+        silence: Duration,
+        timeout: Duration,
+    ) -> Prober<'_> {
         Prober {
             line,
             protocol,
@@ -49,7 +55,8 @@ impl Prober<'_> {
             could_be_doubled: false,
         };
         let late = N2LateReplies::default();
-        self.state.send(request.clone(), frame.clone(), sending, late, Instant::now());
+        self.state
+            .send(request.clone(), frame.clone(), sending, late, Instant::now());
         self.line.send(&frame)?;
         loop {
             let until = match self.state.on_time(Instant::now()) {
@@ -69,7 +76,9 @@ impl Prober<'_> {
             return Ok(None);
         }
         let count = self.line.receive(&mut buffer)?;
-        let exchanged = self.state.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
+        let exchanged = self
+            .state
+            .heard(buffer.get(..count).unwrap_or_default(), Instant::now());
         Ok(exchanged.map(|exchanged| exchanged.ended))
     }
 }

@@ -60,7 +60,9 @@ impl Report {
             News::Unlike(drive, device) => self.unlike(*drive, *device),
             News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception),
             News::NotConfirmed(drive, text) => {
-                self.tell(*drive, EventKind::NotConfirmed, None, |name| format!("drive {name} {text}"));
+                self.tell(*drive, EventKind::NotConfirmed, None, |name| {
+                    format!("drive {name} {text}")
+                });
             }
             News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
             News::ActionRefused { drive, what, refusal } => {
@@ -217,7 +219,11 @@ impl Report {
             s.link = Link::Offline(SystemTime::now());
             s.outlive();
         });
-        let why = if self.up { "it does not answer" } else { "its bus is down" };
+        let why = if self.up {
+            "it does not answer"
+        } else {
+            "its bus is down"
+        };
         self.tell(index, EventKind::Offline, None, |name| {
             format!("drive {name} is offline: {why}; it is asked again with pauses up to 10 s")
         });

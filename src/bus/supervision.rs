@@ -115,7 +115,10 @@ impl Supervision {
             State::Unheard => {
                 if !held && reading.is_set(ModelPoint::Running) {
                     self.lease = Lease(State::RunsUnheard);
-                    news.push(News::RunsUnsupervised(drive, if spec.adopt { Adopted::Yes } else { Adopted::No }));
+                    news.push(News::RunsUnsupervised(
+                        drive,
+                        if spec.adopt { Adopted::Yes } else { Adopted::No },
+                    ));
                     if spec.adopt {
                         self.renew(now);
                     }
@@ -127,7 +130,7 @@ impl Supervision {
             State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
                 if now.saturating_duration_since(since) >= spec.timeout && !held {
-                    self.runs_out(reading, words, news, drive);
+                    self.runs_out(since, reading, words, news, drive);
                 }
                 match self.lease.0 {
                     State::RanOut => self.act(reading, now),
@@ -146,18 +149,29 @@ impl Supervision {
         }
     }
 
-    /// The time of the lease is over. Of a drive that does not answer nobody knows whether it runs: its lease stays
-    /// until it is back.
-    fn runs_out(&mut self, reading: &Reading<'_>, words: &KnownWords, news: &mut Vec<News>, drive: usize) {
+    /// The time of the lease, which ran since `since`, is over. Of a drive that does not answer, or was not read since,
+    /// nobody knows whether it runs: its lease stays until it is.
+    fn runs_out(
+        &mut self,
+        since: Instant,
+        reading: &Reading<'_>,
+        words: &KnownWords,
+        news: &mut Vec<News>,
+        drive: usize,
+    ) {
         let Some(running) = self.running(reading, words, news, drive) else {
             return;
         };
+        let read_since = reading.model(ModelPoint::Running).at.is_none_or(|at| at > since);
         if running {
-            let acts = !matches!(reading.spec.supervision.as_ref().map(|s| &s.action), Some(LeaseAction::Hold));
+            let acts = !matches!(
+                reading.spec.supervision.as_ref().map(|s| &s.action),
+                Some(LeaseAction::Hold)
+            );
             self.lease = Lease(if acts { State::RanOut } else { State::Ended });
             (self.next_try, self.refused) = (None, None);
             news.push(News::LeaseRanOut(drive));
-        } else if !may_start(reading) {
+        } else if read_since && !may_start(reading) {
             self.lease = Lease(State::Ended);
         }
     }

@@ -26,13 +26,7 @@ pub(super) struct Tap {
 
 impl Tap {
     /// The exchange whose request was given to the line at `began`.
-    pub(super) fn new(
-        image: Arc<BusImage>,
-        index: usize,
-        request: Request,
-        frame: Vec<u8>,
-        began: Instant,
-    ) -> Tap {
+    pub(super) fn new(image: Arc<BusImage>, index: usize, request: Request, frame: Vec<u8>, began: Instant) -> Tap {
         let format = image.spec.format;
         let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
         Tap {

@@ -156,8 +156,14 @@ impl Protocol {
         match self {
             Protocol::ModbusRtu => bytes.len() > 3 && bytes.starts_with(&head),
             Protocol::ModbusAscii => {
-                let text: Vec<u8> = head.drain(..).flat_map(|byte| format!("{byte:02X}").into_bytes()).collect();
-                let begun = bytes.iter().position(|byte| *byte == b':').and_then(|at| bytes.get(at + 1..));
+                let text: Vec<u8> = head
+                    .drain(..)
+                    .flat_map(|byte| format!("{byte:02X}").into_bytes())
+                    .collect();
+                let begun = bytes
+                    .iter()
+                    .position(|byte| *byte == b':')
+                    .and_then(|at| bytes.get(at + 1..));
                 begun.is_some_and(|rest| rest.len() > 6 && rest.to_ascii_uppercase().starts_with(&text))
             }
             Protocol::N2 => bytes.len() >= n2::least_reply_chars(&request.pdu).max(5) - 1,

@@ -271,9 +271,7 @@ impl fmt::Display for Outcome {
             Outcome::Refused(refusal) => refusal.fmt(f),
             Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
             Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
-            Outcome::Expired => {
-                f.write_str("its time ran out before its turn came; it was not sent")
-            }
+            Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
             Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),

@@ -105,7 +105,9 @@ impl Pending {
     /// same, and are answered with it; of two that do different things besides the newer one is sent.
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
-        self.remove(now, &Outcome::Purged, |c| c.drive == drive && c.urgency == Urgency::Command);
+        self.remove(now, &Outcome::Purged, |c| {
+            c.drive == drive && c.urgency == Urgency::Command
+        });
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
         }
@@ -123,9 +125,8 @@ impl Pending {
 
     /// The queued reference whose place a newer one takes.
     fn replaced_by(&mut self, command: &Command) -> Option<&mut Command> {
-        let same = |c: &&mut Command| {
-            c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order)
-        };
+        let same =
+            |c: &&mut Command| c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order);
         self.waiting.iter_mut().filter(|_| command.reference_only).find(same)
     }
 
@@ -135,7 +136,11 @@ impl Pending {
             let of_client = |c: &&Command| c.ticket.client() == client && c.urgency != Urgency::Stop;
             self.waiting.iter().filter(of_client).count()
         };
-        let candidates = self.waiting.iter().enumerate().filter(|(_, c)| c.urgency != Urgency::Stop);
+        let candidates = self
+            .waiting
+            .iter()
+            .enumerate()
+            .filter(|(_, c)| c.urgency != Urgency::Stop);
         let own = held(command.ticket.client()) + 1;
         candidates
             .max_by_key(|(index, c)| (held(c.ticket.client()), *index))
@@ -209,7 +214,10 @@ impl Pending {
     fn served(&self, command: &Command) -> (Option<usize>, Option<usize>) {
         let client = command.ticket.client();
         let last = self.served.iter().rposition(|(of, _)| of == client);
-        let of_drive = self.served.iter().position(|(of, drive)| of == client && *drive == command.drive);
+        let of_drive = self
+            .served
+            .iter()
+            .position(|(of, drive)| of == client && *drive == command.drive);
         (last, of_drive)
     }
 

@@ -391,7 +391,10 @@ impl HalfDuplex {
         let fault = self.faults.next(asked.address);
         self.statistics.faults += u64::from(fault.is_some());
         let mut reply = Vec::with_capacity(64);
-        let refused = asked.request.as_ref().is_ok_and(|pdu| self.faults.refuses(asked.address, pdu));
+        let refused = asked
+            .request
+            .as_ref()
+            .is_ok_and(|pdu| self.faults.refuses(asked.address, pdu));
         match fault {
             None if refused => refuse(asked, Exception::ADDRESS, &mut reply),
             Some(Fault::Deaf) => return,

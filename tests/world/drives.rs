@@ -64,7 +64,13 @@ impl Truth {
     /// Whether the drive did since `since` what `which` looks for.
     pub fn did(&self, since: Instant, which: impl Fn(&RequestPdu, Option<&Vec<u16>>) -> bool) -> bool {
         let forgotten = self.acts.len() == KEPT && self.acts.front().is_some_and(|(at, ..)| *at > since);
-        forgotten || self.acts.iter().rev().take_while(|(at, ..)| *at >= since).any(|(_, pdu, words)| which(pdu, words.as_ref()))
+        forgotten
+            || self
+                .acts
+                .iter()
+                .rev()
+                .take_while(|(at, ..)| *at >= since)
+                .any(|(_, pdu, words)| which(pdu, words.as_ref()))
     }
 
     pub fn trouble(&mut self, until: Instant) {

@@ -38,8 +38,18 @@ fn run(seed: u64) -> Figures {
 fn run_all(seeds: impl Iterator<Item = u64>) {
     let began = Instant::now();
     let mut all = Figures::default();
+    // To see how many seeds meet a fault, and which.
+    let goes_on = std::env::var_os("WORLD_GO_ON").is_some();
+    let mut failed = Vec::new();
     for seed in seeds {
-        let figures = run(seed);
+        let figures = match std::panic::catch_unwind(|| run(seed)) {
+            Ok(figures) => figures,
+            Err(cause) if !goes_on => std::panic::resume_unwind(cause),
+            Err(_) => {
+                failed.push(seed);
+                continue;
+            }
+        };
         all.add(&figures);
         if std::env::var_os("WORLD_EACH").is_some() {
             println!("seed {seed}: {figures}");
@@ -47,6 +57,7 @@ fn run_all(seeds: impl Iterator<Item = u64>) {
     }
     let took = began.elapsed();
     let speed = all.bus_time.as_secs_f64() / 60.0 / took.as_secs_f64();
+    assert!(failed.is_empty(), "seeds that failed: {failed:?}");
     println!("{all}; in {took:.1?}: {speed:.1} bus-minutes a second");
 }
 

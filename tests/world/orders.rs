@@ -78,8 +78,8 @@ pub struct Record {
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
     /// Orders of the bus that waited when it was accepted.
     pub before: usize,
-    /// The drive was silent, away or blocked, or the line was faulty, while it waited.
-    pub excused: bool,
+    /// A newer reference took its place.
+    pub succeeded: bool,
 }
 
 /// The writable register with a figure of its own that sets the speed, and the values that it takes.
@@ -98,8 +98,12 @@ pub fn reference_point(profile: &Profile) -> (usize, &Point) {
 pub fn unique_reference(profile: &Profile, number: usize) -> (usize, Value, Unique) {
     let (index, point) = reference_point(profile);
     let raw = point.raw().unwrap();
-    // 0 to 40 in hundredths: within what every family takes.
-    let value = Value::Number((number % 4_000) as f64 / 100.0);
+    // 0 to 40 in hundredths: within what every family takes, and never what supervision sets (20 %).
+    let hundredths = match number % 4_000 {
+        1_000 | 1_200 | 2_000 => 3_999,
+        other => other,
+    };
+    let value = Value::Number(hundredths as f64 / 100.0);
     let words = raw.encode(value, 0).unwrap();
     (index, value, (raw.table, raw.address, words))
 }
@@ -110,10 +114,17 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
     let (reference, value, unique) = unique_reference(profile, number);
     let (raw, bit, _) = profile.run_bit().unwrap();
     let raw_run = |on: bool| match raw.table {
-        Table::Coil => RequestPdu::WriteCoil { address: raw.address, on },
-        _ => RequestPdu::WriteRegister { address: raw.address, value: u16::from(on) << bit },
+        Table::Coil => RequestPdu::WriteCoil {
+            address: raw.address,
+            on,
+        },
+        _ => RequestPdu::WriteRegister {
+            address: raw.address,
+            value: u16::from(on) << bit,
+        },
     };
-    let model = |point: ModelPoint, value: Value| Some((Order::Points(vec![(profile.model_index(point)?, value)]), None));
+    let model =
+        |point: ModelPoint, value: Value| Some((Order::Points(vec![(profile.model_index(point)?, value)]), None));
     match wish {
         Wish::Reference => Some((Order::Points(vec![(reference, value)]), Some(unique))),
         Wish::Run => Some((Order::Points(vec![run(true)]), None)),
@@ -125,7 +136,10 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
         Wish::RawBlock(on) => {
             let values = vec![u16::from(on), 0, unique.2[0]];
             (profile.name == "vacon-nx").then_some((
-                Order::Write(RequestPdu::WriteRegisters { start: raw.address, values }),
+                Order::Write(RequestPdu::WriteRegisters {
+                    start: raw.address,
+                    values,
+                }),
                 Some(unique),
             ))
         }
@@ -154,6 +168,8 @@ pub fn sets(pdu: &RequestPdu, (table, address, words): &Unique) -> bool {
 pub fn run_command(profile: &Profile, pdu: &RequestPdu) -> Option<bool> {
     let (raw, ..) = profile.run_bit()?;
     let (table, items) = written(pdu)?;
-    let (address, word) = items.into_iter().find(|(at, _)| table == raw.table && *at == raw.address)?;
+    let (address, word) = items
+        .into_iter()
+        .find(|(at, _)| table == raw.table && *at == raw.address)?;
     Some(!profile.is_stop(table, address, word))
 }

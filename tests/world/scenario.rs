@@ -71,8 +71,21 @@ const FAMILIES: [(&str, Protocol); 8] = [
 ];
 
 const FAULTS: [&str; 15] = [
-    "drop", "truncate", "corrupt", "deaf", "noise-before", "noise-after", "foreign-address", "foreign-length",
-    "stray-function", "split", "busy", "exception:4", "double", "late", "corrupt",
+    "drop",
+    "truncate",
+    "corrupt",
+    "deaf",
+    "noise-before",
+    "noise-after",
+    "foreign-address",
+    "foreign-length",
+    "stray-function",
+    "split",
+    "busy",
+    "exception:4",
+    "double",
+    "late",
+    "corrupt",
 ];
 
 impl Scenario {
@@ -141,21 +154,35 @@ impl Line {
             response_timeout,
             retries: dice.within(0..=2) as u32,
             cycle: ms([10, 50, 200][dice.within(0..=2) as usize]),
-            faults: if calm || dice.chance(0.25) { String::new() } else { faults(dice, response_timeout) },
+            faults: if calm || dice.chance(0.25) {
+                String::new()
+            } else {
+                faults(dice, response_timeout)
+            },
             supervision: supervised.then_some(Supervision {
                 timeout,
                 action,
                 adopt: dice.chance(0.3),
             }),
-            on_shutdown: if dice.chance(0.6) { OnShutdown::Stop } else { OnShutdown::Hold },
-            dead: if dice.chance(0.2) && drives > 1 { vec![drives] } else { Vec::new() },
+            on_shutdown: if dice.chance(0.6) {
+                OnShutdown::Stop
+            } else {
+                OnShutdown::Hold
+            },
+            dead: if dice.chance(0.2) && drives > 1 {
+                vec![drives]
+            } else {
+                Vec::new()
+            },
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
         }
     }
 
     /// Whether replies may come when they are not expected any more, or twice.
     pub fn is_late(&self) -> bool {
-        ["late", "double", "stray"].iter().any(|fault| self.faults.contains(fault))
+        ["late", "double", "stray"]
+            .iter()
+            .any(|fault| self.faults.contains(fault))
     }
 }
 
@@ -167,7 +194,10 @@ fn faults(dice: &mut Random, response_timeout: Duration) -> String {
         let rate = [0.005, 0.02, 0.08, 0.2][dice.within(0..=3) as usize] / 1.2;
         let fault = match fault {
             // From just behind the timeout to where a reply is forgotten.
-            "late" => format!("late:{}ms", response_timeout.as_millis() as u64 * dice.within(105..=290) / 100),
+            "late" => format!(
+                "late:{}ms",
+                response_timeout.as_millis() as u64 * dice.within(105..=290) / 100
+            ),
             other => other.to_string(),
         };
         kinds.push(format!("{fault}={rate}"));

@@ -108,7 +108,9 @@ impl World {
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let servers = Servers::new(plant.clone());
         let clients = scenario.clients.iter().enumerate();
-        let clients = clients.map(|(index, habit)| servers.client(index, *habit, now)).collect();
+        let clients = clients
+            .map(|(index, habit)| servers.client(index, *habit, now))
+            .collect();
         World {
             dice: Random::new(scenario.seed ^ 0x5EED),
             began: now,
@@ -146,7 +148,10 @@ impl World {
             Err(cause) => {
                 println!("{:#?}", self.scenario);
                 println!("{}", self.history.take());
-                println!("FAILED: seed {seed} at {:?} (WORLD_SEED={seed} make world)", self.now - self.began);
+                println!(
+                    "FAILED: seed {seed} at {:?} (WORLD_SEED={seed} make world)",
+                    self.now - self.began
+                );
                 resume_unwind(cause)
             }
         }
@@ -209,13 +214,18 @@ impl World {
                 Seen::Sent(asked) => self.sent(index, &asked),
                 Seen::Acted(asked) => self.acted(index, &asked),
                 Seen::Over(asked) => self.over(index, &asked),
-                Seen::Heard(bytes) if self.history.is_long() => self.note(move || format!("line{index} -> {bytes:02X?}")),
+                Seen::Heard(bytes) if self.history.is_long() => {
+                    self.note(move || format!("line{index} -> {bytes:02X?}"))
+                }
                 Seen::Heard(_) => {}
             }
         }
         let line = &self.buses[index].wire;
         let statistics = line.statistics();
-        assert_eq!(statistics.silence_violations, 0, "a request came before the line was silent");
+        assert_eq!(
+            statistics.silence_violations, 0,
+            "a request came before the line was silent"
+        );
         // Behind a late reply that stood for the present one, that is still to come: nobody can know.
         if !self.buses[index].line.is_late() {
             assert_eq!(statistics.collisions, 0, "a request met a reply");
@@ -239,7 +249,9 @@ impl World {
         let truth = &mut self.truths[bus][drive];
         if let Some(run) = run_command(&profile, pdu) {
             if run && !truth.run {
-                let until = truth.may_run.unwrap_or_else(|| panic!("a run went out behind a stop, drive {}", drive + 1));
+                let until = truth
+                    .may_run
+                    .unwrap_or_else(|| panic!("a run went out behind a stop, drive {}", drive + 1));
                 assert!(now < until, "an expired run went out");
             }
             if !run && truth.run {
@@ -278,7 +290,11 @@ impl World {
         );
         let truth = &self.truths[bus][drive];
         if let Some(heard) = truth.heard.0 {
-            assert!(now - heard >= supervision.timeout, "the action came {:?} after the client", now - heard);
+            assert!(
+                now - heard >= supervision.timeout,
+                "the action came {:?} after the client",
+                now - heard
+            );
         } else {
             assert!(
                 supervision.adopt || truth.heard.1.is_some(),
@@ -309,7 +325,10 @@ impl World {
         };
         let record = &mut self.records[id];
         if let Some((code, at)) = &record.answer {
-            panic!("order {id} was answered {code} {:?} ago, and goes out: {record:?}", now - *at);
+            panic!(
+                "order {id} was answered {code} {:?} ago, and goes out: {record:?}",
+                now - *at
+            );
         }
         assert!(now < record.expires, "an expired order goes out: {record:?}");
         let first = record.sent.is_none();
@@ -347,12 +366,16 @@ impl World {
         };
         let image = &self.buses[bus].handle.image.drives[asked.drive];
         let snapshot = image.snapshot();
-        let Some(at) = snapshot.read_at(table, start) else { return };
+        let Some(at) = snapshot.read_at(table, start) else {
+            return;
+        };
         let untouched = asked.last_read == Some(at);
         if untouched {
             return;
         }
-        let stored: Vec<u16> = (0..count).map(|i| snapshot.word(table, start + i).unwrap_or(0)).collect();
+        let stored: Vec<u16> = (0..count)
+            .map(|i| snapshot.word(table, start + i).unwrap_or(0))
+            .collect();
         let truth = &self.truths[bus][asked.drive];
         // The drive may have said it in answer to an earlier try; the image dates it back then.
         let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words == Some(&stored);
@@ -396,7 +419,10 @@ impl World {
             }
             _ => {
                 let bus = self.dice.within(0..=self.buses.len() as u64 - 1) as usize;
-                (bus, self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize)
+                (
+                    bus,
+                    self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize,
+                )
             }
         };
         match habit {
@@ -452,7 +478,7 @@ impl World {
             answer: None,
             read: None,
             before,
-            excused: false,
+            succeeded: false,
         });
         self.note(move || format!("order {id} of client {client}: line{bus} drive {} {wish:?}", drive + 1));
         id
@@ -575,18 +601,23 @@ impl World {
 
     /// Answers of orders that a newer one replaced come before the newer one is taken note of: it takes their place.
     fn replaced(&mut self) {
-        let newest = self.records.len() - 1;
         self.collect();
-        let (now, newest_place) = (self.now, &self.records[newest]);
-        let (bus, drive) = (newest_place.bus, newest_place.drive);
-        let replaced = self.records.iter().rev().take(1_000).filter(|record| {
-            let just = record.answer.as_ref().is_some_and(|(code, at)| code == "replaced" && *at == now);
-            just && record.bus == bus && record.drive == drive && record.sent.is_none()
-        });
-        if newest_place.wish == Wish::Reference
-            && let Some(place) = replaced.map(|record| record.place).max()
+        let Some((newest, before)) = self.records.split_last_mut() else {
+            return;
+        };
+        let now = self.now;
+        let of_drive = |record: &&mut Record| (record.bus, record.drive) == (newest.bus, newest.drive);
+        let just_replaced = |record: &&mut Record| {
+            let answer = record.answer.as_ref();
+            !record.succeeded && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
+        };
+        let recent = before.iter_mut().rev().take(1_000);
+        let mut replaced = recent.filter(of_drive).filter(just_replaced);
+        if newest.wish == Wish::Reference
+            && let Some(older) = replaced.next()
         {
-            self.records[newest].place = place;
+            older.succeeded = true;
+            newest.place = older.place;
         }
     }
 
@@ -656,14 +687,30 @@ impl World {
             }
         }
         let truth = &mut self.truths[record.bus][record.drive];
-        let begun = ["acknowledged", "confirmed", "timeout", "garbled", "refused_by_drive", "interrupted"];
+        let begun = [
+            "acknowledged",
+            "confirmed",
+            "timeout",
+            "garbled",
+            "refused_by_drive",
+            "interrupted",
+        ];
         if begun.contains(&code) || code.starts_with("exception") {
             truth.maybe_heard(now);
         }
         if record.wish.is_stop() || record.wish == Wish::Reset {
             truth.last_stop_over = Some(now);
         }
-        let unsent = ["expired", "replaced", "purged", "queue_full", "offline", "bus_down", "shutting_down", "withdrawn"];
+        let unsent = [
+            "expired",
+            "replaced",
+            "purged",
+            "queue_full",
+            "offline",
+            "bus_down",
+            "shutting_down",
+            "withdrawn",
+        ];
         if unsent.contains(&code) {
             assert!(record.sent.is_none(), "order {id} was sent, and its answer is {code}");
         }
@@ -690,15 +737,24 @@ impl World {
             };
             let words = reply.words();
             let read = |did: &RequestPdu, answered: Option<&Vec<u16>>| did == pdu && answered == words.as_ref();
-            assert!(truth.did(since, read), "order {id} read what the drive did not say: {reply:?}");
+            assert!(
+                truth.did(since, read),
+                "order {id} read what the drive did not say: {reply:?}"
+            );
             return;
         }
         let run = |on: bool| move |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(on);
         let n2 = profile.name.ends_with("n2");
         if record.wish.is_stop() {
-            assert!(truth.did(since, run(false)), "order {id}: {code}, but the drive was not told to stop");
+            assert!(
+                truth.did(since, run(false)),
+                "order {id}: {code}, but the drive was not told to stop"
+            );
         } else if record.wish.is_run() && !n2 {
-            assert!(truth.did(since, run(true)), "order {id}: {code}, but the drive was not told to run");
+            assert!(
+                truth.did(since, run(true)),
+                "order {id}: {code}, but the drive was not told to run"
+            );
         }
         if let Some(unique) = record.unique.as_ref().filter(|_| !n2 && profile.name != "vacon-cx") {
             let wrote = |did: &RequestPdu, _: Option<&Vec<u16>>| sets(did, unique);
@@ -768,7 +824,8 @@ impl World {
         let address = self.dice.within(1..=u64::from(self.buses[bus].line.drives)) as u8;
         let kind = self.dice.within(0..=7);
         let off = now + Duration::from_millis(self.dice.within(50..=5_000));
-        if !self.is_alive(bus, usize::from(address) - 1) || self.off.iter().any(|(b, a, _)| (*b, *a) == (bus, address)) {
+        if !self.is_alive(bus, usize::from(address) - 1) || self.off.iter().any(|(b, a, _)| (*b, *a) == (bus, address))
+        {
             return;
         }
         let sim = now - self.began;
@@ -870,7 +927,9 @@ impl World {
             }
         }
         self.check_answered_in_time();
-        self.check_leases();
+        if !self.stopping {
+            self.check_leases();
+        }
         self.check_states();
     }
 
@@ -917,7 +976,8 @@ impl World {
                     continue;
                 };
                 let last = truth.heard.1.unwrap_or(heard);
-                let due = last.max(running).max(online) + supervision.timeout + ACTION;
+                let round = 2 * bus.handle.image.health().fast.last.unwrap_or_default();
+                let due = last.max(running).max(online) + supervision.timeout + ACTION + round;
                 let waits = self.open.contains_key(&(index, drive));
                 // Until the motor was seen to run, the lease of one that stood has ended.
                 let armed = running <= last + supervision.timeout;
@@ -949,7 +1009,11 @@ impl World {
                 Some(State::Running) => assert!(!bad(ModelPoint::Running), "running though nobody knows"),
                 Some(State::Ready | State::NotReady) => {
                     let unknown = bad(ModelPoint::Running) || bad(ModelPoint::Fault) || bad(ModelPoint::Ready);
-                    assert!(!unknown, "{}: a state that rests on what is not known", drive.image.spec.name);
+                    assert!(
+                        !unknown,
+                        "{}: a state that rests on what is not known",
+                        drive.image.spec.name
+                    );
                 }
                 _ => {}
             }
@@ -977,7 +1041,10 @@ impl World {
         self.next_reload = None;
         self.restarts = None;
         while !reports.is_empty() {
-            assert!(self.now < deadline + Duration::from_secs(1), "the shutdown does not end");
+            assert!(
+                self.now < deadline + Duration::from_secs(1),
+                "the shutdown does not end"
+            );
             self.step();
             reports.retain_mut(|(index, report)| match report.try_recv() {
                 Ok(drives) => {
@@ -994,10 +1061,17 @@ impl World {
             };
             for (drive, truth) in self.truths[index].iter().enumerate() {
                 let spec = &bus.handle.image.drives[drive].spec;
-                let answers = bus.wire.slaves().drive(spec.address).is_some_and(|drive| drive.answers());
+                let answers = bus
+                    .wire
+                    .slaves()
+                    .drive(spec.address)
+                    .is_some_and(|drive| drive.answers());
                 if answers && !truth.is_troubled(begun) {
                     assert!(!truth.run, "{} was not stopped with the gateway", spec.name);
-                    assert!(!missing.iter().any(|text| text.contains(&format!("`{}`", spec.name))), "{missing:?}");
+                    assert!(
+                        !missing.iter().any(|text| text.contains(&format!("`{}`", spec.name))),
+                        "{missing:?}"
+                    );
                 }
             }
         }
@@ -1010,7 +1084,10 @@ impl World {
         assert!(open.is_empty(), "orders without an answer at the end: {open:?}");
         let told: u64 = self.writes.results().values().sum();
         let reads = self.records.iter().filter(|record| record.read.is_some()).count();
-        assert!(told >= (self.records.len() - reads) as u64, "each order is counted once");
+        assert!(
+            told >= (self.records.len() - reads) as u64,
+            "each order is counted once"
+        );
     }
 }
 

@@ -242,7 +242,9 @@ pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, kn
         Action::PulseLow { raw, bit, invert } => {
             let mut changes = vec![(*bit, *invert)];
             // A reset must not start the motor: a run bit left over from before the fault is taken away.
-            if !known.running && let Some(run) = standing_run_bit(profile, raw) {
+            if !known.running
+                && let Some(run) = standing_run_bit(profile, raw)
+            {
                 changes.push(run);
             }
             bits(action, raw, changes, words, profile, known)
@@ -288,7 +290,10 @@ fn bits(
         Check::InVain if !known.running => stands,
         Check::Read | Check::InVain => value,
     };
-    Some(Step::new(StepPurpose::Execute, RequestPdu::WriteRegister { address, value }))
+    Some(Step::new(
+        StepPurpose::Execute,
+        RequestPdu::WriteRegister { address, value },
+    ))
 }
 
 /// The run bit, if it is in the same word, as it is where the motor is to stand.

@@ -4,7 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::{Before, Master, Purpose, Turn};
 use crate::bus::command_run::{CommandRun, Step};
-use crate::bus::drive_state::{DriveState, FRESH, Wanted};
+use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
 use crate::command::{Chosen, Command, Order, Outcome, Urgency};
@@ -159,7 +159,7 @@ impl Master {
         let stands: Vec<bool> = drives
             .iter()
             .zip(&bus.image.drives)
-            .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, FRESH)))
+            .map(|(drive, image)| drive.was_stopped() && drive.stands_by_stop(&image.reading(now, drive.fresh)))
             .collect();
         let redundant = |drive: usize| stands.get(drive).copied().unwrap_or(false);
         for rank in RANKS {

@@ -60,7 +60,8 @@ impl Master {
             }
             Ended::Silent | Ended::Corrupt(_) => {
                 let device = self.sessions.device(turn.drive);
-                self.n2_late.given_up(&turn.pdu, device, super::N2_LATE * self.response_timeout, now);
+                self.n2_late
+                    .given_up(&turn.pdu, device, super::N2_LATE * self.response_timeout, now);
             }
         }
     }
@@ -158,7 +159,8 @@ impl Master {
     /// The drive answered a read of the plan.
     fn read(&mut self, poll: &Poll, reply: &Reply, now: Instant, news: &mut Vec<News>) {
         let (read, pdu) = (poll.read, poll.read.pdu());
-        let (Some(drive), Some(image)) = (self.drives.get_mut(poll.drive), self.bus.image.drives.get(poll.drive)) else {
+        let (Some(drive), Some(image)) = (self.drives.get_mut(poll.drive), self.bus.image.drives.get(poll.drive))
+        else {
             return;
         };
         let at = drive.late.asked_by(&pdu, now);

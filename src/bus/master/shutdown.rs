@@ -45,7 +45,9 @@ enum State {
 impl Stop {
     /// Looks at the answer; `now` is when it is ordered again where it failed.
     fn look(&mut self, now: Instant) {
-        let State::Ordered(answer) = &mut self.state else { return };
+        let State::Ordered(answer) = &mut self.state else {
+            return;
+        };
         self.state = match answer.try_recv() {
             Err(TryRecvError::Empty) => return,
             Ok(answer) if answer.outcome.is_ok() => State::Acknowledged,
@@ -65,9 +67,8 @@ impl Stop {
 impl Shutdown {
     fn new(stopping: Stopping, bus: &BusHandle, now: Instant) -> Shutdown {
         let drives = bus.image.drives.iter().enumerate();
-        let wanted = drives.filter(|(_, image)| {
-            image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control
-        });
+        let wanted = drives
+            .filter(|(_, image)| image.spec.on_shutdown == OnShutdown::Stop && image.spec.access == Access::Control);
         let stop = |(drive, _)| Stop {
             drive,
             state: State::Due(now),
@@ -101,7 +102,13 @@ impl Master {
         if let Some(stopping) = self.bus.queue.lock().take_stopping() {
             self.shutdown = Some(Shutdown::new(stopping, &self.bus, now));
         }
-        let Master { shutdown, bus, schedule, writes, .. } = self;
+        let Master {
+            shutdown,
+            bus,
+            schedule,
+            writes,
+            ..
+        } = self;
         let Some(shutdown) = shutdown else { return };
         let Some(deadline) = shutdown.stopping.as_ref().map(Stopping::deadline) else {
             return;
