@@ -119,8 +119,11 @@ impl CommandRun {
             scope,
             actions,
             not_before: None,
-            expires,
-            tickets: [ticket].into_iter().chain(joined).collect(),
+            expires: joined.iter().map(|(_, joined)| *joined).fold(expires, Instant::max),
+            tickets: [ticket]
+                .into_iter()
+                .chain(joined.into_iter().map(|(ticket, _)| ticket))
+                .collect(),
             effects,
             tries: Tries {
                 failures: 0,

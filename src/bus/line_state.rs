@@ -117,8 +117,11 @@ impl LineState {
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
         transaction.expect_late(late);
-        if doubtful && self.early_replies < UNTIMED {
-            transaction.doubt_before(earliest);
+        if self.early_replies < UNTIMED {
+            transaction.ignore_before(sent);
+            if doubtful {
+                transaction.doubt_before(earliest);
+            }
         }
         self.quiet_since = sent;
         self.underway = Some(Underway {

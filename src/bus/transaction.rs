@@ -60,6 +60,8 @@ pub struct Transaction {
     /// A reply that is whole before then was not made for this request.
     doubted_before: Option<Instant>,
     doubted: bool,
+    /// What comes before then, and is no echo, came before the request was over.
+    ignored_before: Option<Instant>,
     /// What may still come of earlier exchanges on an N2 line.
     late: N2LateReplies,
 }
@@ -91,6 +93,7 @@ impl Transaction {
             echo_seen: false,
             doubted_before: None,
             doubted: false,
+            ignored_before: None,
             late: N2LateReplies::default(),
         }
     }
@@ -99,6 +102,11 @@ impl Transaction {
     /// believed: it is the last reply once more, or the echo of a write.
     pub fn doubt_before(&mut self, earliest: Instant) {
         self.doubted_before = Some(earliest);
+    }
+
+    /// The request is on the wire until `end`: what comes before is nobody's answer, the echo apart.
+    pub fn ignore_before(&mut self, end: Instant) {
+        self.ignored_before = Some(end);
     }
 
     /// Whether a reply came too early to be believed.
@@ -169,6 +177,12 @@ impl Transaction {
                 }
                 // The echo of the request can look like a broken reply until it is whole.
                 _ if self.frame.starts_with(&self.received) => return self.on_time(now),
+                _ if self.ignored_before.is_some_and(|end| now < end) => {
+                    self.foreign += 1;
+                    self.received.clear();
+                    self.first_byte = None;
+                    return self.on_time(now);
+                }
                 Decoded::Incomplete => {
                     return self.behind_garbage(now).unwrap_or_else(|| {
                         // A new colon began a frame anew: it has the time until the deadline.

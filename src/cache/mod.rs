@@ -225,6 +225,11 @@ impl DriveImage {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).take()
     }
 
+    /// Whether a heartbeat came since the bus took note of the last one.
+    pub fn has_heartbeat(&self) -> bool {
+        self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).is_some()
+    }
+
     /// Notes whether the drive ran without a lease when the gateway started, and no client was heard of since.
     pub fn set_unsupervised(&self, unsupervised: bool) {
         self.unsupervised.store(unsupervised, Ordering::Relaxed);

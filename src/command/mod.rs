@@ -141,8 +141,8 @@ pub struct Command {
     pub expires: Instant,
     /// Answers it.
     pub ticket: Ticket,
-    /// Those who wait for the same stop.
-    pub joined: Vec<Ticket>,
+    /// Those who wait for the same stop, and until when.
+    pub joined: Vec<(Ticket, Instant)>,
     /// Younger commands that went before it.
     pub overtaken: usize,
     /// Its number in the queue.
@@ -167,7 +167,8 @@ impl Command {
 
     /// Answers whoever gave it and all who joined.
     pub fn answer(self, outcome: &Outcome, now: Instant) {
-        let tickets = [self.ticket].into_iter().chain(self.joined);
+        let joined = self.joined.into_iter().map(|(ticket, _)| ticket);
+        let tickets = [self.ticket].into_iter().chain(joined);
         tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));
     }
 }

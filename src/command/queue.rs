@@ -115,12 +115,15 @@ impl Pending {
         let alike = |c: &&mut Command| c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare;
         match self.waiting.iter_mut().find(alike) {
             Some(waiting) if waiting.order == stop.order => {
-                waiting.expires = waiting.expires.max(stop.expires);
-                waiting.joined.push(stop.ticket);
+                waiting.joined.push((stop.ticket, stop.expires));
+                return;
             }
-            Some(waiting) => std::mem::replace(waiting, stop).answer(&Outcome::Replaced, now),
-            None => self.waiting.push_back(stop),
+            Some(_) => self.remove(now, &Outcome::Replaced, |c| {
+                c.drive == drive && c.urgency == Urgency::Stop && c.is_bare_stop() == bare
+            }),
+            None => {}
         }
+        self.waiting.push_back(stop);
     }
 
     /// The queued reference whose place a newer one takes.
@@ -164,7 +167,7 @@ impl Pending {
         mut may: impl FnMut(&Command) -> bool,
         redundant: impl Fn(usize) -> bool,
     ) -> Option<Chosen> {
-        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
+        self.expire(now);
         // Drives whose later commands wait: behind an older one, or behind a stop.
         let mut behind: Vec<usize> = self.drives_of(Urgency::Stop);
         let mut best = None;
@@ -245,6 +248,22 @@ impl Pending {
         });
     }
 
+    /// Answers those whose time ran out; a command goes on waiting for those who joined it and have time.
+    fn expire(&mut self, now: Instant) {
+        for command in &mut self.waiting {
+            for (ticket, _) in command.joined.extract_if(.., |(_, expires)| *expires <= now) {
+                ticket.answer(Outcome::Expired, now);
+            }
+            if command.expires <= now
+                && let Some((ticket, expires)) = command.joined.pop()
+            {
+                std::mem::replace(&mut command.ticket, ticket).answer(Outcome::Expired, now);
+                command.expires = expires;
+            }
+        }
+        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
+    }
+
     /// Answers and removes the commands that `which` names.
     pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&Command) -> bool) {
         let mut index = 0;
@@ -292,7 +311,8 @@ impl Command {
     /// Whether a client gave it: no order of the gateway's own.
     fn is_of_client(&self) -> bool {
         let own = [SourceKind::Supervision, SourceKind::Shutdown];
-        let tickets = std::iter::once(&self.ticket).chain(&self.joined);
+        let joined = self.joined.iter().map(|(ticket, _)| ticket);
+        let tickets = std::iter::once(&self.ticket).chain(joined);
         tickets.into_iter().any(|ticket| !own.contains(&ticket.origin().kind))
     }
 }

@@ -273,7 +273,20 @@ impl Master {
     pub fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
         let Some(slot) = turn.slot() else { return true };
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
-        run.is_some_and(|run| !run.is_late(now))
+        let Some(run) = run.filter(|run| !run.is_late(now)) else {
+            return false;
+        };
+        if run.is_of_supervision() && !run.has_begun() {
+            // A client that came back while the line fell silent suspends it.
+            let beats = self
+                .bus
+                .image
+                .drives
+                .get(turn.drive)
+                .is_some_and(|image| image.has_heartbeat());
+            return !beats && self.bus.queue.lock().client_waits_until(turn.drive).is_none();
+        }
+        true
     }
 }
 
