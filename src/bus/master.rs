@@ -318,10 +318,9 @@ pub(super) fn supervise(
     };
     let reading = image.reading(now, drive.fresh);
     let DriveState { supervision, words, .. } = drive;
-    if image.is_unsupervised() && supervision.was_heard() {
-        image.set_unsupervised(false);
-    }
-    match supervision.look(&reading, words, orders, now, news, index) {
+    let demand = supervision.look(&reading, words, orders, now, news, index);
+    image.set_unsupervised(supervision.runs_unheard());
+    match demand {
         Demand::None => {}
         Demand::Withdraw => {
             bus.queue.lock().withdraw_supervision(index, now);

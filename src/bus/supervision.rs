@@ -87,6 +87,11 @@ impl Supervision {
         !matches!(self.lease.0, State::Unheard | State::RunsUnheard)
     }
 
+    /// Whether the drive was seen to run, and no client was heard of since the gateway started.
+    pub(super) fn runs_unheard(&self) -> bool {
+        self.lease.0 == State::RunsUnheard
+    }
+
     /// A client was heard of: its order reached the wire, or ended, or its heartbeat came.
     pub(super) fn renew(&mut self, now: Instant) {
         self.lease = Lease(match self.lease.0 {

@@ -76,7 +76,7 @@ impl Bench {
         };
         Bench {
             bus: handle(bus, image(spec)),
-            drive: DriveState::default(),
+            drive: DriveState::new(Duration::ZERO),
             stats: Arc::default(),
             news: Vec::new(),
             now: Instant::now(),
@@ -145,7 +145,7 @@ impl Bench {
             .close(&Outcome::ShuttingDown, Interruption::ShuttingDown, self.now);
         let lease = self.drive.supervision.lease();
         self.bus = handle(self.bus.image.spec.clone(), image(spec));
-        self.drive = DriveState::default();
+        self.drive = DriveState::new(Duration::ZERO);
         self.drive.supervision.take_over(lease);
     }
 
@@ -443,7 +443,11 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
         assert!(bench.after(1_000, true).is_none(), "nobody commanded it");
     }
     assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::No)]);
-    bench.image().set_unsupervised(true);
+    assert!(bench.image().is_unsupervised());
+    bench.reload(bench.spec());
+    assert!(bench.after(1_000, true).is_none());
+    assert!(bench.image().is_unsupervised(), "after a reload too");
+    assert_eq!(bench.news.len(), 1, "told once");
     bench.heartbeat();
     assert!(bench.after(4_900, true).is_none());
     assert!(!bench.image().is_unsupervised());
