@@ -78,7 +78,7 @@ fn of_two_stops_that_do_different_things_the_newer_one_is_sent() {
 }
 
 #[test]
-fn a_stop_waits_as_long_as_any_that_joined_it() {
+fn who_joined_a_stop_waits_for_it_as_long_as_his_own_time() {
     let mut bench = Bench::new();
     let mut first = bench.stop(1, points(&[1]));
     bench.now += EXPIRY / 2;
@@ -87,7 +87,7 @@ fn a_stop_waits_as_long_as_any_that_joined_it() {
     assert_eq!(bench.sent(), points(&[1]), "the second one still wants it");
     assert_eq!(
         (outcome(&mut first), outcome(&mut second)),
-        (Some(acknowledged()), Some(acknowledged()))
+        (Some(Outcome::Expired), Some(acknowledged()))
     );
 }
 
