@@ -192,3 +192,6 @@ impl LineState {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

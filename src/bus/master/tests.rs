@@ -189,7 +189,7 @@ impl Rig {
         let image = &self.bus.image.drives[drive];
         let index = image.spec.profile.model_index(point).unwrap();
         let order = Order::Points(vec![(index, value)]);
-        let admitted = admit(order, &image.reading(self.now, FRESH), Authority::Write).unwrap();
+        let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
         let origin = Origin::new(SourceKind::Mqtt, who);
         let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
         let command = Command::new(drive, admitted, self.now + DEFAULT_EXPIRY, ticket);
