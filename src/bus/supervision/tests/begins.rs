@@ -23,25 +23,10 @@ fn a_lease_that_nobody_held_does_not_begin_by_an_order_that_waits() {
     let mut bench = Bench::new(LeaseAction::Stop);
     let _order = bench.order();
     bench.look(1_000, true);
-    assert!(!bench.drive.supervision.was_heard());
+    assert_eq!(bench.drive.supervision.lease(), Lease::default());
     assert_eq!(bench.news, [], "the client is there, its order only waits");
     bench.look(1_000, true);
     assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::No)]);
-}
-
-#[test]
-fn a_lease_begins_when_the_order_is_on_the_wire() {
-    let mut bench = Bench::new(LeaseAction::Stop);
-    let _answer = bench.order();
-    bench.look(1_000, true);
-    bench.begin();
-    bench.look(500, true);
-    assert!(!bench.drive.supervision.was_heard(), "begun, but not sent");
-    bench.send();
-    bench.look(4_900, true);
-    assert_eq!(bench.told(), 0);
-    bench.look(100, true);
-    assert_eq!(bench.told(), 1);
 }
 
 #[test]
@@ -72,20 +57,35 @@ fn a_lease_begins_anew_when_the_order_ends() {
 }
 
 #[test]
+fn a_read_that_an_order_needs_first_has_reached_the_wire() {
+    let mut bench = Bench::new(LeaseAction::Stop);
+    let _answer = bench.order_of(ModelPoint::Reverse, Value::Bool(true));
+    bench.begin();
+    let (_, step) = bench.send();
+    assert!(!step.pdu.is_write());
+    bench.look(1_500, true);
+    bench.end(&Outcome::TimedOut);
+    bench.look(4_900, true);
+    assert_eq!(bench.told(), 0);
+    bench.look(100, true);
+    assert_eq!(bench.told(), 1);
+}
+
+#[test]
 fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
     // Begun, and over before anything of it was sent.
     let mut bench = Bench::new(LeaseAction::Stop);
     let _answer = bench.order();
     bench.begin();
     bench.end(&Outcome::Expired);
-    assert!(!bench.drive.supervision.was_heard());
+    assert_eq!(bench.drive.supervision.lease(), Lease::default());
     // Replaced and purged while it waited.
     let _older = bench.order();
     let _newer = bench.order();
     let _stop = bench.order_of(ModelPoint::Run, Value::Bool(false));
     bench.bus.queue.lock().remove(bench.now, &Outcome::Expired, |_| true);
     bench.look(10, false);
-    assert!(!bench.drive.supervision.was_heard());
+    assert_eq!(bench.drive.supervision.lease(), Lease::default());
     // The gateway's own order.
     let mut bench = Bench::new(LeaseAction::SpeedReference(20.0));
     bench.heartbeat();

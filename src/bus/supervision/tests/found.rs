@@ -44,6 +44,7 @@ fn an_action_that_was_acknowledged_while_an_order_waited_is_not_written_again() 
     let action = bench.take().expect("the stop");
     let _order = bench.order();
     bench.look(10, true);
+    assert_eq!(bench.own_results(), [""; 0], "it is not taken back from the wire");
     action.answer(&acknowledged(), bench.now);
     bench.look(10, true);
     bench.look(2_000, true);

@@ -71,14 +71,3 @@ fn an_action_that_failed_is_not_tried_again_while_a_client_is_back() {
     bench.look(1_000, true);
     assert!(is_action(&bench.take().expect("the stop")));
 }
-
-#[test]
-fn an_action_that_has_begun_is_not_taken_back() {
-    let mut bench = ran_out(LeaseAction::Stop);
-    let action = bench.take().expect("the stop");
-    let _order = bench.order();
-    bench.look(10, true);
-    assert_eq!(bench.own_results(), [""; 0]);
-    action.answer(&acknowledged(), bench.now);
-    assert_eq!(bench.own_results(), ["acknowledged"]);
-}
