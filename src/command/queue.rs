@@ -237,7 +237,10 @@ impl Pending {
 
     /// Until when at most a command or stop of a client to that drive waits; none where none waits.
     pub fn client_waits_until(&self, drive: usize) -> Option<Instant> {
-        let commands = self.waiting.iter().filter(|c| c.drive == drive && c.urgency != Urgency::Read);
+        let commands = self
+            .waiting
+            .iter()
+            .filter(|c| c.drive == drive && c.urgency != Urgency::Read);
         commands.filter_map(Command::client_waits_until).max()
     }
 
