@@ -138,6 +138,8 @@ pub struct Master {
     last_answered: Option<(usize, RequestPdu)>,
     turns: Turns,
     shutdown: Option<Shutdown>,
+    /// The line was spoken on before it was opened: by this bus, or by the one before it.
+    successor: bool,
     writes: Arc<WriteStats>,
     /// Probes in a row without an answer, by drive.
     probes: Vec<u32>,
@@ -192,6 +194,7 @@ impl Master {
             last_answered: None,
             turns: Turns::default(),
             shutdown: None,
+            successor: !leases.is_empty(),
             writes,
             late_before: false,
             bus,
@@ -208,6 +211,7 @@ impl Master {
 
     /// The port is gone: everybody whose command was begun is answered.
     pub fn lost(&mut self, now: Instant) -> Vec<News> {
+        self.successor = true;
         for drive in &mut self.drives {
             drive.close(&Outcome::BusDown, Interruption::BusDown, now);
         }
@@ -283,8 +287,9 @@ impl Master {
         let n2 = !self.sessions.is_empty();
         Sending {
             response_timeout: self.timeout_of(turn),
-            // An N2 reply does not even show whose it is. Of a line that was just opened nothing is known.
-            could_be_doubled: last.is_none_or(|(of, last)| match n2 {
+            // An N2 reply does not even show whose it is. What was last on a line that was spoken on before
+            // is not known when it is opened again.
+            could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
                 false => *of == turn.drive && look_alike(last, &turn.pdu),
             }),

@@ -85,12 +85,12 @@ impl N2LateReplies {
         Taken::Late(used)
     }
 
-    /// The answer to `pdu` was doubtful: if it was the late one, the reply itself may still come.
-    pub fn doubted(&mut self, pdu: &RequestPdu, window: Duration, now: Instant) {
-        let Some(wanted) = form(pdu) else { return };
-        let until = now + window;
-        if let Some(late) = self.0.iter_mut().find(|late| late.form.is_like(wanted)) {
-            late.until = late.until.max(until);
+    /// The answer to `pdu` was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it
+    /// was not.
+    pub fn doubted(&mut self, pdu: &RequestPdu, device: u8, window: Duration, now: Instant) {
+        match self.0.iter_mut().find(|late| Some(late.form) == form(pdu)) {
+            Some(late) => late.until = late.until.max(now + window),
+            None => self.given_up(pdu, device, window, now),
         }
     }
 }

@@ -171,7 +171,7 @@ impl Supervision {
             self.lease = Lease(if acts { State::RanOut } else { State::Ended });
             (self.next_try, self.refused) = (None, None);
             news.push(News::LeaseRanOut(drive));
-        } else if read_since && !may_start(reading) {
+        } else if read_since && !may_start(reading, since) {
             self.lease = Lease(State::Ended);
         }
     }
@@ -283,9 +283,11 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
 
 /// Whether a motor that stands may start without another command: the run command is set in the drive's word, or is not
 /// read yet. Of a drive that does not tell it, it is taken to be unset.
-fn may_start(reading: &Reading<'_>) -> bool {
-    if let Some(run) = reading.model(ModelPoint::Run).good() {
-        return run.as_bool();
+fn may_start(reading: &Reading<'_>, since: Instant) -> bool {
+    let sample = reading.model(ModelPoint::Run);
+    if let Some(run) = sample.good() {
+        // What was read before the last order says nothing of what that did.
+        return run.as_bool() || sample.at.is_some_and(|at| at <= since);
     }
     let run = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
     run.is_some_and(|raw| reading.words(raw.table, raw.address, 1) == Err(Unavailable::Stale))

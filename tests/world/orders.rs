@@ -76,7 +76,7 @@ pub struct Record {
     pub sent: Option<Instant>,
     pub answer: Option<(String, Instant)>,
     pub read: Option<(RequestPdu, Option<Vec<u16>>)>,
-    /// Orders of the bus that waited when it was accepted.
+    /// Orders to the same drive that waited when it was accepted: they go before it.
     pub before: usize,
     /// A newer reference took its place.
     pub succeeded: bool,

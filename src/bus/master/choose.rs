@@ -121,12 +121,27 @@ impl Master {
 
     fn commands(&mut self, now: Instant) -> Commands {
         let mut commands = Commands::default();
-        for (index, (drive, image)) in self.drives.iter_mut().zip(&self.bus.image.drives).enumerate() {
+        let Master {
+            drives,
+            bus,
+            n2_late,
+            sessions,
+            ..
+        } = self;
+        for (index, (drive, image)) in drives.iter_mut().zip(&bus.image.drives).enumerate() {
             if !drive.has_runs() {
                 continue;
             }
-            match drive.wanted(image, &self.n2_late, now) {
+            match drive.wanted(image, n2_late, now) {
                 Wanted::Step(slot, step) => {
+                    // What N2 needs said before is blocked by late replies as the step itself is.
+                    let before = sessions.before(index, Some(slot), now).map(RequestPdu::N2);
+                    let blocked = before.and_then(|before| n2_late.blocks(&before, now));
+                    let waits = drive.run(slot).is_some_and(|run| run.waits_for_late());
+                    if let Some(until) = blocked.filter(|_| waits) {
+                        commands.wait(until);
+                        continue;
+                    }
                     let rank = drive.run(slot).map_or(slot, |run| run.rank);
                     let place = commands.ready.get_mut(rank as usize);
                     if let Some(place @ None) = place {
