@@ -18,7 +18,9 @@ mod bus;
 mod clients;
 mod drives;
 mod history;
+mod matrix;
 mod orders;
+mod rig;
 mod scenario;
 mod world;
 
