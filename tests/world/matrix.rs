@@ -26,6 +26,8 @@ use super::rig::{Counts, Rig, line, write};
 const DRIVES: u8 = 3;
 /// How long faults come at a high rate.
 const STORM: Duration = Duration::from_secs(30);
+/// The same on N2, which is slow.
+const N2_STORM: Duration = Duration::from_secs(150);
 /// Time between the answer to a write and the next one.
 const PAUSE: Duration = Duration::from_millis(7);
 /// Time in which all drives are back behind a storm: the longest back-off, and a round.
@@ -80,6 +82,7 @@ fn rig(protocol: Protocol, delivery: Delivery) -> Rig {
 enum Tells {
     /// Nothing: the exchange goes well.
     Nothing,
+    /// No reply is believed; drives are now and then taken for dead.
     Timeouts,
     Corrupt,
     Foreign,
@@ -288,11 +291,16 @@ impl Watched {
     }
 }
 
+fn storm(protocol: Protocol) -> Duration {
+    if protocol == Protocol::N2 { N2_STORM } else { STORM }
+}
+
 /// Good exchanges of a sound line in the time of a storm.
 fn sound(protocol: Protocol, delivery: Delivery) -> u64 {
     let mut watched = Watched::new(protocol, delivery);
     let before = watched.rig.counts();
-    watched.run(STORM, true);
+    watched.run(storm(protocol), true);
+    watched.run(Duration::from_secs(1), false);
     assert!(watched.wrong.is_empty(), "{:?}", watched.wrong);
     watched.rig.counts().since(before).ok
 }
@@ -303,7 +311,9 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
     let recovery = single.map(|fault| watched.recovery(fault));
     let before = watched.rig.counts();
     watched.rig.set_faults(FaultPlan::new(row.rates.parse().unwrap(), 7));
-    watched.run(STORM, true);
+    watched.run(storm(protocol), true);
+    // An echo that ceases takes the acknowledgement of a write with it.
+    watched.run(Duration::from_secs(1), false);
     let ok = watched.rig.counts().since(before).ok;
     // What the last fault brings is waited for, and the drives that were taken for dead.
     watched.rig.set_faults(FaultPlan::default());
@@ -324,20 +334,41 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
             wrong.push(what);
         }
     };
-    must(row.tells.fits(&counts), format!("the counters do not tell {:?}", row.tells));
-    must(counts.faults >= 100, "hardly a fault was met".to_string());
+    must(
+        row.tells.fits(&counts),
+        format!("the counters do not tell {:?}", row.tells),
+    );
+    must(counts.faults >= 50, "hardly a fault was met".to_string());
     // A refused register stays refused for a minute; the drives are there.
     let back = (0..usize::from(DRIVES)).all(|drive| rig.is_online(drive));
     let refused = matches!(row.tells, Tells::Exceptions | Tells::All);
-    must(back && (refused || rig.is_whole()), "drives are away behind it".to_string());
+    must(
+        back && (refused || rig.is_whole()),
+        "drives are away behind it".to_string(),
+    );
     let share = ok as f64 / sound as f64;
     must(share >= row.share, format!("less than {} of the sound line", row.share));
-    must((vanished > 0) == row.vanish, format!("drives vanished {vanished} times"));
-    must(recovery.is_none_or(|time| time <= longest(protocol)), "a long time to recover".to_string());
-    must(s.silence_violations == 0, format!("{} silence violations", s.silence_violations));
-    must(s.collisions == 0, format!("{} collisions", s.collisions));
+    must(
+        (vanished > 0) == row.vanish,
+        format!("drives vanished {vanished} times"),
+    );
+    must(
+        recovery.is_none_or(|time| time <= longest(protocol)),
+        "a long time to recover".to_string(),
+    );
+    must(
+        s.silence_violations == 0,
+        format!("{} silence violations", s.silence_violations),
+    );
+    // A late reply to a request that was repeated is believed, rightly; the drive's second reply then meets the next
+    // request. Nobody who does not know the future can avoid that.
+    let late = row.rates.contains("late");
+    must(late || s.collisions == 0, format!("{} collisions", s.collisions));
     must(s.bad_crc == 0, format!("{} broken requests", s.bad_crc));
-    must(s.provoked_overlaps == 0, format!("{} requests met noise", s.provoked_overlaps));
+    // So it is with a frame that is seen at its end only, after the line seemed silent.
+    let unseen = late || (row.rates.contains("double") && row.delivery != Delivery::Chunks(1));
+    let met = s.provoked_overlaps;
+    must(unseen || met == 0, format!("{met} requests met noise"));
     Met {
         counts,
         acknowledged,
@@ -388,26 +419,139 @@ fn named(fault: &str, rates: &str, tells: Tells, share: f64) -> Row {
     }
 }
 
-const FAULTS: [&str; 21] = [
-    "deaf", "drop", "truncate", "corrupt", "double", "late:20ms", "late:101ms", "late:103ms", "late:106ms", "late:150ms",
-    "late:400ms", "foreign-address", "foreign-function", "foreign-length", "stray-address", "stray-function", "stray-length",
-    "noise-before", "noise-after", "split", "busy",
-];
+/// As a row of whole replies, but handed over in chunks.
+fn by(chunk: u8, row: Row) -> Row {
+    Row {
+        delivery: Delivery::Chunks(chunk),
+        ..row
+    }
+}
+
+const ALL: &str = "deaf=0.03,drop=0.04,truncate=0.04,corrupt=0.05,double=0.05,late:104ms=0.03,late:130ms=0.03,\
+                   foreign-address=0.04,foreign-length=0.04,stray-function=0.04,noise-before=0.05,noise-after=0.05,busy=0.03";
+
+fn storm_of_all(name: &str) -> Row {
+    Row {
+        vanish: true,
+        ..named(name, ALL, Tells::All, 0.05)
+    }
+}
 
 #[test]
-fn probe_all() {
-    for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii, Protocol::N2] {
-        let mut rows: Vec<Row> = FAULTS.iter().map(|f| row(f, Tells::All, 0.0)).collect();
-        rows.push(named("echo", "echo=1", Tells::All, 0.0));
-        rows.push(named("echo now and then", "echo=0.3", Tells::All, 0.0));
-        rows.push(named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Tells::All, 0.0));
-        rows.push(named("always late", "late:110ms=1", Tells::All, 0.0));
-        rows.push(row("exception:4", Tells::All, 0.0));
-        for delivery in [Delivery::Chunks(1), Delivery::Chunks(14)] {
-            for fault in ["double", "noise-after", "noise-before", "corrupt", "stray-length"] {
-                rows.push(Row { delivery, ..row(fault, Tells::All, 0.0) });
-            }
-        }
-        let _ = std::panic::catch_unwind(|| matrix(protocol, rows));
-    }
+fn modbus_rtu() {
+    use Tells::*;
+    let rows = [
+        row("deaf", Timeouts, 0.05),
+        row("drop", Timeouts, 0.05),
+        row("truncate", Corrupt, 0.05),
+        row("corrupt", Corrupt, 0.35),
+        row("double", Foreign, 0.95),
+        by(1, row("double", Foreign, 0.85)),
+        row("late:20ms", Nothing, 0.28),
+        row("late:101ms", Timeouts, 0.05),
+        row("late:103ms", Timeouts, 0.05),
+        row("late:106ms", Timeouts, 0.05),
+        row("late:150ms", Timeouts, 0.05),
+        row("late:400ms", Timeouts, 0.05),
+        named("always late", "late:110ms=1", Timeouts, 0.005),
+        named(
+            "late and dropped",
+            "late:104ms=0.2,late:107ms=0.2,late:120ms=0.2,drop=0.1",
+            Timeouts,
+            0.01,
+        ),
+        row("foreign-address", ForeignAndTimeouts, 0.05),
+        row("foreign-function", ForeignAndTimeouts, 0.05),
+        row("foreign-length", ForeignAndTimeouts, 0.05),
+        row("stray-address", Foreign, 0.85),
+        row("stray-function", Foreign, 0.85),
+        row("stray-length", Foreign, 0.85),
+        named("echo", "echo=1", Nothing, 0.99),
+        named("echo now and then", "echo=0.3", All, 0.5),
+        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.05),
+        row("noise-before", Foreign, 0.95),
+        row("noise-after", Foreign, 0.95),
+        by(1, row("noise-after", Foreign, 0.95)),
+        row("split", Nothing, 0.99),
+        row("exception:1", Exceptions, 0.2),
+        row("exception:2", Exceptions, 0.2),
+        row("exception:3", Exceptions, 0.2),
+        row("exception:4", Exceptions, 0.7),
+        row("exception:5", Exceptions, 0.7),
+        row("busy", Exceptions, 0.7),
+        storm_of_all("everything"),
+        by(1, storm_of_all("everything, by 1")),
+        by(14, storm_of_all("everything, by 14")),
+    ];
+    matrix(Protocol::ModbusRtu, rows);
+}
+
+#[test]
+fn modbus_ascii() {
+    use Tells::*;
+    let rows = [
+        row("deaf", Timeouts, 0.05),
+        row("drop", Timeouts, 0.05),
+        row("truncate", Corrupt, 0.05),
+        row("corrupt", Corrupt, 0.65),
+        row("double", Foreign, 0.95),
+        by(1, row("double", Foreign, 0.85)),
+        row("late:20ms", Nothing, 0.38),
+        row("late:104ms", Timeouts, 0.07),
+        row("late:150ms", Timeouts, 0.07),
+        row("foreign-address", ForeignAndTimeouts, 0.07),
+        row("foreign-function", ForeignAndTimeouts, 0.07),
+        row("foreign-length", ForeignAndTimeouts, 0.07),
+        row("stray-address", Foreign, 0.85),
+        row("stray-function", Foreign, 0.85),
+        row("stray-length", Foreign, 0.8),
+        named("echo", "echo=1", Nothing, 0.99),
+        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.05),
+        // Before a colon it is no matter at all.
+        row("noise-before", Nothing, 0.95),
+        row("noise-after", Foreign, 0.95),
+        by(1, row("noise-after", Foreign, 0.95)),
+        by(14, row("noise-after", Foreign, 0.95)),
+        row("split", Nothing, 0.99),
+        row("exception:4", Exceptions, 0.7),
+        row("busy", Exceptions, 0.7),
+        storm_of_all("everything"),
+        by(1, storm_of_all("everything, by 1")),
+        by(14, storm_of_all("everything, by 14")),
+    ];
+    matrix(Protocol::ModbusAscii, rows);
+}
+
+#[test]
+fn n2() {
+    use Tells::*;
+    let rows = [
+        row("deaf", Timeouts, 0.15),
+        row("drop", Timeouts, 0.15),
+        row("truncate", Corrupt, 0.15),
+        row("corrupt", Corrupt, 0.22),
+        row("double", Foreign, 0.95),
+        by(1, row("double", Foreign, 0.9)),
+        row("late:20ms", Nothing, 0.75),
+        row("late:255ms", Timeouts, 0.15),
+        row("late:275ms", Timeouts, 0.15),
+        row("late:400ms", Timeouts, 0.15),
+        // No reply of N2 names anything, so that a foreign one cannot be told: here it is none.
+        row("foreign-address", Timeouts, 0.15),
+        row("foreign-function", Timeouts, 0.15),
+        row("foreign-length", Timeouts, 0.15),
+        row("stray-address", Nothing, 0.9),
+        named("echo", "echo=1", Nothing, 0.99),
+        named("echo now and then", "echo=0.3", Nothing, 0.99),
+        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.13),
+        row("noise-before", All, 0.5),
+        row("noise-after", Foreign, 0.95),
+        by(1, row("noise-after", Foreign, 0.95)),
+        row("split", Nothing, 0.99),
+        row("exception:4", Exceptions, 0.65),
+        row("busy", Exceptions, 0.65),
+        named("everything", ALL, All, 0.1),
+        by(1, named("everything, by 1", ALL, All, 0.1)),
+    ];
+    matrix(Protocol::N2, rows);
 }

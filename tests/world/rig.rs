@@ -51,7 +51,11 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
         family,
         protocol,
         baud,
-        format: if protocol == Protocol::ModbusAscii { "7E1" } else { "8N1" },
+        format: if protocol == Protocol::ModbusAscii {
+            "7E1"
+        } else {
+            "8N1"
+        },
         drives,
         turnaround: Duration::from_micros(500),
         response_timeout: protocol.usual_timeout(),
