@@ -16,6 +16,7 @@
 
 mod bus;
 mod clients;
+mod cost;
 mod drives;
 mod history;
 mod matrix;

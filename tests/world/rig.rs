@@ -3,7 +3,6 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::bus::master::Purpose;
 use drivegate::cache::{OnShutdown, Outcome as Counted};
 use drivegate::codec::{Protocol, RequestPdu};
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind, WriteStats};
@@ -153,16 +152,6 @@ impl Rig {
             let reading = image.reading(self.now, self.plant.stale_after);
             let mut fast = image.plan.reads.iter().filter(|read| read.class == PollClass::Fast);
             fast.all(|read| reading.words(read.table, read.start, read.count).is_ok())
-        })
-    }
-
-    /// Whether the turn on the line is a probe of that drive.
-    pub fn probes(&self, drive: usize) -> bool {
-        let turn = self.bus.core.asked().filter(|turn| turn.drive == drive);
-        turn.is_some_and(|turn| match &turn.purpose {
-            Purpose::Poll(poll) => poll.probe,
-            Purpose::Session(..) => true,
-            Purpose::Command { .. } => false,
         })
     }
 }
