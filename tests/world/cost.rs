@@ -26,9 +26,6 @@ fn exchanges(line: &Line) -> f64 {
     let before = rig.counts();
     rig.run(10 * MINUTE);
     let counts = rig.counts().since(before);
-        "{} {} {:?} {:?}: {counts:?}",
-        line.family, line.drives, line.dead, line.faults
-    );
     counts.ok as f64
 }
 
@@ -134,7 +131,6 @@ fn stops_to_a_silent_drive_leave_the_others_their_data() {
     let specs: Vec<DriveSpec> = image.drives.iter().map(|drive| drive.spec.clone()).collect();
     let round = predict(&image.spec, Silence::Spec, &specs).fast_cycle.unwrap();
     let most = round * 3 / 2 + 2 * line.response_timeout;
-    let (sound, _) = oldest(&mut rig, 2 * MINUTE, None);
     rig.bus.wire.slaves().drive(30).unwrap().set_alive(false);
     let (first, sent) = oldest(&mut rig, MINUTE, Some(Duration::from_millis(50)));
     let (seldom, sent2) = oldest(&mut rig, 2 * MINUTE, Some(Duration::from_millis(700)));

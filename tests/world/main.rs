@@ -21,6 +21,7 @@ mod drives;
 mod history;
 mod matrix;
 mod orders;
+mod prediction;
 mod rig;
 mod scenario;
 mod world;
