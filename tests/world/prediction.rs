@@ -28,10 +28,10 @@ fn a_saturated_line_has_the_cycle_that_was_predicted() {
     let predicted = predict(&image.spec, Silence::Spec, &specs).fast_cycle.unwrap();
 
     // The process data of drive 1 begins each round.
-    let first = |frame: &&Recorded| {
+    let first = |frame: &Recorded| {
         frame.direction == Direction::ToDrives && frame.bytes.starts_with(&[0x01, 0x03, 0x08, 0x34, 0x00, 0x0B])
     };
-    let frames = rig.bus.wire.transcript().frames();
+    let frames = rig.bus.wire.transcript().frames().into_iter();
     let rounds: Vec<Duration> = frames.filter(first).map(|frame| frame.start).take(ROUNDS + 1).collect();
     assert_eq!(rounds.len(), ROUNDS + 1);
     let took = (rounds[ROUNDS] - rounds[0]).as_secs_f64() / ROUNDS as f64;
