@@ -85,12 +85,12 @@ impl N2LateReplies {
         Taken::Late(used)
     }
 
-    /// The answer to `pdu` was doubtful: if it was the late one, the reply itself may still come.
-    pub fn doubted(&mut self, pdu: &RequestPdu, window: Duration, now: Instant) {
-        let Some(wanted) = form(pdu) else { return };
-        let until = now + window;
-        if let Some(late) = self.0.iter_mut().find(|late| late.form.is_like(wanted)) {
-            late.until = late.until.max(until);
+    /// The answer to `pdu` was doubtful: if it was the late one, the reply itself may still come; it may look otherwise.
+    pub fn doubted(&mut self, pdu: &RequestPdu, device: u8, window: Duration, now: Instant) {
+        let wanted = form(pdu);
+        match self.0.iter_mut().find(|late| Some(late.form) == wanted) {
+            Some(late) => late.until = late.until.max(now + window),
+            None => self.given_up(pdu, device, window, now),
         }
     }
 }
@@ -197,6 +197,20 @@ mod tests {
             Taken::Reply,
             "forgotten"
         );
+    }
+
+    #[test]
+    fn behind_a_doubtful_answer_the_reply_itself_may_still_come() {
+        let now = Instant::now();
+        let state = read(Table::DiscreteInput, 0, 1);
+        let mut late = N2LateReplies::default();
+        late.given_up(&RequestPdu::N2(Session::Identify), 0x10, WINDOW, now);
+        // It was the late identity: the state comes in the next exchange.
+        assert_eq!(late.take(&state, b"A1061\r", now), Taken::Doubtful);
+        late.doubted(&state, 0x10, WINDOW, now);
+        assert_eq!(late.blocks(&state, now), Some(now + WINDOW));
+        let float = read(Table::Input, 0, 2);
+        assert!(matches!(late.take(&float, b"A4064\r", now), Taken::Late(_)));
     }
 
     #[test]

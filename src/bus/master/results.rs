@@ -56,7 +56,8 @@ impl Master {
             }
             Ended::Corrupt(MAY_BE_LATE) => {
                 let window = super::N2_LATE * self.response_timeout;
-                self.n2_late.doubted(&turn.pdu, window, now);
+                let device = self.sessions.device(turn.drive);
+                self.n2_late.doubted(&turn.pdu, device, window, now);
             }
             Ended::Silent | Ended::Corrupt(_) => {
                 let device = self.sessions.device(turn.drive);
