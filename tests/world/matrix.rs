@@ -468,7 +468,7 @@ fn modbus_rtu() {
         row("stray-length", Foreign, 0.85),
         named("echo", "echo=1", Nothing, 0.99),
         named("echo now and then", "echo=0.3", All, 0.5),
-        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.05),
+        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.03),
         row("noise-before", Foreign, 0.95),
         row("noise-after", Foreign, 0.95),
         by(1, row("noise-after", Foreign, 0.95)),
@@ -506,7 +506,7 @@ fn modbus_ascii() {
         row("stray-function", Foreign, 0.85),
         row("stray-length", Foreign, 0.8),
         named("echo", "echo=1", Nothing, 0.99),
-        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.05),
+        named("echo, drive deaf", "echo=0.7,deaf-echo=0.3", Timeouts, 0.03),
         // Before a colon it is no matter at all.
         row("noise-before", Nothing, 0.95),
         row("noise-after", Foreign, 0.95),
