@@ -91,65 +91,6 @@ fn reference(rig: &Rig, address: u8) -> u16 {
 }
 
 #[tokio::test]
-async fn a_late_answer_of_one_drive_is_never_taken_for_anothers() {
-    let rig = Rig::of(setup("vacon-nx-n2", &[1, 2]), |_| {});
-    rig.until("both answer", |r| {
-        r.state(1) == State::Ready && r.state(2) == State::Ready
-    })
-    .await;
-    assert!(rig.set(1, &[("speed_reference", 50.0), ("run", 1.0)]).await.is_ok());
-    assert!(rig.set(2, &[("speed_reference", 20.0)]).await.is_ok());
-    is_good(&rig, ModelPoint::Running, Value::Bool(true)).await;
-    is_good(&rig, ModelPoint::OutputFrequency, Value::Number(25.0)).await;
-    rig.until("the other one's reference", |r| {
-        r.good(2, ModelPoint::SpeedReference) == Some(Value::Number(20.0))
-    })
-    .await;
-    // From just behind the timeout on.
-    let late = "late:255ms=0.03,late:275ms=0.03,late:300ms=0.03,late:350ms=0.03,late:450ms=0.03";
-    let faults = FaultPlan::new(late.parse().unwrap(), 7).only(&[1]);
-    rig.line.set_faults(faults);
-    let told = |address, point| rig.sample(address, point).value.map(Value::as_f64);
-    let watch = async {
-        for _ in 0..3000 {
-            for (address, point, expected) in [
-                (1, ModelPoint::OutputFrequency, &[25.0][..]),
-                (1, ModelPoint::Running, &[1.0]),
-                (1, ModelPoint::SpeedReference, &[50.0]),
-                (2, ModelPoint::OutputFrequency, &[0.0]),
-                (2, ModelPoint::Running, &[0.0]),
-                (2, ModelPoint::SpeedReference, &[20.0, 21.0]),
-                (2, ModelPoint::MotorCurrent, &[0.0]),
-            ] {
-                let value = told(address, point);
-                assert!(
-                    value.is_none_or(|value| expected.contains(&value)),
-                    "drive {address}: {} = {value:?}",
-                    point.name()
-                );
-            }
-            tokio::time::sleep(Duration::from_millis(3)).await;
-        }
-    };
-    let command = async {
-        let mut taken = 0;
-        for turn in 1.. {
-            let wanted = 20 + turn % 2;
-            if rig.set(2, &[("speed_reference", f64::from(wanted))]).await.is_ok() {
-                assert_eq!(reference(&rig, 2), 100 * wanted as u16, "acknowledged, and so it is");
-                taken += 1;
-            }
-            if taken == 20 {
-                break;
-            }
-        }
-    };
-    tokio::join!(watch, command);
-    assert!(rig.line.statistics().faults > 5);
-    assert!(rig.handle(2).image.snapshot().link.is_online());
-}
-
-#[tokio::test]
 async fn what_the_drive_has_already_is_not_written_again() {
     let rig = Rig::of(setup("vacon-nx-n2", &[1]), |_| {});
     rig.until("the drive answers", |r| r.state(1) == State::Ready).await;

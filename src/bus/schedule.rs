@@ -154,6 +154,7 @@ impl Schedule {
         let drives = plans.iter().enumerate().map(|(index, plan)| DriveSchedule {
             presence: Presence::Away(now, Duration::ZERO),
             tried: false,
+            doubted: false,
             failures: 0,
             garbled: 0,
             items: plan
@@ -271,7 +272,7 @@ impl Schedule {
     /// The drive answered a command: it is alive, and probed at once if it was away.
     pub fn seen(&mut self, drive: usize, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive) {
-            drive.failures = 0;
+            (drive.failures, drive.doubted) = (0, false);
             if let Presence::Away(at, pause) = drive.presence {
                 drive.presence = Presence::Away(at.min(now), pause);
             }
@@ -287,12 +288,31 @@ impl Schedule {
         }
     }
 
+    /// A drive that is online did not answer a command: its process data is read next in the round, which tells whether it is
+    /// there at all, before more is said to it in vain.
+    pub fn doubted(&mut self, index: usize) {
+        let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;
+        let Some(drive) = self.drives.get_mut(index).filter(online) else {
+            return;
+        };
+        let fast = |item: &&Item| item.read.class == PollClass::Fast;
+        let Some(read) = drive.items.iter().find(fast).map(|item| item.read) else {
+            return;
+        };
+        if !self.round.is_empty() {
+            drive.doubted = true;
+            self.round.retain(|waiting| *waiting != (index, read));
+            self.round.push_front((index, read));
+        }
+    }
+
     /// A poll may not go before then.
     pub fn postpone(&mut self, poll: &Poll, until: Instant) {
         self.round.retain(|waiting| *waiting != (poll.drive, poll.read));
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return;
         };
+        drive.doubted = false;
         if let (Presence::Away(_, pause), true) = (drive.presence, poll.probe) {
             drive.presence = Presence::Away(until, pause);
         }

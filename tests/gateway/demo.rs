@@ -73,7 +73,7 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     demo.signal("INT");
     let (status, took) = demo.ended();
     assert!(status.success(), "{status}");
-    assert!(took < Duration::from_secs(3), "it took {took:?}");
+    assert!(took < Duration::from_secs(10), "it took {took:?}");
 }
 
 #[test]

@@ -17,7 +17,7 @@ use drivegate::line::Rs485;
 use drivegate::plant::BusHandle;
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::half_duplex::{HalfDuplex, LineRules};
+use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
 
@@ -62,28 +62,20 @@ pub struct WorldBus {
     asked: Option<Asked>,
 }
 
-impl WorldBus {
-    pub fn new(
-        index: usize,
-        line: &Line,
-        seed: u64,
-        events: &Events,
-        writes: &Arc<WriteStats>,
-        now: Instant,
-    ) -> WorldBus {
+/// What a line has that its description does not tell.
+pub struct Parts {
+    pub profile: Arc<Profile>,
+    pub drives: Vec<DriveOptions>,
+    pub faults: FaultPlan,
+    pub delivery: Delivery,
+    pub silence: Silence,
+}
+
+impl Parts {
+    /// The usual ones: drives of the family, all but the dead, and the faults of the description.
+    pub fn of(index: usize, line: &Line, seed: u64) -> Parts {
         let mut profile = Profiles::built_in().get(line.family).unwrap().clone();
-        let own = Arc::make_mut(&mut profile);
-        own.turnaround = line.turnaround;
-        let format = LineFormat::new(line.baud, line.format).unwrap();
-        let options = BusOptions {
-            response_timeout: line.response_timeout,
-            retries: line.retries,
-            silence: Silence::Spec,
-            rs485: Rs485::Off,
-        };
-        let handle = handle(index, line, &profile, format);
-        let mut rules = LineRules::of(line.protocol, format);
-        rules.turnaround = line.turnaround;
+        Arc::make_mut(&mut profile).turnaround = line.turnaround;
         let drives = (1..=line.drives).filter(|address| !line.dead.contains(address));
         let drives = drives.map(|address| {
             let mut model = ModelOptions::by_name(profile.simulator.as_deref().unwrap()).unwrap();
@@ -96,8 +88,39 @@ impl WorldBus {
         {
             faults = faults.refusing(1, raw.table, raw.address);
         }
-        let slaves = Slaves::new(drives, Duration::ZERO);
-        let mut wire = HalfDuplex::new(rules, slaves, faults, Transcript::new(0));
+        Parts {
+            drives: drives.collect(),
+            faults,
+            delivery: Delivery::Whole,
+            silence: Silence::Spec,
+            profile,
+        }
+    }
+}
+
+impl WorldBus {
+    pub fn new(
+        index: usize,
+        line: &Line,
+        parts: Parts,
+        events: &Events,
+        writes: &Arc<WriteStats>,
+        now: Instant,
+    ) -> WorldBus {
+        let profile = parts.profile;
+        let format = LineFormat::new(line.baud, line.format).unwrap();
+        let options = BusOptions {
+            response_timeout: line.response_timeout,
+            retries: line.retries,
+            silence: parts.silence,
+            rs485: Rs485::Off,
+        };
+        let handle = handle(index, line, &profile, format);
+        let mut rules = LineRules::of(line.protocol, format);
+        rules.turnaround = line.turnaround;
+        rules.delivery = parts.delivery;
+        let slaves = Slaves::new(parts.drives, Duration::ZERO);
+        let mut wire = HalfDuplex::new(rules, slaves, parts.faults, Transcript::new(0));
         wire.take_acts();
         let mut core = BusCore::new(
             handle.clone(),

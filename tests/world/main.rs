@@ -16,9 +16,13 @@
 
 mod bus;
 mod clients;
+mod cost;
 mod drives;
 mod history;
+mod matrix;
 mod orders;
+mod prediction;
+mod rig;
 mod scenario;
 mod world;
 

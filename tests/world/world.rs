@@ -18,7 +18,7 @@ use drivegate::sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
-use super::bus::{Asked, Seen, WorldBus};
+use super::bus::{Asked, Parts, Seen, WorldBus};
 use super::clients::{Client, Servers, Way, answers, write_frame};
 use super::drives::{AFTERMATH, Truth};
 use super::history::History;
@@ -102,7 +102,10 @@ impl World {
             .buses
             .iter()
             .enumerate()
-            .map(|(index, line)| WorldBus::new(index, line, scenario.seed, &events, &writes, now))
+            .map(|(index, line)| {
+                let parts = Parts::of(index, line, scenario.seed);
+                WorldBus::new(index, line, parts, &events, &writes, now)
+            })
             .collect();
         let plant = plant_of(&buses, &events, &writes);
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));

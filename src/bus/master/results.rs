@@ -256,6 +256,7 @@ impl Master {
             drive.end(slot, &outcome, image, now);
             if *ended == Ended::Silent {
                 drive.silent_until = Some(now + STOP_AGAIN.max(took * STOPS_IN_VAIN));
+                self.schedule.doubted(index);
             }
         }
         if !online {

@@ -117,7 +117,7 @@ impl Schedule {
     /// The read that a command asked for, waiting longest.
     pub(super) fn due_asked(&self, now: Instant) -> Option<Poll> {
         let online = self.drives.iter().enumerate();
-        let online = online.filter(|(_, d)| d.presence == Presence::Online);
+        let online = online.filter(|(_, d)| d.presence == Presence::Online && !d.doubted);
         let asked = online.flat_map(|(drive, d)| d.items.iter().map(move |item| (drive, item)));
         let due = asked.filter_map(|(drive, item)| Some((item.asked.filter(|since| *since <= now)?, drive, item.read)));
         let (_, drive, read) = due.min_by_key(|(since, _, _)| *since)?;

@@ -47,6 +47,8 @@ pub(super) enum Presence {
 pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
     pub(super) tried: bool,
+    /// It did not answer a command: a fast poll tells whether it is there, before anything else is read.
+    pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,
     pub(super) items: Vec<Item>,
@@ -58,7 +60,8 @@ pub(super) struct DriveSchedule {
 pub(super) fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
     let (first, longest) = PROBE_PAUSE;
     if pause.is_zero() {
-        return Presence::Away(now + (took * 4).clamp(first, longest), first);
+        // What is on the line then, and what goes before it, is within the longest pause too.
+        return Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first);
     }
     let doubled = (pause * 2).min(longest);
     let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);

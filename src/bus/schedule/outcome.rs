@@ -20,6 +20,7 @@ impl Schedule {
         drive.failures = 0;
         drive.garbled = 0;
         drive.tried = true;
+        drive.doubted = false;
         let came = drive.presence != Presence::Online;
         if came {
             drive.presence = Presence::Online;
@@ -83,6 +84,8 @@ impl Schedule {
             return Change::None;
         }
         drive.failures += 1;
+        // While it is tried again, nothing else is asked of it; what was garbled shows that something is there.
+        drive.doubted &= drive.failures <= retries && poll.read.class == PollClass::Fast;
         if drive.failures <= retries {
             if poll.read.class == PollClass::Fast {
                 self.round.push_front((poll.drive, poll.read));
@@ -106,6 +109,7 @@ impl Schedule {
             return self.failed(poll, took, now);
         }
         drive.garbled += 1;
+        drive.doubted = false;
         if poll.read.class == PollClass::Fast {
             if drive.garbled <= retries {
                 self.round.push_front((poll.drive, poll.read));

@@ -1,0 +1,139 @@
+//! What a silent drive, garbled frames and stops that nobody answers cost the other drives of a line.
+
+use std::time::Duration;
+
+use drivegate::bus::predict::predict;
+use drivegate::cache::DriveSpec;
+use drivegate::codec::Protocol;
+use drivegate::codec::wire::Silence;
+use drivegate::command::{Order, Urgency};
+use drivegate::drive::{ModelPoint, PollClass, Value};
+
+use super::bus::{Parts, Seen};
+use super::rig::{Rig, line};
+use super::scenario::Line;
+
+const MINUTE: Duration = Duration::from_secs(60);
+
+fn rig(line: &Line) -> Rig {
+    Rig::new(line, Parts::of(0, line, 5))
+}
+
+/// Exchanges that went well in ten minutes behind the first.
+fn exchanges(line: &Line) -> f64 {
+    let mut rig = rig(line);
+    rig.run(MINUTE);
+    let before = rig.counts();
+    rig.run(10 * MINUTE);
+    let counts = rig.counts().since(before);
+    counts.ok as f64
+}
+
+fn cost(sound: &Line, change: impl Fn(&mut Line)) -> f64 {
+    let mut troubled = sound.clone();
+    change(&mut troubled);
+    1.0 - exchanges(&troubled) / exchanges(sound)
+}
+
+const N2: [&str; 2] = ["vacon-nx-n2", "teco-7300pa-n2"];
+
+#[test]
+fn one_dead_drive_costs_its_line_two_percent_at_most() {
+    let mut lines: Vec<Line> = N2.map(|family| line(family, Protocol::N2, 9600, 3)).into();
+    lines.push(line("vacon-nx", Protocol::ModbusRtu, 9600, 10));
+    lines.push(line("vacon-nx", Protocol::ModbusRtu, 115_200, 10));
+    for line in lines {
+        let cost = cost(&line, |line| line.dead = vec![line.drives]);
+        assert!(cost <= 0.02, "{} at {}: {cost:.4}", line.family, line.baud);
+    }
+}
+
+#[test]
+fn garbled_frames_cost_an_n2_line_ten_percent_at_most() {
+    for family in N2 {
+        let line = line(family, Protocol::N2, 9600, 3);
+        let cost = cost(&line, |line| line.faults = "corrupt=0.02".to_string());
+        assert!(cost <= 0.1, "{family}: {cost:.4}");
+    }
+}
+
+#[test]
+fn the_first_probe_of_a_silent_drive_comes_within_ten_seconds() {
+    let patient = Duration::from_millis(3_500);
+    for (family, protocol) in [("vacon-nx", Protocol::ModbusRtu), ("vacon-nx-n2", Protocol::N2)] {
+        for timeout in [protocol.usual_timeout(), patient] {
+            let line = Line {
+                response_timeout: timeout,
+                ..line(family, protocol, 9600, 3)
+            };
+            let mut rig = rig(&line);
+            rig.run(MINUTE);
+            for _ in 0..5 {
+                rig.bus.wire.slaves().drive(2).unwrap().set_alive(false);
+                rig.until("it counts as offline", MINUTE, |rig| !rig.is_online(1));
+                let asks = |rig: &Rig| rig.bus.core.asked().is_some_and(|turn| turn.drive == 1);
+                let pause = rig.until("it is probed", MINUTE, asks);
+                let bounds = Duration::from_millis(500)..=Duration::from_secs(10);
+                assert!(bounds.contains(&pause), "{family}, {timeout:?}: {pause:?}");
+                rig.bus.wire.slaves().drive(2).unwrap().set_alive(true);
+                rig.until("it is back", MINUTE, |rig| rig.is_online(1));
+                rig.run(MINUTE / 2);
+            }
+        }
+    }
+}
+
+/// The oldest process data of any drive but the last within `time`, while stops are given to that one, and how many of
+/// them went out.
+fn oldest(rig: &mut Rig, time: Duration, stops: Option<Duration>) -> (Duration, u32) {
+    let silent = rig.bus.line.drives;
+    let end = rig.now + time;
+    let mut next = rig.now;
+    let (mut oldest, mut sent) = (Duration::ZERO, 0);
+    loop {
+        if let Some(every) = stops.filter(|_| rig.now >= next) {
+            let run = rig.bus.profile.model_index(ModelPoint::Run).unwrap();
+            rig.place(silent, Order::Points(vec![(run, Value::Bool(false))]));
+            next += every;
+        }
+        let until = if stops.is_some() { next.min(end) } else { end };
+        let Some(seen) = rig.step(until) else {
+            if rig.now >= end {
+                return (oldest, sent);
+            }
+            continue;
+        };
+        let rank = rig.bus.core.asked().and_then(|turn| turn.rank());
+        for one in seen {
+            match one {
+                Seen::Sent(asked) if asked.drive + 1 == usize::from(silent) => {
+                    sent += u32::from(rank == Some(Urgency::Stop));
+                }
+                Seen::Over(asked) if asked.is_poll && asked.drive + 1 != usize::from(silent) => {
+                    let image = &rig.bus.handle.image.drives[asked.drive];
+                    let mut fast = image.plan.reads.iter().filter(|read| read.class == PollClass::Fast);
+                    if let Some(at) = asked.last_read.filter(|_| fast.any(|read| read.pdu() == asked.pdu)) {
+                        oldest = oldest.max(rig.now - at);
+                    }
+                }
+                _ => {}
+            }
+        }
+    }
+}
+
+#[test]
+fn stops_to_a_silent_drive_leave_the_others_their_data() {
+    let line = line("vacon-nx", Protocol::ModbusRtu, 9600, 30);
+    let mut rig = rig(&line);
+    rig.run(2 * MINUTE);
+    let image = &rig.bus.handle.image;
+    let specs: Vec<DriveSpec> = image.drives.iter().map(|drive| drive.spec.clone()).collect();
+    let round = predict(&image.spec, Silence::Spec, &specs).fast_cycle.unwrap();
+    let most = round * 3 / 2 + 2 * line.response_timeout;
+    rig.bus.wire.slaves().drive(30).unwrap().set_alive(false);
+    let (first, sent) = oldest(&mut rig, MINUTE, Some(Duration::from_millis(50)));
+    let (seldom, sent2) = oldest(&mut rig, 2 * MINUTE, Some(Duration::from_millis(700)));
+    assert!(sent > 10 && sent2 > 10, "{sent} and {sent2} stops went out");
+    assert!(first.max(seldom) <= most, "{first:?} and {seldom:?}, bound {most:?}");
+}
