@@ -49,6 +49,7 @@ pub enum Seen {
 }
 
 pub struct WorldBus {
+    pub index: usize,
     pub line: Line,
     pub handle: BusHandle,
     pub core: BusCore,
@@ -56,6 +57,8 @@ pub struct WorldBus {
     pub options: BusOptions,
     pub profile: Arc<Profile>,
     pub open: bool,
+    /// It was asked to stop its drives: its polls cease.
+    pub ending: bool,
     pub exchanges: u64,
     began: Instant,
     until: Instant,
@@ -103,6 +106,7 @@ impl WorldBus {
         let mut core = BusCore::new(handle.clone(), &options, events.clone(), writes.clone(), &[], now);
         core.opened(now);
         WorldBus {
+            index,
             line: line.clone(),
             handle,
             core,
@@ -110,6 +114,7 @@ impl WorldBus {
             options,
             profile,
             open: true,
+            ending: false,
             exchanges: 0,
             began: now,
             until: now,
