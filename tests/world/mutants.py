@@ -103,6 +103,8 @@ def run(program, name, options):
     if ended.returncode == 0:
         return None
     output = ended.stdout + ended.stderr
+    if ended.returncode < 0:
+        return ("none", f"ended by signal {-ended.returncode}")
     seed = re.search(r"FAILED: seed (\d+)", output)
     seen = re.search(r"panicked at [^\n]*:\n([^\n]*)", output)
     words = re.sub(r":? ?(Record )?\{.*", "", seen.group(1)) if seen else output[-200:]
@@ -113,7 +115,7 @@ def main():
     options = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     options.add_argument("only", nargs="*", help="names of faults; all without any")
     options.add_argument("--seeds", type=int, default=400, help="seeds tried on each (400)")
-    options.add_argument("--time", type=int, default=1200, help="seconds for one fault (1200)")
+    options.add_argument("--time", type=int, default=600, help="seconds for one fault (600)")
     options.add_argument("--jobs", type=int, default=os.cpu_count(), help="faults run side by side")
     options = options.parse_args()
     mutants = tomllib.loads((ROOT / "tests/world/mutants.toml").read_text())["mutant"]
@@ -126,6 +128,7 @@ def main():
     chosen = [mutant for mutant in mutants if not options.only or mutant["name"] in options.only]
     sound = {"name": "none", "promise": "no fault is switched on: all seeds pass"}
     survived = []
+    print("| fault | promise | found by seed |\n|---|---|---|")
     with concurrent.futures.ThreadPoolExecutor(options.jobs) as pool:
         work = [(mutant, pool.submit(run, program, mutant["name"], options)) for mutant in [sound, *chosen]]
         for mutant, ended in work:

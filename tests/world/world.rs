@@ -313,7 +313,7 @@ impl World {
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
             let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt;
             assert!(
-                !waits || now - record.accepted < Duration::from_millis(25),
+                !waits || now - record.accepted < Duration::from_millis(2),
                 "the action overrides a client that is back: {record:?}"
             );
         }
@@ -417,7 +417,12 @@ impl World {
         if now < self.clients[index].silent_until {
             return;
         }
-        if habit != Habit::Steady && self.dice.chance(0.01) {
+        let falls_silent = match habit {
+            // They come back so often that they would be silent most of the time.
+            Habit::StopsInALoop | Habit::Floods => 0.000_3,
+            _ => 0.01,
+        };
+        if habit != Habit::Steady && self.dice.chance(falls_silent) {
             self.clients[index].silent_until = now + ms(self.dice.within(500..=6_000));
         }
         if pause.is_zero() && self.clients[index].open > 24 {
