@@ -8,6 +8,7 @@ use arc_swap::ArcSwap;
 use tokio_util::sync::CancellationToken;
 
 use crate::bus::BusTask;
+use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
 use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, WriteStats};
@@ -151,10 +152,13 @@ impl Daemon {
         // Ports are free again before a changed bus opens one of them. A bus that starts anew does not set a running drive
         // free of its supervision.
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
+        let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         for (before, task) in ends {
             tracing::info!(bus = %before.spec.name, "the bus ends");
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
-            leases.extend(drives.zip(task.stop()));
+            let left = task.stop();
+            leases.extend(drives.zip(left.leases));
+            quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         for (bus, mut task) in begins {
             tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
@@ -166,7 +170,10 @@ impl Daemon {
                     Lease::default()
                 }
             };
-            task.begin(bus.drives.iter().map(lease).collect());
+            task.begin(Handover {
+                leases: bus.drives.iter().map(lease).collect(),
+                quiet_until: quiet_until.get(&bus.spec.port).copied(),
+            });
             kept.push((bus, task));
         }
         for (bus, task) in &kept {

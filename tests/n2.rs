@@ -105,7 +105,7 @@ async fn a_late_answer_of_one_drive_is_never_taken_for_anothers() {
         r.good(2, ModelPoint::SpeedReference) == Some(Value::Number(20.0))
     })
     .await;
-    // From just behind the timeout to the end of the rest.
+    // From just behind the timeout on.
     let late = "late:255ms=0.03,late:275ms=0.03,late:300ms=0.03,late:350ms=0.03,late:450ms=0.03";
     let faults = FaultPlan::new(late.parse().unwrap(), 7).only(&[1]);
     rig.line.set_faults(faults);
@@ -147,9 +147,6 @@ async fn a_late_answer_of_one_drive_is_never_taken_for_anothers() {
     tokio::join!(watch, command);
     assert!(rig.line.statistics().faults > 5);
     assert!(rig.handle(2).image.snapshot().link.is_online());
-    // Behind each of them somebody was identified: at first the drive whose turn it was, whoever that is.
-    let fences = count(&rig, ">01F") + count(&rig, ">02F");
-    assert!(fences > 5, "the fence of the line: {fences}");
 }
 
 #[tokio::test]

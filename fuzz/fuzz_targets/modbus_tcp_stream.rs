@@ -89,12 +89,18 @@ fn answer(command: Command, how: u8) {
             _ => Reply::Written,
         }),
     };
-    command.ticket.answer(outcome, Instant::now());
+    command.answer(&outcome, Instant::now());
 }
 
 fn next_command(plant: &SharedPlant) -> Option<Command> {
     let plant = plant.load();
-    plant.buses.iter().find_map(|bus| bus.queue.lock().pop(Urgency::Read, Instant::now()))
+    let now = Instant::now();
+    plant.buses.iter().find_map(|bus| {
+        let mut pending = bus.queue.lock();
+        let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
+        let chosen = ranks.into_iter().find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+        pending.take(chosen)
+    })
 }
 
 /// The frames of a client up to the first that is none, read by the letter of the specification.

@@ -6,10 +6,9 @@ use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::line_state::{Exchanged, LineState};
-use super::master::{Master, Turn, TurnEnd};
+use super::master::{Handover, Master, Turn, TurnEnd};
 use super::news::News;
 use super::report::Report;
-use super::supervision::Lease;
 use super::tap::Tap;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
@@ -50,29 +49,32 @@ pub struct BusCore {
     master: Master,
     report: Report,
     chosen: Option<Chosen>,
+    /// Until when a reply to what the bus before asked may come: the line is left alone.
+    quiet_until: Option<Instant>,
     /// What is on the line.
     asked: Option<Turn>,
     tap: Option<Tap>,
 }
 
 impl BusCore {
-    /// A bus whose port is not open yet; `leases` are those of the bus before it, by drive.
+    /// A bus whose port is not open yet; `before` is what the bus before it left.
     pub fn new(
         bus: BusHandle,
         options: &BusOptions,
         events: Events,
         writes: Arc<WriteStats>,
-        leases: &[Lease],
+        before: &Handover,
         now: Instant,
     ) -> BusCore {
         let spec = &bus.image.spec;
         let silence = spec.protocol.silence(options.silence, &spec.format);
         BusCore {
             line: LineState::new(spec.protocol, spec.format, silence, now),
-            master: Master::new(bus.clone(), options, silence, writes, leases, now),
+            master: Master::new(bus.clone(), options, silence, writes, &before.leases, now),
             report: Report::new(bus.image.clone(), events, now),
             bus,
             chosen: None,
+            quiet_until: before.quiet_until,
             asked: None,
             tap: None,
         }
@@ -81,6 +83,9 @@ impl BusCore {
     /// The port was opened.
     pub fn opened(&mut self, now: Instant) {
         self.line.reset(now);
+        if let Some(until) = self.quiet_until.take() {
+            self.line.leave_alone(until);
+        }
         self.master.opened(now);
         self.bus.queue.open();
         self.report.bus_up(now);
@@ -95,8 +100,8 @@ impl BusCore {
         self.tell(&news, now);
     }
 
-    /// The bus ends: everybody who waits is answered. The leases, for the bus that comes after.
-    pub fn ended(&mut self, now: Instant) -> Vec<Lease> {
+    /// The bus ends: everybody who waits is answered. What the bus that comes after has to know.
+    pub fn ended(&mut self, now: Instant) -> Handover {
         self.master.ended(now)
     }
 

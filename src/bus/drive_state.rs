@@ -247,7 +247,6 @@ impl DriveState {
         }
         self.confirmations.clear();
         self.words.forget();
-        self.late = LateReplies::default();
         self.stopped = None;
         self.silent_until = None;
         self.supervision.settle(now);

@@ -159,6 +159,11 @@ impl LateReplies {
         })
     }
 
+    /// Until when any reply may still come.
+    pub fn until(&self) -> Option<Instant> {
+        self.expected.iter().map(LateReply::ends).max()
+    }
+
     /// Whether any reply may still come.
     pub fn may_come(&self, now: Instant) -> bool {
         self.expected.iter().any(|late| late.ends() > now)

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::core::{Action, BusCore};
-use super::supervision::Lease;
+use super::master::Handover;
 use crate::command::{Outcome, WriteStats};
 use crate::event::Events;
 use crate::line::{self, Line, Lost, Names, Woken};
@@ -26,8 +26,8 @@ pub struct BusTask {
     stop: Arc<AtomicBool>,
     beats: Arc<AtomicU64>,
     /// Present until the bus begins.
-    begin: Option<SyncSender<Vec<Lease>>>,
-    thread: Option<std::thread::JoinHandle<Vec<Lease>>>,
+    begin: Option<SyncSender<Handover>>,
+    thread: Option<std::thread::JoinHandle<Handover>>,
 }
 
 impl BusTask {
@@ -42,7 +42,7 @@ impl BusTask {
         events: Events,
     ) -> std::io::Result<BusTask> {
         let mut task = BusTask::prepare(handle, options, writes, events)?;
-        task.begin(Vec::new());
+        task.begin(Handover::default());
         Ok(task)
     }
 
@@ -65,13 +65,13 @@ impl BusTask {
             beats: beats.clone(),
         };
         let name = format!("bus-{}", handle.image.spec.name);
-        let (begin, begun) = sync_channel::<Vec<Lease>>(1);
+        let (begin, begun) = sync_channel::<Handover>(1);
         let thread = std::thread::Builder::new().name(name).spawn(move || {
             // A bus that is given up before it began has nothing to end.
-            let Ok(leases) = begun.recv() else {
-                return Vec::new();
+            let Ok(before) = begun.recv() else {
+                return Handover::default();
             };
-            or_end_the_process(|| worker.run(events, writes, &leases))
+            or_end_the_process(|| worker.run(events, writes, &before))
         })?;
         Ok(BusTask {
             handle,
@@ -82,12 +82,11 @@ impl BusTask {
         })
     }
 
-    /// Lets a prepared bus open its port; nothing further can fail. `leases` are those that its drives had on the bus
-    /// before, in their order; none where there was no such drive.
-    pub fn begin(&mut self, leases: Vec<Lease>) {
+    /// Lets a prepared bus open its port; nothing further can fail. `before` is what the bus before left it.
+    pub fn begin(&mut self, before: Handover) {
         if let Some(begin) = self.begin.take() {
             // Room for one; the thread waits for it.
-            let _ = begin.send(leases);
+            let _ = begin.send(before);
         }
     }
 
@@ -101,12 +100,13 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus after the exchange that is on the line; everything that waits is answered. The leases of its drives, for a bus that comes after.
-    pub fn stop(mut self) -> Vec<Lease> {
+    /// Ends the bus after the exchange that is on the line; everything that waits is answered. What a bus that comes
+    /// after has to know.
+    pub fn stop(mut self) -> Handover {
         self.halt()
     }
 
-    fn halt(&mut self) -> Vec<Lease> {
+    fn halt(&mut self) -> Handover {
         self.stop.store(true, Ordering::Relaxed);
         self.begin = None;
         self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
@@ -148,9 +148,9 @@ struct Worker {
 }
 
 impl Worker {
-    fn run(self, events: Events, writes: Arc<WriteStats>, leases: &[Lease]) -> Vec<Lease> {
+    fn run(self, events: Events, writes: Arc<WriteStats>, before: &Handover) -> Handover {
         let handle = self.handle.clone();
-        let mut core = BusCore::new(handle, &self.options, events, writes, leases, Instant::now());
+        let mut core = BusCore::new(handle, &self.options, events, writes, before, Instant::now());
         line::sharpen_timers();
         let mut pause = REOPEN.0;
         let mut names = Names::default();

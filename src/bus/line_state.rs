@@ -49,6 +49,8 @@ pub struct LineState {
     silence: Duration,
     /// End of the last character on the line, either direction.
     quiet_since: Instant,
+    /// Nothing is sent before then: a reply to whoever spoke before may come.
+    left_alone: Instant,
     /// The adapter sends back what it is given.
     echo: bool,
     /// Replies in a row that came faster than the wire could carry them.
@@ -73,6 +75,7 @@ impl LineState {
             format,
             silence,
             quiet_since: now,
+            left_alone: now,
             echo: false,
             early_replies: 0,
             underway: None,
@@ -92,7 +95,14 @@ impl LineState {
     /// When a request may go out that is wanted since `since`: when the line has been silent long enough, or has babbled
     /// too long.
     pub fn clear_at(&self, since: Instant) -> Instant {
-        (self.quiet_since + self.silence).min(since + self.silence + BABBLE)
+        let since = since.max(self.left_alone);
+        let silent = (self.quiet_since + self.silence).min(since + self.silence + BABBLE);
+        silent.max(self.left_alone)
+    }
+
+    /// Nothing is sent before `until`.
+    pub fn leave_alone(&mut self, until: Instant) {
+        self.left_alone = until;
     }
 
     /// Whether the line babbled until then.
@@ -192,3 +202,6 @@ impl LineState {
         })
     }
 }
+
+#[cfg(test)]
+mod tests;

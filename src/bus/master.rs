@@ -114,6 +114,15 @@ pub struct TurnEnd {
     pub mangled: bool,
 }
 
+/// What a bus that ends leaves to the one that comes after it on the same line.
+#[derive(Debug, Clone, Default)]
+pub struct Handover {
+    /// The leases of its drives, in their order.
+    pub leases: Vec<Lease>,
+    /// Until when a reply to what it asked may come.
+    pub quiet_until: Option<Instant>,
+}
+
 /// The master of a line.
 #[derive(Debug)]
 pub struct Master {
@@ -193,7 +202,6 @@ impl Master {
     pub fn opened(&mut self, now: Instant) {
         self.schedule.reset(now);
         self.sessions.reset();
-        self.n2_late.clear();
         self.last_answered = None;
         self.probes.fill(0);
     }
@@ -206,8 +214,8 @@ impl Master {
         (0..self.drives.len()).map(News::Offline).collect()
     }
 
-    /// The bus ends: everybody whose command was begun is answered. The leases, for the bus that comes after.
-    pub fn ended(&mut self, now: Instant) -> Vec<Lease> {
+    /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know.
+    pub fn ended(&mut self, now: Instant) -> Handover {
         if let Some(shutdown) = &mut self.shutdown {
             shutdown.end(&self.bus);
         }
@@ -215,7 +223,12 @@ impl Master {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             drive.supervision.lease()
         };
-        self.drives.iter_mut().map(close).collect()
+        let leases = self.drives.iter_mut().map(close).collect();
+        let late = self.drives.iter().filter_map(|drive| drive.late.until());
+        Handover {
+            leases,
+            quiet_until: late.chain(self.n2_late.until()).max(),
+        }
     }
 
     /// What goes on the line next.
@@ -270,8 +283,8 @@ impl Master {
         let n2 = !self.sessions.is_empty();
         Sending {
             response_timeout: self.timeout_of(turn),
-            // An N2 reply does not even show whose it is.
-            could_be_doubled: last.is_some_and(|(of, last)| match n2 {
+            // An N2 reply does not even show whose it is. Of a line that was just opened nothing is known.
+            could_be_doubled: last.is_none_or(|(of, last)| match n2 {
                 true => n2_look_alike(last, &turn.pdu),
                 false => *of == turn.drive && look_alike(last, &turn.pdu),
             }),
@@ -300,7 +313,7 @@ impl Master {
 }
 
 /// Looks at the lease of a drive.
-fn supervise(
+pub(super) fn supervise(
     bus: &BusHandle,
     index: usize,
     image: &Arc<DriveImage>,
@@ -318,10 +331,9 @@ fn supervise(
     };
     let reading = image.reading(now, drive.fresh);
     let DriveState { supervision, words, .. } = drive;
-    if image.is_unsupervised() && supervision.was_heard() {
-        image.set_unsupervised(false);
-    }
-    match supervision.look(&reading, words, orders, now, news, index) {
+    let demand = supervision.look(&reading, words, orders, now, news, index);
+    image.set_unsupervised(supervision.runs_unheard());
+    match demand {
         Demand::None => {}
         Demand::Withdraw => {
             bus.queue.lock().withdraw_supervision(index, now);
@@ -344,3 +356,6 @@ fn supervise(
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

@@ -57,9 +57,9 @@ impl N2LateReplies {
         self.0.iter().any(|late| late.until > now)
     }
 
-    /// Forgets all: the port was lost.
-    pub fn clear(&mut self) {
-        self.0.clear();
+    /// Until when any reply may still come.
+    pub fn until(&self) -> Option<Instant> {
+        self.0.iter().map(|late| late.until).max()
     }
 
     /// Until when a request must wait because a late reply could pass for its own.

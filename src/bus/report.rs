@@ -145,8 +145,6 @@ impl Report {
     }
 
     fn runs_unsupervised(&self, index: usize, adopted: Adopted) {
-        let Some(drive) = self.drive(index) else { return };
-        drive.set_unsupervised(adopted == Adopted::No);
         let then = match adopted {
             Adopted::Yes => "its lease starts now (supervision.adopt)",
             Adopted::No => {

@@ -82,9 +82,9 @@ impl Supervision {
         self.lease
     }
 
-    /// Whether any client was heard of since the gateway started.
-    pub(super) fn was_heard(&self) -> bool {
-        !matches!(self.lease.0, State::Unheard | State::RunsUnheard)
+    /// Whether the drive was seen to run, and no client was heard of since the gateway started.
+    pub(super) fn runs_unheard(&self) -> bool {
+        self.lease.0 == State::RunsUnheard
     }
 
     /// A client was heard of: its order reached the wire, or ended, or its heartbeat came.

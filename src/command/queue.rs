@@ -237,8 +237,11 @@ impl Pending {
 
     /// Until when at most a command or stop of a client to that drive waits; none where none waits.
     pub fn client_waits_until(&self, drive: usize) -> Option<Instant> {
-        let of_client = |c: &&Command| c.drive == drive && c.urgency != Urgency::Read && c.is_of_client();
-        self.waiting.iter().filter(of_client).map(|c| c.expires).max()
+        let commands = self
+            .waiting
+            .iter()
+            .filter(|c| c.drive == drive && c.urgency != Urgency::Read);
+        commands.filter_map(Command::client_waits_until).max()
     }
 
     /// Takes away what supervision wants of a drive and has not begun: a client commands the drive again.
@@ -308,12 +311,13 @@ impl Command {
         }
     }
 
-    /// Whether a client gave it: no order of the gateway's own.
-    fn is_of_client(&self) -> bool {
+    /// Until when a client waits for it; none where it is the gateway's own.
+    fn client_waits_until(&self) -> Option<Instant> {
         let own = [SourceKind::Supervision, SourceKind::Shutdown];
-        let joined = self.joined.iter().map(|(ticket, _)| ticket);
-        let tickets = std::iter::once(&self.ticket).chain(joined);
-        tickets.into_iter().any(|ticket| !own.contains(&ticket.origin().kind))
+        let joined = self.joined.iter().map(|(ticket, expires)| (ticket, *expires));
+        let tickets = std::iter::once((&self.ticket, self.expires)).chain(joined);
+        let of_clients = tickets.filter(|(ticket, _)| !own.contains(&ticket.origin().kind));
+        of_clients.map(|(_, expires)| expires).max()
     }
 }
 

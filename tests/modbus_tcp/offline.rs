@@ -5,11 +5,11 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{RequestPdu, Table};
-use drivegate::command::{Authority, Command, Order, Urgency};
+use drivegate::command::{Authority, Command, Order};
 use drivegate::north::modbus_tcp::Offline;
 use drivegate::plant::{Plant, SharedPlant};
 
-use crate::rig::{acknowledge, frame, n2_plant, options, plant, registers, words};
+use crate::rig::{acknowledge, frame, n2_plant, options, plant, registers, take_next, words};
 
 struct Bench {
     plant: SharedPlant,
@@ -30,7 +30,7 @@ impl Bench {
     }
 
     fn pop(&self) -> Option<Command> {
-        self.plant.load().buses[0].queue.lock().pop(Urgency::Read, self.now)
+        take_next(&self.plant.load().buses[0].queue, self.now)
     }
 
     /// The drive takes the next order, which this gives.

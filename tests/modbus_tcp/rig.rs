@@ -72,6 +72,16 @@ class = "fast"
 /// What a simulated bus does with a command; `None` keeps it for good.
 pub(crate) type Script = Box<dyn FnMut(&Command) -> Option<Outcome> + Send>;
 
+/// Takes the command that has its turn, where every drive is free and no stop is redundant.
+pub(crate) fn take_next(queue: &CommandQueue, now: Instant) -> Option<Command> {
+    let mut pending = queue.lock();
+    let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
+    let chosen = ranks
+        .into_iter()
+        .find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+    pending.take(chosen)
+}
+
 /// The other end of a command queue.
 pub(crate) struct FakeBus {
     queue: Arc<CommandQueue>,
@@ -100,12 +110,12 @@ impl FakeBus {
                 poll(&mut [PollFd::from_borrowed_fd(queue.wake_fd(), PollFlags::IN)], None).unwrap();
                 queue.clear_wake();
                 while !paused.load(Ordering::SeqCst) {
-                    let Some(command) = queue.lock().pop(Urgency::Read, Instant::now()) else {
+                    let Some(command) = take_next(&queue, Instant::now()) else {
                         break;
                     };
                     seen.lock().unwrap().push((command.drive, command.order.clone()));
                     match (script.lock().unwrap())(&command) {
-                        Some(outcome) => command.ticket.answer(outcome, Instant::now()),
+                        Some(outcome) => command.answer(&outcome, Instant::now()),
                         None => kept.push(command),
                     }
                 }

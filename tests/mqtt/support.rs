@@ -12,7 +12,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 use drivegate::codec::{LineFormat, Protocol, Reply, Table};
-use drivegate::command::{CommandQueue, Order, Outcome, Urgency};
+use drivegate::command::{self, CommandQueue, Order, Outcome, Urgency};
 use drivegate::drive::Value;
 use drivegate::drive::profile::Profiles;
 use drivegate::event::{Event, EventKind};
@@ -513,12 +513,22 @@ impl Gateway {
     }
 }
 
+/// Takes the command that has its turn, where every drive is free and no stop is redundant.
+fn take_next(queue: &CommandQueue, now: Instant) -> Option<command::Command> {
+    let mut pending = queue.lock();
+    let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
+    let chosen = ranks
+        .into_iter()
+        .find_map(|rank| pending.next(rank, now, |_| true, |_| false))?;
+    pending.take(chosen)
+}
+
 /// Acknowledges all commands.
 async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
     loop {
         let now = Instant::now();
         for bus in &plant.load().buses {
-            while let Some(command) = bus.queue.lock().pop(Urgency::Read, now) {
+            while let Some(command) = take_next(&bus.queue, now) {
                 let drive = &bus.image.drives[command.drive];
                 let name = |index: usize| drive.spec.profile.points[index].name.clone();
                 if let Order::Points(points) = &command.order {
@@ -526,7 +536,7 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
                     let life = command.expires.saturating_duration_since(now);
                     orders.lock().unwrap().push((command.drive, points, life));
                 }
-                command.ticket.answer(Outcome::Acknowledged(Reply::Written), now);
+                command.answer(&Outcome::Acknowledged(Reply::Written), now);
             }
         }
         tokio::time::sleep(Duration::from_millis(1)).await;

@@ -5,8 +5,7 @@ use std::time::{Duration, Instant};
 
 use drivegate::bus::BusOptions;
 use drivegate::bus::core::{Action, BusCore};
-use drivegate::bus::master::Purpose;
-use drivegate::bus::supervision::Lease;
+use drivegate::bus::master::{Handover, Purpose};
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
@@ -103,7 +102,14 @@ impl WorldBus {
         let slaves = Slaves::new(drives, Duration::ZERO);
         let mut wire = HalfDuplex::new(rules, slaves, faults, Transcript::new(0));
         wire.take_acts();
-        let mut core = BusCore::new(handle.clone(), &options, events.clone(), writes.clone(), &[], now);
+        let mut core = BusCore::new(
+            handle.clone(),
+            &options,
+            events.clone(),
+            writes.clone(),
+            &Handover::default(),
+            now,
+        );
         core.opened(now);
         WorldBus {
             index,
@@ -126,11 +132,11 @@ impl WorldBus {
     /// The bus as a reload starts it anew, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
         self.handle.queue.close(drivegate::command::Outcome::ShuttingDown, now);
-        let leases: Vec<Lease> = self.core.ended(now);
+        let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
         self.handle = handle(index, &self.line, &self.profile, format);
         let (bus, options) = (self.handle.clone(), &self.options);
-        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &leases, now);
+        self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {
             self.core.opened(now);
         }

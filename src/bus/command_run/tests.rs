@@ -6,7 +6,7 @@ use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::codec::Table;
-use crate::command::{Answer, Origin, SourceKind, WriteStats};
+use crate::command::{Admitted, Answer, Origin, SourceKind, WriteStats};
 use crate::drive::Value;
 use crate::drive::profile::Profiles;
 
@@ -54,14 +54,12 @@ impl Bench {
         let stats = Arc::new(WriteStats::default());
         let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, stats);
         let expires = self.now + Duration::from_secs(1);
-        let command = Command {
-            drive: 0,
+        let admitted = Admitted {
             order: Order::Points(values),
             urgency,
             reference_only: false,
-            expires,
-            ticket,
         };
+        let command = Command::new(0, admitted, expires, ticket);
         (CommandRun::new(command, &self.profile), receiver)
     }
 
@@ -73,8 +71,9 @@ impl Bench {
             match run.next(&self.words, &self.profile, self.running, self.now) {
                 Next::Done => return writes,
                 Next::Wait(until) => self.now = until,
-                Next::Send(pdu) => {
-                    let reply = match pdu {
+                Next::Send(step) => {
+                    run.sent(&step);
+                    let reply = match step.pdu {
                         RequestPdu::Read { start, .. } => Reply::Registers(vec![self.drive[&start]]),
                         RequestPdu::WriteRegister { address, value } => {
                             writes.push(((self.now - start).as_millis(), address, value));
@@ -83,7 +82,7 @@ impl Bench {
                         }
                         _ => unreachable!(),
                     };
-                    if run.answered(&pdu, reply, &mut self.words).is_some() {
+                    if run.answered(&step, reply, &mut self.words).is_some() {
                         return writes;
                     }
                 }
@@ -97,14 +96,7 @@ impl Bench {
 fn bits_of_others_are_kept_and_the_word_is_read_first() {
     let mut bench = Bench::new(0x0800);
     let (mut run, _answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
-    assert!(matches!(
-        run.next(&bench.words, &bench.profile, false, bench.now),
-        Next::Send(RequestPdu::Read {
-            start: 2000,
-            count: 1,
-            ..
-        })
-    ));
+    assert!(asks(&sends(&bench, &mut run)));
     assert_eq!(bench.run(&mut run), [(0, 2000, 0x0801)]);
     assert_eq!(run.success(), Outcome::Acknowledged(Reply::Written));
 }
@@ -156,18 +148,81 @@ fn reset_is_a_pulse_whatever_the_level_and_starts_nothing() {
 fn a_stop_purges_what_was_begun() {
     let mut bench = Bench::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
-    let (mut start, _a) = bench.begin(&[("run", 1.0), ("speed_reference", 50.0)], Urgency::Command);
-    let sent = RequestPdu::WriteRegister {
-        address: 2002,
-        value: 5000,
-    };
-    assert_eq!(
-        start.next(&bench.words, &bench.profile, false, bench.now),
-        Next::Send(sent.clone())
-    );
+    let points = [("run", 1.0), ("speed_reference", 50.0)];
+    let (mut start, _a) = bench.begin(&points, Urgency::Command);
+    let sent = sends(&bench, &mut start);
+    assert_eq!(sent, reference(5000));
+    start.sent(&sent);
     assert_eq!(start.answered(&sent, Reply::Written, &mut bench.words), None);
-    assert!(start.purge(), "the run bit is not sent any more");
-    assert_eq!(start.success(), Outcome::Purged);
+    // The run bit is not sent any more; the reference was.
+    let cut_short = Outcome::Interrupted(Interruption::Stop);
+    assert_eq!(start.purge(), Some(cut_short.clone()));
+    // On the wire, and the answer is waited for.
+    let (mut start, _a) = bench.begin(&points, Urgency::Command);
+    let sent = sends(&bench, &mut start);
+    start.sent(&sent);
+    assert_eq!(start.purge(), Some(cut_short));
+    // A read that comes before the write changes nothing at the drive.
+    bench.words.forget();
+    let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
+    let read = sends(&bench, &mut start);
+    start.sent(&read);
+    assert!(asks(&read) && !start.has_begun());
+    assert_eq!(start.purge(), Some(Outcome::Purged));
+}
+
+#[test]
+fn what_was_begun_and_runs_out_of_time_is_not_told_to_be_unsent() {
+    let mut bench = Bench::new(0);
+    bench.words.learn(Table::Holding, 2000, 0);
+    let late = bench.now + Duration::from_secs(1);
+    for (on_the_wire, outcome) in [
+        (false, Outcome::Expired),
+        (true, Outcome::Interrupted(Interruption::Expired)),
+    ] {
+        let (mut start, _a) = bench.begin(&[("run", 1.0), ("speed_reference", 50.0)], Urgency::Command);
+        let step = sends(&bench, &mut start);
+        if on_the_wire {
+            start.sent(&step);
+            assert_eq!(start.answered(&step, Reply::Written, &mut bench.words), None);
+        }
+        assert!(start.is_late(late) && !start.is_late(bench.now));
+        assert_eq!(start.next(&bench.words, &bench.profile, false, late), Next::Done);
+        assert_eq!(start.success(), outcome);
+    }
+}
+
+#[test]
+fn who_is_abandoned_is_told_whether_it_was_sent() {
+    let mut bench = Bench::new(0);
+    bench.words.learn(Table::Holding, 2000, 0);
+    for (on_the_wire, outcome) in [
+        (false, Outcome::BusDown),
+        (true, Outcome::Interrupted(Interruption::BusDown)),
+    ] {
+        let (mut start, mut answer) = bench.begin(&[("run", 1.0)], Urgency::Command);
+        let step = sends(&bench, &mut start);
+        if on_the_wire {
+            start.sent(&step);
+        }
+        start.abandon(Outcome::BusDown, Interruption::BusDown, bench.now);
+        assert_eq!(answer.try_recv().unwrap().outcome, outcome);
+    }
+}
+
+#[test]
+fn a_command_that_was_held_up_asks_again_for_the_word() {
+    let mut bench = Bench::new(1);
+    bench.running = true;
+    let (mut reverse, _a) = bench.begin(&[("reverse", 1.0)], Urgency::Command);
+    let read = sends(&bench, &mut reverse);
+    let told = Reply::Registers(vec![1]);
+    assert_eq!(reverse.answered(&read, told, &mut bench.words), None);
+    assert_eq!(sends(&bench, &mut reverse), word(3));
+    reverse.hold_up();
+    assert!(reverse.asks_again(), "the motor may have been stopped meanwhile");
+    assert!(asks(&sends(&bench, &mut reverse)));
+    assert!(!reverse.asks_again(), "once");
 }
 
 #[test]
@@ -175,30 +230,22 @@ fn a_stop_lets_a_pulse_end() {
     let mut bench = Bench::new(0);
     bench.words.learn(Table::Holding, 2000, 0);
     let (mut both, _a) = bench.begin(&[("run", 1.0), ("fault_reset", 1.0)], Urgency::Command);
-    let high = RequestPdu::WriteRegister {
-        address: 2000,
-        value: 4,
-    };
-    assert_eq!(
-        both.next(&bench.words, &bench.profile, false, bench.now),
-        Next::Send(high.clone())
-    );
+    let high = word(4);
+    assert_eq!(sends(&bench, &mut both), high);
+    both.sent(&high);
     assert_eq!(both.answered(&high, Reply::Written, &mut bench.words), None);
-    assert!(!both.purge());
+    assert_eq!(both.purge(), None);
     assert_eq!(bench.run(&mut both), [(20, 2000, 0)], "no run behind the stop");
-    assert_eq!(both.success(), Outcome::Purged);
+    assert_eq!(both.success(), Outcome::Interrupted(Interruption::Stop));
 }
 
 #[test]
 fn exceptions_and_silence_end_it() {
     let bench = Bench::new(0);
-    let mut shadow = KnownWords::default();
+    let mut words = KnownWords::default();
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
-    let sent = RequestPdu::WriteRegister {
-        address: 2002,
-        value: 100,
-    };
-    let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut shadow);
+    let sent = reference(100);
+    let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut words);
     assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
@@ -210,20 +257,40 @@ fn exceptions_and_silence_end_it() {
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::Garbled, 1), None);
     let late = bench.now + Duration::from_secs(3600);
-    assert_eq!(command.next(&shadow, &bench.profile, false, late), Next::Done);
+    assert_eq!(command.next(&words, &bench.profile, false, late), Next::Done);
     assert_eq!(command.success(), Outcome::Garbled);
 }
 
 /// What the command sends next.
-fn sends(bench: &Bench, command: &mut CommandRun) -> RequestPdu {
+fn sends(bench: &Bench, command: &mut CommandRun) -> Step {
     match command.next(&bench.words, &bench.profile, bench.running, bench.now) {
-        Next::Send(pdu) => pdu,
+        Next::Send(step) => step,
         other => panic!("{other:?}"),
     }
 }
 
-fn word(value: u16) -> RequestPdu {
-    RequestPdu::WriteRegister { address: 2000, value }
+fn execute(pdu: RequestPdu) -> Step {
+    let purpose = StepPurpose::Execute;
+    Step { purpose, pdu }
+}
+
+fn word(value: u16) -> Step {
+    execute(RequestPdu::WriteRegister { address: 2000, value })
+}
+
+fn reference(value: u16) -> Step {
+    execute(RequestPdu::WriteRegister { address: 2002, value })
+}
+
+/// Whether the step reads the control word.
+fn asks(step: &Step) -> bool {
+    let pdu = RequestPdu::Read {
+        table: Table::Holding,
+        start: 2000,
+        count: 1,
+    };
+    let purpose = StepPurpose::ReadWord;
+    *step == Step { purpose, pdu }
 }
 
 #[test]
@@ -234,7 +301,7 @@ fn a_stop_does_not_depend_on_a_read() {
     for answer in [Some(refused), None] {
         let (mut stop, _a) = bench.begin(&[("run", 0.0)], Urgency::Stop);
         let read = sends(&bench, &mut stop);
-        assert!(!read.is_write());
+        assert!(asks(&read));
         let ended = match answer {
             Some(reply) => stop.answered(&read, reply, &mut bench.words),
             None => stop.failed(&read, Outcome::TimedOut, 3),
@@ -254,7 +321,7 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     assert_eq!(sends(&bench, &mut start), word(1));
     assert!(start.answered(&word(1), Reply::Written, &mut bench.words).is_some());
     assert_eq!(
-        bench.words.get(0, 2000),
+        bench.words.get(Table::Holding, 2000),
         Some(1),
         "known from the acknowledged write on"
     );

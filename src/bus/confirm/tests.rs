@@ -1,5 +1,7 @@
 use std::sync::Arc;
 
+use proptest::prelude::*;
+
 use super::*;
 use crate::cache::{Access, DriveImage, DriveSpec, Link};
 use crate::codec::{Reply, RequestPdu, Table};
@@ -32,21 +34,26 @@ impl Bench {
         bench
     }
 
-    fn acknowledge(&mut self, order: &Order) {
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: "t".to_string(),
-        };
+    fn receipt(&self) -> Receipt {
+        let origin = Origin::new(SourceKind::Mqtt, "t");
         let (ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
-        let receipt = ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now);
+        ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now)
+    }
+
+    fn acknowledge(&mut self, order: &Order) {
+        let receipt = self.receipt();
         let effects = effects(&self.drive.spec.profile, order);
         let reading = self.drive.reading(self.now, Duration::from_secs(1));
-        self.confirmations.watch(0, effects, receipt, &reading, self.now);
+        self.confirmations.watch(effects, vec![receipt], &reading, self.now);
+    }
+
+    fn order(&self, point: &str, value: Value) -> Order {
+        let index = self.drive.spec.profile.point_index(point).unwrap();
+        Order::Points(vec![(index, value)])
     }
 
     fn set(&mut self, point: &str, value: Value) {
-        let index = self.drive.spec.profile.point_index(point).unwrap();
-        self.acknowledge(&Order::Points(vec![(index, value)]));
+        self.acknowledge(&self.order(point, value));
     }
 
     /// 10 ms later the drive answered with these words.
@@ -55,16 +62,20 @@ impl Bench {
         let now = self.now;
         self.drive.update(|s| s.store(Table::Holding, start, words, now));
         let reading = self.drive.reading(now, Duration::from_secs(1));
-        self.confirmations.look(0, &reading, now);
+        self.confirmations.look(&reading, now);
     }
 
     fn results(&self) -> Vec<&'static str> {
         self.stats.audit().recent().iter().map(|r| r.result).collect()
     }
 
-    fn expired(&mut self) -> Vec<NotConfirmed> {
-        let profile = self.drive.spec.profile.clone();
-        self.confirmations.expire(|_| Some(&profile), self.now)
+    fn expired(&mut self) -> Vec<String> {
+        self.confirmations.expire(&self.drive.spec.profile, self.now)
+    }
+
+    /// The motor runs, at that speed.
+    fn speed(&mut self, percent: f64) {
+        self.read(2100, &[2, 0, (percent * 100.0) as i16 as u16]);
     }
 }
 
@@ -75,7 +86,7 @@ fn only_a_read_after_the_acknowledgement_confirms() {
     bench.set("run", Value::Bool(true));
     let reading_before = bench.drive.reading(bench.now, Duration::from_secs(1));
     let now = bench.now;
-    bench.confirmations.look(0, &reading_before, now);
+    bench.confirmations.look(&reading_before, now);
     assert!(bench.results().is_empty(), "the old sample proves nothing");
     bench.read(2100, &[2]);
     assert_eq!(bench.results(), ["confirmed"]);
@@ -87,14 +98,106 @@ fn only_a_read_after_the_acknowledgement_confirms() {
 }
 
 #[test]
-fn a_stop_is_confirmed_while_the_motor_slows_down() {
+fn a_stop_is_confirmed_when_the_motor_stands_or_is_near_zero() {
+    for (words, confirmed) in [
+        (&[2, 0, 4900][..], false),
+        (&[2, 0, 101], false),
+        (&[2, 0, 99], true),
+        // Backwards.
+        (&[2, 0, 0_u16.wrapping_sub(101)], false),
+        (&[2, 0, 0_u16.wrapping_sub(99)], true),
+        (&[0, 0, 4000], true),
+    ] {
+        let mut bench = Bench::new();
+        bench.speed(50.0);
+        bench.set("run", Value::Bool(false));
+        bench.read(2100, words);
+        assert_eq!(!bench.results().is_empty(), confirmed, "{words:?}");
+        if confirmed {
+            assert_eq!(bench.results(), ["confirmed"]);
+        }
+    }
+}
+
+#[test]
+fn a_ripple_of_the_speed_does_not_confirm_a_stop_that_the_drive_ignores() {
     let mut bench = Bench::new();
-    bench.read(2100, &[2, 0, 5000]);
+    bench.speed(50.0);
     bench.set("run", Value::Bool(false));
-    bench.read(2100, &[2, 0, 4990]);
-    assert!(bench.results().is_empty());
-    bench.read(2100, &[2, 0, 4900]);
-    assert_eq!(bench.results(), ["confirmed"]);
+    let mut told = Vec::new();
+    for round in 0..400 {
+        bench.speed(if round % 2 == 0 { 49.4 } else { 50.6 });
+        told.append(&mut bench.expired());
+        assert!(!bench.results().contains(&"confirmed"));
+    }
+    assert_eq!(told.len(), 1, "{told:?}");
+    assert!(told[0].ends_with("the motor does not stop"), "{told:?}");
+    assert_eq!(bench.results(), ["acknowledged"]);
+    assert!(bench.confirmations.is_empty());
+}
+
+#[test]
+fn while_the_motor_slows_down_nobody_waits_any_longer_and_nothing_is_told() {
+    let mut bench = Bench::new();
+    bench.speed(90.0);
+    bench.set("run", Value::Bool(false));
+    let since = bench.now;
+    // 10 % a second: at zero after 9 s.
+    loop {
+        let passed = (bench.now - since).as_secs_f64();
+        let speed = 90.0 - 10.0 * passed;
+        if speed <= 0.5 {
+            break;
+        }
+        bench.speed(speed);
+        assert!(bench.expired().is_empty(), "at {speed} %");
+        let in_time = bench.now - since < Duration::from_secs(2);
+        let wanted: &[&str] = if in_time { &[] } else { &["acknowledged"] };
+        assert_eq!(bench.results(), wanted, "after {passed} s");
+    }
+    bench.speed(0.4);
+    assert!(bench.confirmations.is_empty(), "it is near zero");
+    bench.now += Duration::from_secs(60);
+    assert!(bench.expired().is_empty());
+    assert_eq!(bench.results(), ["acknowledged"], "answered once");
+}
+
+#[test]
+fn a_fall_that_ceases_above_near_zero_is_told() {
+    let mut bench = Bench::new();
+    bench.speed(90.0);
+    bench.set("run", Value::Bool(false));
+    let since = bench.now;
+    let mut told = Vec::new();
+    let mut at = None;
+    while bench.now < since + Duration::from_secs(12) {
+        let passed = (bench.now - since).as_secs_f64();
+        // It falls to 40 % within 5 s and stays there.
+        bench.speed((90.0 - 10.0 * passed).max(40.0));
+        told.append(&mut bench.expired());
+        if told.len() == 1 {
+            at.get_or_insert(bench.now - since);
+        }
+    }
+    assert_eq!(told.len(), 1, "{told:?}");
+    let at = at.unwrap().as_secs_f64();
+    assert!(
+        (6.9..7.1).contains(&at),
+        "the profile's time after the fall ceased: {at} s"
+    );
+    assert_eq!(bench.results(), ["acknowledged"]);
+}
+
+#[test]
+fn all_who_joined_a_stop_are_told_that_it_is_confirmed() {
+    let mut bench = Bench::new();
+    bench.speed(50.0);
+    let (a, b) = (bench.receipt(), bench.receipt());
+    let effects = effects(&bench.drive.spec.profile, &bench.order("run", Value::Bool(false)));
+    let reading = bench.drive.reading(bench.now, Duration::from_secs(1));
+    bench.confirmations.watch(effects, vec![a, b], &reading, bench.now);
+    bench.read(2100, &[0]);
+    assert_eq!(bench.results(), ["confirmed", "confirmed"]);
 }
 
 #[test]
@@ -153,9 +256,44 @@ fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
     let told = bench.expired();
     assert_eq!(told.len(), 1);
     assert_eq!(
-        told[0].text,
+        told[0],
         "acknowledged it but did not show it within 2s: the fault is still active"
     );
     assert_eq!(bench.results(), ["acknowledged", "confirmed", "acknowledged"]);
     assert!(bench.expired().is_empty() && bench.confirmations.is_empty());
+}
+
+proptest! {
+    /// Whatever a drive shows after a stop: it is confirmed only by a read that showed it standing or near zero, and by any
+    /// such read in time; else it stays acknowledged, told at most once; and nothing is waited for without an end.
+    #[test]
+    fn a_stop_is_confirmed_or_told_or_neither(
+        reads in proptest::collection::vec((1u64..900, any::<bool>(), 0u16..10_000), 1..60),
+    ) {
+        let mut bench = Bench::new();
+        bench.speed(100.0);
+        bench.set("run", Value::Bool(false));
+        let since = bench.now;
+        let (mut stood, mut stood_in_time, mut told) = (false, false, Vec::new());
+        for (pause, runs, speed) in reads {
+            bench.now += Duration::from_millis(pause);
+            bench.read(2100, &[if runs { 2 } else { 0 }, 0, speed]);
+            let shows = !runs || speed < 100;
+            stood |= shows;
+            stood_in_time |= shows && bench.now - since < Duration::from_secs(2);
+            told.append(&mut bench.expired());
+            if shows {
+                prop_assert!(bench.confirmations.is_empty());
+            }
+            let confirmed = bench.results() == ["confirmed"];
+            prop_assert!(confirmed || !stood_in_time);
+            prop_assert!(stood || !confirmed);
+            prop_assert!(told.is_empty() || (told.len() == 1 && !confirmed));
+        }
+        // A fall ends some day.
+        bench.now += Duration::from_secs(3);
+        told.append(&mut bench.expired());
+        prop_assert!(bench.confirmations.is_empty() && told.len() <= 1);
+        prop_assert_eq!(bench.results().len(), 1);
+    }
 }

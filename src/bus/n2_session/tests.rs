@@ -89,6 +89,19 @@ fn a_report_that_never_ends() {
     assert_eq!(polls, MOST_POLLS);
 }
 
+/// Two drives that were identified and read.
+fn two() -> N2Sessions {
+    let now = Instant::now();
+    let mut sessions = N2Sessions::new([N2Options::DEFAULT, N2Options::DEFAULT]);
+    for drive in 0..2 {
+        sessions.done(drive, IDENTIFY, &identity(), now);
+        sessions.done(drive, POLL, &changes(b""), now);
+        sessions.heard(drive, &value());
+        assert_eq!(sessions.before(drive, None, now), None);
+    }
+    sessions
+}
+
 #[test]
 fn who_is_not_asked_is_polled_all_the_same() {
     let now = Instant::now();

@@ -194,8 +194,9 @@ fn the_built_in_family_reads_as_planned() {
         [
             (fast, 2100, 11),
             (slow, 7, 2),
+            (slow, 100, 2),
             (slow, 2000, 3),
-            (once, 100, 4),
+            (once, 102, 2),
             (once, 732, 2)
         ]
     );

@@ -1,11 +1,27 @@
+use std::sync::Arc;
+use std::time::SystemTime;
+
 use super::*;
-use crate::bus::execute::{Execution, Next, Shadow};
-use crate::cache::{Access, BusImage, BusSpec, DriveImage, Link, Supervision};
+use crate::bus::command_run::{CommandRun, Next, Step};
+use crate::bus::drive_state::{DriveState, Wanted};
+use crate::bus::master::supervise;
+use crate::bus::n2_late_replies::N2LateReplies;
+use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
-use crate::command::{Command, CommandQueue, Urgency, written};
+use crate::command::{
+    Authority, Command, CommandQueue, DEFAULT_EXPIRY, Interruption, Order, Origin, Outcome, SourceKind, Ticket,
+    Urgency, WriteStats, admit, written,
+};
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
+use crate::plant::BusHandle;
+
+mod begins;
+mod chance;
+mod found;
+mod suspended;
+mod unknown;
 
 /// A drive that answers.
 fn image(spec: DriveSpec) -> DriveImage {
@@ -14,9 +30,23 @@ fn image(spec: DriveSpec) -> DriveImage {
     drive
 }
 
+fn handle(spec: BusSpec, drive: DriveImage) -> BusHandle {
+    BusHandle {
+        image: Arc::new(BusImage::new(spec, vec![Arc::new(drive)])),
+        queue: Arc::new(CommandQueue::new().unwrap()),
+    }
+}
+
+fn acknowledged() -> Outcome {
+    Outcome::Acknowledged(Reply::Written)
+}
+
+/// One drive, whose lease is looked at as the master does.
 struct Bench {
     bus: BusHandle,
-    leases: Leases,
+    drive: DriveState,
+    stats: Arc<WriteStats>,
+    news: Vec<News>,
     now: Instant,
 }
 
@@ -28,7 +58,7 @@ impl Bench {
     fn of(profile: &Arc<Profile>, action: LeaseAction) -> Bench {
         let spec = DriveSpec {
             access: Access::Control,
-            supervision: Some(Supervision {
+            supervision: Some(Settings {
                 timeout: Duration::from_secs(5),
                 action,
                 adopt: false,
@@ -44,26 +74,56 @@ impl Bench {
             cycle: Duration::from_millis(10),
             slow_cycle: Duration::from_secs(1),
         };
-        let drive = image(spec);
         Bench {
-            bus: BusHandle {
-                image: Arc::new(BusImage::new(bus, vec![Arc::new(drive)])),
-                queue: Arc::new(CommandQueue::new().unwrap()),
-            },
-            leases: Leases::new(Events::default(), Arc::default()),
+            bus: handle(bus, image(spec)),
+            drive: DriveState::new(Duration::ZERO),
+            stats: Arc::default(),
+            news: Vec::new(),
             now: Instant::now(),
         }
     }
 
-    /// `ms` later the drive says whether it runs, and the leases are looked at: the rank of the action that is
-    /// written then, and where its answer goes.
-    fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
+    fn image(&self) -> Arc<DriveImage> {
+        self.bus.image.drives[0].clone()
+    }
+
+    fn heartbeat(&self) {
+        self.image().renew_lease(self.now);
+    }
+
+    /// The lease is looked at.
+    fn supervise(&mut self) {
+        let (bus, now) = (self.bus.clone(), self.now);
+        supervise(
+            &bus,
+            0,
+            &self.image(),
+            &mut self.drive,
+            &self.stats,
+            now,
+            &mut self.news,
+        );
+    }
+
+    /// `ms` later the drive says whether it runs, and its lease is looked at.
+    fn look(&mut self, ms: u64, runs: bool) {
         self.now += Duration::from_millis(ms);
-        let now = self.now;
         self.tells(ModelPoint::Running, Value::Bool(runs));
-        self.leases.look(&self.bus, now);
+        self.supervise();
+    }
+
+    /// The command that has its turn.
+    fn take(&self) -> Option<Command> {
+        self.bus.queue.lock().pop(Urgency::Read, self.now)
+    }
+
+    /// As [`Bench::look`]: the action that is written then, and where its answer goes.
+    fn after(&mut self, ms: u64, runs: bool) -> Option<Command> {
+        self.look(ms, runs);
         assert!(self.bus.queue.lock().len() <= 1, "one at a time");
-        self.bus.queue.lock().pop(Urgency::Read, now)
+        let action = self.take();
+        assert!(action.as_ref().is_none_or(is_action));
+        action
     }
 
     /// The drive has that value now.
@@ -72,7 +132,7 @@ impl Bench {
     }
 
     fn knows(&self, point: &str, value: Value) {
-        let drive = &self.bus.image.drives[0];
+        let drive = self.image();
         let profile = &drive.spec.profile;
         let raw = profile.points[profile.point_index(point).unwrap()].raw().unwrap();
         let words = raw.encode(value, 0).unwrap();
@@ -81,24 +141,70 @@ impl Bench {
 
     /// The bus starts anew with these settings, as in a reload.
     fn reload(&mut self, spec: DriveSpec) {
-        self.leases.settle(&self.bus, self.now);
-        let before = self.bus.image.drives[0].clone();
-        let drive = image(spec);
-        drive.take_over_lease(&before);
-        self.bus = BusHandle {
-            image: Arc::new(BusImage::new(self.bus.image.spec.clone(), vec![Arc::new(drive)])),
-            queue: Arc::new(CommandQueue::new().unwrap()),
-        };
-        self.leases = Leases::new(self.leases.events.clone(), self.leases.stats.clone());
+        self.drive
+            .close(&Outcome::ShuttingDown, Interruption::ShuttingDown, self.now);
+        let lease = self.drive.supervision.lease();
+        self.bus = handle(self.bus.image.spec.clone(), image(spec));
+        self.drive = DriveState::new(Duration::ZERO);
+        self.drive.supervision.take_over(lease);
     }
 
     fn spec(&self) -> DriveSpec {
-        self.bus.image.drives[0].spec.clone()
+        self.image().spec.clone()
     }
 
+    /// Leases that ran out while the drive ran.
     fn told(&self) -> usize {
-        self.leases.events.recent().len()
+        let ran_out = |news: &&News| matches!(news, News::LeaseRanOut(0));
+        self.news.iter().filter(ran_out).count()
     }
+
+    /// Results of the gateway's own orders.
+    fn own_results(&self) -> Vec<&'static str> {
+        let audit = self.stats.audit().recent();
+        let own = audit.iter().filter(|r| r.source == SourceKind::Supervision.name());
+        own.map(|r| r.result).collect()
+    }
+
+    /// A reference of a client waits from now on.
+    fn order(&self) -> Receiver<Answer> {
+        self.order_of(ModelPoint::SpeedReference, Value::Number(30.0))
+    }
+
+    fn order_of(&self, point: ModelPoint, value: Value) -> Receiver<Answer> {
+        let image = self.image();
+        let reading = image.reading(self.now, DEFAULT_EXPIRY);
+        let index = image.spec.profile.model_index(point).unwrap();
+        let admitted = admit(Order::Points(vec![(index, value)]), &reading, Authority::Write).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, "client");
+        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
+        let command = Command::new(0, admitted, self.now + DEFAULT_EXPIRY, ticket);
+        self.bus.queue.submit(command, self.now);
+        answer
+    }
+
+    /// What waits is begun.
+    fn begin(&mut self) {
+        let command = self.take().expect("an order");
+        self.drive.begin(CommandRun::new(command, &self.image().spec.profile));
+    }
+
+    /// The next step of what was begun is on the wire.
+    fn send(&mut self) -> (Urgency, Step) {
+        let Wanted::Step(urgency, step) = self.drive.wanted(&self.image(), &N2LateReplies::default(), self.now) else {
+            panic!("nothing to send")
+        };
+        self.drive.sent(urgency, &step, self.now);
+        (urgency, step)
+    }
+
+    fn end(&mut self, outcome: &Outcome) {
+        self.drive.end(Urgency::Command, outcome, &self.image(), self.now);
+    }
+}
+
+fn is_action(command: &Command) -> bool {
+    command.ticket.origin().kind == SourceKind::Supervision
 }
 
 #[test]
@@ -109,7 +215,7 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
     ] {
         let mut bench = Bench::new(action);
         assert!(bench.after(60_000, true).is_none(), "nobody commanded it");
-        bench.bus.image.drives[0].renew_lease(bench.now);
+        bench.heartbeat();
         assert!(bench.after(4_900, true).is_none());
         for failed in [
             Outcome::TimedOut,
@@ -119,46 +225,45 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
             let command = bench.after(1_000, true).expect("the action");
             assert_eq!(command.urgency, urgency);
             assert!(bench.after(10, true).is_none(), "not while its answer is waited for");
-            command.ticket.answer(failed, bench.now);
+            command.answer(&failed, bench.now);
             assert!(bench.after(10, true).is_none(), "a pause first");
         }
         // Also when the drive was seen to stand meanwhile: nobody knows why.
         let command = bench.after(1_000, false).expect("the action");
-        command.ticket.answer(Outcome::Acknowledged(Reply::Written), bench.now);
+        command.answer(&acknowledged(), bench.now);
         for _ in 0..20 {
             assert!(bench.after(1_000, true).is_none(), "once");
         }
         assert_eq!(bench.told(), 1);
-        assert_eq!(bench.bus.image.drives[0].supervisions(), 1);
     }
 }
 
 #[test]
 fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     let mut bench = Bench::new(LeaseAction::Stop);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     assert!(bench.after(10_000, false).is_none());
     assert_eq!(bench.told(), 0);
     let mut bench = Bench::new(LeaseAction::Hold);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     assert!(bench.after(10_000, true).is_none());
     assert_eq!(bench.told(), 1);
 }
 
 /// What a command writes to a drive that has the run command: the point that takes it, and its value there.
 fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Value)> {
-    let mut execution = Execution::new(command, profile);
-    let (mut shadow, mut now, mut sets) = (Shadow::default(), now, Vec::new());
+    let mut run = CommandRun::new(command, profile);
+    let (mut words, mut now, mut sets) = (KnownWords::default(), now, Vec::new());
     for _ in 0..20 {
-        let pdu = match execution.next(&shadow, profile, true, now) {
+        let step = match run.next(&words, profile, true, now) {
             Next::Done => break,
             Next::Wait(until) => {
                 now = until;
                 continue;
             }
-            Next::Send(pdu) => pdu,
+            Next::Send(step) => step,
         };
-        let reply = match &pdu {
+        let reply = match &step.pdu {
             RequestPdu::Read {
                 table: Table::Coil | Table::DiscreteInput,
                 count,
@@ -178,16 +283,11 @@ fn writes(profile: &Profile, command: Command, now: Instant) -> Vec<(String, Val
                 Reply::Written
             }
         };
-        if execution.answered(&pdu, reply, &mut shadow).is_some() {
+        if run.answered(&step, reply, &mut words).is_some() {
             break;
         }
     }
-    assert!(
-        execution.success().is_ok(),
-        "{}: {:?}",
-        profile.name,
-        execution.success()
-    );
+    assert!(run.success().is_ok(), "{}: {:?}", profile.name, run.success());
     sets
 }
 
@@ -202,7 +302,7 @@ fn every_family_is_written_its_action() {
                 ..bench.spec()
             };
             bench.reload(spec);
-            bench.bus.image.drives[0].renew_lease(bench.now);
+            bench.heartbeat();
             let command = bench.after(6_000, true).expect("the action");
             assert_eq!(command.urgency == Urgency::Stop, stop, "{}", profile.name);
             let sets = writes(profile, command, bench.now);
@@ -224,61 +324,61 @@ fn every_family_is_written_its_action() {
 }
 
 #[test]
-fn an_action_that_cannot_be_written_is_told_once_and_stays_owed() {
+fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     let profiles = Profiles::built_in();
     let mut bench = Bench::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     for _ in 0..10 {
         assert!(bench.after(5_000, true).is_none(), "the frequency range is not known");
     }
-    let events = bench.leases.events.recent();
-    assert_eq!(events.len(), 2, "{events:?}");
-    assert!(events[1].text.contains("frequency_range"), "{}", events[1].text);
-    assert!(events.iter().all(|e| e.kind == EventKind::Supervision));
-    let audit = bench.leases.stats.audit().recent();
-    assert_eq!(audit.iter().map(|r| r.result).collect::<Vec<_>>(), ["not_writable"]);
+    let [News::LeaseRanOut(0), News::ActionRefused { drive: 0, refusal, .. }] = &bench.news[..] else {
+        panic!("{:?}", bench.news)
+    };
+    assert!(refusal.to_string().contains("frequency_range"), "{refusal}");
+    assert_eq!(bench.own_results(), ["not_writable"]);
     bench.knows("maximum_frequency", Value::Number(50.0));
     let command = bench.after(1_000, true).expect("the drive tells its range now");
-    command.ticket.answer(Outcome::Acknowledged(Reply::Written), bench.now);
+    command.answer(&acknowledged(), bench.now);
     assert!(bench.after(1_000, true).is_none());
     // A client that is back has its own reference.
     let mut bench = Bench::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     assert!(bench.after(5_000, true).is_none());
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     bench.knows("maximum_frequency", Value::Number(50.0));
     assert!(bench.after(2_000, true).is_none(), "it commands the drive");
-    assert!(bench.after(4_000, true).is_some(), "until it falls silent again");
+    bench.knows("maximum_frequency", Value::Number(50.0));
+    assert!(bench.after(3_000, true).is_some(), "until it falls silent again");
 }
 
 #[test]
-fn an_action_that_is_owed_outlives_the_bus() {
+fn an_action_that_is_due_outlives_the_bus() {
     let mut bench = Bench::new(LeaseAction::Stop);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     let command = bench.after(5_000, true).expect("the stop");
-    command.ticket.answer(Outcome::TimedOut, bench.now);
+    command.answer(&Outcome::TimedOut, bench.now);
     bench.reload(bench.spec());
-    let command = bench.after(10, true).expect("the stop is owed still");
+    let command = bench.after(10, true).expect("the stop is due still");
     assert_eq!(command.urgency, Urgency::Stop);
     // The bus ends while the stop is on its way.
     drop(command);
     bench.reload(bench.spec());
-    let command = bench.after(10, false).expect("the stop is owed still");
-    command.ticket.answer(Outcome::Acknowledged(Reply::Written), bench.now);
+    let command = bench.after(10, false).expect("the stop is due still");
+    command.answer(&acknowledged(), bench.now);
     bench.reload(bench.spec());
     assert!(
         bench.after(5_000, true).is_none(),
-        "what was acknowledged last is not owed"
+        "what was acknowledged last is not due again"
     );
     assert_eq!(bench.told(), 1);
-    // Nothing is owed to a drive that is only monitored from now on, nor where nothing is to be written.
+    // Nothing is due to a drive that is only monitored from now on, nor where nothing is to be written.
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
         |spec| spec.supervision = None,
         |spec| spec.supervision.as_mut().unwrap().action = LeaseAction::Hold,
     ] {
         let mut bench = Bench::new(LeaseAction::Stop);
-        bench.bus.image.drives[0].renew_lease(bench.now);
+        bench.heartbeat();
         drop(bench.after(5_000, true).expect("the stop"));
         let mut spec = bench.spec();
         change(&mut spec);
@@ -288,12 +388,22 @@ fn an_action_that_is_owed_outlives_the_bus() {
 }
 
 #[test]
+fn a_lease_that_runs_outlives_the_bus() {
+    let mut bench = Bench::new(LeaseAction::Stop);
+    bench.heartbeat();
+    assert!(bench.after(3_000, true).is_none());
+    bench.reload(bench.spec());
+    assert!(bench.after(1_900, true).is_none());
+    assert!(bench.after(100, true).is_some());
+}
+
+#[test]
 fn an_action_waits_for_a_drive_that_does_not_answer() {
     let mut bench = Bench::new(LeaseAction::Stop);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     let command = bench.after(5_000, true).expect("the stop");
-    command.ticket.answer(Outcome::TimedOut, bench.now);
-    let link = |bench: &Bench, link| bench.bus.image.drives[0].update(|s| s.link = link);
+    command.answer(&Outcome::TimedOut, bench.now);
+    let link = |bench: &Bench, link| bench.image().update(|s| s.link = link);
     link(&bench, Link::Offline(SystemTime::now()));
     for _ in 0..10 {
         assert!(bench.after(1_000, true).is_none());
@@ -305,7 +415,7 @@ fn an_action_waits_for_a_drive_that_does_not_answer() {
 #[test]
 fn a_motor_that_may_start_by_itself_keeps_its_lease() {
     let mut bench = Bench::new(LeaseAction::Stop);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     // A fault, with the run command left in the drive's word.
     for _ in 0..10 {
         bench.tells(ModelPoint::Run, Value::Bool(true));
@@ -315,11 +425,46 @@ fn a_motor_that_may_start_by_itself_keeps_its_lease() {
     assert!(bench.after(10, true).is_some(), "it started by it");
     // The run command was taken away.
     let mut bench = Bench::new(LeaseAction::Stop);
-    bench.bus.image.drives[0].renew_lease(bench.now);
+    bench.heartbeat();
     bench.tells(ModelPoint::Run, Value::Bool(true));
     assert!(bench.after(6_000, false).is_none());
     bench.tells(ModelPoint::Run, Value::Bool(false));
     assert!(bench.after(10, false).is_none());
     assert!(bench.after(10, true).is_none(), "started by someone else");
     assert_eq!(bench.told(), 0);
+}
+
+#[test]
+fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_wanted() {
+    let mut bench = Bench::new(LeaseAction::Stop);
+    assert!(bench.after(100, false).is_none());
+    assert_eq!(bench.news, [], "it stands");
+    for _ in 0..100 {
+        assert!(bench.after(1_000, true).is_none(), "nobody commanded it");
+    }
+    assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::No)]);
+    assert!(bench.image().is_unsupervised());
+    bench.reload(bench.spec());
+    assert!(bench.after(1_000, true).is_none());
+    assert!(bench.image().is_unsupervised(), "after a reload too");
+    assert_eq!(bench.news.len(), 1, "told once");
+    bench.heartbeat();
+    assert!(bench.after(4_900, true).is_none());
+    assert!(!bench.image().is_unsupervised());
+    assert!(bench.after(100, true).is_some());
+
+    let mut bench = Bench::new(LeaseAction::Stop);
+    let mut spec = bench.spec();
+    spec.supervision.as_mut().unwrap().adopt = true;
+    bench.reload(spec);
+    assert!(bench.after(10_000, false).is_none());
+    assert!(bench.after(100, true).is_none(), "the clock only");
+    assert!(bench.after(4_900, true).is_none());
+    assert_eq!(bench.news, [News::RunsUnsupervised(0, Adopted::Yes)]);
+    assert_eq!(bench.after(100, true).expect("the stop").urgency, Urgency::Stop);
+    // Whoever commands it before it is seen to run has his lease.
+    let mut bench = Bench::new(LeaseAction::Stop);
+    bench.heartbeat();
+    assert!(bench.after(100, true).is_none());
+    assert_eq!(bench.news, []);
 }

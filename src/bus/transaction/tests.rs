@@ -25,8 +25,9 @@ fn reply(value: u16) -> Vec<u8> {
     frame
 }
 
-fn start<'r>(request: &'r Request, frame: &'r [u8], now: Instant) -> Transaction<'r> {
+fn start(request: &Request, frame: &[u8], now: Instant) -> Transaction {
     let ms = Duration::from_millis;
+    let (request, frame) = (request.clone(), frame.to_vec());
     Transaction::new(Protocol::ModbusRtu, request, frame, now, ms(100), ms(5), false)
 }
 
@@ -116,7 +117,10 @@ fn a_known_echo_does_not_acknowledge_a_write() {
     rtu::encode_request(&request, &mut frame);
     let now = Instant::now();
     let ms = Duration::from_millis;
-    let begin = |echo| Transaction::new(Protocol::ModbusRtu, &request, &frame, now, ms(100), ms(5), echo);
+    let begin = |echo| {
+        let (request, frame) = (request.clone(), frame.clone());
+        Transaction::new(Protocol::ModbusRtu, request, frame, now, ms(100), ms(5), echo)
+    };
     assert_eq!(
         begin(false).on_bytes(now, &frame),
         Step::Done(Ended::Reply(Reply::Written))
@@ -184,7 +188,10 @@ fn a_reply_behind_noise_is_found_but_no_exception_and_no_echo() {
     let mut bytes = vec![0x37];
     rtu::encode_request(&write, &mut bytes);
     let (ms, protocol) = (Duration::from_millis, Protocol::ModbusRtu);
-    let begin = |echo| Transaction::new(protocol, &write, &bytes[1..], now, ms(100), ms(5), echo);
+    let begin = |echo| {
+        let frame = bytes[1..].to_vec();
+        Transaction::new(protocol, write.clone(), frame, now, ms(100), ms(5), echo)
+    };
     assert_eq!(
         begin(false).on_bytes(now, &bytes),
         Step::Done(Ended::Reply(Reply::Written))

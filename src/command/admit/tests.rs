@@ -184,7 +184,7 @@ fn no_command_rests_on_an_old_parameter() {
     };
     let set = |image: &DriveImage, now, name: &str, value| {
         let order = Order::Points(vec![(point(name), Value::Number(value))]);
-        let admitted = admit(order, &image.reading(now, Duration::from_secs(60)), true)?;
+        let admitted = admit(order, &image.reading(now, Duration::from_secs(60)), Authority::Write)?;
         match admitted.order {
             Order::Points(values) => Ok(values[0].1.as_f64()),
             other => panic!("{other:?}"),

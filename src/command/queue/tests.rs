@@ -4,14 +4,34 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::super::ticket::tests::ticket;
-use super::super::{Answer, Origin, SourceKind, Ticket, WriteStats};
+use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, WriteStats};
 use super::*;
 use crate::drive::Value;
+
+mod stops;
+
+const EXPIRY: Duration = Duration::from_secs(2);
+
+impl Pending {
+    /// Takes the next command of that rank or a higher one, where every drive is free and no stop is redundant.
+    pub(crate) fn pop(&mut self, lowest: Urgency, now: Instant) -> Option<Command> {
+        let ranks = [Urgency::Stop, Urgency::Command, Urgency::Read];
+        let chosen = ranks
+            .into_iter()
+            .filter(|rank| *rank <= lowest)
+            .find_map(|rank| self.next(rank, now, |_| true, |_| false))?;
+        self.take(chosen)
+    }
+}
 
 struct Bench {
     pending: Pending,
     stats: Arc<WriteStats>,
     now: Instant,
+}
+
+fn points(points: &[usize]) -> Order {
+    Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect())
 }
 
 impl Bench {
@@ -23,46 +43,58 @@ impl Bench {
         }
     }
 
-    fn push(&mut self, drive: usize, urgency: Urgency, points: &[usize], reference_only: bool) -> Receiver<Answer> {
-        let (ticket, receiver) = ticket(&self.stats, self.now);
-        let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
-        let expires = self.now + Duration::from_secs(2);
-        self.pending.push(
-            Command {
-                drive,
-                order,
-                urgency,
-                reference_only,
-                expires,
-                ticket,
-            },
-            self.now,
-        );
-        receiver
-    }
-
-    fn push_from(&mut self, who: &str, drive: usize, points: &[usize]) -> Receiver<Answer> {
-        let origin = Origin {
-            kind: SourceKind::Mqtt,
-            who: who.to_string(),
-        };
+    /// An order of that client.
+    fn give(
+        &mut self,
+        (kind, who): (SourceKind, &str),
+        drive: usize,
+        urgency: Urgency,
+        order: Order,
+        reference_only: bool,
+    ) -> Receiver<Answer> {
+        let origin = Origin::new(kind, who);
         let (ticket, receiver) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
-        let order = Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect());
-        let command = Command {
-            drive,
+        let admitted = Admitted {
             order,
-            urgency: Urgency::Command,
-            reference_only: false,
-            expires: self.now + Duration::from_secs(2),
-            ticket,
+            urgency,
+            reference_only,
         };
+        let command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
         self.pending.push(command, self.now);
         receiver
     }
 
-    fn pop(&mut self) -> Option<(usize, Urgency)> {
-        self.pending.pop(Urgency::Read, self.now).map(|c| (c.drive, c.urgency))
+    fn push(&mut self, drive: usize, urgency: Urgency, of: &[usize], reference_only: bool) -> Receiver<Answer> {
+        self.give((SourceKind::Mqtt, "t"), drive, urgency, points(of), reference_only)
     }
+
+    fn push_from(&mut self, who: &str, drive: usize, of: &[usize]) -> Receiver<Answer> {
+        self.give((SourceKind::Mqtt, who), drive, Urgency::Command, points(of), false)
+    }
+
+    fn take(&mut self) -> Option<Command> {
+        self.pending.pop(Urgency::Read, self.now)
+    }
+
+    fn pop(&mut self) -> Option<(usize, Urgency)> {
+        self.take().map(|c| (c.drive, c.urgency))
+    }
+
+    /// All that waits, in the order in which it has its turn: client, drive and first point.
+    fn drain(&mut self) -> Vec<(String, usize, usize)> {
+        let mut all = Vec::new();
+        while let Some(command) = self.take() {
+            let Order::Points(values) = &command.order else {
+                panic!("{command:?}")
+            };
+            all.push((command.ticket.origin().who.clone(), command.drive, values[0].0));
+        }
+        all
+    }
+}
+
+fn of(who: &str, drive: usize, point: usize) -> (String, usize, usize) {
+    (who.to_string(), drive, point)
 }
 
 fn outcome(receiver: &mut Receiver<Answer>) -> Option<Outcome> {
@@ -97,23 +129,88 @@ fn newer_references_replace_older_ones_of_the_same_points() {
 }
 
 #[test]
-fn full_queue_refuses_all_but_a_stop() {
+fn a_newer_reference_takes_the_place_of_the_older_one() {
+    let mut bench = Bench::new();
+    let reference = |bench: &mut Bench, percent: f64| {
+        let order = Order::Points(vec![(7, Value::Number(percent))]);
+        bench.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, true)
+    };
+    let mut old = reference(&mut bench, 10.0);
+    let _run = bench.push(1, Urgency::Command, &[1], false);
+    let mut new = reference(&mut bench, 12.0);
+    assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
+    assert_eq!(outcome(&mut new), None);
+    let sent: Vec<Order> = std::iter::from_fn(|| bench.take()).map(|c| c.order).collect();
+    let wanted = Order::Points(vec![(7, Value::Number(12.0))]);
+    assert_eq!(
+        sent,
+        [wanted, points(&[1])],
+        "before the run that followed the older one"
+    );
+    // A reference of another client does so too: whoever wrote last.
+    let mut old = reference(&mut bench, 10.0);
+    let order = Order::Points(vec![(7, Value::Number(15.0))]);
+    let _new = bench.give((SourceKind::ModbusTcp, "10.0.0.1:1"), 1, Urgency::Command, order, true);
+    assert_eq!(outcome(&mut old), Some(Outcome::Replaced));
+    assert_eq!(bench.pending.len(), 1);
+}
+
+#[test]
+fn to_one_drive_it_is_the_order_of_acceptance_whoever_the_client_is() {
+    let mut bench = Bench::new();
+    // The first client was served last, so that the others would have their turn.
+    let _served = bench.push_from("a", 9, &[0]);
+    assert!(bench.take().is_some());
+    let _all = [("a", 1), ("b", 2), ("a", 3), ("c", 4)].map(|(who, point)| bench.push_from(who, 1, &[point]));
+    assert_eq!(
+        bench.drain(),
+        [of("a", 1, 1), of("b", 1, 2), of("a", 1, 3), of("c", 1, 4)]
+    );
+}
+
+#[test]
+fn later_commands_wait_behind_the_oldest_of_their_drive_that_cannot_begin() {
+    let mut bench = Bench::new();
+    let _all = [(1, 1), (1, 2), (2, 3)].map(|(drive, point)| bench.push_from("t", drive, &[point]));
+    let mut asked = Vec::new();
+    let chosen = bench.pending.next(
+        Urgency::Command,
+        bench.now,
+        |command| {
+            asked.push(command.order.clone());
+            command.drive != 1
+        },
+        |_| false,
+    );
+    assert_eq!(asked, [points(&[1]), points(&[3])], "the second one is not asked for");
+    let command = bench.pending.take(chosen.unwrap()).unwrap();
+    assert_eq!(command.order, points(&[3]));
+    assert_eq!(bench.drain(), [of("t", 1, 1), of("t", 1, 2)]);
+}
+
+#[test]
+fn what_was_chosen_and_is_gone_is_not_taken() {
+    let mut bench = Bench::new();
+    let mut run = bench.push(1, Urgency::Command, &[1], false);
+    let chosen = bench.pending.next(Urgency::Command, bench.now, |_| true, |_| false);
+    let _stop = bench.push(1, Urgency::Stop, &[1], false);
+    assert_eq!(outcome(&mut run), Some(Outcome::Purged));
+    assert!(bench.pending.take(chosen.unwrap()).is_none());
+    assert_eq!(bench.pop(), Some((1, Urgency::Stop)));
+}
+
+#[test]
+fn a_full_queue_refuses_commands_and_reads() {
     let mut bench = Bench::new();
     let mut waiting: Vec<_> = (0..CAPACITY)
         .map(|_| bench.push(1, Urgency::Command, &[1], false))
         .collect();
-    let mut refused = bench.push(1, Urgency::Command, &[1], false);
-    assert_eq!(outcome(&mut refused), Some(Outcome::QueueFull));
-    let mut stop = bench.push(2, Urgency::Stop, &[1], false);
-    assert_eq!(outcome(&mut stop), None);
-    assert_eq!(
-        outcome(waiting.last_mut().unwrap()),
-        Some(Outcome::QueueFull),
-        "the youngest made room"
-    );
-    assert_eq!(outcome(waiting.first_mut().unwrap()), None);
+    for urgency in [Urgency::Command, Urgency::Read] {
+        let mut refused = bench.push(1, urgency, &[1], false);
+        assert_eq!(outcome(&mut refused), Some(Outcome::QueueFull));
+    }
+    assert!(waiting.iter_mut().all(|w| outcome(w).is_none()));
     assert_eq!(bench.pending.len(), CAPACITY);
-    assert_eq!(bench.pop(), Some((2, Urgency::Stop)));
 }
 
 #[test]
@@ -124,16 +221,29 @@ fn clients_take_turns_and_each_keeps_its_order() {
     assert_eq!(bench.pending.len(), CAPACITY);
     assert_eq!(flood.iter_mut().filter_map(outcome).count(), 3, "the flood made room");
     assert!(quiet.iter_mut().all(|q| outcome(q).is_none()));
-    let popped: Vec<_> = (0..8)
-        .map(|_| bench.pending.pop(Urgency::Read, bench.now).unwrap())
-        .map(|c| (c.drive, c.order))
-        .collect();
-    let of = |drive: usize, point: usize| (drive, Order::Points(vec![(point, Value::Bool(true))]));
+    let turns = bench.drain();
+    let (flood, quiet) = (|point| of("flood", 1, point), |point| of("quiet", 2, point));
+    assert_eq!(turns[..6], [flood(0), quiet(0), flood(1), quiet(1), flood(2), quiet(2)]);
+    assert_eq!(turns[6..8], [flood(3), flood(4)]);
+}
+
+#[test]
+fn within_a_client_its_drives_take_turns() {
+    let mut bench = Bench::new();
+    let _many: Vec<_> = (0..3).map(|i| bench.push_from("a", 1, &[i])).collect();
+    let _few: Vec<_> = (0..2).map(|i| bench.push_from("a", 2, &[i])).collect();
+    let _other = bench.push_from("b", 3, &[0]);
     assert_eq!(
-        popped[..6],
-        [of(1, 0), of(2, 0), of(1, 1), of(2, 1), of(1, 2), of(2, 2)]
+        bench.drain(),
+        [
+            of("a", 1, 0),
+            of("b", 3, 0),
+            of("a", 2, 0),
+            of("a", 1, 1),
+            of("a", 2, 1),
+            of("a", 1, 2)
+        ]
     );
-    assert_eq!(popped[6..], [of(1, 3), of(1, 4)]);
 }
 
 #[test]
@@ -155,27 +265,60 @@ fn many_clients_get_equal_places() {
 }
 
 #[test]
+fn nobody_is_overtaken_without_a_bound() {
+    let mut bench = Bench::new();
+    let _served = bench.push_from("old", 1, &[0]);
+    assert!(bench.take().is_some());
+    let _old = bench.push_from("old", 1, &[1]);
+    // Clients that were never served come before it, one after the other.
+    let mut turns = 0;
+    loop {
+        let _new = bench.push_from(&format!("new {turns}"), 2, &[2]);
+        if bench.take().unwrap().drive == 1 {
+            break;
+        }
+        turns += 1;
+        assert!(turns <= CAPACITY, "it waits for ever");
+    }
+    assert_eq!(turns, CAPACITY);
+}
+
+#[test]
 fn before_the_end_only_stops_get_in() {
     let queue = CommandQueue::new().unwrap();
     let mut bench = Bench::new();
+    let mut waiting = bench.push(2, Urgency::Command, &[1], false);
+    let mut stops = bench.push(3, Urgency::Stop, &[1], false);
     std::mem::swap(&mut *queue.lock(), &mut bench.pending);
-    queue.stops_only(bench.now);
+    let deadline = bench.now + Duration::from_secs(3);
+    let mut missing = queue.begin_shutdown(deadline, bench.now);
     std::mem::swap(&mut *queue.lock(), &mut bench.pending);
+    assert_eq!(
+        (outcome(&mut waiting), outcome(&mut stops)),
+        (Some(Outcome::ShuttingDown), None)
+    );
     let mut run = bench.push(1, Urgency::Command, &[1], false);
     let mut stop = bench.push(1, Urgency::Stop, &[1], false);
     assert_eq!(
         (outcome(&mut run), outcome(&mut stop)),
         (Some(Outcome::ShuttingDown), None)
     );
+    let stopping = bench.pending.take_stopping().unwrap();
+    assert!(bench.pending.take_stopping().is_none(), "once");
+    assert_eq!(stopping.deadline(), deadline);
+    stopping.report(vec!["one".to_string()]);
+    assert_eq!(missing.try_recv(), Ok(vec!["one".to_string()]));
 }
 
 #[test]
 fn expired_commands_are_never_sent() {
     let mut bench = Bench::new();
     let mut late = bench.push(1, Urgency::Command, &[1], false);
-    bench.now += Duration::from_secs(2);
+    let mut stop = bench.push(2, Urgency::Stop, &[1], false);
+    bench.now += EXPIRY;
     assert_eq!(bench.pop(), None);
     assert_eq!(outcome(&mut late), Some(Outcome::Expired));
+    assert_eq!(outcome(&mut stop), Some(Outcome::Expired));
 }
 
 #[test]
@@ -183,19 +326,50 @@ fn a_closed_queue_answers_at_once() {
     let queue = CommandQueue::new().unwrap();
     let mut bench = Bench::new();
     let (ticket_a, mut a) = ticket(&bench.stats, bench.now);
-    let command = |ticket| Command {
-        drive: 0,
+    let admitted = |urgency| Admitted {
         order: Order::Points(Vec::new()),
-        urgency: Urgency::Command,
+        urgency,
         reference_only: false,
-        expires: bench.now + Duration::from_secs(1),
-        ticket,
     };
-    queue.submit(command(ticket_a), bench.now);
+    let command = |urgency, ticket| Command::new(0, admitted(urgency), bench.now + Duration::from_secs(1), ticket);
+    queue.submit(command(Urgency::Command, ticket_a), bench.now);
     queue.close(Outcome::BusDown, bench.now);
     assert_eq!(outcome(&mut a), Some(Outcome::BusDown));
-    let (ticket_b, mut b) = ticket(&bench.stats, bench.now);
-    queue.submit(command(ticket_b), bench.now);
-    assert_eq!(outcome(&mut b), Some(Outcome::BusDown));
+    for urgency in [Urgency::Command, Urgency::Stop] {
+        let (ticket_b, mut b) = ticket(&bench.stats, bench.now);
+        queue.submit(command(urgency, ticket_b), bench.now);
+        assert_eq!(outcome(&mut b), Some(Outcome::BusDown));
+    }
+    queue.open();
+    let (ticket_c, mut c) = ticket(&bench.stats, bench.now);
+    queue.submit(command(Urgency::Command, ticket_c), bench.now);
+    assert_eq!(outcome(&mut c), None);
     bench.now += Duration::from_secs(1);
+}
+
+#[test]
+fn supervision_is_withdrawn_and_nothing_else() {
+    let mut bench = Bench::new();
+    let own = (SourceKind::Supervision, "supervision");
+    let mut action = bench.give(own, 1, Urgency::Command, points(&[7]), false);
+    let mut elsewhere = bench.give(own, 2, Urgency::Stop, points(&[1]), false);
+    assert_eq!(bench.pending.client_waits_until(1), None, "no client is behind it");
+    let mut client = bench.push(1, Urgency::Command, &[1], false);
+    let _read = bench.push(2, Urgency::Read, &[], false);
+    assert_eq!(bench.pending.client_waits_until(1), Some(bench.now + EXPIRY));
+    assert_eq!(bench.pending.client_waits_until(2), None, "a read is no command");
+    bench.pending.withdraw_supervision(1, bench.now);
+    assert_eq!(outcome(&mut action), Some(Outcome::Withdrawn));
+    assert_eq!((outcome(&mut elsewhere), outcome(&mut client)), (None, None));
+    // A stop that a client has joined is the client's too.
+    let mut stop = bench.give(own, 3, Urgency::Stop, points(&[1]), false);
+    bench.now += EXPIRY / 2;
+    let mut joined = bench.push(3, Urgency::Stop, &[1], false);
+    assert_eq!(
+        bench.pending.client_waits_until(3),
+        Some(bench.now + EXPIRY),
+        "as long as the client's own time"
+    );
+    bench.pending.withdraw_supervision(3, bench.now);
+    assert_eq!((outcome(&mut stop), outcome(&mut joined)), (None, None));
 }

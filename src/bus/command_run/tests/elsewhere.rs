@@ -14,17 +14,6 @@ fn reverse(bench: &Bench) -> CommandRun {
     bench.begin(&[("reverse", 1.0)], Urgency::Command).0
 }
 
-fn asks(sent: &RequestPdu) -> bool {
-    matches!(
-        sent,
-        RequestPdu::Read {
-            start: 2000,
-            count: 1,
-            ..
-        }
-    )
-}
-
 #[test]
 fn the_word_is_read_before_a_run_bit_that_is_not_named_is_written() {
     for (has, written) in [(0, 2), (1, 3), (0x0800, 0x0802)] {

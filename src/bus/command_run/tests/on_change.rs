@@ -13,23 +13,27 @@ fn bench() -> Bench {
     }
 }
 
-fn read(table: Table, count: u16) -> RequestPdu {
+fn read(table: Table, count: u16) -> Step {
     let start = 0;
-    RequestPdu::Read { table, start, count }
+    let purpose = StepPurpose::Compare;
+    let pdu = RequestPdu::Read { table, start, count };
+    Step { purpose, pdu }
 }
 
-fn override_ao() -> RequestPdu {
+fn override_ao() -> Step {
     let (start, values) = (0, HALF.to_vec());
-    RequestPdu::WriteRegisters { start, values }
+    execute(RequestPdu::WriteRegisters { start, values })
 }
 
-fn release() -> RequestPdu {
+fn release() -> Step {
     let (table, address) = (Table::Holding, 0);
-    RequestPdu::N2(Session::Release { table, address })
+    let purpose = StepPurpose::Release;
+    let pdu = RequestPdu::N2(Session::Release { table, address });
+    Step { purpose, pdu }
 }
 
-fn coil(address: u16, on: bool) -> RequestPdu {
-    RequestPdu::WriteCoil { address, on }
+fn coil(address: u16, on: bool) -> Step {
+    execute(RequestPdu::WriteCoil { address, on })
 }
 
 /// AO 1 was something else when it was read last.
@@ -152,9 +156,9 @@ fn a_pulse_is_never_left_out() {
         match reset.next(&bench.words, &bench.profile, bench.running, bench.now) {
             Next::Wait(until) => bench.now = until,
             Next::Done => break,
-            Next::Send(pdu) => {
-                let over = reset.answered(&pdu, Reply::Written, &mut bench.words).is_some();
-                sent.push(pdu);
+            Next::Send(step) => {
+                let over = reset.answered(&step, Reply::Written, &mut bench.words).is_some();
+                sent.push(step);
                 if over {
                     break;
                 }

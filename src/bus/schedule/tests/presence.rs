@@ -233,3 +233,60 @@ fn garbled_answers_do_not_take_a_drive_away_at_once_but_at_last() {
     }
     assert!((8..=12).contains(&garbled), "{garbled}");
 }
+
+#[test]
+fn a_drive_that_answers_a_command_is_probed_at_once() {
+    let mut bench = Bench::new(2, Duration::from_millis(10));
+    bench.dead = vec![1];
+    bench.run(Duration::from_secs(30));
+    bench.dead.clear();
+    bench.log.clear();
+    bench.schedule.seen(1, bench.now);
+    let answered = bench.now;
+    bench.run(COST * 3);
+    assert!(bench.schedule.is_online(1));
+    let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1 && poll.probe);
+    let probed = bench.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - answered);
+    assert!(probed.is_some_and(|after| after <= COST), "{probed:?}");
+}
+
+#[test]
+fn a_command_in_vain_is_as_good_as_a_probe() {
+    let probed_after = |in_vain: bool| {
+        let mut bench = Bench::new(2, Duration::from_millis(10));
+        bench.run(Duration::from_secs(1));
+        bench.dead = vec![1];
+        while bench.offline.is_empty() {
+            bench.step(None);
+        }
+        bench.log.clear();
+        bench.now += Duration::from_millis(400);
+        let from = bench.now;
+        if in_vain {
+            bench.schedule.probed_in_vain(1, COST * 10, bench.now);
+        }
+        bench.run(Duration::from_secs(15));
+        let probe = |d: &Decision| matches!(d, Decision::Poll(poll) if poll.drive == 1);
+        bench.log.iter().find(|(_, d)| probe(d)).map(|(at, _)| *at - from)
+    };
+    assert!(probed_after(false).unwrap() < Duration::from_millis(150));
+    let after = probed_after(true).unwrap();
+    assert!((1.0..10.0).contains(&after.as_secs_f64()), "{after:?}");
+    // A drive that answers is not sent away by it.
+    let mut bench = Bench::new(1, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    bench.schedule.probed_in_vain(0, COST * 10, bench.now);
+    assert!(bench.schedule.is_online(0));
+}
+
+#[test]
+fn the_first_probe_comes_after_half_a_second_to_ten() {
+    let now = Instant::now();
+    for (took, wanted) in [(10, 500), (200, 800), (2400, 9600), (3500, 10_000), (60_000, 10_000)] {
+        let took = Duration::from_millis(took);
+        let Presence::Away(at, _) = drives::away(now, Duration::ZERO, took) else {
+            panic!("it is there")
+        };
+        assert_eq!(at - now, Duration::from_millis(wanted), "{took:?}");
+    }
+}

@@ -1,0 +1,420 @@
+//! The master with drives of one family that do as they are told, in virtual time.
+
+use std::collections::BTreeMap;
+use std::time::SystemTime;
+
+use tokio::sync::oneshot::Receiver;
+
+use super::*;
+use crate::bus::transaction::MAY_BE_LATE;
+use crate::cache::{Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
+use crate::codec::wire::Silence;
+use crate::codec::{Exception, LineFormat, Reply, Table};
+use crate::command::{Answer, Authority, Command, CommandQueue, Order, Ticket, admit};
+use crate::drive::profile::Profiles;
+use crate::drive::{ModelPoint, PollClass, Value};
+use crate::line::Rs485;
+
+/// What an exchange takes.
+const COST: Duration = Duration::from_millis(20);
+/// What one without an answer takes.
+const TIMEOUT: Duration = Duration::from_millis(110);
+
+/// Registers of a drive, and whether it answers.
+#[derive(Default)]
+struct Registers {
+    holding: BTreeMap<u16, u16>,
+    silent: bool,
+    /// How its next write ends.
+    next_write: Option<Ended>,
+}
+
+impl Registers {
+    /// The control word is in 2000, the status word in 2100.
+    fn answer(&mut self, pdu: &RequestPdu) -> Ended {
+        if self.silent {
+            return Ended::Silent;
+        }
+        if let Some(ended) = self.next_write.take_if(|_| pdu.is_write()) {
+            return ended;
+        }
+        let reply = match pdu {
+            RequestPdu::Read {
+                table: Table::Holding,
+                start,
+                count,
+            } => {
+                let run = self.holding.get(&2000).is_some_and(|word| word & 1 == 1);
+                self.holding.insert(2100, if run { 3 } else { 1 });
+                let word = |address| self.holding.get(&address).copied().unwrap_or(0);
+                Reply::Registers((*start..start + count).map(word).collect())
+            }
+            RequestPdu::WriteRegister { address, value } => {
+                self.holding.insert(*address, *value);
+                Reply::Written
+            }
+            RequestPdu::Read {
+                table: Table::Coil | Table::DiscreteInput,
+                count,
+                ..
+            } => Reply::Bits(vec![false; usize::from(*count)]),
+            RequestPdu::Read { count, .. } => Reply::Registers(vec![0; usize::from(*count)]),
+            RequestPdu::N2(Session::Identify) => Reply::Identified(0x10),
+            RequestPdu::N2(Session::Poll { .. }) => Reply::Changes(Vec::new()),
+            RequestPdu::N2(_) | RequestPdu::WriteCoil { .. } => Reply::Written,
+            _ => Reply::Exception(Exception::ADDRESS),
+        };
+        Ended::Reply(reply)
+    }
+}
+
+struct Rig {
+    bus: BusHandle,
+    master: Master,
+    stats: Arc<WriteStats>,
+    drives: Vec<Registers>,
+    news: Vec<News>,
+    /// All that went onto the line.
+    wire: Vec<(Instant, Turn)>,
+    now: Instant,
+}
+
+impl Rig {
+    fn new(drives: u8) -> Rig {
+        Rig::of(drives, "vacon-nx", Protocol::ModbusRtu)
+    }
+
+    fn of(drives: u8, profile: &str, protocol: Protocol) -> Rig {
+        let profile = Profiles::built_in().get(profile).unwrap().clone();
+        let spec = |address| DriveSpec {
+            access: Access::Control,
+            turnaround: Duration::ZERO,
+            on_shutdown: OnShutdown::Stop,
+            supervision: Some(Settings {
+                timeout: Duration::from_millis(500),
+                action: LeaseAction::Stop,
+                adopt: false,
+            }),
+            ..DriveSpec::new(&format!("d{address}"), "b", address, profile.clone())
+        };
+        let images = (1..=drives).map(|address| Arc::new(DriveImage::new(spec(address), Duration::from_secs(1))));
+        let bus = BusSpec {
+            name: "b".to_string(),
+            port: "none".to_string(),
+            protocol,
+            format: LineFormat::new(38_400, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_secs(1),
+        };
+        let bus = BusHandle {
+            image: Arc::new(BusImage::new(bus, images.collect())),
+            queue: Arc::new(CommandQueue::new().unwrap()),
+        };
+        let options = BusOptions {
+            response_timeout: Duration::from_millis(100),
+            retries: 1,
+            silence: Silence::Spec,
+            rs485: Rs485::Off,
+        };
+        let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
+        let silence = Duration::from_micros(1750);
+        let mut master = Master::new(bus.clone(), &options, silence, stats.clone(), &[], now);
+        master.opened(now);
+        let mut rig = Rig {
+            bus,
+            master,
+            stats,
+            drives: (0..drives).map(|_| Registers::default()).collect(),
+            news: Vec::new(),
+            wire: Vec::new(),
+            now,
+        };
+        rig.run(Duration::from_secs(3));
+        rig
+    }
+
+    /// One exchange, or the wait for the next one.
+    fn step(&mut self) {
+        let mut news = Vec::new();
+        match self.master.next(self.now, &mut news) {
+            Err(until) => {
+                assert!(until > self.now, "idle into the past");
+                self.now = until;
+            }
+            Ok(turn) => {
+                self.master.sending(&turn, self.now);
+                let began = self.now;
+                let ended = self.drives[turn.drive].answer(turn.pdu());
+                let took = if ended == Ended::Silent { TIMEOUT } else { COST };
+                self.now += took;
+                let mangled = false;
+                news.append(&mut self.master.done(
+                    &turn,
+                    TurnEnd {
+                        ended,
+                        began,
+                        took,
+                        mangled,
+                    },
+                    self.now,
+                ));
+                self.wire.push((began, turn));
+            }
+        }
+        for one in &news {
+            self.apply(one);
+        }
+        self.news.append(&mut news);
+    }
+
+    /// What the process image is told.
+    fn apply(&self, news: &News) {
+        let image = |drive: usize| self.bus.image.drives[drive].clone();
+        match news {
+            News::Read { drive, read, words, at } => image(*drive).update(|s| {
+                s.store(read.table, read.start, words, *at);
+                if read.class == PollClass::Fast {
+                    s.fast_at = Some(*at);
+                }
+            }),
+            News::Online(drive) => image(*drive).update(|s| s.link = Link::Online(SystemTime::now())),
+            News::Offline(drive) => image(*drive).update(|s| s.link = Link::Offline(SystemTime::now())),
+            _ => {}
+        }
+    }
+
+    fn run(&mut self, time: Duration) {
+        let end = self.now + time;
+        while self.now < end {
+            self.step();
+        }
+    }
+
+    /// An order of a client.
+    fn order(&self, drive: usize, who: &str, point: ModelPoint, value: Value) -> Receiver<Answer> {
+        let image = &self.bus.image.drives[drive];
+        let index = image.spec.profile.model_index(point).unwrap();
+        let order = Order::Points(vec![(index, value)]);
+        let admitted = admit(order, &image.reading(self.now, DEFAULT_EXPIRY), Authority::Write).unwrap();
+        let origin = Origin::new(SourceKind::Mqtt, who);
+        let (ticket, answer) = Ticket::new(origin, "d", String::new(), true, self.now, self.stats.clone());
+        let command = Command::new(drive, admitted, self.now + DEFAULT_EXPIRY, ticket);
+        self.bus.queue.submit(command, self.now);
+        answer
+    }
+
+    fn switch(&self, drive: usize, who: &str, run: bool) -> Receiver<Answer> {
+        self.order(drive, who, ModelPoint::Run, Value::Bool(run))
+    }
+
+    fn runs(&self, drive: usize) -> bool {
+        self.drives[drive].holding.get(&2000).is_some_and(|word| word & 1 == 1)
+    }
+}
+
+fn outcome(answer: &mut Receiver<Answer>) -> Option<Outcome> {
+    answer.try_recv().ok().map(|a| a.outcome)
+}
+
+#[test]
+fn a_lease_ends_with_the_action_though_its_order_waited_longer_than_it() {
+    let mut rig = Rig::new(2);
+    let _writes: Vec<_> = (0..12)
+        .map(|k| {
+            rig.order(
+                1,
+                &format!("{k}"),
+                ModelPoint::SpeedReference,
+                Value::Number(f64::from(k)),
+            )
+        })
+        .collect();
+    let _flood: Vec<_> = (0..40).map(|k| rig.switch(1, &format!("{k}"), true)).collect();
+    let mut run = rig.switch(0, "client", true);
+    let begin = rig.now;
+    while !rig.runs(0) {
+        rig.step();
+        assert!(rig.now < begin + DEFAULT_EXPIRY);
+    }
+    rig.run(Duration::from_millis(1));
+    assert!(outcome(&mut run).is_some_and(|o| o.is_ok()));
+    let started = rig.now;
+    while rig.runs(0) {
+        rig.step();
+        assert!(
+            rig.now < started + Duration::from_millis(900),
+            "the action does not come"
+        );
+    }
+    assert!(rig.now >= started + Duration::from_millis(450), "it came too soon");
+    assert!(rig.news.contains(&News::LeaseRanOut(0)));
+}
+
+#[test]
+fn a_stop_is_the_probe_of_a_drive_that_does_not_answer() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(20));
+    assert!(rig.news.contains(&News::Offline(0)));
+    let mut run = rig.switch(0, "a", true);
+    rig.run(Duration::from_millis(50));
+    assert_eq!(outcome(&mut run), Some(Outcome::Offline), "at once, and unsent");
+    // It is back, and nobody knows yet.
+    rig.drives[0].silent = false;
+    rig.drives[0].holding.insert(2000, 1);
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(200));
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+    assert!(!rig.runs(0));
+    rig.run(Duration::from_millis(200));
+    assert!(matches!(
+        rig.news
+            .iter()
+            .rfind(|n| **n == News::Online(0) || **n == News::Offline(0)),
+        Some(News::Online(0))
+    ));
+}
+
+#[test]
+fn stops_at_a_silent_drive_leave_the_line_to_the_others() {
+    let mut rig = Rig::new(2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(10));
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let mut answers = Vec::new();
+    while rig.now < begin + Duration::from_secs(20) {
+        answers.push(rig.switch(0, "a", false));
+        rig.step();
+    }
+    let polls: Vec<Instant> = rig.wire[from..]
+        .iter()
+        .filter(|(_, t)| t.drive == 1)
+        .map(|(at, _)| *at)
+        .collect();
+    let longest = polls.windows(2).map(|w| w[1] - w[0]).max().unwrap();
+    assert!(longest < Duration::from_millis(400), "{longest:?}");
+    rig.run(Duration::from_secs(3));
+    let open = answers
+        .iter_mut()
+        .filter_map(|a| outcome(a).is_none().then_some(()))
+        .count();
+    assert_eq!(open, 0, "every stop is answered");
+}
+
+#[test]
+fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
+    let mut rig = Rig::new(2);
+    let _first = rig.switch(0, "plc", false);
+    rig.run(Duration::from_secs(1));
+    let mut longest = Duration::ZERO;
+    for round in 0..50 {
+        let begin = rig.now;
+        let mut reference = rig.order(1, "other", ModelPoint::SpeedReference, Value::Number(f64::from(round)));
+        while outcome(&mut reference).is_none() {
+            let _stop = rig.switch(0, "plc", false);
+            let _other = rig.switch(0, "second plc", false);
+            rig.step();
+        }
+        longest = longest.max(rig.now - begin);
+    }
+    // At most eight stops in a row, then polls for as long as those took.
+    assert!(longest < COST * 32, "{longest:?}");
+}
+
+#[test]
+fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
+    let mut rig = Rig::new(2);
+    let mut sent = rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(10.0));
+    loop {
+        let turn = rig.master.next(rig.now, &mut Vec::new()).expect("the write");
+        rig.master.sending(&turn, rig.now);
+        if turn.pdu().is_write() {
+            break;
+        }
+        let ended = rig.drives[turn.drive].answer(turn.pdu());
+        let end = TurnEnd {
+            ended,
+            began: rig.now,
+            took: COST,
+            mangled: false,
+        };
+        rig.now += COST;
+        rig.master.done(&turn, end, rig.now);
+    }
+    let mut waiting = rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(20.0));
+    rig.bus.queue.close(Outcome::BusDown, rig.now);
+    let news = rig.master.lost(rig.now);
+    assert_eq!(news, [News::Offline(0), News::Offline(1)]);
+    assert_eq!(outcome(&mut sent), Some(Outcome::Interrupted(Interruption::BusDown)));
+    assert_eq!(outcome(&mut waiting), Some(Outcome::BusDown));
+}
+
+#[test]
+fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
+    let mut rig = Rig::new(20);
+    for drive in 0..20 {
+        rig.drives[drive].holding.insert(2000, 1);
+    }
+    rig.drives[7].silent = true;
+    let (from, begin) = (rig.wire.len(), rig.now);
+    let deadline = begin + Duration::from_secs(5);
+    let mut missing = rig.bus.queue.begin_shutdown(deadline, begin);
+    let missing = loop {
+        rig.step();
+        if let Ok(missing) = missing.try_recv() {
+            break missing;
+        }
+        assert!(rig.now < deadline + TIMEOUT * 2);
+    };
+    assert_eq!(missing, ["`d8` did not acknowledge its stop"]);
+    let running: Vec<usize> = (0..20).filter(|drive| rig.runs(*drive)).collect();
+    assert_eq!(running, [7]);
+    let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
+    assert!(!rig.wire[from..].iter().any(|(_, turn)| poll(turn)), "polls cease");
+    // All but the silent one are stopped before that is tried for long.
+    let last = (0..20).filter(|d| *d != 7).filter_map(|drive| {
+        let stop = |(_, turn): &&(Instant, Turn)| turn.drive == drive && turn.pdu().is_write();
+        rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
+    });
+    assert!(last.max().unwrap() < COST * 60);
+}
+
+#[test]
+fn a_stop_to_an_n2_drive_that_cannot_be_identified_is_answered_and_leaves_the_line() {
+    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+    rig.drives[0].silent = true;
+    rig.run(Duration::from_secs(10));
+    assert!(rig.news.contains(&News::Offline(0)));
+    let from = rig.wire.len();
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_millis(1500));
+    let tries = rig.wire[from..]
+        .iter()
+        .filter(|(_, turn)| turn.slot().is_some())
+        .count();
+    assert!(tries <= 4, "{tries} times Identify for one stop");
+    assert_eq!(outcome(&mut stop), Some(Outcome::TimedOut));
+}
+
+#[test]
+fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() {
+    let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+    let writes = |rig: &Rig, of: usize| -> Vec<Instant> {
+        let of = |(_, turn): &&(Instant, Turn)| turn.drive == of && turn.pdu().is_write();
+        rig.wire.iter().filter(of).map(|(at, _)| *at).collect()
+    };
+    rig.drives[1].next_write = Some(Ended::Silent);
+    let _run = rig.switch(1, "a", true);
+    while writes(&rig, 1).is_empty() {
+        rig.step();
+    }
+    let given_up = rig.now;
+    rig.drives[0].next_write = Some(Ended::Corrupt(MAY_BE_LATE));
+    let mut stop = rig.switch(0, "a", false);
+    rig.run(Duration::from_secs(1));
+    let sent = writes(&rig, 0);
+    assert_eq!(sent.len(), 2);
+    assert!(sent[0] < given_up + COST * 2, "it waits for nobody");
+    assert!(sent[1] >= sent[0] + rig.master.response_timeout * N2_LATE);
+    assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
+}

@@ -1,0 +1,113 @@
+//! Whatever a client does and when: the action comes when it falls silent, and only then.
+
+use proptest::prelude::*;
+
+use super::*;
+
+#[derive(Debug, Clone, Copy)]
+enum Event {
+    Nothing,
+    Heartbeat,
+    /// A reference of a client is queued.
+    Order,
+    /// What waits is begun, or the next step of what was begun is sent.
+    Send,
+    /// What was begun ends so.
+    End(bool),
+}
+
+fn event() -> impl Strategy<Value = Event> {
+    prop_oneof![
+        4 => Just(Event::Nothing),
+        1 => Just(Event::Heartbeat),
+        2 => Just(Event::Order),
+        2 => Just(Event::Send),
+        2 => any::<bool>().prop_map(Event::End),
+    ]
+}
+
+/// What the client did, as a model of one line.
+#[derive(Default)]
+struct Client {
+    /// When it was last heard of.
+    heard: Option<Instant>,
+    /// The action was acknowledged since.
+    acted: bool,
+    /// Until when what waits, and what was begun, hold the lease; whether the latter is on the wire.
+    queued: Option<Instant>,
+    begun: Option<(Instant, bool)>,
+}
+
+impl Client {
+    fn heard(&mut self, now: Instant) {
+        (self.heard, self.acted) = (Some(now), false);
+    }
+
+    fn acts(&mut self, bench: &mut Bench, event: Event) {
+        let now = bench.now;
+        self.queued = self.queued.filter(|until| *until > now);
+        match (event, self.queued, self.begun) {
+            (Event::Heartbeat, ..) => {
+                bench.heartbeat();
+                self.heard(now);
+            }
+            (Event::Order, ..) => {
+                drop(bench.order());
+                self.queued = Some(now + DEFAULT_EXPIRY);
+            }
+            (Event::Send, _, Some((until, false))) if until > now => {
+                bench.send();
+                self.begun = Some((until, true));
+                self.heard(now);
+            }
+            (Event::Send, Some(until), None) => {
+                bench.begin();
+                (self.queued, self.begun) = (None, Some((until, false)));
+            }
+            (Event::End(ok), _, Some((_, sent))) => {
+                bench.end(if ok && sent {
+                    &Outcome::TimedOut
+                } else {
+                    &Outcome::Expired
+                });
+                self.begun = None;
+                if sent {
+                    self.heard(now);
+                }
+            }
+            _ => {}
+        }
+    }
+
+    fn is_silent(&self, now: Instant) -> bool {
+        let holds = self
+            .queued
+            .max(self.begun.map(|(until, _)| until))
+            .is_some_and(|until| until > now);
+        let late = self.heard.is_some_and(|at| now - at >= Duration::from_secs(5));
+        late && !holds && !self.acted
+    }
+}
+
+proptest! {
+    #[test]
+    fn the_action_comes_when_the_client_falls_silent_and_only_then(
+        events in proptest::collection::vec((1u64..1500, event()), 1..200),
+    ) {
+        let mut bench = Bench::new(LeaseAction::Stop);
+        let mut client = Client::default();
+        for (ms, event) in events {
+            bench.now += Duration::from_millis(ms);
+            client.acts(&mut bench, event);
+            let due = client.is_silent(bench.now);
+            bench.look(0, true);
+            let action = bench.bus.queue.lock().pop(Urgency::Stop, bench.now);
+            prop_assert_eq!(action.is_some(), due, "{:?}", event);
+            if let Some(action) = action {
+                action.answer(&acknowledged(), bench.now);
+                bench.look(0, true);
+                client.acted = true;
+            }
+        }
+    }
+}

@@ -1,0 +1,110 @@
+//! Drives that do not say whether they run, and what their registers say of a response of their own.
+
+use super::*;
+
+fn cx() -> Bench {
+    let bench = Bench::of(Profiles::built_in().get("vacon-cx").unwrap(), LeaseAction::Stop);
+    bench.heartbeat();
+    bench
+}
+
+impl Bench {
+    fn refuses_running(&self) {
+        let image = self.image();
+        let raw = image
+            .spec
+            .profile
+            .model_point(ModelPoint::Running)
+            .and_then(|p| p.raw());
+        let raw = raw.unwrap();
+        image.update(|s| s.refuse(raw.table, raw.address, 1, Exception::ADDRESS));
+    }
+
+    /// `ms` later its lease is looked at; the action.
+    fn later(&mut self, ms: u64) -> Option<Command> {
+        self.now += Duration::from_millis(ms);
+        self.supervise();
+        self.take()
+    }
+}
+
+#[test]
+fn where_the_drive_refuses_to_tell_its_run_command_stands_for_it() {
+    for (run, acts) in [(Some(true), true), (Some(false), false), (None, true)] {
+        let mut bench = cx();
+        bench.refuses_running();
+        assert!(bench.later(4_900).is_none());
+        if let Some(run) = run {
+            bench.tells(ModelPoint::Run, Value::Bool(run));
+        }
+        let action = bench.later(100);
+        assert_eq!(action.map(|a| a.urgency), acts.then_some(Urgency::Stop), "{run:?}");
+        let unknown = bench.news.iter().filter(|n| **n == News::RunningUnknown(0));
+        assert_eq!((unknown.count(), bench.told()), (1, usize::from(acts)), "{run:?}");
+    }
+}
+
+#[test]
+fn a_run_command_that_is_known_only_from_a_write_counts() {
+    for (word, acts) in [(0, false), (1, true)] {
+        let mut bench = cx();
+        bench.refuses_running();
+        bench.drive.words.learn(Table::Coil, 0, word);
+        assert_eq!(bench.later(5_000).is_some(), acts, "{word}");
+    }
+}
+
+#[test]
+fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
+    let mut bench = cx();
+    for _ in 0..10 {
+        assert!(bench.later(1_000).is_none());
+    }
+    assert_eq!(bench.news, []);
+    assert!(bench.after(10, true).is_some());
+    // So does one that does not answer at all, though it refused before.
+    let mut bench = cx();
+    bench.refuses_running();
+    bench.image().update(|s| s.link = Link::Offline(SystemTime::now()));
+    assert!(bench.later(10_000).is_none());
+    assert_eq!(bench.news, []);
+    bench.image().update(|s| s.link = Link::Online(SystemTime::now()));
+    assert!(bench.later(10).is_some());
+}
+
+const START: &str = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n\
+    [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 999\nread = 30\n";
+
+fn drive(points: &str) -> DriveImage {
+    let profile = Profile::parse("p.toml", &format!("{START}{points}"), false).unwrap();
+    let spec = DriveSpec {
+        access: Access::Control,
+        turnaround: Duration::ZERO,
+        ..DriveSpec::new("d", "b", 1, Arc::new(profile))
+    };
+    image(spec)
+}
+
+fn told(drive: &DriveImage, words: &[(u16, u16)]) -> OwnResponse {
+    let now = Instant::now();
+    for (address, word) in words {
+        drive.update(|s| s.store(Table::Holding, *address, &[*word], now));
+    }
+    own_response(&drive.reading(now, Duration::from_secs(1)))
+}
+
+#[test]
+fn what_the_points_tell_together() {
+    let response = "[[point]]\nname = \"fieldbus_fault_response\"\nat = \"holding 732\"\nclass = \"once\"\n";
+    let timeout = "[[point]]\nname = \"communication_timeout\"\nat = \"holding 542\"\nscale = 0.1\nunit = \"s\"\nclass = \"once\"\n";
+    let other = "[[point]]\nname = \"other\"\nat = \"holding 7\"\nclass = \"once\"\n";
+    assert_eq!(told(&drive(other), &[(7, 0)]), OwnResponse::Unknown);
+    let one = drive(response);
+    assert_eq!(told(&one, &[]), OwnResponse::Unknown, "not read yet");
+    assert_eq!(told(&one, &[(732, 0)]), OwnResponse::Off(FIELDBUS_FAULT_RESPONSE));
+    assert_eq!(told(&one, &[(732, 2)]), OwnResponse::On);
+    let both = drive(&format!("{response}{timeout}"));
+    assert_eq!(told(&both, &[(732, 2)]), OwnResponse::Unknown);
+    assert_eq!(told(&both, &[(542, 0)]), OwnResponse::Off(COMMUNICATION_TIMEOUT));
+    assert_eq!(told(&both, &[(542, 50)]), OwnResponse::On);
+}
