@@ -1056,7 +1056,7 @@ impl World {
                 let age = drive.snapshot().fast_at.map(|at| self.now - at);
                 assert!(
                     !truth.online_since.is_some_and(settled)
-                        || age.is_some_and(|age| age < Duration::from_secs(1) + 3 * round),
+                        || age.is_some_and(|age| age < Duration::from_secs(2) + 3 * round),
                     "the process data of {} is {age:?} old",
                     drive.spec.name
                 );
