@@ -418,8 +418,8 @@ impl World {
             return;
         }
         let falls_silent = match habit {
-            // They come back so often that they would be silent most of the time.
-            Habit::StopsInALoop | Habit::Floods => 0.000_3,
+            // It comes back so often that it would be silent most of the time.
+            Habit::StopsInALoop => 0.000_3,
             _ => 0.01,
         };
         if habit != Habit::Steady && self.dice.chance(falls_silent) {
