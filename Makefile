@@ -10,7 +10,7 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -48,6 +48,18 @@ fuzz: ## Run every fuzz target FUZZ_RUNS times; wants nightly Rust and cargo-fuz
 	for target in $$(cargo +nightly fuzz list); do \
 		cargo +nightly fuzz run -s none "$$target" -- -runs=$(FUZZ_RUNS) -max_len=600; \
 	done
+
+WORLD := cargo test --locked --profile world --test world
+check: ## Run the seeded world with its fixed seeds: virtual time, no outside tools
+	$(WORLD)
+
+SEEDS ?= 1000
+world: ## Run SEEDS new worlds, or with WORLD_SEED=n that one with its history
+	WORLD_SEEDS=$(SEEDS) $(WORLD) fixed -- --nocapture
+
+ONLY ?=
+mutants: ## Put faults into the core on purpose; the seeded world must find each. ONLY=name runs one
+	tests/world/mutants.py $(ONLY)
 
 clean: ## Remove everything that was built or installed here
 	cargo clean

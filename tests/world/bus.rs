@@ -48,6 +48,7 @@ pub enum Seen {
 }
 
 pub struct WorldBus {
+    pub index: usize,
     pub line: Line,
     pub handle: BusHandle,
     pub core: BusCore,
@@ -55,6 +56,8 @@ pub struct WorldBus {
     pub options: BusOptions,
     pub profile: Arc<Profile>,
     pub open: bool,
+    /// It was asked to stop its drives: its polls cease.
+    pub ending: bool,
     pub exchanges: u64,
     began: Instant,
     until: Instant,
@@ -132,6 +135,7 @@ impl WorldBus {
         );
         core.opened(now);
         WorldBus {
+            index,
             line: line.clone(),
             handle,
             core,
@@ -139,6 +143,7 @@ impl WorldBus {
             options,
             profile,
             open: true,
+            ending: false,
             exchanges: 0,
             began: now,
             until: now,

@@ -239,6 +239,10 @@ impl World {
     /// A request is on the wire.
     fn sent(&mut self, bus: usize, asked: &Asked) {
         let (drive, pdu, now) = (asked.drive, &asked.pdu, self.now);
+        assert!(
+            !asked.is_poll || !self.buses[bus].ending,
+            "a poll goes out while the gateway stops"
+        );
         if !asked.is_poll || self.history.is_long() {
             let text = pdu.clone();
             self.note(move || format!("line{bus} drive {} <- {text:?}", drive + 1));
@@ -316,7 +320,7 @@ impl World {
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
             let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt;
             assert!(
-                !waits || now - record.accepted < Duration::from_millis(25),
+                !waits || now - record.accepted < Duration::from_millis(2),
                 "the action overrides a client that is back: {record:?}"
             );
         }
@@ -420,7 +424,12 @@ impl World {
         if now < self.clients[index].silent_until {
             return;
         }
-        if habit != Habit::Steady && self.dice.chance(0.01) {
+        let falls_silent = match habit {
+            // It comes back so often that it would be silent most of the time.
+            Habit::StopsInALoop => 0.000_3,
+            _ => 0.01,
+        };
+        if habit != Habit::Steady && self.dice.chance(falls_silent) {
             self.clients[index].silent_until = now + ms(self.dice.within(500..=6_000));
         }
         if pause.is_zero() && self.clients[index].open > 24 {
@@ -737,12 +746,40 @@ impl World {
             !(code == "queue_full" && record.wish.is_stop()),
             "a stop was refused for want of room"
         );
+        let bare_stop = matches!(record.wish, Wish::Stop | Wish::RawStop);
+        assert!(
+            !(code == "offline" && bare_stop),
+            "a stop was refused because the drive was away: it is the probe"
+        );
         match code {
             "acknowledged" | "confirmed" => self.check_done(id, &record, code, outcome),
             "expired" => self.check_expired(id, &record),
             _ => {}
         }
+        if code == "confirmed" && record.wish == Wish::Stop {
+            self.check_stands(id, &record);
+        }
         self.figures.confirmed += u64::from(code == "confirmed");
+    }
+
+    /// A confirmed stop: the motor stands, or is near zero speed.
+    fn check_stands(&mut self, id: usize, record: &Record) {
+        let (sim, troubled) = (
+            self.now - self.began,
+            self.truths[record.bus][record.drive].is_troubled(record.accepted),
+        );
+        let bus = &mut self.buses[record.bus];
+        let late = bus.line.is_late();
+        let Some(drive) = bus.wire.slaves().drive(record.drive as u8 + 1) else {
+            return;
+        };
+        drive.advance(sim);
+        let state = drive.state();
+        assert!(
+            troubled || late || !state.running || state.output.abs() < 2.0,
+            "order {id}: the stop is confirmed, and the motor turns with {:.1} Hz",
+            state.output
+        );
     }
 
     /// What was acknowledged was done.
@@ -950,6 +987,7 @@ impl World {
         self.check_answered_in_time();
         if !self.stopping {
             self.check_leases();
+            self.check_polls();
         }
         self.check_states();
     }
@@ -1019,6 +1057,24 @@ impl World {
         }
     }
 
+    /// On a sound line the process data of a drive that answers stays fresh, whoever commands what.
+    fn check_polls(&self) {
+        let sound = |bus: &&WorldBus| bus.open && bus.line.faults.is_empty() && self.scenario.incidents.is_none();
+        for bus in self.buses.iter().filter(sound) {
+            let round = bus.handle.image.health().fast.last.unwrap_or_default();
+            for (drive, truth) in bus.handle.image.drives.iter().zip(&self.truths[bus.index]) {
+                let settled = |at: Instant| self.now - at > Duration::from_secs(3);
+                let age = drive.snapshot().fast_at.map(|at| self.now - at);
+                assert!(
+                    !truth.online_since.is_some_and(settled)
+                        || age.is_some_and(|age| age < Duration::from_secs(2) + 3 * round),
+                    "the process data of {} is {age:?} old",
+                    drive.spec.name
+                );
+            }
+        }
+    }
+
     /// A state is known only while all that it rests on is.
     fn check_states(&self) {
         let plant = self.plant.load();
@@ -1055,11 +1111,11 @@ impl World {
         for (index, bus) in self.buses.iter_mut().enumerate() {
             if bus.open {
                 reports.push((index, bus.handle.queue.begin_shutdown(deadline, self.now)));
+                bus.ending = true;
                 bus.command_came(self.now);
             }
         }
         let mut missing: BTreeMap<usize, Vec<String>> = BTreeMap::new();
-        let sound = |bus: &WorldBus| bus.line.faults.is_empty();
         let begun = self.now;
         self.next_incident = None;
         self.next_reload = None;
@@ -1080,7 +1136,7 @@ impl World {
         }
         for (index, bus) in self.buses.iter_mut().enumerate() {
             let on_shutdown = bus.line.on_shutdown == drivegate::cache::OnShutdown::Stop;
-            let Some(missing) = missing.get(&index).filter(|_| on_shutdown && sound(bus)) else {
+            let Some(missing) = missing.get(&index).filter(|_| on_shutdown) else {
                 continue;
             };
             for (drive, truth) in self.truths[index].iter().enumerate() {
