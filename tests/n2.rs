@@ -16,7 +16,6 @@ use drivegate::command::Outcome;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
-use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 
 fn setup(profile: &str, addresses: &[u8]) -> Setup {

@@ -177,7 +177,7 @@ impl Transaction {
                 }
                 // The echo of the request can look like a broken reply until it is whole.
                 _ if self.frame.starts_with(&self.received) => return self.on_time(now),
-                _ if self.ignored_before.is_some_and(|end| now < end) => {
+                Decoded::Corrupt(_) if self.ignored_before.is_some_and(|end| now < end) => {
                     self.foreign += 1;
                     self.received.clear();
                     self.first_byte = None;
