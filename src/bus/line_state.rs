@@ -12,7 +12,8 @@ use crate::drive::plan::WireTime;
 pub const BABBLE: Duration = Duration::from_millis(500);
 
 /// After so many replies in a row that came faster than the wire could carry them the line has no wire time: a simulation, or
-/// another baud rate behind a device server. A single one may be a late reply, or one that came twice.
+/// another baud rate behind a device server. A single one may be a late reply, or one that came twice; where it cannot be, it
+/// is enough.
 const UNTIMED: u32 = 3;
 
 /// How a request is to be sent.
@@ -22,6 +23,8 @@ pub struct Sending {
     pub response_timeout: Duration,
     /// The last reply on the line, if it came once more, could pass for this one's.
     pub could_be_doubled: bool,
+    /// A late reply to an earlier request may come.
+    pub late_may_come: bool,
 }
 
 /// An exchange that is over.
@@ -65,6 +68,7 @@ struct Underway {
     sent: Instant,
     earliest: Instant,
     doubtful: bool,
+    late: bool,
 }
 
 impl LineState {
@@ -140,6 +144,7 @@ impl LineState {
             sent: sent + wire.recognition,
             earliest,
             doubtful,
+            late: sending.late_may_come,
         });
     }
 
@@ -181,14 +186,18 @@ impl LineState {
             sent,
             earliest,
             doubtful,
+            late,
         } = self.underway.take()?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         match &ended {
+            _ if self.early_replies >= UNTIMED => {}
             Ended::Reply(Reply::Exception(_)) => {}
             Ended::Reply(_) if now >= earliest => self.early_replies = 0,
-            Ended::Reply(_) if doubtful => {}
+            // It can be no other reply: the line has no wire time.
+            Ended::Reply(_) if !doubtful && !late => self.early_replies = UNTIMED,
+            Ended::Reply(_) => {}
             Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
-            _ => self.early_replies = self.early_replies.saturating_add(1),
+            _ => self.early_replies += 1,
         }
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));

@@ -287,6 +287,7 @@ impl Master {
         let n2 = !self.sessions.is_empty();
         Sending {
             response_timeout: self.timeout_of(turn),
+            late_may_come: self.late_before,
             // An N2 reply does not even show whose it is. What was last on a line that was spoken on before
             // is not known when it is opened again.
             could_be_doubled: last.map_or(self.successor, |(of, last)| match n2 {

@@ -53,6 +53,7 @@ impl Prober<'_> {
         let sending = Sending {
             response_timeout: self.timeout,
             could_be_doubled: false,
+            late_may_come: false,
         };
         let late = N2LateReplies::default();
         self.state

@@ -32,6 +32,7 @@ impl Bench {
         let sending = Sending {
             response_timeout: Duration::from_millis(100),
             could_be_doubled: true,
+            late_may_come: false,
         };
         self.now += Duration::from_secs(1);
         self.line
