@@ -20,7 +20,7 @@ build: ## Build the optimised binary, target/release/drivegate
 	DRIVEGATE_COMMIT="$${commit:-unknown}" cargo build --release --locked
 
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
-test: tools lint deny ## Run every check and every test; installs missing test tools first
+test: tools lint deny check ## Run every check and every test; installs missing test tools first
 	cargo test --locked --doc
 	cargo test --locked --tests --no-fail-fast
 

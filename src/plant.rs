@@ -186,6 +186,11 @@ impl DriveHandle {
         self.image.reading(now, self.stale_after)
     }
 
+    /// Stops of the drive that were taken in since its bus was started.
+    pub fn stops(&self) -> u64 {
+        self.bus.queue.lock().stops(self.index)
+    }
+
     /// Whether the bus is open.
     pub fn bus_up(&self) -> bool {
         self.bus.image.is_up()

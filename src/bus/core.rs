@@ -70,7 +70,7 @@ impl BusCore {
         let silence = spec.protocol.silence(options.silence, &spec.format);
         BusCore {
             line: LineState::new(spec.protocol, spec.format, silence, now),
-            master: Master::new(bus.clone(), options, silence, writes, &before.leases, now),
+            master: Master::new(bus.clone(), options, silence, writes, before, now),
             report: Report::new(bus.image.clone(), events, now),
             bus,
             chosen: None,

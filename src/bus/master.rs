@@ -119,7 +119,7 @@ pub struct TurnEnd {
 pub struct Handover {
     /// The leases of its drives, in their order.
     pub leases: Vec<Lease>,
-    /// Until when a reply to what it asked may come.
+    /// Until when a reply to what it asked may come; none where no bus spoke on the line before.
     pub quiet_until: Option<Instant>,
 }
 
@@ -154,7 +154,7 @@ impl Master {
         options: &BusOptions,
         silence: Duration,
         writes: Arc<WriteStats>,
-        leases: &[Lease],
+        before: &Handover,
         now: Instant,
     ) -> Master {
         let spec = &bus.image.spec;
@@ -176,7 +176,7 @@ impl Master {
         let round = spec.cycle.max(plans.iter().enumerate().map(fast).sum());
         let schedule = Schedule::new(cadence, &plans, cost, now);
         let mut drives: Vec<DriveState> = images.iter().map(|_| DriveState::new(round)).collect();
-        for (drive, lease) in drives.iter_mut().zip(leases) {
+        for (drive, lease) in drives.iter_mut().zip(&before.leases) {
             drive.supervision.take_over(*lease);
         }
         let sessions = match spec.protocol {
@@ -194,7 +194,7 @@ impl Master {
             last_answered: None,
             turns: Turns::default(),
             shutdown: None,
-            successor: !leases.is_empty(),
+            successor: before.quiet_until.is_some(),
             writes,
             late_before: false,
             bus,
@@ -231,7 +231,7 @@ impl Master {
         let late = self.drives.iter().filter_map(|drive| drive.late.until());
         Handover {
             leases,
-            quiet_until: late.chain(self.n2_late.until()).max(),
+            quiet_until: late.chain(self.n2_late.until()).chain([now]).max(),
         }
     }
 

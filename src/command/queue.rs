@@ -1,6 +1,6 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::sync::{Mutex, MutexGuard, PoisonError};
@@ -33,6 +33,8 @@ pub struct Pending {
     stopped: Vec<usize>,
     /// Commands taken in so far.
     numbered: u64,
+    /// Stops taken in so far, by drive.
+    stops: BTreeMap<usize, u64>,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
 }
@@ -105,6 +107,7 @@ impl Pending {
     /// same, and are answered with it; of two that do different things besides the newer one is sent.
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
+        *self.stops.entry(drive).or_default() += 1;
         self.remove(now, &Outcome::Purged, |c| {
             c.drive == drive && c.urgency == Urgency::Command
         });
@@ -279,6 +282,11 @@ impl Pending {
                 index += 1;
             }
         }
+    }
+
+    /// Stops of that drive that were taken in so far.
+    pub fn stops(&self, drive: usize) -> u64 {
+        self.stops.get(&drive).copied().unwrap_or_default()
     }
 
     /// The stops that the gateway wants before it ends, once.

@@ -550,7 +550,7 @@ fn n2() {
         row("split", Nothing, 0.99),
         row("exception:4", Exceptions, 0.65),
         row("busy", Exceptions, 0.65),
-        named("everything", ALL, All, 0.1),
+        storm_of_all("everything"),
         by(1, named("everything, by 1", ALL, All, 0.1)),
     ];
     matrix(Protocol::N2, rows);

@@ -118,7 +118,7 @@ impl Rig {
         };
         let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
         let silence = Duration::from_micros(1750);
-        let mut master = Master::new(bus.clone(), &options, silence, stats.clone(), &[], now);
+        let mut master = Master::new(bus.clone(), &options, silence, stats.clone(), &Handover::default(), now);
         master.opened(now);
         let mut rig = Rig {
             bus,

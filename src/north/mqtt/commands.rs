@@ -14,7 +14,7 @@ use super::outbox::Message;
 use super::payload::Topics;
 use super::reply::Reply;
 use super::request::{self, Incoming, MAX_NAME, excerpt};
-use crate::command::{Answer, Authority, Order, Origin, SourceKind};
+use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
 use crate::document::nearest;
 use crate::drive::ModelPoint;
 use crate::plant::{Placed, Plant};
@@ -79,6 +79,8 @@ struct Taken {
     packet: u16,
     /// Hash of topic and `id`, where it has one.
     identity: Option<u64>,
+    /// Stops of the drive by then.
+    stops: u64,
     at: Instant,
     /// Once it is there.
     result: Option<Message>,
@@ -142,10 +144,17 @@ impl Commands {
         let id = request.id.as_ref().map(Json::to_string);
         let identity = id.map(|id| self.hasher.hash_one((&incoming.topic, id)));
         if !stop && let Some(known) = self.repeated(&incoming, fingerprint, identity, now) {
-            return known.result.clone();
+            if known.stops == drive.stops() {
+                return known.result.clone();
+            }
+            // The motor was stopped since: the old result would be untrue, and to do it again would start it.
+            let why = "it repeats an earlier command, and a stop came since; send it anew, with another `id`";
+            let answer = drive.refuse(&what(), Refusal::NotAllowed(why.to_string()), origin, now);
+            return Some(reply.message(request.id, &answer, None, time));
         }
+        let stops = drive.stops();
         let running = Running {
-            number: self.remember(fingerprint, &incoming, identity, now),
+            number: self.remember(fingerprint, &incoming, identity, stops, now),
             id: request.id,
             reply,
             placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
@@ -187,7 +196,14 @@ impl Commands {
         marked.or_else(by_id)
     }
 
-    fn remember(&mut self, fingerprint: u64, incoming: &Incoming, identity: Option<u64>, now: Instant) -> u64 {
+    fn remember(
+        &mut self,
+        fingerprint: u64,
+        incoming: &Incoming,
+        identity: Option<u64>,
+        stops: u64,
+        now: Instant,
+    ) -> u64 {
         if self.recent.len() == REMEMBERED {
             self.recent.pop_front();
         }
@@ -197,6 +213,7 @@ impl Commands {
             fingerprint,
             packet: incoming.packet,
             identity,
+            stops,
             at: now,
             result: None,
         });

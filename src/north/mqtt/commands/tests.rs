@@ -344,3 +344,16 @@ fn a_refusal_of_the_queue_tells_its_reason() {
     assert!(text.starts_with("64 commands wait already"), "{text}");
     assert_eq!(bench.queued(), crate::command::CAPACITY);
 }
+
+#[test]
+fn a_repetition_behind_a_stop_is_neither_answered_nor_done() {
+    let mut bench = Bench::new();
+    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
+    assert_eq!(bench.take(run.clone()), None);
+    bench.acknowledge();
+    assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
+    bench.acknowledge();
+    let again = json(&bench.take(Incoming { dup: true, ..run }).expect("an answer at once"));
+    assert_eq!(again["error"]["code"], "not_allowed", "{again}");
+    assert_eq!(bench.queued(), 0);
+}
