@@ -212,11 +212,11 @@ mod tests {
             let series = format!("drivegate_drive_unsupervised{{bus=\"line1\",drive=\"pump-1\"}} {value}");
             vec!["# TYPE drivegate_drive_unsupervised gauge".to_string(), series]
         };
-        assert_eq!(gauge(), shown("0.0"));
+        assert_eq!(gauge(), shown("0"));
         pump.set_unsupervised(true);
-        assert_eq!(gauge(), shown("1.0"));
+        assert_eq!(gauge(), shown("1"));
         pump.set_unsupervised(false);
-        assert_eq!(gauge(), shown("0.0"));
+        assert_eq!(gauge(), shown("0"));
         let page = include_str!("../../../docs/http.md");
         assert!(page.contains("`drivegate_drive_unsupervised`"));
     }
