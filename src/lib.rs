@@ -27,8 +27,8 @@
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
-//! - [`bus`]: one exchange ([`bus::transaction`]), what comes next ([`bus::schedule`]), what N2 wants said beside
-//!   ([`bus::session`]), commands step by step ([`bus::execute`]), leases, and the task that does it.
+//! - [`bus`]: one exchange ([`bus::transaction`]), which poll is next ([`bus::schedule`]), all decisions about drives and
+//!   commands ([`bus::master`]), the bus without its thread ([`bus::core`]): pure; and the thread that does the I/O.
 //! - [`north`]: the servers, and the public register map.
 //! - [`sim`]: simulated drives of every family on a simulated wire, and the broker of the demo.
 //! - [`config`]: file and environment to settings, every fault in one run.

@@ -1,4 +1,18 @@
-//! The bus: one owner of the line, one transaction at a time.
+//! The bus: one owner of the line, one exchange at a time.
+//!
+//! - `line_loop`: the thread, the port, the clock; it does what the core says. [`prober`] does the same for `scan`.
+//! - [`core`](self::core): the bus without its thread: bytes and time in, what to do with the port out.
+//! - [`line_state`]: how long the line has been silent, and the exchange that is under way, a [`transaction`].
+//! - [`master`]: what goes on the line next (`choose`), what came of it (`results`), the stops at shutdown (`shutdown`).
+//!   [`schedule`] knows which poll is due, [`predict`] what that comes to on a given line.
+//! - `drive_state`: what is known of one drive beside its samples, polls and N2 session: its begun commands
+//!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
+//!   still send ([`late_replies`]).
+//! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
+//! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
+//!
+//! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
+//! `tap`, which feeds the trace, add the time of day to what they tell.
 
 pub mod command_run;
 pub mod confirm;

@@ -112,11 +112,18 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         "drivegate_supervision_actions_total",
         "Leases that ran out while the drive ran.",
     );
+    let mut unsupervised = gauge(
+        "drivegate_drive_unsupervised",
+        "Whether a drive with supervision ran, and no client was heard of since the gateway started: 1, else 0.",
+    );
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
         supervision.add(labels.clone(), Figure::Count(image.supervisions()));
+        if image.spec.supervision.is_some() {
+            unsupervised.add(labels.clone(), yes(image.is_unsupervised()));
+        }
         up.add(labels.clone(), yes(reading.snapshot.link.is_online()));
         if let Some(current) = reading.state() {
             for one in State::ALL {
@@ -137,7 +144,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     }
     all.extend([up, state, age]);
     all.append(&mut model);
-    all.extend([point, transactions, turnaround, supervision]);
+    all.extend([point, transactions, turnaround, supervision, unsupervised]);
 }
 
 /// The good points of a drive; `model` has the families of [`MODEL`], in its order.

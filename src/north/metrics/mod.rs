@@ -152,7 +152,74 @@ fn gauge(value: f64, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
 
 #[cfg(test)]
 mod tests {
+    use std::sync::Arc;
+    use std::time::Duration;
+
     use super::*;
+    use crate::cache::{BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Supervision};
+    use crate::codec::{LineFormat, Protocol};
+    use crate::command::{CommandQueue, WriteStats};
+    use crate::drive::profile::Profiles;
+    use crate::event::Events;
+    use crate::plant::BusHandle;
+
+    fn drive(name: &str, supervision: Option<Supervision>) -> Arc<DriveImage> {
+        let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let spec = DriveSpec {
+            supervision,
+            ..DriveSpec::new(name, "line1", 1, nx)
+        };
+        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+    }
+
+    fn plant(drives: Vec<Arc<DriveImage>>) -> Plant {
+        let spec = BusSpec {
+            name: "line1".to_string(),
+            port: "/dev/ttyUSB0".to_string(),
+            protocol: Protocol::ModbusRtu,
+            format: LineFormat::new(38_400, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_secs(1),
+        };
+        let bus = BusHandle {
+            image: Arc::new(BusImage::new(spec, drives)),
+            queue: Arc::new(CommandQueue::new().unwrap()),
+        };
+        Plant {
+            gateway: "pump-house".to_string(),
+            stale_after: Duration::from_secs(1),
+            buses: vec![bus],
+            events: Events::default(),
+            writes: Arc::new(WriteStats::default()),
+        }
+    }
+
+    #[test]
+    fn a_drive_that_runs_unsupervised_has_a_gauge_where_it_has_supervision() {
+        let supervision = Supervision {
+            timeout: Duration::from_secs(5),
+            action: LeaseAction::Stop,
+            adopt: false,
+        };
+        let pump = drive("pump-1", Some(supervision));
+        let plant = plant(vec![pump.clone(), drive("fan-2", None)]);
+        let gauge = || {
+            let text = encode(&plant, &NorthStats::default(), Instant::now(), Format::Prometheus).unwrap();
+            let of = |line: &&str| line.contains("drivegate_drive_unsupervised") && !line.starts_with("# HELP");
+            text.lines().filter(of).map(str::to_string).collect::<Vec<_>>()
+        };
+        let shown = |value: &str| {
+            let series = format!("drivegate_drive_unsupervised{{bus=\"line1\",drive=\"pump-1\"}} {value}");
+            vec!["# TYPE drivegate_drive_unsupervised gauge".to_string(), series]
+        };
+        assert_eq!(gauge(), shown("0"));
+        pump.set_unsupervised(true);
+        assert_eq!(gauge(), shown("1"));
+        pump.set_unsupervised(false);
+        assert_eq!(gauge(), shown("0"));
+        let page = include_str!("../../../docs/http.md");
+        assert!(page.contains("`drivegate_drive_unsupervised`"));
+    }
 
     #[test]
     fn open_metrics_only_for_those_that_ask() {
