@@ -15,6 +15,8 @@ pub const BABBLE: Duration = Duration::from_millis(500);
 /// another baud rate behind a device server. A single one may be a late reply, or one that came twice; where it cannot be, it
 /// is enough.
 const UNTIMED: u32 = 3;
+/// As many early replies as make it certain, whatever comes behind.
+const CERTAIN: u32 = u32::MAX;
 
 /// How a request is to be sent.
 #[derive(Debug, Clone, Copy)]
@@ -190,14 +192,14 @@ impl LineState {
         } = self.underway.take()?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         match &ended {
-            _ if self.early_replies >= UNTIMED => {}
+            _ if self.early_replies == CERTAIN => {}
             Ended::Reply(Reply::Exception(_)) => {}
             Ended::Reply(_) if now >= earliest => self.early_replies = 0,
             // It can be no other reply: the line has no wire time.
-            Ended::Reply(_) if !doubtful && !late => self.early_replies = UNTIMED,
+            Ended::Reply(_) if !doubtful && !late => self.early_replies = CERTAIN,
             Ended::Reply(_) => {}
             Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
-            _ => self.early_replies += 1,
+            _ => self.early_replies = self.early_replies.saturating_add(1).min(UNTIMED),
         }
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
