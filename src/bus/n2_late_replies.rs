@@ -143,13 +143,16 @@ impl Form {
     /// Whether a late reply of this form could pass for one of that. A late identity is told from a state by its value.
     fn is_like(self, wanted: Form) -> bool {
         use Form::{Acknowledgement, Changes, Float, Identity, Integer, State};
-        match (self, wanted) {
-            (Acknowledgement | Changes, Acknowledgement | Changes) => true,
-            (Changes, Float | Integer) | (Float | Integer, Changes) => true,
-            (State, State | Identity) | (Identity, Identity) => true,
-            (Integer, Integer) | (Float, Float) => true,
-            _ => false,
-        }
+        matches!(
+            (self, wanted),
+            (Acknowledgement | Changes, Acknowledgement | Changes)
+                | (Changes, Float | Integer)
+                | (Float | Integer, Changes)
+                | (State, State | Identity)
+                | (Identity, Identity)
+                | (Integer, Integer)
+                | (Float, Float)
+        )
     }
 }
 
