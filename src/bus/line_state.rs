@@ -195,9 +195,9 @@ impl LineState {
             _ if self.early_replies == CERTAIN => {}
             Ended::Reply(Reply::Exception(_)) => {}
             Ended::Reply(_) if now >= earliest => self.early_replies = 0,
-            // It can be no other reply: the line has no wire time.
-            Ended::Reply(_) if !doubtful && !late => self.early_replies = CERTAIN,
-            Ended::Reply(_) => {}
+            Ended::Reply(_) if doubtful || late => {}
+            // It can be no other reply: the line has no wire time. An N2 reply shows too little of its request for that.
+            Ended::Reply(_) if self.protocol != Protocol::N2 => self.early_replies = CERTAIN,
             Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
             _ => self.early_replies = self.early_replies.saturating_add(1).min(UNTIMED),
         }
