@@ -1,6 +1,6 @@
 //! What was commanded: one record a command, the last 1,000 kept.
 
-use std::collections::VecDeque;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, SystemTime};
 
@@ -108,17 +108,18 @@ pub struct Audit(Mutex<VecDeque<Arc<AuditRecord>>>);
 
 impl Audit {
     /// Keeps a record. When 1,000 are kept, it takes the place of the oldest of its own client if that has half of
-    /// them, else of the oldest of all.
+    /// them, else of the oldest of the client that has most.
     pub(super) fn keep(&self, record: AuditRecord) {
         let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.len() >= AUDIT_KEPT {
             let own = kept.iter().filter(|r| r.share == record.share).count();
-            let index = if own >= AUDIT_SHARE {
-                kept.iter().position(|r| r.share == record.share)
+            let from = if own >= AUDIT_SHARE {
+                Some(record.share.clone())
             } else {
-                None
+                largest_share(&kept)
             };
-            kept.remove(index.unwrap_or(0));
+            let oldest = kept.iter().position(|r| Some(&r.share) == from.as_ref());
+            kept.remove(oldest.unwrap_or(0));
         }
         kept.push_back(Arc::new(record));
     }
@@ -132,6 +133,16 @@ impl Audit {
             .cloned()
             .collect()
     }
+}
+
+/// The client that has most of the records.
+fn largest_share(kept: &VecDeque<Arc<AuditRecord>>) -> Option<Arc<str>> {
+    let mut shares: BTreeMap<&Arc<str>, usize> = BTreeMap::new();
+    for record in kept {
+        *shares.entry(&record.share).or_default() += 1;
+    }
+    let largest = shares.into_iter().max_by_key(|(_, records)| *records);
+    largest.map(|(share, _)| share.clone())
 }
 
 #[cfg(test)]
@@ -171,6 +182,19 @@ mod tests {
         assert_eq!(kept.len(), AUDIT_KEPT);
         assert_eq!(kept.iter().filter(|r| r.client == "quiet").count(), AUDIT_SHARE);
         assert_eq!(kept.last().unwrap().command, "9999", "the newest comes last");
+    }
+
+    #[test]
+    fn a_quiet_client_among_a_flood_loses_nothing() {
+        let audit = Audit::default();
+        for i in 0..20_000 {
+            audit.keep(record("flood", i));
+            if i % 1000 == 0 {
+                audit.keep(record("quiet", i));
+            }
+        }
+        let quiet = audit.recent().iter().filter(|r| r.client == "quiet").count();
+        assert_eq!(quiet, 20);
     }
 
     #[test]
