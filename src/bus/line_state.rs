@@ -196,8 +196,11 @@ impl LineState {
             Ended::Reply(Reply::Exception(_)) => {}
             Ended::Reply(_) if now >= earliest => self.early_replies = 0,
             Ended::Reply(_) if doubtful || late => {}
-            // It can be no other reply: the line has no wire time. An N2 reply shows too little of its request for that.
-            Ended::Reply(_) if self.protocol != Protocol::N2 => self.early_replies = CERTAIN,
+            // It is hardly another reply, and two in a row are none: the line has no wire time. An N2 reply shows too little
+            // of its request for that.
+            Ended::Reply(_) if self.protocol != Protocol::N2 => {
+                self.early_replies = if self.early_replies >= 2 { CERTAIN } else { 2 };
+            }
             Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
             _ => self.early_replies = self.early_replies.saturating_add(1).min(UNTIMED),
         }
