@@ -11,12 +11,19 @@ use crate::drive::plan::WireTime;
 /// A line that never falls silent is spoken on after this time: a stop must get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
 
-/// After so many replies in a row that came faster than the wire could carry them the line has no wire time: a simulation, or
-/// another baud rate behind a device server. A single one may be a late reply, or one that came twice; where it cannot be, it
-/// is enough.
-const UNTIMED: u32 = 3;
-/// As many early replies as make it certain, whatever comes behind.
-const CERTAIN: u32 = u32::MAX;
+/// Replies that are whole before the wire could have carried them show a line without wire time: a simulation, or another
+/// baud rate behind a device server. A single one may be a late reply, or one that came twice, and on a busy machine not all
+/// replies of such a line are early; so they are weighed, and each regular reply takes 1 back. From this weight on, early
+/// replies are believed.
+const WITHOUT_WIRE_TIME: u32 = 64;
+/// Most that early replies weigh together: so many regular replies bring a line back to its protection.
+const MOST_WEIGHT: u32 = 256;
+/// An early reply that can hardly be another one's: two within some thirty replies are enough.
+const WEIGHT_OF_EARLY: u32 = 48;
+/// An early reply that was not believed, with no other behind it: three are enough.
+const WEIGHT_OF_DOUBTED: u32 = 24;
+/// An early reply that could be another one's and was believed: one in nine keeps the line as it is.
+const WEIGHT_OF_BELIEVED: u32 = 8;
 
 /// How a request is to be sent.
 #[derive(Debug, Clone, Copy)]
@@ -58,8 +65,8 @@ pub struct LineState {
     left_alone: Instant,
     /// The adapter sends back what it is given.
     echo: bool,
-    /// Replies in a row that came faster than the wire could carry them.
-    early_replies: u32,
+    /// Weight of the replies that came faster than the wire could carry them.
+    early_weight: u32,
     underway: Option<Underway>,
 }
 
@@ -83,7 +90,7 @@ impl LineState {
             quiet_since: now,
             left_alone: now,
             echo: false,
-            early_replies: 0,
+            early_weight: 0,
             underway: None,
         }
     }
@@ -133,7 +140,7 @@ impl LineState {
         let timeout = sending.response_timeout;
         let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
         transaction.expect_late(late);
-        if self.early_replies < UNTIMED {
+        if self.early_weight < WITHOUT_WIRE_TIME {
             transaction.ignore_before(sent);
             if doubtful {
                 transaction.doubt_before(earliest);
@@ -191,19 +198,8 @@ impl LineState {
             late,
         } = self.underway.take()?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
-        match &ended {
-            _ if self.early_replies == CERTAIN => {}
-            Ended::Reply(Reply::Exception(_)) => {}
-            Ended::Reply(_) if now >= earliest => self.early_replies = 0,
-            Ended::Reply(_) if doubtful || late => {}
-            // It is hardly another reply, and two in a row are none: the line has no wire time. An N2 reply shows too little
-            // of its request for that.
-            Ended::Reply(_) if self.protocol != Protocol::N2 => {
-                self.early_replies = if self.early_replies >= 2 { CERTAIN } else { 2 };
-            }
-            Ended::Silent | Ended::Corrupt(_) if !transaction.doubted() => {}
-            _ => self.early_replies = self.early_replies.saturating_add(1).min(UNTIMED),
-        }
+        let early = now < earliest;
+        self.weigh(&ended, early, doubtful || late, transaction.doubted());
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
         Some(Exchanged {
@@ -214,6 +210,27 @@ impl LineState {
             reply_time,
             took: now.saturating_duration_since(began) + self.silence,
         })
+    }
+
+    /// Weighs what the end of an exchange shows of the wire time. `early`: faster than the wire; `doubtful`: the reply could
+    /// be another one's; `doubted`: an early reply was not believed.
+    fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, doubted: bool) {
+        let believed = self.early_weight >= WITHOUT_WIRE_TIME;
+        let weight = match ended {
+            Ended::Reply(Reply::Exception(_)) => 0,
+            Ended::Reply(_) if !early => {
+                self.early_weight = self.early_weight.saturating_sub(1);
+                0
+            }
+            Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
+            Ended::Reply(_) if doubtful => 0,
+            // An N2 reply shows too little of its request to be certain.
+            Ended::Reply(_) if self.protocol == Protocol::N2 => WEIGHT_OF_DOUBTED,
+            Ended::Reply(_) => WEIGHT_OF_EARLY,
+            Ended::Silent | Ended::Corrupt(_) if doubted => WEIGHT_OF_DOUBTED,
+            Ended::Silent | Ended::Corrupt(_) => 0,
+        };
+        self.early_weight = (self.early_weight + weight).min(MOST_WEIGHT);
     }
 }
 
