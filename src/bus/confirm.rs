@@ -14,6 +14,9 @@ const RIPPLE: f64 = 0.5;
 /// A motor slower than that, in percent of the speed range, has stopped as far as its speed shows.
 const NEAR_ZERO: f64 = 1.0;
 
+/// On a busy line the next read may come late: so many times the time for confirmation pass before that is reported.
+const UNREAD: u32 = 5;
+
 /// What a read must show.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Effect {
@@ -101,26 +104,26 @@ fn effect_of(profile: &Profile, index: usize, value: Value) -> Option<Effect> {
     readable.then_some(Effect::ReadBack(index, value))
 }
 
-/// Whether the reading shows it, by samples that were read after `since`.
-fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> bool {
+/// Whether the reading shows it, by samples that were read after `since`; none where there is no such sample.
+fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> {
     let after = |sample: crate::drive::Sample| sample.good().filter(|_| sample.at.is_some_and(|at| at > since));
+    let model = |point| after(reading.model(point));
     match effect {
-        Effect::Runs => after(reading.model(ModelPoint::Running)).is_some_and(Value::as_bool),
-        Effect::NoFault => after(reading.model(ModelPoint::Fault)).is_some_and(|fault| !fault.as_bool()),
+        Effect::Runs => model(ModelPoint::Running).map(Value::as_bool),
+        Effect::NoFault => model(ModelPoint::Fault).map(|fault| !fault.as_bool()),
         Effect::Stops => {
-            let stands = after(reading.model(ModelPoint::Running)).is_some_and(|running| !running.as_bool());
-            let near_zero = after(reading.model(ModelPoint::ActualSpeed)).is_some_and(|v| v.as_f64().abs() < NEAR_ZERO);
-            stands || near_zero
+            let stands = model(ModelPoint::Running).map(|running| !running.as_bool());
+            let near_zero = model(ModelPoint::ActualSpeed).map(|v| v.as_f64().abs() < NEAR_ZERO);
+            stands.into_iter().chain(near_zero).reduce(|a, b| a || b)
         }
         Effect::ReadBack(index, value) => {
-            let read = after(reading.sample(index));
-            let raw = reading.spec.profile.points.get(index).and_then(|p| p.raw());
-            match (read, raw) {
-                (Some(read), Some(raw)) if matches!(raw.form, Form::Bit { .. }) => read.as_bool() == value.as_bool(),
+            let read = after(reading.sample(index))?;
+            let raw = reading.spec.profile.points.get(index)?.raw()?;
+            Some(match raw.form {
+                Form::Bit { .. } => read.as_bool() == value.as_bool(),
                 // Compared as the register holds them.
-                (Some(read), Some(raw)) => raw.encode(read, 0).ok() == raw.encode(value, 0).ok(),
-                _ => false,
-            }
+                _ => raw.encode(read, 0).ok() == raw.encode(value, 0).ok(),
+            })
         }
     }
 }
@@ -134,9 +137,11 @@ struct Watch {
     /// Least amount of the speed since the acknowledgement, percent, and when it last fell.
     slowest: Option<f64>,
     fell_at: Instant,
+    /// Whether the drive was read since, as far as it could show an effect.
+    was_read: bool,
     /// What it was, for people.
     what: String,
-    /// Of those who wait for the effect; none once its time is over while the motor still slows down.
+    /// Of those who wait for the effect; none once its time is over while nothing can be said of it yet.
     receipts: Vec<Receipt>,
 }
 
@@ -148,6 +153,24 @@ impl Watch {
     /// Whether a motor that is to stop still slows down.
     fn slows_down(&self, now: Instant) -> bool {
         self.effects.contains(&Effect::Stops) && now.saturating_duration_since(self.fell_at) < self.within
+    }
+
+    /// Whether it is too early to say that the effect is missing: the motor still slows down, or the drive was not read.
+    fn is_open(&self, now: Instant) -> bool {
+        let unread = !self.was_read && now.saturating_duration_since(self.since) < self.within * UNREAD;
+        unread || self.slows_down(now)
+    }
+
+    /// For people: what was not seen.
+    fn report(&self, profile: &Profile) -> String {
+        let Watch { what, within, .. } = self;
+        if !self.was_read {
+            let within = *within * UNREAD;
+            return format!("acknowledged {what} but was not read within {within:?}: whether it did it is not known");
+        }
+        let missing: Vec<String> = self.effects.iter().map(|e| e.missing(profile)).collect();
+        let missing = missing.join(", ");
+        format!("acknowledged {what} but did not show it within {within:?}: {missing}")
     }
 
     fn note_speed(&mut self, reading: &Reading<'_>, now: Instant) {
@@ -187,6 +210,7 @@ impl Confirmations {
             within: reading.spec.profile.confirm_within,
             slowest: reading.model(ModelPoint::ActualSpeed).good().map(|v| v.as_f64().abs()),
             fell_at: now,
+            was_read: false,
             what: receipts
                 .first()
                 .map(|receipt| receipt.what().to_string())
@@ -201,8 +225,17 @@ impl Confirmations {
         while let Some(watch) = self.0.get_mut(index) {
             let since = watch.since;
             watch.note_speed(reading, now);
-            if !watch.is_over(now) || watch.slows_down(now) {
-                watch.effects.retain(|e| !shows(*e, reading, since));
+            if !watch.is_over(now) || watch.is_open(now) {
+                let was_read = &mut watch.was_read;
+                watch.effects.retain(|effect| {
+                    let shown = shows(*effect, reading, since);
+                    *was_read |= shown.is_some();
+                    shown != Some(true)
+                });
+            }
+            if watch.is_over(now) {
+                // Shown too late for those who waited.
+                watch.receipts.clear();
             }
             if watch.effects.is_empty() {
                 let receipts = self.0.remove(index).receipts;
@@ -213,25 +246,19 @@ impl Confirmations {
         }
     }
 
-    /// What showed no effect in time, in words, each once. Of a motor that still slows down nothing is said yet, but
-    /// nobody waits for it any longer.
+    /// What showed no effect in time, in words, each once. Of a motor that still slows down, and of a drive that was not
+    /// read since, nothing is said yet, but nobody waits for it any longer.
     pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<String> {
         let mut late = Vec::new();
         self.0.retain_mut(|watch| {
             if !watch.is_over(now) {
                 return true;
             }
-            if watch.slows_down(now) {
+            if watch.is_open(now) {
                 watch.receipts.clear();
                 return true;
             }
-            let missing: Vec<String> = watch.effects.iter().map(|e| e.missing(profile)).collect();
-            late.push(format!(
-                "acknowledged {} but did not show it within {:?}: {}",
-                watch.what,
-                watch.within,
-                missing.join(", ")
-            ));
+            late.push(watch.report(profile));
             false
         });
         late
