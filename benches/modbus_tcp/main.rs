@@ -1,7 +1,7 @@
 //! The Modbus TCP server beside others: tokio-modbus, libmodbus with epoll, pymodbus.
 //!
 //! `cargo bench --bench modbus_tcp` (options: `-- --seconds 0.5 --runs 15`). Every server is a process of its own, reads are
-//! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs; `drivegate of it`
+//! function 3 with 11 registers. All take turns in short runs, and each figure is the median of the runs; `drivegate ratio`
 //! is the median of the ratios turn by turn, so that what slows the machine for a while slows both sides. At the end the
 //! rounds of a bus at 115200 baud, without and with that load on the daemon in turns eight times as long, since one round in
 //! a hundred counts; `--rounds 15` measures these alone, so often.
@@ -67,7 +67,7 @@ fn speed(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
         }
     }
     println!(
-        "| server | connections × depth | requests/s | batch p50, µs | p99, µs | server µs/request | drivegate of it |"
+        "| server | connections × depth | requests/s | batch p50, µs | p99, µs | server µs/request | drivegate ratio |"
     );
     println!("|---|---|---|---|---|---|---|");
     for (connections, depth) in LOADS {
@@ -138,7 +138,7 @@ fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
         }
     }
     println!(
-        "\n| load on the daemon | written: cycle p50, ms | p99 | heard by the drives: p50 | p99 |\n|---|---|---|---|---|"
+        "\n| load on the daemon | written: cycle p50, ms | p99 | received by the drives: p50 | p99 |\n|---|---|---|---|---|"
     );
     let told = format!("16 × 1, {:.0} requests/s", median(&rates));
     let column =

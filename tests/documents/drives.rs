@@ -1,4 +1,4 @@
-//! The tables of docs/drives.md, made of the built-in profiles.
+//! The tables of docs/drives.md, generated from the built-in profiles.
 
 use std::fmt::Write;
 
@@ -58,7 +58,7 @@ fn model(profiles: &Profiles, names: &[&str]) -> String {
     text
 }
 
-/// Place, scale, class, and whether it is verified.
+/// Address, scale, class, and whether it is verified.
 fn cell(profile: &Profile, point: &Point) -> String {
     let place = place(profile, point);
     let class = if point.raw().is_some() {
@@ -128,39 +128,44 @@ fn derivation(profile: &Profile, derived: &Derived) -> String {
     };
     match derived {
         Derived::Band { of, minimum, maximum } => {
-            format!("{} of {} to {}", name(of), end(minimum), end(maximum))
+            format!("{} of the band {} to {}", name(of), end(minimum), end(maximum))
         }
         Derived::Percent { of, minimum, maximum } => {
-            format!("{} in {} to {}", name(of), end(minimum), end(maximum))
+            format!(
+                "{} as percent of the band {} to {}",
+                name(of),
+                end(minimum),
+                end(maximum)
+            )
         }
-        Derived::Zero { of, .. } => format!("{} is 0", name(of)),
-        Derived::Equal { of, to, .. } => format!("{} is {}", name(of), name(to)),
+        Derived::Zero { of, .. } => format!("{} = 0", name(of)),
+        Derived::Equal { of, to, .. } => format!("{} = {}", name(of), name(to)),
         Derived::All { of } => of.iter().map(name).collect::<Vec<_>>().join(" and "),
         Derived::LowestBit { of } => format!("lowest bit of {}", name(of)),
     }
 }
 
-/// What a family has beyond the model.
+/// The points of a family beyond the common model.
 fn family(profile: &Profile) -> String {
     let doubtful = profile.points.iter().filter(|p| !p.verified).count();
     let mut text = format!(
         "\n## `{}`: {}\n\nSource: {}.",
         profile.name, profile.title, profile.source
     );
-    let mut sure: Vec<String> = Vec::new();
-    let mut unsure: Vec<String> = Vec::new();
+    let mut verified: Vec<String> = Vec::new();
+    let mut unverified: Vec<String> = Vec::new();
     for (code, fault) in &profile.faults {
-        let told = format!("{code} {}", fault.text);
+        let text = format!("{code} {}", fault.text);
         if fault.verified {
-            sure.push(told)
+            verified.push(text)
         } else {
-            unsure.push(told)
+            unverified.push(text)
         }
     }
     if doubtful > 0 {
         let _ = write!(text, " Not verified: {doubtful} of {} points.", profile.points.len());
     }
-    text += "\n\n| point | unit | place | class | commands | |\n|---|---|---|---|---|---|\n";
+    text += "\n\n| point | unit | address | class | commands | note |\n|---|---|---|---|---|---|\n";
     for point in profile.points.iter().filter(|p| p.model.is_none()) {
         let class = if point.raw().is_some() { point.class.name() } else { "" };
         let range = point.range.as_ref().map(|r| format!("{} to {}", r.start(), r.end()));
@@ -195,20 +200,20 @@ fn family(profile: &Profile) -> String {
     if !rules.is_empty() {
         let _ = write!(text, "\nWrites: {}.\n", rules.join("; "));
     }
-    if !sure.is_empty() {
-        let _ = write!(text, "\nFault texts: {}.\n", sure.join(", "));
+    if !verified.is_empty() {
+        let _ = write!(text, "\nFault texts: {}.\n", verified.join(", "));
     }
-    if !unsure.is_empty() {
-        let _ = write!(text, "\nFault texts that are not verified: {}.\n", unsure.join(", "));
+    if !unverified.is_empty() {
+        let _ = write!(text, "\nUnverified fault texts: {}.\n", unverified.join(", "));
     }
     text
 }
 
-/// What no manual says of N2.
+/// N2 details that no manual specifies.
 fn assumptions() -> String {
     let mut text = String::from(
-        "\n## Assumptions about Metasys N2\n\nNone of these was verified on hardware. Those with a key can be changed \
-         in `[n2]` of a profile.\n\n| key | value | assumption | why |\n|---|---|---|---|\n",
+        "\n## Assumptions about Metasys N2\n\nNone of these has been verified on hardware. Those with a key can be changed \
+         in `[n2]` of a profile.\n\n| key | value | assumption | basis |\n|---|---|---|---|\n",
     );
     for one in n2::ASSUMPTIONS {
         let key = one.key.map(|key| format!("`{key}`")).unwrap_or_default();

@@ -97,42 +97,42 @@ macro_rules! assumptions {
 }
 
 assumptions! {
-    Some("state_bit"), "bit of the status byte of BI and BO that is the state",
-        "the manuals name the bit without its place", |o| o.state_bit.to_string();
-    Some("unreliable_bit"), "bit of that byte which calls the state unreliable; such a state is not served",
-        "the manuals name the bit without its place (7 is likely), and the drives at hand are always reliable",
+    Some("state_bit"), "bit of the BI and BO status byte that holds the state",
+        "the manuals name the bit but not its position", |o| o.state_bit.to_string();
+    Some("unreliable_bit"), "bit of that byte that marks the state as unreliable; such a state is not served",
+        "the manuals name the bit but not its position (7 is likely), and these drives are always reliable",
         |o| o.unreliable_bit.map_or("none".to_string(), |bit| bit.to_string());
     Some("region_width"), "digits of the region in override and release",
-        "one open master sends 2, and 1 in reads and writes", |o| o.region_width.digits().to_string();
-    Some("identify"), "a drive answers nothing before it was identified, so that goes first",
-        "TECO and others say so; the frame is that of one open master", |o| o.identify.to_string();
-    Some("device_type"), "device type that the drive tells; another one is a warning",
-        "Danfoss, Rockwell and ProSoft print 10h for what is no JCI device", |o| format!("0x{:02X}", o.device_type);
+        "one open-source master sends 2, but 1 in reads and writes", |o| o.region_width.digits().to_string();
+    Some("identify"), "a drive replies to nothing before Identify, so Identify is sent first",
+        "stated by TECO and others; the frame is from one open-source master", |o| o.identify.to_string();
+    Some("device_type"), "device type that the drive reports; any other causes a warning",
+        "Danfoss, Rockwell and ProSoft document 10h for non-JCI devices", |o| format!("0x{:02X}", o.device_type);
     Some("release"), "an overridden AO is released at once",
-        "Vacon and Eaton advise it; TECO acknowledges it without action", |o| o.release.to_string();
-    Some("poll"), "pause between two polls for changes",
-        "Vacon and Eaton release what is overridden after about 10 minutes without a poll",
+        "recommended by Vacon and Eaton; TECO acknowledges it without effect", |o| o.release.to_string();
+    Some("poll"), "interval of polls for changes",
+        "Vacon and Eaton release overrides after about 10 minutes without a poll",
         |o| humantime::format_duration(o.poll).to_string();
-    None, "checksum: sum of the characters behind the lead, modulo 256",
-        "one open master; fits printed frames of a related protocol", |_| "sum".to_string();
-    None, "nothing new: an acknowledgement without data",
-        "one open master", |_| "A".to_string();
-    None, "records of a report of changes: any data means that something changed, and is read",
-        "no source has the layout; the simulator sends region, number, status and value", |_| "any".to_string();
-    None, "reports are taken with poll 0/4 first and 0/5 after it, 16 at most",
+    None, "checksum: sum of the characters after the lead character, modulo 256",
+        "one open-source master; matches printed frames of a related protocol", |_| "sum".to_string();
+    None, "no changes: an acknowledgement without data",
+        "one open-source master", |_| "A".to_string();
+    None, "report of changes: any data means that something changed and the drive is read",
+        "no source describes the layout; the simulator sends region, number, status and value", |_| "any".to_string();
+    None, "reports are fetched with poll 0/4 first, then 0/5, at most 16",
         "one source each for the order and for the acknowledgement", |_| "0/4, 0/5".to_string();
-    None, "a read may put one byte before the value; it is not looked at",
+    None, "a reply to a read may have one byte before the value; it is ignored",
         "devices differ", |_| "both".to_string();
-    None, "a refusal has no checksum; one with a checksum is read too",
-        "one open master sends none", |_| "both".to_string();
+    None, "a refusal has no checksum; one with a checksum is accepted too",
+        "one open-source master expects none", |_| "both".to_string();
     None, "any NaN or infinity means that there is no value",
-        "the manuals name an Invalid Float without its bits; the simulator sends 7FC00000", |_| "no value".to_string();
-    None, "object numbers on the wire are those printed in the maps, from 1",
-        "the manuals print no frame", |_| "from 1".to_string();
+        "the manuals name an Invalid Float without its bit pattern; the simulator sends 7FC00000", |_| "no value".to_string();
+    None, "object numbers on the wire are those of the printed maps, from 1",
+        "the manuals print no frames", |_| "from 1".to_string();
     None, "time is not synchronised",
-        "no source has the payload", |_| "never sent".to_string();
-    None, "bit 0 of a configuration byte switches reports on, bit 5 of a status byte tells an override",
-        "simulator only: the manuals name the bits without their places", |_| "0, 5".to_string();
+        "no source describes the payload", |_| "never sent".to_string();
+    None, "bit 0 of a configuration byte enables reports, bit 5 of a status byte indicates an override",
+        "simulator only: the manuals name the bits but not their positions", |_| "0, 5".to_string();
     None, "an override of ADI takes 4 digits, of BD 2",
         "simulator only: by analogy", |_| "4, 2".to_string();
 }
