@@ -1,14 +1,14 @@
 #!/bin/sh
-# Makes what [modbus_tcp.tls] needs to be tried: a CA, a server certificate, client certificates with roles.
-# For trials and small plants; a works CA should sign where there is one. Needs openssl.
+# Creates what [modbus_tcp.tls] needs: a CA, a server certificate, client certificates with roles.
+# For tests and small plants; use your company CA if there is one. Needs openssl.
 #
 #   modbus-tls-ca.sh DIR ca                       a CA: DIR/ca.crt, DIR/ca.key
 #   modbus-tls-ca.sh DIR server NAME [HOST...]    DIR/NAME.crt, DIR/NAME.key, for these names and addresses
 #                                                 (default: localhost 127.0.0.1 ::1)
 #   modbus-tls-ca.sh DIR client NAME [ROLE]       DIR/NAME.crt, DIR/NAME.key; without a role it may only read
 #
-# DAYS sets how long a certificate is valid (default 825; the CA ten years). Files that are there are not replaced.
-# Keys are readable for their owner only; DIR/ca.key is what must not get lost or out.
+# DAYS sets the validity of a certificate (default 825; the CA: ten years). Existing files are not replaced.
+# Keys are readable by their owner only; keep DIR/ca.key safe and secret.
 set -eu
 
 # The role is an extension of the certificate (Modbus/TCP Security protocol specification), a UTF8String.
