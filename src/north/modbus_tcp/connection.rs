@@ -3,7 +3,6 @@
 use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt;
@@ -15,7 +14,6 @@ use tokio_util::sync::CancellationToken;
 use super::dialogue::Dialogue;
 use super::errand::Answered;
 use super::frame::NotModbus;
-use super::lookout::{Lookout, Turns};
 use super::session::Session;
 
 /// Time for the rest of a frame.
@@ -57,12 +55,10 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     let now = Instant::now();
     let mut connection = Connection {
         now,
-        turns: session.turns(),
         stream,
         dialogue: Dialogue::new(session),
         since_yield: 0,
         idle: idle_timeout.map(|timeout| Idle::new(timeout, now)),
-        lookout: Lookout::new(now.into_std()),
     };
     let end = match connection.run(&cancel).await {
         Ok(never) => match never {},
@@ -86,8 +82,6 @@ struct Connection<S> {
     /// Requests since others had their turn.
     since_yield: usize,
     idle: Option<Idle>,
-    lookout: Lookout,
-    turns: Arc<Turns>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
@@ -139,11 +133,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                     self.dialogue.finish(answered, self.now.into_std());
                     self.touch();
                 }
-                Event::Input(0, _) => client_done = true,
-                Event::Input(count, looked) => {
-                    self.lookout.served(self.turns.next(), self.now.into_std(), looked);
-                    self.dialogue.received(count);
-                }
+                Event::Input(0) => client_done = true,
+                Event::Input(count) => self.dialogue.received(count),
             }
         }
     }
@@ -152,33 +143,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn next(&mut self, reads: bool, half_frame_since: Option<Instant>) -> Result<Event, End> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
-        let (mut read, mut looked) = (None, false);
-        if reads {
-            read = self.stream.read(space).now_or_never();
+        if reads && let Some(count) = self.stream.read(space).now_or_never() {
+            return Ok(Event::Input(count?));
         }
-        if read.is_none() {
-            // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
-            // task may go on on another thread, later.
-            self.since_yield = 0;
-            if reads
-                && !waits
-                && let Some(patience) = self.lookout.patience()
-            {
-                looked = true;
-                read = look_out(&mut self.stream, space, &mut self.lookout, &self.turns, patience).await;
-            }
+        // A client that waits does not flood the gateway: no need to yield.
+        self.since_yield = 0;
+        tokio::select! {
+            biased;
+            Some(answered) = waiting.next() => Ok(Event::Answer(answered)),
+            count = self.stream.read(space), if reads => Ok(Event::Input(count?)),
+            () = expired(half_frame_since) => Err(End::HalfFrame),
+            timeout = Idle::over(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
         }
-        let count = match read {
-            Some(count) => count?,
-            None => tokio::select! {
-                biased;
-                Some(answered) = waiting.next() => return Ok(Event::Answer(answered)),
-                count = self.stream.read(space), if reads => count?,
-                () = expired(half_frame_since) => return Err(End::HalfFrame),
-                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
-            },
-        };
-        Ok(Event::Input(count, looked))
     }
 
     /// The client uses its connection.
@@ -216,8 +192,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 enum Event {
     /// An answer from the bus.
     Answer(Answered),
-    /// So many bytes from the client, 0 at its end; whether they were looked out for.
-    Input(usize, bool),
+    /// So many bytes from the client, 0 at its end.
+    Input(usize),
 }
 
 /// How long the client has been silent. The timer is set anew only when it runs out, not with each request.
@@ -250,26 +226,6 @@ impl Idle {
             idle.timer.as_mut().reset(end);
         }
     }
-}
-
-/// Watches for input without sleeping; everything else on this thread goes first.
-async fn look_out<S: AsyncRead + Unpin>(
-    stream: &mut S,
-    space: &mut [u8],
-    lookout: &mut Lookout,
-    turns: &Turns,
-    patience: Duration,
-) -> Option<io::Result<usize>> {
-    let began = std::time::Instant::now();
-    let read = loop {
-        tokio::task::yield_now().await;
-        let read = stream.read(space).now_or_never();
-        if read.is_some() || began.elapsed() >= patience || lookout.is_disturbed(turns.last()) {
-            break read;
-        }
-    };
-    lookout.spent(began.elapsed());
-    read
 }
 
 /// Writes the output if the stream takes all of it without waiting, as it nearly always does: no timer, no registration.

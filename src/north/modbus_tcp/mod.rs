@@ -12,7 +12,6 @@ mod door;
 mod errand;
 pub(crate) mod frame;
 pub(crate) mod identify;
-mod lookout;
 mod offline;
 mod places;
 mod session;

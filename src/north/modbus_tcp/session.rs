@@ -8,7 +8,6 @@ use futures_util::FutureExt;
 use super::errand::{Answered, Errand, Step, Waiting, Work, pieces};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::lookout::Turns;
 use super::shared::{Client, Routes, Shared, View};
 use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
@@ -79,11 +78,6 @@ impl Session {
     /// The client, for the log.
     pub(super) fn who(&self) -> &str {
         &self.client.who
-    }
-
-    /// The turns of all connections.
-    pub(super) fn turns(&self) -> Arc<Turns> {
-        self.shared.turns.clone()
     }
 
     fn stats(&self) -> &ModbusTcpStats {

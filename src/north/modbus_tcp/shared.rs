@@ -7,7 +7,6 @@ use std::time::Instant;
 
 use arc_swap::ArcSwap;
 
-use super::lookout::Turns;
 use super::{Options, Seldom};
 use crate::command::{Authority, Origin, SourceKind};
 use crate::north::NorthStats;
@@ -21,7 +20,6 @@ pub(super) struct Shared {
     /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
     command_words: Mutex<HashMap<String, Option<u16>>>,
     tls_log: Mutex<Seldom>,
-    pub(super) turns: Arc<Turns>,
 }
 
 impl Shared {
@@ -31,7 +29,6 @@ impl Shared {
             stats,
             command_words: Mutex::default(),
             tls_log: Mutex::default(),
-            turns: Arc::default(),
         }
     }
 
