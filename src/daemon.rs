@@ -224,7 +224,7 @@ impl Daemon {
             (&self.settings.modbus_tcp, &settings.modbus_tcp, &self.modbus_tcp)
             && new.differs_in_certificates_only(old)
         {
-            server.renew_certificates(new).map_err(StartError)?;
+            server.renew_certificates(new).map_err(|e| StartError(e.to_string()))?;
             tracing::info!("Modbus TCP: new certificates for clients that connect from now on");
             self.settings.modbus_tcp = settings.modbus_tcp.clone();
         }

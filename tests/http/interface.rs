@@ -431,10 +431,9 @@ async fn an_address_in_use_is_told() {
     let error = http::start(options, shared, plant::stats(), CancellationToken::new())
         .await
         .unwrap_err();
-    assert_eq!(error.kind(), ErrorKind::AddrInUse);
     let text = error.to_string();
     assert!(
-        text.contains(&server.address.to_string()) && text.contains("[http] listen"),
+        text.contains(&format!("HTTP on {}: Address already in use", server.address)) && text.ends_with("of [http]"),
         "{text}"
     );
 }

@@ -5,17 +5,18 @@ use std::time::Instant;
 
 use futures_util::FutureExt;
 
+use super::Uncached;
 use super::errand::{Answered, Errand, Step, Waiting, Work, pieces};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
 use super::shared::{Client, Routes, Shared, View};
-use super::{Seldom, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Authority, Order, Outcome};
 use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
+use crate::north::log_throttle::LogThrottle;
 use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
 use crate::plant::{BusHandle, DriveHandle};
 
@@ -47,7 +48,7 @@ pub(super) struct Session {
     view: Arc<View>,
     client: Client,
     routes: Arc<Routes>,
-    foreign_codes: Seldom,
+    foreign_codes: LogThrottle,
 }
 
 impl Drop for Session {
@@ -66,7 +67,7 @@ impl Session {
             view,
             client,
             routes,
-            foreign_codes: Seldom::default(),
+            foreign_codes: LogThrottle::default(),
         }
     }
 
@@ -99,7 +100,7 @@ impl Session {
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
                 let drive = self.routes.drive(frame.header.unit);
                 let name = drive.map_or_else(String::new, |d| d.image.spec.name.clone());
-                self.tell_foreign_code(&name, code, now);
+                self.log_foreign_code(&name, code, now);
                 self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
@@ -143,7 +144,7 @@ impl Session {
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET
         {
-            self.tell_foreign_code(drive, *code, now);
+            self.log_foreign_code(drive, *code, now);
         }
         let exception = outcome.exception();
         match (outcome, exception) {
@@ -163,11 +164,11 @@ impl Session {
         self.stats().answered(function, code.0);
     }
 
-    /// A drive's own code is answered as 04; what it means is told here.
-    fn tell_foreign_code(&mut self, drive: &str, code: Exception, now: Instant) {
-        if let Some(more) = self.foreign_codes.tell(now) {
-            tracing::warn!(drive, client = %self.client.who, more,
-                "Modbus TCP: the drive answered {code}; the client was told 04");
+    /// A code of the drive's own is answered as 04; the log has the original.
+    fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
+        if let Some(suppressed) = self.foreign_codes.permit(now) {
+            tracing::warn!(drive, client = %self.client.who, suppressed,
+                "Modbus TCP: the drive answered {code}; passed on as exception 04");
         }
     }
 

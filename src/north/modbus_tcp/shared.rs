@@ -3,11 +3,10 @@
 use std::collections::HashMap;
 use std::net::SocketAddr;
 use std::sync::{Arc, Mutex, PoisonError};
-use std::time::Instant;
 
 use arc_swap::ArcSwap;
 
-use super::{Options, Seldom};
+use super::Options;
 use crate::command::{Authority, Origin, SourceKind};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
@@ -19,7 +18,6 @@ pub(super) struct Shared {
     pub(super) stats: Arc<NorthStats>,
     /// The word last written at 0x8100, by drive name: a fault reset is a change of its bit 2.
     command_words: Mutex<HashMap<String, Option<u16>>>,
-    tls_log: Mutex<Seldom>,
 }
 
 impl Shared {
@@ -28,13 +26,7 @@ impl Shared {
             options,
             stats,
             command_words: Mutex::default(),
-            tls_log: Mutex::default(),
         }
-    }
-
-    /// Whether to log a refused handshake now; as [`Seldom::tell`].
-    pub(super) fn tell_tls(&self, now: Instant) -> Option<u64> {
-        self.tls_log.lock().unwrap_or_else(PoisonError::into_inner).tell(now)
     }
 
     /// Does something with the word of a drive that nobody else may change in between.
