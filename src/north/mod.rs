@@ -14,7 +14,7 @@ mod stats;
 use std::io;
 use std::net::SocketAddr;
 
-pub use stats::{ModbusTcpStats, MqttStats, NorthStats, Turned};
+pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

@@ -8,7 +8,7 @@
 mod command;
 mod gateway;
 
-pub use command::{Before, CommandWrite, command, without_reset};
+pub use command::{CommandContext, CommandWrite, command, without_reset};
 pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, BusRegister, gateway};
 
 use crate::cache::Reading;
@@ -219,13 +219,13 @@ impl Entry {
         (COMMAND_WORD..=HEARTBEAT).contains(&self.address)
     }
 
-    fn registers(&self, look: &Look<'_>) -> [u16; 2] {
+    fn registers(&self, view: &DriveView<'_>) -> [u16; 2] {
         match self.content {
-            Content::Status => [look.status(), 0],
-            Content::State => [look.state().map_or(NO_U16, State::code), 0],
-            Content::Age => [look.age_ms(), 0],
-            Content::Point(point) => self.form.registers_of(look.good(point), self.per_unit),
-            Content::Command => [look.command(), 0],
+            Content::Status => [view.status(), 0],
+            Content::State => [view.state().map_or(NO_U16, State::code), 0],
+            Content::Age => [view.age_ms(), 0],
+            Content::Point(point) => self.form.registers_of(view.good(point), self.per_unit),
+            Content::Command => [view.command(), 0],
             Content::Heartbeat => [0, 0],
         }
     }
@@ -233,17 +233,17 @@ impl Entry {
 
 /// A drive as a Modbus TCP client sees it at one time.
 #[derive(Debug)]
-pub struct Look<'r> {
+pub struct DriveView<'r> {
     reading: &'r Reading<'r>,
     bus_up: bool,
     stale: bool,
 }
 
-impl<'r> Look<'r> {
+impl<'r> DriveView<'r> {
     /// The drive as `reading` shows it; while the bus is down nothing of it is good.
-    pub fn new(reading: &'r Reading<'r>, bus_up: bool) -> Look<'r> {
+    pub fn new(reading: &'r Reading<'r>, bus_up: bool) -> DriveView<'r> {
         let stale = !bus_up || reading.is_stale();
-        Look { reading, bus_up, stale }
+        DriveView { reading, bus_up, stale }
     }
 
     /// Registers of the blocks from 0x8000 on, all of the same reading. A drive that is offline or stale is

@@ -26,7 +26,7 @@ const OTHER: &str = "other";
 
 /// Why a Modbus TCP client was not let in.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Turned {
+pub enum ConnectionRefusal {
     /// Its address is not in `allow`.
     NotAllowed,
     /// All places are taken.
@@ -37,17 +37,22 @@ pub enum Turned {
     Tls,
 }
 
-impl Turned {
+impl ConnectionRefusal {
     /// All reasons.
-    pub const ALL: [Turned; 4] = [Turned::NotAllowed, Turned::Full, Turned::AddressFull, Turned::Tls];
+    pub const ALL: [ConnectionRefusal; 4] = [
+        ConnectionRefusal::NotAllowed,
+        ConnectionRefusal::Full,
+        ConnectionRefusal::AddressFull,
+        ConnectionRefusal::Tls,
+    ];
 
     /// The name in metrics.
     pub fn name(self) -> &'static str {
         match self {
-            Turned::NotAllowed => "not_allowed",
-            Turned::Full => "full",
-            Turned::AddressFull => "address_full",
-            Turned::Tls => "tls",
+            ConnectionRefusal::NotAllowed => "not_allowed",
+            ConnectionRefusal::Full => "full",
+            ConnectionRefusal::AddressFull => "address_full",
+            ConnectionRefusal::Tls => "tls",
         }
     }
 }
@@ -56,7 +61,7 @@ impl Turned {
 #[derive(Debug, Default)]
 pub struct ModbusTcpStats {
     connections: AtomicU64,
-    turned_away: [AtomicU64; Turned::ALL.len()],
+    refused_connections: [AtomicU64; ConnectionRefusal::ALL.len()],
     requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
 }
 
@@ -77,16 +82,16 @@ impl ModbusTcpStats {
     }
 
     /// Counts a client that was not let in.
-    pub fn turned_away(&self, why: Turned) {
-        if let Some(counter) = self.turned_away.get(why as usize) {
+    pub fn connection_refused(&self, why: ConnectionRefusal) {
+        if let Some(counter) = self.refused_connections.get(why as usize) {
             counter.fetch_add(1, Ordering::Relaxed);
         }
     }
 
     /// Clients that were not let in so far, by reason.
-    pub fn refused(&self) -> impl Iterator<Item = (Turned, u64)> {
-        let counts = self.turned_away.iter().map(|c| c.load(Ordering::Relaxed));
-        Turned::ALL.into_iter().zip(counts)
+    pub fn refused_connections(&self) -> impl Iterator<Item = (ConnectionRefusal, u64)> {
+        let counts = self.refused_connections.iter().map(|c| c.load(Ordering::Relaxed));
+        ConnectionRefusal::ALL.into_iter().zip(counts)
     }
 
     /// Counts an answer: exception code, 0 for a regular one.

@@ -8,7 +8,7 @@ use std::sync::atomic::{AtomicBool, AtomicU32, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use drivegate::codec::Table;
-use drivegate::north::Turned;
+use drivegate::north::ConnectionRefusal;
 use rand_free::Dice;
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -47,10 +47,10 @@ fn allow_files(count: u64) {
     }
 }
 
-fn turned_away(rig: &Rig, why: Turned) -> u64 {
+fn turned_away(rig: &Rig, why: ConnectionRefusal) -> u64 {
     rig.stats
         .modbus_tcp
-        .refused()
+        .refused_connections()
         .find(|(reason, _)| *reason == why)
         .unwrap()
         .1
@@ -80,7 +80,7 @@ async fn a_thousand_connections() {
     }
     until("all are in", || rig.stats.modbus_tcp.connections() == 1000).await;
     assert!(rig.client().await.is_closed().await, "one more than there are places");
-    assert_eq!(turned_away(&rig, Turned::Full), 1);
+    assert_eq!(turned_away(&rig, ConnectionRefusal::Full), 1);
     for client in idle.iter_mut().skip(1).step_by(3) {
         assert_eq!(
             client.ask(1, &words(3, &[2102, 1])).await,
@@ -104,7 +104,10 @@ async fn places_of_one_address() {
     }
     assert!(rig.client().await.is_closed().await);
     assert_eq!(
-        (turned_away(&rig, Turned::AddressFull), turned_away(&rig, Turned::Full)),
+        (
+            turned_away(&rig, ConnectionRefusal::AddressFull),
+            turned_away(&rig, ConnectionRefusal::Full)
+        ),
         (1, 0)
     );
     let mut neighbour = Client::connect_from([127, 0, 0, 2], rig.address()).await;

@@ -9,7 +9,7 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, SystemTime};
 
 use drivegate::command::SourceKind;
-use drivegate::north::Turned;
+use drivegate::north::ConnectionRefusal;
 use drivegate::north::modbus_tcp::{Identity, Options, Role, Tls};
 use rustls::version::{TLS12, TLS13};
 use rustls::{ClientConfig, RootCertStore, SupportedProtocolVersion};
@@ -146,13 +146,13 @@ impl TlsClient {
 }
 
 fn refused(rig: &Rig) -> u64 {
-    refused_for(rig, Turned::Tls)
+    refused_for(rig, ConnectionRefusal::Tls)
 }
 
-fn refused_for(rig: &Rig, reason: Turned) -> u64 {
+fn refused_for(rig: &Rig, reason: ConnectionRefusal) -> u64 {
     rig.stats
         .modbus_tcp
-        .refused()
+        .refused_connections()
         .find(|(why, _)| *why == reason)
         .unwrap()
         .1
@@ -271,7 +271,7 @@ async fn who_never_ends_the_handshake_is_closed() {
     let address = rig.server.tls_addresses()[0];
     // A handshake record of 512 bytes, of which no more than these ever come.
     for (round, begun) in [&[][..], &[0x16, 3, 1, 2, 0, 1, 0, 1, 0xFC]].into_iter().enumerate() {
-        let (round, full) = (round as u64, refused_for(&rig, Turned::Full));
+        let (round, full) = (round as u64, refused_for(&rig, ConnectionRefusal::Full));
         let mut slow = Client::connect(address).await;
         assert!(Client::connect(address).await.is_closed().await, "the place is taken");
         for bytes in begun.chunks(3) {
@@ -280,7 +280,7 @@ async fn who_never_ends_the_handshake_is_closed() {
         }
         later(5.0 - 1.5 * begun.len().div_ceil(3) as f32).await;
         assert!(Client::connect(address).await.is_closed().await, "it still is");
-        assert_eq!(refused_for(&rig, Turned::Full), full + 2);
+        assert_eq!(refused_for(&rig, ConnectionRefusal::Full), full + 2);
         assert_eq!(refused(&rig), round);
         later(5.1).await;
         assert!(slow.is_closed().await);

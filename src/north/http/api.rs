@@ -11,7 +11,7 @@ use crate::plant::{BusHandle, DriveHandle};
 
 /// An error reply.
 #[derive(Debug, Serialize)]
-pub(super) struct Problem {
+pub(super) struct ErrorReply {
     pub(super) error: String,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) known: Vec<String>,

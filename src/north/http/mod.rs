@@ -1,6 +1,6 @@
 //! HTTP: status page, Prometheus metrics, health and the JSON interface. GET and HEAD only.
 //!
-//! The connections are served by hyper directly, because axum's own loop gives a client unlimited time to
+//! The connections are app by hyper directly, because axum's own loop gives a client unlimited time to
 //! send its request. Everything ends on the cancellation token, open event streams included.
 
 mod api;

@@ -20,7 +20,7 @@ use tokio::sync::{OwnedSemaphorePermit, broadcast};
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
-use super::routes::{Served, not_found};
+use super::routes::{AppState, not_found};
 use super::{MAX_LISTENERS, api};
 use crate::cache::{Direction, FrameRecord};
 use crate::codec::{Protocol, describe};
@@ -36,8 +36,8 @@ const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// `GET /api/v1/events`: the kept events that the client does not have yet, then each as it happens. A client
 /// that wants JSON instead gets the kept ones only, and no stream.
-pub(super) async fn events(State(served): State<Arc<Served>>, headers: HeaderMap) -> Response {
-    let plant = served.plant.load();
+pub(super) async fn events(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let plant = app.plant.load();
     // Heard from before the kept ones are read: what comes between is in both, and is told once.
     let live = plant.events.subscribe();
     let mut kept = plant.events.recent();
@@ -49,31 +49,31 @@ pub(super) async fn events(State(served): State<Arc<Served>>, headers: HeaderMap
     kept.retain(|event| event.id > seen);
     let accept = header_text(&headers, &header::ACCEPT).unwrap_or_default();
     if accept.contains("application/json") && !accept.contains("text/event-stream") {
-        let kept = Kept {
+        let kept = RecentEvents {
             last: event_id(newest),
             events: kept.iter().map(Arc::as_ref).collect(),
         };
         return ([(header::VARY, "accept")], Json(kept)).into_response();
     }
-    let Some(place) = place(&served) else {
+    let Some(place) = place(&app) else {
         return full();
     };
     let kept: Vec<Message> = kept.iter().map(|event| event_message(event)).collect();
     let live = hear(live, move |event| (event.id > newest).then(|| event_message(&event)));
-    respond(stream::iter(kept).chain(live), &served, place)
+    respond(stream::iter(kept).chain(live), &app, place)
 }
 
 /// `GET /api/v1/trace?bus=`: the frames of one bus, or of all, from now on.
-pub(super) async fn trace(State(served): State<Arc<Served>>, RawQuery(query): RawQuery) -> Response {
+pub(super) async fn trace(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
     let wanted = match query.as_deref().map(bus_of) {
         None | Some(Ok(None)) => None,
         Some(Ok(Some(name))) => Some(name),
         Some(Err(error)) => {
             let known = Vec::new();
-            return (StatusCode::BAD_REQUEST, Json(api::Problem { error, known })).into_response();
+            return (StatusCode::BAD_REQUEST, Json(api::ErrorReply { error, known })).into_response();
         }
     };
-    let plant = served.plant.load();
+    let plant = app.plant.load();
     let buses = plant.buses.iter().map(|bus| &bus.image);
     let heard: Vec<_> = buses
         .filter(|image| wanted.as_ref().is_none_or(|name| *name == image.spec.name))
@@ -90,18 +90,18 @@ pub(super) async fn trace(State(served): State<Arc<Served>>, RawQuery(query): Ra
         let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
         return not_found(format!("there is no bus `{name}`"), known.collect());
     }
-    match place(&served) {
-        Some(place) => respond(stream::select_all(heard), &served, place),
+    match place(&app) {
+        Some(place) => respond(stream::select_all(heard), &app, place),
         None => full(),
     }
 }
 
-fn place(served: &Served) -> Option<OwnedSemaphorePermit> {
-    served.listeners.clone().try_acquire_owned().ok()
+fn place(app: &AppState) -> Option<OwnedSemaphorePermit> {
+    app.listeners.clone().try_acquire_owned().ok()
 }
 
 fn full() -> Response {
-    let problem = api::Problem {
+    let problem = api::ErrorReply {
         error: format!("{MAX_LISTENERS} event streams are open; close one and try again"),
         known: Vec::new(),
     };
@@ -125,14 +125,14 @@ fn hear<T: Clone + Send + 'static>(
 /// The reply; `place` is given back when the stream ends or the client leaves.
 fn respond(
     messages: impl Stream<Item = Message> + Send + 'static,
-    served: &Served,
+    app: &AppState,
     place: OwnedSemaphorePermit,
 ) -> Response {
     // Something is sent at once, so that a client sees the stream open before there is news.
     let hello = Message::default().retry(RETRY).comment("open");
     let messages = stream::iter([hello])
         .chain(messages)
-        .take_until(served.cancel.clone().cancelled_owned())
+        .take_until(app.cancel.clone().cancelled_owned())
         .map(move |message| {
             let _held = &place;
             Ok::<_, Infallible>(message)
@@ -168,7 +168,7 @@ fn event_id(number: u64) -> String {
 
 /// The kept events for a client that asks now and then.
 #[derive(Debug, Serialize)]
-struct Kept<'e> {
+struct RecentEvents<'e> {
     /// To be sent as `Last-Event-ID` the next time.
     last: String,
     events: Vec<&'e Event>,

@@ -15,7 +15,7 @@ use prometheus_client::encoding::{DescriptorEncoder, MetricEncoder};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 
-use self::families::{Family, Figure, Kind};
+use self::families::{Family, Kind, SeriesValue};
 use super::NorthStats;
 use crate::plant::Plant;
 
@@ -118,16 +118,16 @@ impl Collector for Scrape {
 }
 
 impl Scrape {
-    fn figure(&self, figure: &Figure, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
+    fn figure(&self, figure: &SeriesValue, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
         type NoLabels = [(&'static str, &'static str); 0];
         match (figure, self.format) {
-            (Figure::Value(value), _) => gauge(*value, metric),
+            (SeriesValue::Value(value), _) => gauge(*value, metric),
             // The library appends `_total` to a counter; in the older format the name has it already.
-            (Figure::Count(count), Format::Prometheus) => metric.encode_gauge(count),
-            (Figure::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
-            (Figure::Total(total), Format::Prometheus) => metric.encode_gauge(total),
-            (Figure::Total(total), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, f64>(total, None),
-            (Figure::Histogram(times), _) => {
+            (SeriesValue::Count(count), Format::Prometheus) => metric.encode_gauge(count),
+            (SeriesValue::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
+            (SeriesValue::Total(total), Format::Prometheus) => metric.encode_gauge(total),
+            (SeriesValue::Total(total), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, f64>(total, None),
+            (SeriesValue::Histogram(times), _) => {
                 // The unbounded bucket of the image has the greatest number as its bound.
                 let buckets: Vec<(f64, u64)> = times
                     .buckets

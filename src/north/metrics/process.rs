@@ -1,10 +1,10 @@
-//! Figures of the process itself, from /proc. What cannot be read is left out.
+//! ProcessStats of the process itself, from /proc. What cannot be read is left out.
 
 use std::fs;
 
-/// Figures of the process.
+/// ProcessStats of the process.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Figures {
+pub(super) struct ProcessStats {
     pub(super) cpu_seconds: Option<f64>,
     pub(super) open_fds: Option<f64>,
     pub(super) max_fds: Option<f64>,
@@ -16,7 +16,7 @@ pub(super) struct Figures {
 }
 
 /// The figures now.
-pub(super) fn read() -> Figures {
+pub(super) fn read() -> ProcessStats {
     let ticks = rustix::param::clock_ticks_per_second() as f64;
     let page = rustix::param::page_size() as f64;
     let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
@@ -32,19 +32,19 @@ pub(super) fn read() -> Figures {
     figures
 }
 
-/// Figures of a line of /proc/PID/stat. The second field is the program's name in parentheses and can hold
+/// ProcessStats of a line of /proc/PID/stat. The second field is the program's name in parentheses and can hold
 /// anything, so fields count from its last parenthesis: the first after it is field 3 (proc(5)).
-fn of_stat(stat: &str, ticks: f64, page: f64, boot: Option<f64>) -> Figures {
+fn of_stat(stat: &str, ticks: f64, page: f64, boot: Option<f64>) -> ProcessStats {
     let rest = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
     let fields: Vec<&str> = rest.split_ascii_whitespace().collect();
     let field = |number: usize| -> Option<f64> { fields.get(number.checked_sub(3)?)?.parse().ok() };
-    Figures {
+    ProcessStats {
         cpu_seconds: field(14).zip(field(15)).map(|(user, system)| (user + system) / ticks),
         threads: field(20),
         start_seconds: field(22).zip(boot).map(|(start, boot)| boot + start / ticks),
         virtual_bytes: field(23),
         resident_bytes: field(24).map(|pages| pages * page),
-        ..Figures::default()
+        ..ProcessStats::default()
     }
 }
 
@@ -67,7 +67,7 @@ mod tests {
         assert_eq!(figures.start_seconds, Some(1_700_000_010.0));
         assert_eq!(figures.virtual_bytes, Some(8_192_000.0));
         assert_eq!(figures.resident_bytes, Some(300.0 * 4096.0));
-        assert_eq!(of_stat("", 100.0, 4096.0, None), Figures::default());
+        assert_eq!(of_stat("", 100.0, 4096.0, None), ProcessStats::default());
     }
 
     #[test]

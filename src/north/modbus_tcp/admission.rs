@@ -9,12 +9,13 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio_util::sync::CancellationToken;
 
-use super::connection;
-use super::session::Session;
-use super::shared::{Client, Shared, View};
-use super::tls::{Gatekeeper, Role};
+use super::client::Client;
+use super::routes::PlantView;
+use super::session::ClientSession;
+use super::tls::{Role, TlsAuthenticator};
+use super::{ServerState, connection};
 use crate::command::Authority;
-use crate::north::Turned;
+use crate::north::ConnectionRefusal;
 use crate::north::connection_limit::{ConnectionPermit, LimitReached};
 use crate::north::listener::ConnectionHandler;
 use crate::north::log_throttle::LogThrottle;
@@ -30,7 +31,7 @@ pub(super) enum WriteAccess {
     /// Its address: these networks may write.
     ByAddress(Vec<IpNet>),
     /// The role in its certificate.
-    ByCertificate(Arc<Gatekeeper>),
+    ByCertificate(Arc<TlsAuthenticator>),
 }
 
 /// Admits clients to the sockets of one section of the configuration.
@@ -39,8 +40,8 @@ pub(super) struct Admission {
     pub(super) section: String,
     pub(super) allow: Vec<IpNet>,
     pub(super) write: WriteAccess,
-    pub(super) view: Arc<View>,
-    pub(super) shared: Arc<Shared>,
+    pub(super) view: Arc<PlantView>,
+    pub(super) state: Arc<ServerState>,
     pub(super) cancel: CancellationToken,
     pub(super) logs: RefusalLogs,
 }
@@ -57,7 +58,10 @@ impl ConnectionHandler for Admission {
     fn admits(&self, address: IpAddr) -> bool {
         let admitted = contains(&self.allow, address);
         if !admitted {
-            self.shared.stats.modbus_tcp.turned_away(Turned::NotAllowed);
+            self.state
+                .stats
+                .modbus_tcp
+                .connection_refused(ConnectionRefusal::NotAllowed);
             if let Some(suppressed) = self.logs.not_allowed.permit(Instant::now()) {
                 let section = &self.section;
                 tracing::warn!(client = %address, suppressed,
@@ -68,15 +72,19 @@ impl ConnectionHandler for Admission {
     }
 
     fn refuse(&self, _: &TcpStream, peer: SocketAddr, reached: LimitReached) {
-        let (turned, why, key) = match reached {
-            LimitReached::Total(limit) => (Turned::Full, format!("{limit} connections are open"), "max_connections"),
+        let (refusal, why, key) = match reached {
+            LimitReached::Total(limit) => (
+                ConnectionRefusal::Full,
+                format!("{limit} connections are open"),
+                "max_connections",
+            ),
             LimitReached::Address(limit) => (
-                Turned::AddressFull,
+                ConnectionRefusal::AddressFull,
                 format!("{limit} connections are open from its address"),
                 "max_connections_per_address",
             ),
         };
-        self.shared.stats.modbus_tcp.turned_away(turned);
+        self.state.stats.modbus_tcp.connection_refused(refusal);
         if let Some(suppressed) = self.logs.limit.permit(Instant::now()) {
             tracing::warn!(client = %peer.ip(), suppressed,
                 "Modbus TCP: client refused: {why}; raise `{key}` of [modbus_tcp] or close unused connections");
@@ -94,8 +102,12 @@ impl ConnectionHandler for Admission {
                 };
                 self.converse(stream, Client::new(peer, None, authority)).await;
             }
-            WriteAccess::ByCertificate(gatekeeper) => {
-                match self.cancel.run_until_cancelled(gatekeeper.admit(stream)).await {
+            WriteAccess::ByCertificate(authenticator) => {
+                match self
+                    .cancel
+                    .run_until_cancelled(authenticator.authenticate(stream))
+                    .await
+                {
                     None => {}
                     Some(Ok((stream, known))) => {
                         let authority = match known.role {
@@ -106,7 +118,7 @@ impl ConnectionHandler for Admission {
                             .await;
                     }
                     Some(Err(error)) => {
-                        self.shared.stats.modbus_tcp.turned_away(Turned::Tls);
+                        self.state.stats.modbus_tcp.connection_refused(ConnectionRefusal::Tls);
                         if let Some(suppressed) = self.logs.tls.permit(Instant::now()) {
                             tracing::warn!(client = %peer, suppressed, "Modbus TCP: client refused: TLS: {error}");
                         }
@@ -120,8 +132,8 @@ impl ConnectionHandler for Admission {
 
 impl Admission {
     async fn converse(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client) {
-        let session = Session::new(self.shared.clone(), self.view.clone(), client);
-        let idle_timeout = self.shared.options.idle_timeout;
+        let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
+        let idle_timeout = self.state.options.idle_timeout;
         connection::serve(stream, session, idle_timeout, self.cancel.child_token()).await;
     }
 }

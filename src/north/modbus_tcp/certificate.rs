@@ -26,7 +26,7 @@ const EXTENSIONS: u8 = 0xA3;
 
 /// What a certificate tells.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Facts {
+pub(super) struct CertificateSummary {
     /// Common name of the subject, else the serial number; printable, of bounded length.
     pub(super) name: String,
     /// Seconds since 1970; before 1970 is 0.
@@ -38,7 +38,7 @@ pub(super) struct Facts {
 }
 
 /// Reads a certificate; `None` when it is none.
-pub(super) fn read(der: &[u8]) -> Option<Facts> {
+pub(super) fn read(der: &[u8]) -> Option<CertificateSummary> {
     let mut certificate = Der(Der(der).take(SEQUENCE)?);
     let mut fields = Der(certificate.take(SEQUENCE)?);
     fields.take(VERSION);
@@ -55,7 +55,7 @@ pub(super) fn read(der: &[u8]) -> Option<Facts> {
             role = role_of(Der(Der(content).take(SEQUENCE)?));
         }
     }
-    Some(Facts {
+    Some(CertificateSummary {
         name: common_name(Der(subject)).unwrap_or_else(|| format!("serial {}", hex(serial))),
         not_before,
         not_after,

@@ -12,9 +12,9 @@ use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
-use super::errand::Answered;
+use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
-use super::session::Session;
+use super::session::ClientSession;
 
 /// Time for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
@@ -47,7 +47,7 @@ enum End {
 /// Serves a client until it leaves, misbehaves, is silent for `idle_timeout` or the gateway stops.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
-    session: Session,
+    session: ClientSession,
     idle_timeout: Option<Duration>,
     cancel: CancellationToken,
 ) {
@@ -101,11 +101,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 }
                 self.now = Instant::now();
             }
-            let taken = worked?;
-            if taken.frames > 0 {
+            let consumed = worked?;
+            if consumed.frames > 0 {
                 half_frame_since = None;
                 self.touch();
-                self.give_way(taken.frames).await;
+                self.give_way(consumed.frames).await;
                 if self.since_yield == 0 && cancel.is_cancelled() {
                     return Err(End::Cancelled);
                 }
@@ -191,7 +191,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
 /// What a connection waits for.
 enum Event {
     /// An answer from the bus.
-    Answer(Answered),
+    Answer(AnsweredRequest),
     /// So many bytes from the client, 0 at its end.
     Input(usize),
 }

@@ -6,9 +6,9 @@ use std::time::Instant;
 use futures_util::FutureExt;
 use futures_util::stream::{FuturesUnordered, StreamExt};
 
-use super::errand::{Answered, Waiting};
+use super::forwarded_request::{AnsweredRequest, PendingRequest};
 use super::frame::{self, MAX_FRAME, NotModbus};
-use super::session::Session;
+use super::session::ClientSession;
 
 /// Room for input at first: a frame and its successor. A thousand idle clients should cost no memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
@@ -23,15 +23,15 @@ const TURN: usize = 128;
 
 /// What one turn took.
 #[derive(Debug, Default, Clone, Copy)]
-pub(super) struct Taken {
+pub(super) struct Consumed {
     pub(super) bytes: usize,
     pub(super) frames: usize,
 }
 
 #[derive(Debug)]
 pub(super) struct Dialogue {
-    session: Session,
-    waiting: FuturesUnordered<Waiting>,
+    session: ClientSession,
+    waiting: FuturesUnordered<PendingRequest>,
     input: Vec<u8>,
     /// Bytes in `input` that are not worked off yet.
     filled: usize,
@@ -39,7 +39,7 @@ pub(super) struct Dialogue {
 }
 
 impl Dialogue {
-    pub(super) fn new(session: Session) -> Dialogue {
+    pub(super) fn new(session: ClientSession) -> Dialogue {
         Dialogue {
             session,
             waiting: FuturesUnordered::new(),
@@ -49,7 +49,7 @@ impl Dialogue {
         }
     }
 
-    pub(super) fn session(&self) -> &Session {
+    pub(super) fn session(&self) -> &ClientSession {
         &self.session
     }
 
@@ -60,12 +60,12 @@ impl Dialogue {
 
     /// Where more input goes, and what waits for the bus. There is room after [`Dialogue::work`] while the dialogue is
     /// not full and has no more: a frame is shorter than the input.
-    pub(super) fn parts(&mut self) -> (&mut [u8], &mut FuturesUnordered<Waiting>) {
+    pub(super) fn parts(&mut self) -> (&mut [u8], &mut FuturesUnordered<PendingRequest>) {
         (self.input.get_mut(self.filled..).unwrap_or_default(), &mut self.waiting)
     }
 
-    /// The bus has answered: so the request is answered, or waits for the next piece of what it reads.
-    pub(super) fn finish(&mut self, answered: Answered, now: Instant) {
+    /// The bus has answered: so the request is answered, or waits for the next part of what it reads.
+    pub(super) fn finish(&mut self, answered: AnsweredRequest, now: Instant) {
         self.waiting
             .extend(self.session.finish(answered, now, &mut self.output));
     }
@@ -83,25 +83,25 @@ impl Dialogue {
     ///
     /// # Errors
     /// When what follows is no Modbus. What came before it is answered.
-    pub(super) fn work(&mut self, now: Instant) -> Result<Taken, NotModbus> {
-        let mut taken = Taken::default();
+    pub(super) fn work(&mut self, now: Instant) -> Result<Consumed, NotModbus> {
+        let mut consumed = Consumed::default();
         self.session.refresh();
         let result = loop {
-            if self.is_full() || self.output.len() >= OUTPUT || taken.frames >= TURN {
-                break Ok(taken);
+            if self.is_full() || self.output.len() >= OUTPUT || consumed.frames >= TURN {
+                break Ok(consumed);
             }
-            match frame::decode(self.input.get(taken.bytes..self.filled).unwrap_or_default()) {
+            match frame::decode(self.input.get(consumed.bytes..self.filled).unwrap_or_default()) {
                 Ok(Some(frame)) => {
-                    taken.bytes += frame.used;
-                    taken.frames += 1;
+                    consumed.bytes += frame.used;
+                    consumed.frames += 1;
                     self.waiting.extend(self.session.take(&frame, now, &mut self.output));
                 }
-                Ok(None) => break Ok(taken),
+                Ok(None) => break Ok(consumed),
                 Err(misfit) => break Err(misfit),
             }
         };
-        self.input.copy_within(taken.bytes..self.filled, 0);
-        self.filled -= taken.bytes;
+        self.input.copy_within(consumed.bytes..self.filled, 0);
+        self.filled -= consumed.bytes;
         result
     }
 

@@ -7,14 +7,16 @@
 
 mod admission;
 mod certificate;
+mod client;
+mod command_words;
 mod connection;
 mod dialogue;
-mod errand;
+mod forwarded_request;
 pub(crate) mod frame;
 pub(crate) mod identify;
 mod offline;
+mod routes;
 mod session;
-mod shared;
 mod tls;
 
 use std::io;
@@ -28,8 +30,9 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use self::admission::{Admission, RefusalLogs, WriteAccess};
-use self::shared::{Shared, View};
-use self::tls::Gatekeeper;
+use self::command_words::CommandWords;
+use self::routes::PlantView;
+use self::tls::TlsAuthenticator;
 use crate::north::connection_limit::ConnectionLimit;
 use crate::north::listener::{AcceptLoop, bind};
 use crate::north::{NorthStats, ServerError};
@@ -100,7 +103,7 @@ pub enum Uncached {
 pub struct Server {
     addresses: Vec<SocketAddr>,
     tls_addresses: Vec<SocketAddr>,
-    gatekeeper: Option<Arc<Gatekeeper>>,
+    authenticator: Option<Arc<TlsAuthenticator>>,
     tasks: TaskTracker,
 }
 
@@ -120,8 +123,8 @@ impl Server {
     /// # Errors
     /// When they cannot be used; the old ones stay.
     pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
-        match (&self.gatekeeper, &options.tls) {
-            (Some(gatekeeper), Some(tls)) => gatekeeper.renew(&tls.identity).map_err(ServerError::Tls),
+        match (&self.authenticator, &options.tls) {
+            (Some(authenticator), Some(tls)) => authenticator.renew(&tls.identity).map_err(ServerError::Tls),
             _ => Ok(()),
         }
     }
@@ -129,6 +132,24 @@ impl Server {
     /// Waits until every listener and connection has ended, after the token was cancelled.
     pub async fn stopped(&self) {
         self.tasks.wait().await;
+    }
+}
+
+/// What all connections share.
+#[derive(Debug)]
+struct ServerState {
+    options: Options,
+    stats: Arc<NorthStats>,
+    command_words: CommandWords,
+}
+
+impl ServerState {
+    fn new(options: Options, stats: Arc<NorthStats>) -> ServerState {
+        ServerState {
+            options,
+            stats,
+            command_words: CommandWords::default(),
+        }
     }
 }
 
@@ -155,18 +176,18 @@ async fn open(
     cancel: &CancellationToken,
     tasks: &TaskTracker,
 ) -> Result<Server, ServerError> {
-    let gatekeeper = options.tls.as_ref().map(Gatekeeper::new).transpose();
-    let gatekeeper = gatekeeper.map_err(ServerError::Tls)?.map(Arc::new);
+    let authenticator = options.tls.as_ref().map(TlsAuthenticator::new).transpose();
+    let authenticator = authenticator.map_err(ServerError::Tls)?.map(Arc::new);
     raise_file_limit(options.max_connections);
     let limit = ConnectionLimit::new(options.max_connections, options.max_connections_per_address);
-    let shared = Arc::new(Shared::new(options, stats));
+    let state = Arc::new(ServerState::new(options, stats));
     let accept_loop = |section: &str, allow: &[IpNet], write: WriteAccess, buses: &Option<Vec<String>>| {
         let handler = Arc::new(Admission {
             section: section.to_string(),
             allow: allow.to_vec(),
             write,
-            view: Arc::new(View::new(plant.clone(), buses.clone())),
-            shared: shared.clone(),
+            view: Arc::new(PlantView::new(plant.clone(), buses.clone())),
+            state: state.clone(),
             cancel: cancel.clone(),
             logs: RefusalLogs::default(),
         });
@@ -181,7 +202,7 @@ async fn open(
     };
     let (own, here) = (own_thread(tasks)?, Handle::current());
     let (mut loops, mut addresses, mut tls_addresses) = (Vec::new(), Vec::new(), Vec::new());
-    for listener in &shared.options.listeners {
+    for listener in &state.options.listeners {
         let write = WriteAccess::ByAddress(listener.write.clone());
         let accept = accept_loop(&listener.section, &listener.allow, write, &listener.buses);
         // A socket belongs to the runtime in which it is bound.
@@ -192,8 +213,8 @@ async fn open(
             loops.push((socket, accept(), &own));
         }
     }
-    if let (Some(tls), Some(gatekeeper)) = (&shared.options.tls, &gatekeeper) {
-        let (section, write) = ("[modbus_tcp.tls]", WriteAccess::ByCertificate(gatekeeper.clone()));
+    if let (Some(tls), Some(authenticator)) = (&state.options.tls, &authenticator) {
+        let (section, write) = ("[modbus_tcp.tls]", WriteAccess::ByCertificate(authenticator.clone()));
         let accept = accept_loop(section, &tls.allow, write, &tls.buses);
         for (socket, address) in bind(&tls.listen, PROTOCOL, section).await? {
             tls_addresses.push(address);
@@ -211,7 +232,7 @@ async fn open(
     Ok(Server {
         addresses,
         tls_addresses,
-        gatekeeper,
+        authenticator,
         tasks: tasks.clone(),
     })
 }

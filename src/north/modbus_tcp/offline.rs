@@ -4,10 +4,11 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::Options;
+use super::client::Client;
 use super::dialogue::Dialogue;
-use super::session::Session;
-use super::shared::{Client, Shared, View};
+use super::routes::PlantView;
+use super::session::ClientSession;
+use super::{Options, ServerState};
 use crate::command::Authority;
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
@@ -30,9 +31,9 @@ impl Offline {
         peer: SocketAddr,
         authority: Authority,
     ) -> Offline {
-        let (shared, view) = (Shared::new(options, stats), View::new(plant, None));
+        let (state, view) = (ServerState::new(options, stats), PlantView::new(plant, None));
         let client = Client::new(peer, None, authority);
-        Offline::of(Session::new(Arc::new(shared), Arc::new(view), client))
+        Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))
     }
 
     /// Another client of the same server.
@@ -40,7 +41,7 @@ impl Offline {
         Offline::of(self.dialogue.session().beside(Client::new(peer, None, authority)))
     }
 
-    fn of(session: Session) -> Offline {
+    fn of(session: ClientSession) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
             backlog: Vec::new(),

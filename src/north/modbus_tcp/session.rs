@@ -5,11 +5,12 @@ use std::time::Instant;
 
 use futures_util::FutureExt;
 
-use super::Uncached;
-use super::errand::{Answered, Errand, Step, Waiting, Work, pieces};
+use super::client::Client;
+use super::forwarded_request::{AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, read_parts};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::shared::{Client, Routes, Shared, View};
+use super::routes::{PlantView, Routes};
+use super::{ServerState, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
@@ -17,7 +18,7 @@ use crate::command::{Authority, Order, Outcome};
 use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
 use crate::north::log_throttle::LogThrottle;
-use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
+use crate::north::register_map::{self, BusFigures, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
 use crate::plant::{BusHandle, DriveHandle};
 
 /// Function codes that change something.
@@ -27,12 +28,12 @@ const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
 
 /// What becomes of a request.
 enum Decision {
-    /// Answered at once.
+    /// AnsweredRequest at once.
     Reply(RequestPdu, Reply),
     /// Refused at once.
     Exception(Exception),
     /// The drive is asked, or a command refused on the way to it.
-    Drive(Errand, Work),
+    Drive(ForwardedRequest, BusWork),
 }
 
 impl From<Exception> for Decision {
@@ -43,27 +44,27 @@ impl From<Exception> for Decision {
 
 /// One client.
 #[derive(Debug)]
-pub(super) struct Session {
-    shared: Arc<Shared>,
-    view: Arc<View>,
+pub(super) struct ClientSession {
+    state: Arc<ServerState>,
+    view: Arc<PlantView>,
     client: Client,
     routes: Arc<Routes>,
     foreign_codes: LogThrottle,
 }
 
-impl Drop for Session {
+impl Drop for ClientSession {
     fn drop(&mut self) {
         self.stats().disconnected();
     }
 }
 
-impl Session {
+impl ClientSession {
     /// A client has connected; it has left when the session is dropped.
-    pub(super) fn new(shared: Arc<Shared>, view: Arc<View>, client: Client) -> Session {
-        shared.stats.modbus_tcp.connected();
+    pub(super) fn new(state: Arc<ServerState>, view: Arc<PlantView>, client: Client) -> ClientSession {
+        state.stats.modbus_tcp.connected();
         let routes = view.routes();
-        Session {
-            shared,
+        ClientSession {
+            state,
             view,
             client,
             routes,
@@ -72,8 +73,8 @@ impl Session {
     }
 
     /// Another client has connected to the same server.
-    pub(super) fn beside(&self, client: Client) -> Session {
-        Session::new(self.shared.clone(), self.view.clone(), client)
+    pub(super) fn beside(&self, client: Client) -> ClientSession {
+        ClientSession::new(self.state.clone(), self.view.clone(), client)
     }
 
     /// The client, for the log.
@@ -82,7 +83,7 @@ impl Session {
     }
 
     fn stats(&self) -> &ModbusTcpStats {
-        &self.shared.stats.modbus_tcp
+        &self.state.stats.modbus_tcp
     }
 
     /// Takes over a plant that a reload has put in place.
@@ -94,7 +95,7 @@ impl Session {
 
     /// Answers a request into `out`, or gives what its answer waits for. An order has been queued when this
     /// returns, so orders reach the bus in the order of their frames.
-    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
         match self.decide(frame, now) {
             Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
@@ -104,29 +105,34 @@ impl Session {
                 self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
-            Decision::Drive(errand, work) => {
-                let step = errand.send(work, &self.client, now);
+            Decision::Drive(forwarded, work) => {
+                let step = forwarded.send(work, &self.client, now);
                 return self.follow(step, now, out);
             }
         }
         None
     }
 
-    /// The bus has answered: appends the answer to the request, or gives what it waits for next. A read piece by piece
+    /// The bus has answered: appends the answer to the request, or gives what it waits for next. A read part by part
     /// has its next order in the queue when this returns.
-    pub(super) fn finish(&mut self, answered: Answered, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    pub(super) fn finish(
+        &mut self,
+        answered: AnsweredRequest,
+        now: Instant,
+        out: &mut Vec<u8>,
+    ) -> Option<PendingRequest> {
         let step = answered.go_on(&self.client, now);
         self.follow(step, now, out)
     }
 
-    fn follow(&mut self, mut step: Step, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    fn follow(&mut self, mut step: Progress, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
         loop {
             match step {
-                Step::Done(errand, outcome) => {
-                    self.answer(&errand, &outcome, now, out);
+                Progress::Done(forwarded, outcome) => {
+                    self.answer(&forwarded, &outcome, now, out);
                     return None;
                 }
-                Step::Waits(mut waiting) => match (&mut waiting).now_or_never() {
+                Progress::Pending(mut waiting) => match (&mut waiting).now_or_never() {
                     Some(answered) => step = answered.go_on(&self.client, now),
                     None => return Some(waiting),
                 },
@@ -134,12 +140,13 @@ impl Session {
         }
     }
 
-    fn answer(&mut self, errand: &Errand, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
-        let Errand { header, request, .. } = errand;
-        let drive = &errand.drive.image.spec.name;
-        if errand.resets && !outcome.is_ok() {
-            self.shared
-                .with_command_word(drive, |word| *word = word.map(register_map::without_reset));
+    fn answer(&mut self, forwarded: &ForwardedRequest, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
+        let ForwardedRequest { header, request, .. } = forwarded;
+        let drive = &forwarded.drive.image.spec.name;
+        if forwarded.resets && !outcome.is_ok() {
+            self.state
+                .command_words
+                .update(drive, |word| *word = word.map(register_map::without_reset));
         }
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET
@@ -184,7 +191,12 @@ impl Session {
         // Authority comes before everything that the request could be wrong in.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
-                Ok(request) => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
+                Ok(request) => forwarded(
+                    frame.header,
+                    drive,
+                    request.clone(),
+                    BusWork::Order(Order::Write(request)),
+                ),
                 Err(_) => Exception::FUNCTION.into(),
             };
         }
@@ -219,7 +231,12 @@ impl Session {
                     .map_or_else(Decision::from, |reply| Decision::Reply(request, reply))
             }
             RequestPdu::Read { .. } if has_function => self.raw_read(frame.header, drive, request, now),
-            _ if has_function => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
+            _ if has_function => forwarded(
+                frame.header,
+                drive,
+                request.clone(),
+                BusWork::Order(Order::Write(request)),
+            ),
             _ => Exception::FUNCTION.into(),
         }
     }
@@ -274,15 +291,15 @@ impl Session {
             Ok(words) => Decision::Reply(request, Reply::Registers(words)),
             Err(Unavailable::Refused(code)) => code.into(),
             Err(Unavailable::Stale) => Exception::GATEWAY_TARGET.into(),
-            Err(Unavailable::NotPolled) if self.shared.options.uncached == Uncached::Refuse => {
-                Exception::ADDRESS.into()
+            Err(Unavailable::NotPolled) if self.state.options.uncached == Uncached::Refuse => Exception::ADDRESS.into(),
+            Err(Unavailable::NotPolled) => {
+                match read_parts(drive.bus.image.spec.protocol, &reading, table, start, count) {
+                    Err(code) => code.into(),
+                    Ok(Some(read_parts)) => forwarded(header, drive, request, BusWork::Parts(read_parts)),
+                    Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
+                    Ok(None) => forwarded(header, drive, request.clone(), BusWork::Order(Order::Read(request))),
+                }
             }
-            Err(Unavailable::NotPolled) => match pieces(drive.bus.image.spec.protocol, &reading, table, start, count) {
-                Err(code) => code.into(),
-                Ok(Some(pieces)) => errand(header, drive, request, Work::Pieces(pieces)),
-                Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
-                Ok(None) => errand(header, drive, request.clone(), Work::Order(Order::Read(request))),
-            },
         }
     }
 
@@ -298,8 +315,8 @@ impl Session {
     ) -> Decision {
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
-        let write = self.shared.with_command_word(&spec.name, |last| {
-            let before = register_map::Before { word: *last, fault };
+        let write = self.state.command_words.update(&spec.name, |last| {
+            let before = register_map::CommandContext { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
             let resets = write.word.is_some_and(|word| before.resets(word));
             *last = write.word.or(*last);
@@ -311,20 +328,20 @@ impl Session {
                 drive.image.renew_lease(now);
                 return Decision::Reply(request, Reply::Written);
             }
-            Ok((CommandWrite { points, .. }, resets)) => (Work::Order(Order::Points(points)), resets),
-            Err(refusal) => (Work::Refused(refusal), false),
+            Ok((CommandWrite { points, .. }, resets)) => (BusWork::Order(Order::Points(points)), resets),
+            Err(refusal) => (BusWork::Refused(refusal), false),
         };
-        Decision::Drive(Errand::new(header, drive, request, resets), work)
+        Decision::Drive(ForwardedRequest::new(header, drive, request, resets), work)
     }
 }
 
-fn errand(header: Header, drive: &DriveHandle, request: RequestPdu, work: Work) -> Decision {
-    Decision::Drive(Errand::new(header, drive, request, false), work)
+fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
+    Decision::Drive(ForwardedRequest::new(header, drive, request, false), work)
 }
 
 fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
     let reading = drive.reading(now);
-    Look::new(&reading, drive.bus_up())
+    DriveView::new(&reading, drive.bus_up())
         .registers(start, count)
         .map_or_else(Decision::from, |words| {
             Decision::Reply(request, Reply::Registers(words))

@@ -213,22 +213,22 @@ fn judge_time(file: &Path, der: &CertificateDer<'_>, now: SystemTime) -> Result<
 
 /// What a listener does handshakes with; certificates can be renewed while it serves.
 #[derive(Debug)]
-pub(super) struct Gatekeeper {
+pub(super) struct TlsAuthenticator {
     config: ArcSwap<ServerConfig>,
     roles: BTreeMap<String, Role>,
 }
 
 /// A client that has shown who it is.
 #[derive(Debug)]
-pub(super) struct Known {
+pub(super) struct AuthenticatedClient {
     pub(super) name: String,
     pub(super) role: Role,
 }
 
-impl Gatekeeper {
-    pub(super) fn new(tls: &Tls) -> Result<Gatekeeper, String> {
+impl TlsAuthenticator {
+    pub(super) fn new(tls: &Tls) -> Result<TlsAuthenticator, String> {
         let config = tls.identity.server_config().map_err(|(_, text)| text)?;
-        Ok(Gatekeeper {
+        Ok(TlsAuthenticator {
             config: ArcSwap::new(config),
             roles: tls.roles.clone(),
         })
@@ -244,7 +244,10 @@ impl Gatekeeper {
     ///
     /// # Errors
     /// Why the client is refused.
-    pub(super) async fn admit(&self, stream: TcpStream) -> Result<(TlsStream<TcpStream>, Known), String> {
+    pub(super) async fn authenticate(
+        &self,
+        stream: TcpStream,
+    ) -> Result<(TlsStream<TcpStream>, AuthenticatedClient), String> {
         let handshake = TlsAcceptor::from(self.config.load_full()).accept(stream);
         let stream = tokio::time::timeout(HANDSHAKE, handshake)
             .await
@@ -254,11 +257,11 @@ impl Gatekeeper {
         // The verifier lets nobody in without one; a certificate that rustls can read and this house cannot gets no role.
         let facts = certificate.and_then(|der| certificate::read(der));
         let known = match facts {
-            Some(facts) => Known {
+            Some(facts) => AuthenticatedClient {
                 role: self.role(facts.role.as_deref()),
                 name: facts.name,
             },
-            None => Known {
+            None => AuthenticatedClient {
                 role: Role::Monitor,
                 name: "unreadable certificate".to_string(),
             },

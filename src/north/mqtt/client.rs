@@ -12,9 +12,9 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::commands::{Commands, Ended};
-use super::connection::{self, Bounds, Connection, KEEP_ALIVE, News};
-use super::outbox::{Acked, Message, Outbox};
+use super::commands::{Commands, FinishedCommand};
+use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
+use super::outbox::{Acknowledged, Message, Outbox};
 use super::payload::{self, Topics};
 use super::publisher::Publisher;
 use super::request::Incoming;
@@ -54,7 +54,7 @@ pub(super) async fn run(
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            news = next(&mut client.link), if client.commands.has_room() => client.on_news(news),
+            event = next(&mut client.link), if client.commands.has_room() => client.on_connection_event(event),
             ended = client.commands.finished() => client.on_ended(ended),
             _ = ticks.tick() => client.on_tick().await,
         }
@@ -64,23 +64,23 @@ pub(super) async fn run(
 }
 
 /// What the connection tells next; waits for ever while there is none. May be cancelled without loss.
-async fn next(link: &mut Link) -> News {
+async fn next(link: &mut BrokerLink) -> ConnectionEvent {
     match link {
-        Link::Away { .. } => std::future::pending().await,
-        Link::Open(session) => session.connection.next().await,
+        BrokerLink::Away { .. } => std::future::pending().await,
+        BrokerLink::Open(session) => session.connection.next().await,
     }
 }
 
 #[derive(Debug)]
-enum Link {
+enum BrokerLink {
     /// No connection; the next attempt comes then.
     Away { until: Instant },
     /// A connection, not necessarily taken by the broker yet.
-    Open(Session),
+    Open(BrokerSession),
 }
 
 #[derive(Debug)]
-struct Session {
+struct BrokerSession {
     connection: Connection,
     phase: Phase,
     /// When the broker was last heard of.
@@ -90,8 +90,8 @@ struct Session {
 #[derive(Debug, Clone, Copy)]
 enum Phase {
     Connecting,
-    Subscribing { bounds: Bounds, since: Instant },
-    Ready { bounds: Bounds, since: Instant },
+    Subscribing { limits: BrokerLimits, since: Instant },
+    Ready { limits: BrokerLimits, since: Instant },
 }
 
 struct Client {
@@ -106,7 +106,7 @@ struct Client {
     outbox: Outbox,
     store: EventStore,
     commands: Commands,
-    link: Link,
+    link: BrokerLink,
     /// Wait before the next attempt.
     back_off: Duration,
     /// Why there is no connection, as it was last logged.
@@ -129,7 +129,7 @@ impl Client {
             store: EventStore::open(options.buffer.clone()).await,
             commands: Commands::new(topics.clone()),
             outbox: Outbox::default(),
-            link: Link::Away { until: now },
+            link: BrokerLink::Away { until: now },
             back_off: BACK_OFF.0,
             trouble: None,
             missed: 0,
@@ -183,47 +183,49 @@ impl Client {
         let Some((topic, payload)) = payload::event(&self.topics, event) else {
             return;
         };
-        self.store.push(Message::passing(topic, payload), &mut self.outbox);
+        self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
     }
 
-    fn on_news(&mut self, news: News) {
-        let Link::Open(session) = &mut self.link else { return };
-        if !matches!(news, News::Sent(_)) {
+    fn on_connection_event(&mut self, event: ConnectionEvent) {
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
+        if !matches!(event, ConnectionEvent::Sent(_)) {
             session.heard = Instant::now();
         }
-        match news {
-            News::Connected(bounds) => self.connected(bounds),
-            News::Subscribed(refused) => {
+        match event {
+            ConnectionEvent::Connected(limits) => self.connected(limits),
+            ConnectionEvent::Subscribed(refused) => {
                 if let Some(why) = refused {
                     tracing::error!(
                         "the broker refuses the set topics ({why}): no commands by MQTT; allow the client to subscribe to {}",
                         self.topics.set_filters().join(" and ")
                     );
                 }
-                if let Phase::Subscribing { bounds, since } = session.phase {
-                    self.ready(bounds, since);
+                if let Phase::Subscribing { limits, since } = session.phase {
+                    self.ready(limits, since);
                 }
             }
-            News::Sent(packet) => {
+            ConnectionEvent::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
                     self.lost(why);
                 }
             }
-            News::Acked(packet) => {
+            ConnectionEvent::Acked(packet) => {
                 self.stats.mqtt.published.fetch_add(1, Ordering::Relaxed);
                 let acked = self.outbox.acked(packet);
                 self.done(acked);
             }
-            News::Refused(packet, why) => {
+            ConnectionEvent::Refused(packet, why) => {
                 let acked = self.outbox.acked(packet);
-                if let Some(Acked { topic, .. }) = &acked {
+                if let Some(Acknowledged { topic, .. }) = &acked {
                     self.tell_refused(topic, &format!("the broker refuses it: {why}"));
                 }
                 self.done(acked);
             }
-            News::Command(publish) => self.on_command(*publish),
-            News::Alive => {}
-            News::Lost(why) => self.lost(&why),
+            ConnectionEvent::SetMessage(publish) => self.on_command(*publish),
+            ConnectionEvent::Alive => {}
+            ConnectionEvent::Lost(why) => self.lost(&why),
         }
     }
 
@@ -235,29 +237,33 @@ impl Client {
     }
 
     /// An entry left the outbox: the disk need not keep it.
-    fn done(&mut self, acked: Option<Acked>) {
+    fn done(&mut self, acked: Option<Acknowledged>) {
         if let Some(record) = acked.and_then(|a| a.record) {
             self.store.acknowledge(record);
         }
     }
 
-    fn connected(&mut self, bounds: Bounds) {
+    fn connected(&mut self, limits: BrokerLimits) {
         let since = Instant::now();
-        let Link::Open(session) = &mut self.link else { return };
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
         if !self.options.commands {
-            self.ready(bounds, since);
+            self.ready(limits, since);
         } else if session.connection.subscribe(self.topics.set_filters()) {
             // Who reads `online` may command: first the subscription, then the birth.
-            session.phase = Phase::Subscribing { bounds, since };
+            session.phase = Phase::Subscribing { limits, since };
         } else {
             self.lost("the subscription could not be sent");
         }
     }
 
     /// Birth: status first, then everything there is.
-    fn ready(&mut self, bounds: Bounds, since: Instant) {
-        let Link::Open(session) = &mut self.link else { return };
-        session.phase = Phase::Ready { bounds, since };
+    fn ready(&mut self, limits: BrokerLimits, since: Instant) {
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
+        session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
         self.trouble = None;
@@ -270,7 +276,7 @@ impl Client {
     fn lost(&mut self, why: &str) {
         let now = Instant::now();
         let held = match &self.link {
-            Link::Open(Session {
+            BrokerLink::Open(BrokerSession {
                 phase: Phase::Ready { since, .. },
                 ..
             }) => now.saturating_duration_since(*since),
@@ -282,7 +288,7 @@ impl Client {
         let wait = jittered(self.back_off, RandomState::new().hash_one(0));
         self.back_off = (self.back_off * 2).min(BACK_OFF.1);
         // Dropping the session ends its task and closes the socket.
-        self.link = Link::Away { until: now + wait };
+        self.link = BrokerLink::Away { until: now + wait };
         self.outbox.lost();
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
         if self.trouble.as_deref() == Some(why) {
@@ -324,7 +330,7 @@ impl Client {
         }
     }
 
-    fn on_ended(&mut self, ended: Ended) {
+    fn on_ended(&mut self, ended: FinishedCommand) {
         let result = self.commands.result(ended, SystemTime::now());
         self.outbox.push_result(result);
     }
@@ -333,9 +339,9 @@ impl Client {
         let now = Instant::now();
         self.follow_plant();
         match &self.link {
-            Link::Away { until } if now >= *until => self.connect().await,
-            Link::Away { .. } => {}
-            Link::Open(session) => match session.phase {
+            BrokerLink::Away { until } if now >= *until => self.connect().await,
+            BrokerLink::Away { .. } => {}
+            BrokerLink::Open(session) => match session.phase {
                 Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
                     self.lost("the broker does not answer the subscription");
                 }
@@ -377,7 +383,7 @@ impl Client {
         match config.unwrap_or_else(|e| Err(e.to_string())) {
             Ok(config) => {
                 let connection = Connection::open(&self.options, self.topics.status(), config);
-                self.link = Link::Open(Session {
+                self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
                     heard: now,
@@ -390,15 +396,15 @@ impl Client {
     /// Hands over to the connection what may go.
     fn pump(&mut self) {
         self.store.refill(&mut self.outbox);
-        if let Link::Open(Session {
+        if let BrokerLink::Open(BrokerSession {
             connection,
-            phase: Phase::Ready { bounds, .. },
+            phase: Phase::Ready { limits, .. },
             ..
         }) = &self.link
         {
-            let most = bounds.max_packet;
+            let most = limits.max_packet;
             let mut oversized = Vec::new();
-            while let Some((key, message)) = self.outbox.next(bounds.limit) {
+            while let Some((key, message)) = self.outbox.next(limits.limit) {
                 if connection::packet_size(&message) > most {
                     oversized.push(self.outbox.give_up(key));
                 } else if connection.publish(message) {
@@ -408,7 +414,7 @@ impl Client {
                 }
             }
             for acked in oversized {
-                if let Some(Acked { topic, .. }) = &acked {
+                if let Some(Acknowledged { topic, .. }) = &acked {
                     self.tell_refused(topic, &format!("the broker takes packets of {most} bytes at most"));
                 }
                 self.done(acked);
@@ -448,7 +454,7 @@ impl Client {
         self.options.commands = false;
         self.outbox.drop_telemetry();
         let mut offline_put = false;
-        while matches!(&self.link, Link::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
+        while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
             self.pump();
             let quiet = self.commands.is_idle() && self.outbox.waiting() == 0;
             if !offline_put && (quiet || tokio::time::Instant::now() >= last_results) {
@@ -460,17 +466,17 @@ impl Client {
                 break;
             }
             tokio::select! {
-                news = next(&mut self.link), if self.commands.has_room() => self.on_news(news),
+                event = next(&mut self.link), if self.commands.has_room() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
                 () = tokio::time::sleep_until(last_results), if !offline_put => {}
             }
         }
-        if let Link::Open(session) = &mut self.link
+        if let BrokerLink::Open(session) = &mut self.link
             && !matches!(session.phase, Phase::Connecting)
             && session.connection.disconnect()
         {
-            while !matches!(session.connection.next().await, News::Lost(_)) {}
+            while !matches!(session.connection.next().await, ConnectionEvent::Lost(_)) {}
         }
     }
 }

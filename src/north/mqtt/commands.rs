@@ -21,12 +21,12 @@ use crate::plant::{Placed, Plant};
 
 /// Commands that wait for their answer from the bus, and bytes that are kept for their results. Only stops can be so many:
 /// of all else the queues of the buses take fewer.
-const WAITING: Bound = Bound {
+const WAITING: QueueLimit = QueueLimit {
     most: 4096,
     bytes: 8 << 20,
 };
 /// The same of commands that the drive acknowledged and that wait for the read that shows their effect.
-const CONFIRMING: Bound = Bound {
+const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
@@ -42,19 +42,19 @@ pub(super) struct Commands {
     /// All that comes over the connection to the broker is one client.
     client: Arc<str>,
     /// In the order in which they were taken.
-    waiting: Row,
+    waiting: PendingCommands,
     /// In the order in which they were acknowledged.
-    confirming: Row,
+    confirming: PendingCommands,
     hasher: RandomState,
     /// Commands taken, oldest first.
-    recent: VecDeque<Taken>,
+    recent: VecDeque<RecentCommand>,
     /// Commands taken so far: their numbers.
     taken: u64,
 }
 
 /// A command under way.
 #[derive(Debug)]
-struct Running {
+struct PendingCommand {
     number: u64,
     id: Option<Json>,
     reply: Reply,
@@ -63,7 +63,7 @@ struct Running {
 
 /// A command of which all is known that its result tells.
 #[derive(Debug)]
-pub(super) struct Ended {
+pub(super) struct FinishedCommand {
     number: u64,
     id: Option<Json>,
     reply: Reply,
@@ -73,7 +73,7 @@ pub(super) struct Ended {
 
 /// A command that was taken.
 #[derive(Debug)]
-struct Taken {
+struct RecentCommand {
     number: u64,
     fingerprint: u64,
     packet: u16,
@@ -91,8 +91,8 @@ impl Commands {
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
-            waiting: Row::default(),
-            confirming: Row::default(),
+            waiting: PendingCommands::default(),
+            confirming: PendingCommands::default(),
             hasher: RandomState::new(),
             recent: VecDeque::new(),
             taken: 0,
@@ -153,21 +153,21 @@ impl Commands {
             return Some(reply.message(request.id, &answer, None, time));
         }
         let stops = drive.stops();
-        let running = Running {
+        let pending = PendingCommand {
             number: self.remember(fingerprint, &incoming, identity, stops, now),
             id: request.id,
             reply,
             placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
         };
-        self.follow(running, time)
+        self.follow(pending, time)
     }
 
     /// What was refused has its result at once; all else waits.
-    fn follow(&mut self, mut running: Running, time: SystemTime) -> Option<Message> {
-        match running.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
-            Some(answer) => Some(self.result(running.end(answer, None), time)),
+    fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
+        match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            Some(answer) => Some(self.result(pending.end(answer, None), time)),
             None => {
-                self.waiting.push(running);
+                self.waiting.push(pending);
                 None
             }
         }
@@ -185,9 +185,15 @@ impl Commands {
     }
 
     /// The command that a message repeats. An `id` that was used for something else since is no sign of a repetition.
-    fn repeated(&self, incoming: &Incoming, fingerprint: u64, identity: Option<u64>, now: Instant) -> Option<&Taken> {
+    fn repeated(
+        &self,
+        incoming: &Incoming,
+        fingerprint: u64,
+        identity: Option<u64>,
+        now: Instant,
+    ) -> Option<&RecentCommand> {
         let newest_first = || self.recent.iter().rev();
-        let same = |known: &&Taken| known.fingerprint == fingerprint;
+        let same = |known: &&RecentCommand| known.fingerprint == fingerprint;
         let marked = newest_first().find(|known| incoming.dup && known.packet == incoming.packet && same(known));
         let by_id = || {
             let last = newest_first().find(|known| identity.is_some() && known.identity == identity);
@@ -208,7 +214,7 @@ impl Commands {
             self.recent.pop_front();
         }
         self.taken += 1;
-        self.recent.push_back(Taken {
+        self.recent.push_back(RecentCommand {
             number: self.taken,
             fingerprint,
             packet: incoming.packet,
@@ -221,43 +227,45 @@ impl Commands {
     }
 
     /// The next command that ends; waits for ever when none is under way. May be cancelled without loss.
-    pub(super) async fn finished(&mut self) -> Ended {
+    pub(super) async fn finished(&mut self) -> FinishedCommand {
         poll_fn(|cx| self.poll_finished(cx)).await
     }
 
-    /// The next command that has ended, if there is one.
-    pub(super) fn try_finished(&mut self) -> Option<Ended> {
+    /// The next command that has finished, if there is one.
+    pub(super) fn try_finished(&mut self) -> Option<FinishedCommand> {
         match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
-            Poll::Ready(ended) => Some(ended),
+            Poll::Ready(finished) => Some(finished),
             Poll::Pending => None,
         }
     }
 
     /// Those that the drive acknowledged make room for those that wait for the bus; if too many wait for the read that
     /// shows their effect, the oldest stays "acknowledged".
-    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Ended> {
-        while let Some(mut running) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
-            match running.placed.answer() {
-                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(running.end(answer, None)),
-                _ => self.confirming.push(running),
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
+        while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
+            match pending.placed.answer() {
+                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, None)),
+                _ => self.confirming.push(pending),
             }
         }
-        let settled = |running: &mut Running| running.placed.poll_confirmation(cx).is_ready();
+        let settled = |pending: &mut PendingCommand| pending.placed.poll_confirmation(cx).is_ready();
         let next = self.confirming.take(settled).or_else(|| {
             let full = self.confirming.is_full(CONFIRMING);
             full.then(|| self.confirming.take(|_| true)).flatten()
         });
-        let ended = next.and_then(|mut running| {
-            let (answer, confirmed) = (running.placed.answer()?, running.placed.confirmation().flatten());
-            Some(running.end(answer, confirmed))
+        let finished = next.and_then(|mut pending| {
+            let (answer, confirmed) = (pending.placed.answer()?, pending.placed.confirmation().flatten());
+            Some(pending.end(answer, confirmed))
         });
-        ended.map_or(Poll::Pending, Poll::Ready)
+        finished.map_or(Poll::Pending, Poll::Ready)
     }
 
-    /// The one result of a command that ended, at `time`.
-    pub(super) fn result(&mut self, ended: Ended, time: SystemTime) -> Message {
-        let message = ended.reply.message(ended.id, &ended.answer, ended.confirmed, time);
-        if let Some(known) = self.recent.iter_mut().find(|known| known.number == ended.number) {
+    /// The one result of a command that finished, at `time`.
+    pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
+        let message = finished
+            .reply
+            .message(finished.id, &finished.answer, finished.confirmed, time);
+        if let Some(known) = self.recent.iter_mut().find(|known| known.number == finished.number) {
             known.result = Some(message.clone());
         }
         message
@@ -269,9 +277,9 @@ impl Commands {
     }
 }
 
-impl Running {
-    fn end(self, answer: Answer, confirmed: Option<Duration>) -> Ended {
-        Ended {
+impl PendingCommand {
+    fn end(self, answer: Answer, confirmed: Option<Duration>) -> FinishedCommand {
+        FinishedCommand {
             number: self.number,
             id: self.id,
             reply: self.reply,
@@ -288,33 +296,33 @@ impl Running {
 
 /// How much a row may hold.
 #[derive(Debug, Clone, Copy)]
-struct Bound {
+struct QueueLimit {
     most: usize,
     bytes: usize,
 }
 
 /// Commands in their order.
 #[derive(Debug, Default)]
-struct Row {
-    commands: VecDeque<Running>,
+struct PendingCommands {
+    commands: VecDeque<PendingCommand>,
     bytes: usize,
 }
 
-impl Row {
-    fn push(&mut self, running: Running) {
-        self.bytes += running.bytes();
-        self.commands.push_back(running);
+impl PendingCommands {
+    fn push(&mut self, pending: PendingCommand) {
+        self.bytes += pending.bytes();
+        self.commands.push_back(pending);
     }
 
     /// Takes out the first one that `is_it`.
-    fn take(&mut self, is_it: impl FnMut(&mut Running) -> bool) -> Option<Running> {
+    fn take(&mut self, is_it: impl FnMut(&mut PendingCommand) -> bool) -> Option<PendingCommand> {
         let place = self.commands.iter_mut().position(is_it)?;
-        let running = self.commands.remove(place)?;
-        self.bytes -= running.bytes();
-        Some(running)
+        let pending = self.commands.remove(place)?;
+        self.bytes -= pending.bytes();
+        Some(pending)
     }
 
-    fn is_full(&self, bound: Bound) -> bool {
+    fn is_full(&self, bound: QueueLimit) -> bool {
         self.commands.len() >= bound.most || self.bytes >= bound.bytes
     }
 

@@ -29,7 +29,7 @@ const INFLIGHT: u16 = 100;
 /// Room for half of them, the subscription and the disconnect.
 const REQUESTS: usize = INFLIGHT as usize;
 /// What happened that the client has not looked at; when full, polling pauses.
-const NEWS: usize = 64;
+const EVENTS: usize = 64;
 /// Largest packet taken from the broker. Larger than any command, so that one that is too long is answered.
 const MAX_PACKET: u32 = 256 * 1024;
 /// Commands that the broker may send before the first is acknowledged.
@@ -39,9 +39,9 @@ const CONNECT_TIMEOUT: u64 = 5;
 
 /// What happened on the connection.
 #[derive(Debug)]
-pub(super) enum News {
+pub(super) enum ConnectionEvent {
     /// The broker took the connection.
-    Connected(Bounds),
+    Connected(BrokerLimits),
     /// The broker answered the subscription; with what it refused.
     Subscribed(Option<String>),
     /// The oldest message handed over was sent under this packet id.
@@ -51,7 +51,7 @@ pub(super) enum News {
     /// The broker refuses the message for good.
     Refused(u16, String),
     /// A message on a set topic.
-    Command(Box<Publish>),
+    SetMessage(Box<Publish>),
     /// The broker is alive.
     Alive,
     /// The connection is gone, and why. Nothing comes after this.
@@ -60,19 +60,19 @@ pub(super) enum News {
 
 /// What the broker allows.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Bounds {
+pub(super) struct BrokerLimits {
     /// Messages under way at one time: half the inflight window.
     pub(super) limit: usize,
     /// Largest packet.
     pub(super) max_packet: usize,
 }
 
-impl Bounds {
-    fn of(ack: &ConnAck) -> Bounds {
+impl BrokerLimits {
+    fn of(ack: &ConnAck) -> BrokerLimits {
         let properties = ack.properties.as_ref();
         let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
         let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
-        Bounds {
+        BrokerLimits {
             limit: usize::from(window / 2).max(1),
             max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
         }
@@ -83,7 +83,7 @@ impl Bounds {
 #[derive(Debug)]
 pub(super) struct Connection {
     client: AsyncClient,
-    news: mpsc::Receiver<News>,
+    event: mpsc::Receiver<ConnectionEvent>,
     task: JoinHandle<()>,
 }
 
@@ -97,16 +97,16 @@ impl Connection {
     /// Begins to connect; `will` is the topic of the last will `offline`.
     pub(super) fn open(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> Connection {
         let (client, eventloop) = AsyncClient::new(mqtt_options(options, will, tls), REQUESTS);
-        let (sender, news) = mpsc::channel(NEWS);
+        let (sender, event) = mpsc::channel(EVENTS);
         let task = tokio::spawn(poll(eventloop, sender));
-        Connection { client, news, task }
+        Connection { client, event, task }
     }
 
     /// What happens next; may be cancelled without loss.
-    pub(super) async fn next(&mut self) -> News {
+    pub(super) async fn next(&mut self) -> ConnectionEvent {
         // The sender only goes without a word when the task panicked.
-        let silent = || News::Lost("the MQTT client failed".to_string());
-        self.news.recv().await.unwrap_or_else(silent)
+        let silent = || ConnectionEvent::Lost("the MQTT client failed".to_string());
+        self.event.recv().await.unwrap_or_else(silent)
     }
 
     /// Asks for all set topics. Retained messages are sent too, marked as such even when they arrive while
@@ -178,41 +178,43 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
 }
 
 /// Polls until the first error, and tells what happens.
-async fn poll(mut eventloop: EventLoop, news: mpsc::Sender<News>) {
+async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>) {
     loop {
         let item = match eventloop.poll().await {
             Ok(event) => interpret(event),
-            Err(error) => Some(News::Lost(reason(&error))),
+            Err(error) => Some(ConnectionEvent::Lost(reason(&error))),
         };
         let Some(item) = item else { continue };
-        let end = matches!(item, News::Lost(_));
-        if news.send(item).await.is_err() || end {
+        let end = matches!(item, ConnectionEvent::Lost(_));
+        if event.send(item).await.is_err() || end {
             return;
         }
     }
 }
 
-fn interpret(event: Event) -> Option<News> {
+fn interpret(event: Event) -> Option<ConnectionEvent> {
     match event {
-        Event::Incoming(Packet::ConnAck(ack)) => Some(News::Connected(Bounds::of(&ack))),
+        Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
             let granted = |code: &SubscribeReasonCode| matches!(code, SubscribeReasonCode::Success(_));
             let refused = ack.return_codes.iter().find(|code| !granted(code));
-            Some(News::Subscribed(refused.map(|code| format!("{code:?}"))))
+            Some(ConnectionEvent::Subscribed(refused.map(|code| format!("{code:?}"))))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
-            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => News::Acked(ack.pkid),
+            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),
             PubAckReason::NotAuthorized | PubAckReason::TopicNameInvalid | PubAckReason::PayloadFormatInvalid => {
-                News::Refused(ack.pkid, format!("{:?}", ack.reason))
+                ConnectionEvent::Refused(ack.pkid, format!("{:?}", ack.reason))
             }
             // The broker cannot take it now: try again on a new connection, a little later.
-            other => News::Lost(format!("the broker cannot take messages now: {other:?}")),
+            other => ConnectionEvent::Lost(format!("the broker cannot take messages now: {other:?}")),
         }),
-        Event::Incoming(Packet::Publish(publish)) => Some(News::Command(Box::new(publish))),
-        Event::Incoming(_) => Some(News::Alive),
-        Event::Outgoing(Outgoing::Publish(packet)) => Some(News::Sent(packet)),
+        Event::Incoming(Packet::Publish(publish)) => Some(ConnectionEvent::SetMessage(Box::new(publish))),
+        Event::Incoming(_) => Some(ConnectionEvent::Alive),
+        Event::Outgoing(Outgoing::Publish(packet)) => Some(ConnectionEvent::Sent(packet)),
         // A packet id was to be used again before it was free. rumqttc could wait for ever.
-        Event::Outgoing(Outgoing::AwaitAck(_)) => Some(News::Lost("the broker left a message unacknowledged".into())),
+        Event::Outgoing(Outgoing::AwaitAck(_)) => {
+            Some(ConnectionEvent::Lost("the broker left a message unacknowledged".into()))
+        }
         Event::Outgoing(_) => None,
     }
 }

@@ -297,7 +297,7 @@ impl Record {
         let (topic, payload) = rest.split_at_checked(usize::from(u16::from_le_bytes(*topic_length)))?;
         Some(Record {
             waits,
-            message: Message::passing(std::str::from_utf8(topic).ok()?, payload.to_vec()),
+            message: Message::not_retained(std::str::from_utf8(topic).ok()?, payload.to_vec()),
             length: HEADER + body.len(),
         })
     }
@@ -352,7 +352,7 @@ mod tests {
     const BIG: u64 = 1 << 20;
 
     fn event(n: usize) -> Message {
-        Message::passing("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
+        Message::not_retained("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
     }
 
     fn number(message: &Message) -> usize {
@@ -465,7 +465,7 @@ mod tests {
             journal.acknowledge(record).unwrap();
         }
         assert_eq!((journal.bytes(), segments(dir.path()).len()), (0, 1));
-        assert!(journal.append(&Message::passing("t", vec![0; 5000])).is_err());
+        assert!(journal.append(&Message::not_retained("t", vec![0; 5000])).is_err());
     }
 
     #[test]

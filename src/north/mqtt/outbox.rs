@@ -31,7 +31,7 @@ pub(super) struct Message {
 
 impl Message {
     /// A message that the broker does not keep.
-    pub(super) fn passing(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
+    pub(super) fn not_retained(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
         Message {
             topic: topic.into(),
             payload,
@@ -58,7 +58,7 @@ pub(super) enum Key {
 
 /// What was acknowledged.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Acked {
+pub(super) struct Acknowledged {
     /// Topic of the message.
     pub(super) topic: Arc<str>,
     /// Its record on disk.
@@ -235,12 +235,12 @@ impl Outbox {
     }
 
     /// The broker acknowledged a message: its entry leaves.
-    pub(super) fn acked(&mut self, packet: u16) -> Option<Acked> {
+    pub(super) fn acked(&mut self, packet: u16) -> Option<Acknowledged> {
         self.settle(self.flying.get(&packet).cloned()?, Some(packet))
     }
 
     /// Gives up the message of `key`, which cannot be sent.
-    pub(super) fn give_up(&mut self, key: Key) -> Option<Acked> {
+    pub(super) fn give_up(&mut self, key: Key) -> Option<Acknowledged> {
         if let Key::Latest(topic) = &key {
             self.latest.get_mut(topic)?.waiting = None;
             self.order.retain(|t| t != topic);
@@ -248,7 +248,7 @@ impl Outbox {
         self.settle(key, None)
     }
 
-    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acked> {
+    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acknowledged> {
         if let Some(packet) = packet {
             self.flying.remove(&packet);
         }
@@ -259,7 +259,7 @@ impl Outbox {
                 if slot.waiting.is_none() {
                     self.latest.remove(&topic);
                 }
-                Some(Acked { topic, record: None })
+                Some(Acknowledged { topic, record: None })
             }
             Key::Result(serial) => take(&mut self.results, serial),
             Key::Event(serial) => take(&mut self.events, serial),
@@ -329,9 +329,9 @@ fn mark(queue: &mut VecDeque<Entry>, serial: u64) {
     }
 }
 
-fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acked> {
+fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acknowledged> {
     let index = queue.iter().position(|e| e.serial == serial)?;
-    queue.remove(index).map(|entry| Acked {
+    queue.remove(index).map(|entry| Acknowledged {
         topic: entry.message.topic,
         record: entry.record,
     })
@@ -346,7 +346,7 @@ mod tests {
     }
 
     fn event(name: &str) -> Message {
-        Message::passing(name, Vec::new())
+        Message::not_retained(name, Vec::new())
     }
 
     /// Hands everything over that may go; returns topics and payloads.

@@ -74,7 +74,7 @@ pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
 
 /// What the state object of a drive tells, its times apart: a change of it is worth a message.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Shown {
+pub(super) struct StateContent {
     /// `None` while it is not known.
     pub(super) state: Option<State>,
     pub(super) quality: Quality,
@@ -88,13 +88,13 @@ pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String
     (!point.texts.is_empty()).then(|| (format!("{}_text", point.name), text))
 }
 
-impl Shown {
-    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> Shown {
+impl StateContent {
+    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
             (sample.good(), sample.quality)
         };
-        Shown {
+        StateContent {
             state: reading.state(),
             quality: reading.overall(),
             points: points.map(shown).collect(),
@@ -104,7 +104,7 @@ impl Shown {
 
 /// The state object of a drive.
 pub(super) struct StateObject<'s> {
-    pub(super) shown: &'s Shown,
+    pub(super) shown: &'s StateContent,
     /// Names in the order of `shown.points`.
     pub(super) names: &'s [String],
     /// Their indices in the profile.
@@ -156,7 +156,7 @@ fn tidy(value: Value) -> Value {
 
 /// The payload of a point topic.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Bare {
+pub(super) enum PointPayload {
     /// Nothing good is known: an empty payload, which takes the retained value away.
     Nothing,
     /// A value.
@@ -167,32 +167,32 @@ pub(super) enum Bare {
     FaultText(i64),
 }
 
-impl Bare {
+impl PointPayload {
     /// The value, if it is good.
-    pub(super) fn of(value: Option<Value>) -> Bare {
-        value.map_or(Bare::Nothing, Bare::Value)
+    pub(super) fn of(value: Option<Value>) -> PointPayload {
+        value.map_or(PointPayload::Nothing, PointPayload::Value)
     }
 
     /// The drive in one word, if that is known.
-    pub(super) fn state(state: Option<State>) -> Bare {
-        state.map_or(Bare::Nothing, Bare::State)
+    pub(super) fn state(state: Option<State>) -> PointPayload {
+        state.map_or(PointPayload::Nothing, PointPayload::State)
     }
 
     /// The text of the active fault, if the fault code is good.
-    pub(super) fn fault_text(reading: &Reading<'_>) -> Bare {
+    pub(super) fn fault_text(reading: &Reading<'_>) -> PointPayload {
         match reading.model(ModelPoint::FaultCode).good() {
-            Some(Value::Integer(code)) => Bare::FaultText(code),
-            _ => Bare::Nothing,
+            Some(Value::Integer(code)) => PointPayload::FaultText(code),
+            _ => PointPayload::Nothing,
         }
     }
 
     /// The bytes: `true`, `false`, a shortest decimal, a word, or nothing.
     pub(super) fn render(self, profile: &Profile) -> Vec<u8> {
         match self {
-            Bare::Nothing => Vec::new(),
-            Bare::Value(value) => tidy(value).to_string().into_bytes(),
-            Bare::State(state) => state.name().into(),
-            Bare::FaultText(code) => profile.fault_text(code).into_bytes(),
+            PointPayload::Nothing => Vec::new(),
+            PointPayload::Value(value) => tidy(value).to_string().into_bytes(),
+            PointPayload::State(state) => state.name().into(),
+            PointPayload::FaultText(code) => profile.fault_text(code).into_bytes(),
         }
     }
 }
@@ -321,7 +321,7 @@ mod tests {
             .get("vacon-nx")
             .unwrap()
             .clone();
-        let text = |bare: Bare| String::from_utf8(bare.render(&profile)).unwrap();
+        let text = |bare: PointPayload| String::from_utf8(bare.render(&profile)).unwrap();
         for (value, expected) in [
             (Value::Number(25.0), "25"),
             (Value::Number(0.1), "0.1"),
@@ -330,10 +330,10 @@ mod tests {
             (Value::Integer(-7), "-7"),
             (Value::Bool(true), "true"),
         ] {
-            assert_eq!(text(Bare::Value(value)), expected);
+            assert_eq!(text(PointPayload::Value(value)), expected);
         }
-        assert_eq!(text(Bare::FaultText(53)), "fieldbus fault");
-        assert_eq!(text(Bare::FaultText(0)), "");
+        assert_eq!(text(PointPayload::FaultText(53)), "fieldbus fault");
+        assert_eq!(text(PointPayload::FaultText(0)), "");
     }
 
     #[test]
@@ -342,7 +342,7 @@ mod tests {
              [[point]]\nname = \"mode\"\nat = \"holding 1\"\n[point.texts]\n3 = \"auto\"\n";
         let profile = Profile::parse("m.toml", source, false).unwrap();
         let state = |value: Option<i64>| {
-            let shown = Shown {
+            let shown = StateContent {
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
@@ -385,7 +385,7 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -405,9 +405,9 @@ mod tests {
             (&serde_json::Value::Null, &true.into())
         );
         assert_eq!(told["point_quality"], serde_json::json!({"ready": "good"}));
-        assert_eq!(Bare::state(shown.state), Bare::Nothing);
+        assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 

@@ -5,7 +5,7 @@ use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::payload::{self, Bare, BusFigures, BusState, Shown, StateObject, Topics};
+use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject, Topics};
 use crate::drive::ModelPoint;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 
@@ -23,7 +23,7 @@ pub(super) struct Update {
 #[derive(Debug)]
 pub(super) struct Publisher {
     topics: Topics,
-    pace: Pace,
+    pace: PublishInterval,
     drives: Vec<DriveTopics>,
     buses: Vec<BusTopic>,
     /// Topics of drives and buses that are not configured any more, for the broker to forget.
@@ -32,12 +32,12 @@ pub(super) struct Publisher {
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Pace {
+struct PublishInterval {
     min: Duration,
     max: Duration,
 }
 
-impl Pace {
+impl PublishInterval {
     fn due(self, last: Option<Instant>, now: Instant, changed: bool) -> bool {
         last.is_none_or(|last| {
             let since = now.saturating_duration_since(last);
@@ -53,20 +53,20 @@ struct DriveTopics {
     /// Index in the profile and name of each published point.
     indices: Vec<usize>,
     names: Vec<String>,
-    last: Option<(Shown, Instant)>,
+    last: Option<(StateContent, Instant)>,
     points: Vec<PointTopic>,
 }
 
 #[derive(Debug)]
 struct PointTopic {
     topic: Arc<str>,
-    what: What,
-    last: Option<(Bare, Instant)>,
+    source: PointSource,
+    last: Option<(PointPayload, Instant)>,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum What {
-    /// Place in [`Shown::points`].
+enum PointSource {
+    /// Place in [`StateContent::points`].
     Point(usize),
     State,
     FaultText,
@@ -84,7 +84,7 @@ impl Publisher {
     pub(super) fn new(topics: Topics, min: Duration, max: Duration) -> Publisher {
         Publisher {
             topics,
-            pace: Pace { min, max },
+            pace: PublishInterval { min, max },
             drives: Vec::new(),
             buses: Vec::new(),
             vanished: BTreeSet::new(),
@@ -153,19 +153,19 @@ impl DriveTopics {
     fn new(topics: &Topics, drive: DriveHandle) -> DriveTopics {
         let spec = &drive.image.spec;
         let published = payload::published_points(&spec.profile);
-        let topic = |name: &str, what| PointTopic {
+        let topic = |name: &str, source| PointTopic {
             topic: topics.point(&spec.name, name).into(),
-            what,
+            source,
             last: None,
         };
         let mut points: Vec<_> = published
             .iter()
             .enumerate()
-            .map(|(place, (_, name))| topic(name, What::Point(place)))
+            .map(|(place, (_, name))| topic(name, PointSource::Point(place)))
             .collect();
-        points.push(topic("state", What::State));
+        points.push(topic("state", PointSource::State));
         if spec.profile.model_index(ModelPoint::FaultCode).is_some() {
-            points.push(topic("fault_text", What::FaultText));
+            points.push(topic("fault_text", PointSource::FaultText));
         }
         DriveTopics {
             state: topics.drive(&spec.name, "state").into(),
@@ -177,20 +177,20 @@ impl DriveTopics {
         }
     }
 
-    fn tick(&mut self, pace: Pace, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
+    fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let reading = self.drive.reading(now);
-        let shown = Shown::of(&reading, self.indices.iter().copied());
+        let shown = StateContent::of(&reading, self.indices.iter().copied());
         for point in &mut self.points {
-            let bare = match point.what {
-                What::Point(place) => Bare::of(shown.points.get(place).and_then(|(value, _)| *value)),
-                What::State => Bare::state(shown.state),
-                What::FaultText => Bare::fault_text(&reading),
+            let payload = match point.source {
+                PointSource::Point(place) => PointPayload::of(shown.points.get(place).and_then(|(value, _)| *value)),
+                PointSource::State => PointPayload::state(shown.state),
+                PointSource::FaultText => PointPayload::fault_text(&reading),
             };
-            if point.due(pace, now, bare) {
-                point.last = Some((bare, now));
+            if point.due(pace, now, payload) {
+                point.last = Some((payload, now));
                 updates.push(Update {
                     topic: point.topic.clone(),
-                    payload: bare.render(&reading.spec.profile),
+                    payload: payload.render(&reading.spec.profile),
                 });
             }
         }
@@ -219,11 +219,11 @@ impl DriveTopics {
 
 impl PointTopic {
     /// A value that is not good any more is taken away at once, and once only.
-    fn due(&self, pace: Pace, now: Instant, bare: Bare) -> bool {
-        match (&self.last, bare) {
-            (Some((last, _)), Bare::Nothing) => *last != Bare::Nothing,
+    fn due(&self, pace: PublishInterval, now: Instant, payload: PointPayload) -> bool {
+        match (&self.last, payload) {
+            (Some((last, _)), PointPayload::Nothing) => *last != PointPayload::Nothing,
             (last, _) => {
-                let changed = last.as_ref().is_none_or(|(last, _)| *last != bare);
+                let changed = last.as_ref().is_none_or(|(last, _)| *last != payload);
                 pace.due(last.as_ref().map(|(_, at)| *at), now, changed)
             }
         }
@@ -231,10 +231,10 @@ impl PointTopic {
 }
 
 impl BusTopic {
-    fn tick(&mut self, pace: Pace, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
+    fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let (state, figures) = payload::bus_now(&self.bus);
         let due = self.last.as_ref().is_none_or(|(last_state, last_figures, at)| {
-            let slower = Pace {
+            let slower = PublishInterval {
                 min: pace.min.max(FIGURES_INTERVAL),
                 ..pace
             };

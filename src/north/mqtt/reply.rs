@@ -83,7 +83,7 @@ impl Reply {
         let payload = serde_json::to_vec(&object).unwrap_or_default();
         Message {
             correlation: self.correlation.clone(),
-            ..Message::passing(self.topic.as_str(), payload)
+            ..Message::not_retained(self.topic.as_str(), payload)
         }
     }
 }

@@ -60,7 +60,7 @@ pub(super) fn excerpt(payload: &[u8]) -> String {
 
 /// What a message asks for.
 #[derive(Debug, PartialEq)]
-pub(super) struct Request {
+pub(super) struct SetRequest {
     /// The `id`, also when the rest is refused.
     pub(super) id: Option<Json>,
     /// Points and time to live.
@@ -71,8 +71,8 @@ pub(super) struct Request {
 type Points = Vec<(usize, Value)>;
 
 /// Reads a message on a set topic; `point` is given for a bare value.
-pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Request {
-    Request {
+pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> SetRequest {
+    SetRequest {
         id: id(incoming, point),
         order: order(incoming, point, profile),
     }
@@ -294,7 +294,7 @@ mod tests {
         }
     }
 
-    fn set(payload: &str) -> Request {
+    fn set(payload: &str) -> SetRequest {
         read(&message(payload), None, &profile())
     }
 
@@ -303,7 +303,7 @@ mod tests {
         order.map(|(points, _)| points[0].1)
     }
 
-    fn code(request: Request) -> (&'static str, String) {
+    fn code(request: SetRequest) -> (&'static str, String) {
         let refusal = request.order.unwrap_err();
         (refusal.code(), refusal.to_string())
     }

@@ -20,14 +20,14 @@ pub struct CommandWrite {
 
 /// What stands before a write of 0x8100.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Before {
+pub struct CommandContext {
     /// The word that was written there last; none since the server started.
     pub word: Option<u16>,
     /// The drive tells of a fault.
     pub fault: bool,
 }
 
-impl Before {
+impl CommandContext {
     /// Whether `word` asks for a fault reset: bit 2 changes from 0 to 1, or it comes without run while the drive has a
     /// fault, whatever was written before: no client has to take back a bit that reads as 0. With run only the change
     /// counts, so a client that repeats its word does not start a motor again after each fault; nor does the first word
@@ -45,7 +45,7 @@ impl Before {
 ///
 /// # Errors
 /// An address that takes no command or that the family lacks, then a value that is none.
-pub fn command(profile: &Profile, start: u16, values: &[u16], before: Before) -> Result<CommandWrite, Refusal> {
+pub fn command(profile: &Profile, start: u16, values: &[u16], before: CommandContext) -> Result<CommandWrite, Refusal> {
     let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
@@ -120,7 +120,7 @@ fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
 fn command_word(
     profile: &Profile,
     word: u16,
-    before: Before,
+    before: CommandContext,
     points: &mut Vec<(usize, Value)>,
 ) -> Result<Option<Refusal>, Refusal> {
     points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));

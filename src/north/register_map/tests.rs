@@ -39,7 +39,7 @@ fn running(now: Instant) -> DriveImage {
 }
 
 fn read(image: &DriveImage, now: Instant, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
-    Look::new(&image.reading(now, STALE_AFTER), true).registers(start, count)
+    DriveView::new(&image.reading(now, STALE_AFTER), true).registers(start, count)
 }
 
 #[test]
@@ -149,7 +149,11 @@ fn a_stale_drive_tells_why_and_nothing_else() {
     assert!(floats.chunks(2).all(|w| w == [0x7FC0, 0]), "{floats:04X?}");
 
     let reading = image.reading(now, STALE_AFTER);
-    nothing(&Look::new(&reading, false).registers(0x8000, 19).unwrap(), STALE, 0);
+    nothing(
+        &DriveView::new(&reading, false).registers(0x8000, 19).unwrap(),
+        STALE,
+        0,
+    );
 
     image.update(|s| s.link = Link::Offline(SystemTime::now()));
     nothing(&read(&image, now, 0x8000, 19).unwrap(), STALE, 0);
@@ -334,9 +338,9 @@ fn command_writes() {
     }
 }
 
-fn before(word: u16, fault: bool) -> Before {
+fn before(word: u16, fault: bool) -> CommandContext {
     let word = Some(word);
-    Before { word, fault }
+    CommandContext { word, fault }
 }
 
 #[test]
@@ -368,7 +372,7 @@ fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
         (1, true, false),
     ] {
         assert_eq!(
-            Before { word: None, fault }.resets(word),
+            CommandContext { word: None, fault }.resets(word),
             resets,
             "{word} first, fault {fault}"
         );
@@ -410,10 +414,10 @@ fn refused_command_writes() {
         (&lacking, 0x8100, &[8, 100, 2500], address),
     ];
     for (profile, start, values, wanted) in table {
-        let refusal = command(profile, *start, values, Before::default()).unwrap_err();
+        let refusal = command(profile, *start, values, CommandContext::default()).unwrap_err();
         assert_eq!(refusal.exception(), *wanted, "{start:04X} {values:04X?}: {refusal}");
     }
-    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], Before::default()).unwrap();
+    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], CommandContext::default()).unwrap();
     assert_eq!(named(&lacking, &word), ["run=true", "speed_reference=50"]);
 }
 

@@ -4,8 +4,9 @@ use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
 
-use super::super::shared::{Client, Shared, View};
-use super::super::{Options, Uncached};
+use super::super::client::Client;
+use super::super::routes::PlantView;
+use super::super::{Options, ServerState, Uncached};
 use super::*;
 use crate::command::Authority;
 use crate::north::NorthStats;
@@ -44,10 +45,10 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         writes: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
-    let shared = Shared::new(options, stats.clone());
-    let view = View::new(Arc::new(ArcSwap::from_pointee(plant)), None);
+    let state = ServerState::new(options, stats.clone());
+    let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), None);
     let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);
-    let session = Session::new(Arc::new(shared), Arc::new(view), client);
+    let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
     let (client, end) = tokio::io::duplex(pipe);
     let cancel = CancellationToken::new();
     let server = tokio::spawn(serve(end, session, idle_timeout, cancel.clone()));

@@ -5,8 +5,8 @@ use std::pin::Pin;
 use std::task::{Context, Poll};
 use std::time::Instant;
 
+use super::client::Client;
 use super::frame::Header;
-use super::shared::Client;
 use crate::cache::{Reading, Unavailable};
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
@@ -15,28 +15,28 @@ use crate::plant::{DriveHandle, Placed};
 
 /// A request on its way to a drive.
 #[derive(Debug)]
-pub(super) struct Errand {
+pub(super) struct ForwardedRequest {
     pub(super) header: Header,
     pub(super) drive: DriveHandle,
     pub(super) request: RequestPdu,
     /// The order carries a fault reset that came by 0x8100.
     pub(super) resets: bool,
-    read: Option<PiecewiseRead>,
+    read: Option<PartialRead>,
 }
 
 /// What there is to do.
 #[derive(Debug)]
-pub(super) enum Work {
+pub(super) enum BusWork {
     Order(Order),
     /// There is no order; it is refused, which the audit shows.
     Refused(Refusal),
     /// A read object by object.
-    Pieces(Vec<Piece>),
+    Parts(Vec<ReadPart>),
 }
 
 /// Part of a read.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Piece {
+pub(super) enum ReadPart {
     /// The cache has it.
     Known(Vec<u16>),
     /// The drive is asked for an object; so many of its items are left out, so many taken.
@@ -45,57 +45,57 @@ pub(super) enum Piece {
 
 /// How far a read object by object has come.
 #[derive(Debug)]
-struct PiecewiseRead {
+struct PartialRead {
     words: Vec<u16>,
-    left: std::vec::IntoIter<Piece>,
+    left: std::vec::IntoIter<ReadPart>,
     /// Of the object that the drive is asked for now: so many items are left out, so many taken.
     asked: (usize, usize),
 }
 
-/// What becomes of an errand.
+/// What becomes of an forwarded.
 #[derive(Debug)]
-pub(super) enum Step {
+pub(super) enum Progress {
     /// An order of it is in the queue.
-    Waits(Waiting),
+    Pending(PendingRequest),
     /// Its answer is known.
-    Done(Box<Errand>, Outcome),
+    Done(Box<ForwardedRequest>, Outcome),
 }
 
-/// An errand that waits for the bus. Its order is in the queue; waiting is all that is left.
+/// An forwarded that waits for the bus. Its order is in the queue; waiting is all that is left.
 #[derive(Debug)]
-pub(super) struct Waiting {
+pub(super) struct PendingRequest {
     /// Gone once it is answered.
-    errand: Option<Box<Errand>>,
+    forwarded: Option<Box<ForwardedRequest>>,
     placed: Placed,
 }
 
-/// The bus has answered an order of the errand.
+/// The bus has answered an order of the forwarded.
 #[derive(Debug)]
-pub(super) struct Answered {
-    errand: Box<Errand>,
+pub(super) struct AnsweredRequest {
+    forwarded: Box<ForwardedRequest>,
     outcome: Outcome,
 }
 
-impl Future for Waiting {
-    type Output = Answered;
+impl Future for PendingRequest {
+    type Output = AnsweredRequest;
 
-    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<Answered> {
-        match (self.placed.poll_answer(cx), self.errand.take()) {
-            (Poll::Ready(answer), Some(errand)) => Poll::Ready(Answered {
-                errand,
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<AnsweredRequest> {
+        match (self.placed.poll_answer(cx), self.forwarded.take()) {
+            (Poll::Ready(answer), Some(forwarded)) => Poll::Ready(AnsweredRequest {
+                forwarded,
                 outcome: answer.outcome,
             }),
-            (_, errand) => {
-                self.errand = errand;
+            (_, forwarded) => {
+                self.forwarded = forwarded;
                 Poll::Pending
             }
         }
     }
 }
 
-impl Errand {
-    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu, resets: bool) -> Errand {
-        Errand {
+impl ForwardedRequest {
+    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu, resets: bool) -> ForwardedRequest {
+        ForwardedRequest {
             header,
             drive: drive.clone(),
             request,
@@ -105,43 +105,43 @@ impl Errand {
     }
 
     /// Sends it: its order, or its first one, is in the queue when this returns.
-    pub(super) fn send(self, work: Work, client: &Client, now: Instant) -> Step {
-        let mut errand = Box::new(self);
+    pub(super) fn send(self, work: BusWork, client: &Client, now: Instant) -> Progress {
+        let mut forwarded = Box::new(self);
         match work {
-            Work::Order(order) => errand.place(order, client, client.authority, now),
-            Work::Refused(refusal) => {
-                let what = describe::request(&errand.request);
-                let answer = errand.drive.refuse(&what, refusal, client.origin(), now);
-                Step::Done(errand, answer.outcome)
+            BusWork::Order(order) => forwarded.place(order, client, client.authority, now),
+            BusWork::Refused(refusal) => {
+                let what = describe::request(&forwarded.request);
+                let answer = forwarded.drive.refuse(&what, refusal, client.origin(), now);
+                Progress::Done(forwarded, answer.outcome)
             }
-            Work::Pieces(pieces) => {
-                errand.read = Some(PiecewiseRead {
+            BusWork::Parts(read_parts) => {
+                forwarded.read = Some(PartialRead {
                     words: Vec::new(),
-                    left: pieces.into_iter(),
+                    left: read_parts.into_iter(),
                     asked: (0, 0),
                 });
-                errand.read_on(client, now)
+                forwarded.read_on(client, now)
             }
         }
     }
 
-    fn place(self: Box<Self>, order: Order, client: &Client, authority: Authority, now: Instant) -> Step {
+    fn place(self: Box<Self>, order: Order, client: &Client, authority: Authority, now: Instant) -> Progress {
         let placed = self.drive.place(order, client.origin(), authority, DEFAULT_EXPIRY, now);
-        Step::Waits(Waiting {
-            errand: Some(self),
+        Progress::Pending(PendingRequest {
+            forwarded: Some(self),
             placed,
         })
     }
 
     /// Asks for the next object of a read, if any is left.
-    fn read_on(mut self: Box<Self>, client: &Client, now: Instant) -> Step {
+    fn read_on(mut self: Box<Self>, client: &Client, now: Instant) -> Progress {
         let Some(read) = &mut self.read else {
-            return Step::Done(self, Outcome::Exception(Exception::DEVICE_FAILURE));
+            return Progress::Done(self, Outcome::Exception(Exception::DEVICE_FAILURE));
         };
-        for piece in read.left.by_ref() {
-            match piece {
-                Piece::Known(known) => read.words.extend(known),
-                Piece::Ask { pdu, skip, take } => {
+        for part in read.left.by_ref() {
+            match part {
+                ReadPart::Known(known) => read.words.extend(known),
+                ReadPart::Ask { pdu, skip, take } => {
                     read.asked = (skip, take);
                     return self.place(Order::Read(pdu), client, Authority::ReadOnly, now);
                 }
@@ -154,15 +154,15 @@ impl Errand {
             }
             _ => Reply::Registers(words),
         };
-        Step::Done(self, Outcome::Acknowledged(reply))
+        Progress::Done(self, Outcome::Acknowledged(reply))
     }
 }
 
-impl Answered {
-    /// What comes of the errand now: a read object by object asks for the next one, until one fails.
-    pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Step {
-        let Some(read) = &mut self.errand.read else {
-            return Step::Done(self.errand, self.outcome);
+impl AnsweredRequest {
+    /// What comes of the forwarded now: a read object by object asks for the next one, until one fails.
+    pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Progress {
+        let Some(read) = &mut self.forwarded.read else {
+            return Progress::Done(self.forwarded, self.outcome);
         };
         let (skip, take) = read.asked;
         match self.outcome {
@@ -172,11 +172,11 @@ impl Answered {
                     .extend(got.iter().skip(skip).take(take).map(|bit| u16::from(*bit)));
             }
             Outcome::Acknowledged(_) => {
-                return Step::Done(self.errand, Outcome::Exception(Exception::DEVICE_FAILURE));
+                return Progress::Done(self.forwarded, Outcome::Exception(Exception::DEVICE_FAILURE));
             }
-            outcome => return Step::Done(self.errand, outcome),
+            outcome => return Progress::Done(self.forwarded, outcome),
         }
-        self.errand.read_on(client, now)
+        self.forwarded.read_on(client, now)
     }
 }
 
@@ -185,27 +185,27 @@ impl Answered {
 ///
 /// # Errors
 /// What the client is told at once: part of it is stale, was refused by the drive, or cannot be an object.
-pub(super) fn pieces(
+pub(super) fn read_parts(
     protocol: Protocol,
     reading: &Reading<'_>,
     table: Table,
     start: u16,
     count: u16,
-) -> Result<Option<Vec<Piece>>, Exception> {
+) -> Result<Option<Vec<ReadPart>>, Exception> {
     if protocol != Protocol::N2 {
         return Ok(None);
     }
-    let mut pieces = Vec::new();
+    let mut read_parts = Vec::new();
     let (mut at, mut left) = (start, count);
     while left > 0 {
         let (first, items) = object_around(table, at).ok_or(Exception::ADDRESS)?;
         let skip = at - first;
         let take = left.min(items - skip);
         match reading.words(table, at, take) {
-            Ok(words) => pieces.push(Piece::Known(words)),
+            Ok(words) => read_parts.push(ReadPart::Known(words)),
             Err(Unavailable::Refused(code)) => return Err(code),
             Err(Unavailable::Stale) => return Err(Exception::GATEWAY_TARGET),
-            Err(Unavailable::NotPolled) => pieces.push(Piece::Ask {
+            Err(Unavailable::NotPolled) => read_parts.push(ReadPart::Ask {
                 pdu: RequestPdu::Read {
                     table,
                     start: first,
@@ -218,7 +218,7 @@ pub(super) fn pieces(
         left -= take;
         at = at.saturating_add(take);
     }
-    Ok(Some(pieces))
+    Ok(Some(read_parts))
 }
 
 /// First address and items of the object that has that address.
