@@ -268,11 +268,13 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<Identity> {
         Ok((identity, warnings)) => {
             warnings
                 .iter()
-                .for_each(|(file, text)| reader.warning(name(*file), text));
+                .for_each(|fault| reader.warning(name(fault.file), fault.to_string()));
             Some(identity)
         }
         Err(errors) => {
-            errors.iter().for_each(|(file, text)| reader.problem(name(*file), text));
+            errors
+                .iter()
+                .for_each(|fault| reader.problem(name(fault.file), fault.to_string()));
             None
         }
     }

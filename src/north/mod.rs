@@ -8,12 +8,14 @@ mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
+mod pem;
 pub mod register_map;
 mod stats;
 
 use std::io;
 use std::net::SocketAddr;
 
+pub use pem::PemError;
 pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
 
 /// Why a server cannot start.
@@ -36,7 +38,7 @@ pub enum ServerError {
     Thread(io::Error),
     /// The certificates of the server cannot be used.
     #[error("TLS of Modbus TCP: {0}")]
-    Tls(String),
+    Tls(#[from] modbus_tcp::IdentityFault),
 }
 
 fn remedy(cause: &io::Error) -> &'static str {

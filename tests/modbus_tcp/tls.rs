@@ -36,6 +36,21 @@ fn make(dir: &Path, arguments: &[&str], days: &str) {
     assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }
 
+/// Replaces the certificate of a client by one whose role is of the wrong string type.
+fn sign_with_printable_role(dir: &Path, name: &str) {
+    let command = format!(
+        "printf 'extendedKeyUsage=clientAuth\n1.3.6.1.4.1.50316.802.1=ASN1:PRINTABLESTRING:operator\n' >ext &&
+         openssl req -new -key {name}.key -subj /CN={name} -out csr &&
+         openssl x509 -req -in csr -CA ca.crt -CAkey ca.key -set_serial 7 -days 30 -extfile ext -out {name}.crt"
+    );
+    let output = Command::new("sh")
+        .args(["-ec", &command])
+        .current_dir(dir)
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+}
+
 /// Two CAs; below the first a server and clients of all kinds.
 struct Works(TempDir);
 
@@ -52,6 +67,8 @@ static WORKS: LazyLock<Works> = LazyLock::new(|| {
     make(&own, &["client", "stranger", "cleaner"], "30");
     make(&own, &["client", "plain"], "30");
     make(&own, &["client", "late", "operator"], "-1");
+    make(&own, &["client", "malformed", "operator"], "30");
+    sign_with_printable_role(&own, "malformed");
     Works(dir)
 });
 
@@ -215,7 +232,13 @@ async fn who_is_not_known_is_refused() {
     let address = rig.server.tls_addresses()[0];
     let mut count = 0;
     for version in [&TLS12, &TLS13] {
-        for name in [None, Some("own/late"), Some("other/hmi"), Some("own/gateway")] {
+        for name in [
+            None,
+            Some("own/late"),
+            Some("other/hmi"),
+            Some("own/gateway"),
+            Some("own/malformed"),
+        ] {
             let answer = match TlsClient::connect(address, WORKS.client(name, version)).await {
                 Ok(mut client) => client.ask(1, &words(3, &[2102, 1])).await,
                 Err(why) => Err(why),
@@ -431,7 +454,7 @@ async fn the_daemon_takes_new_certificates() {
     daemon.signal("HUP");
     daemon.until_printed("everything runs on as before");
     assert!(
-        daemon.output().contains("server.key holds no private key"),
+        daemon.output().contains("server.key contains no private key"),
         "{}",
         daemon.output()
     );

@@ -39,7 +39,7 @@ use crate::north::{NorthStats, ServerError};
 use crate::plant::SharedPlant;
 
 pub use self::offline::Offline;
-pub use self::tls::{Finding, Identity, Role, Tls, TlsFile};
+pub use self::tls::{Identity, IdentityFault, IdentityProblem, Role, Tls, TlsFile};
 
 /// Name in messages.
 const PROTOCOL: &str = "Modbus TCP";
@@ -124,7 +124,7 @@ impl Server {
     /// When they cannot be used; the old ones stay.
     pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
         match (&self.authenticator, &options.tls) {
-            (Some(authenticator), Some(tls)) => authenticator.renew(&tls.identity).map_err(ServerError::Tls),
+            (Some(authenticator), Some(tls)) => Ok(authenticator.renew(&tls.identity)?),
             _ => Ok(()),
         }
     }
@@ -176,8 +176,12 @@ async fn open(
     cancel: &CancellationToken,
     tasks: &TaskTracker,
 ) -> Result<Server, ServerError> {
-    let authenticator = options.tls.as_ref().map(TlsAuthenticator::new).transpose();
-    let authenticator = authenticator.map_err(ServerError::Tls)?.map(Arc::new);
+    let authenticator = options
+        .tls
+        .as_ref()
+        .map(TlsAuthenticator::new)
+        .transpose()?
+        .map(Arc::new);
     raise_file_limit(options.max_connections);
     let limit = ConnectionLimit::new(options.max_connections, options.max_connections_per_address);
     let state = Arc::new(ServerState::new(options, stats));

@@ -380,7 +380,8 @@ impl Client {
         let options = self.options.clone();
         // Read anew for each attempt: a renewed certificate is taken without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
-        match config.unwrap_or_else(|e| Err(e.to_string())) {
+        let config = config.map_err(|error| error.to_string());
+        match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
                 let connection = Connection::open(&self.options, self.topics.status(), config);
                 self.link = BrokerLink::Open(BrokerSession {

@@ -1,0 +1,59 @@
+//! Reads certificates and keys from PEM files.
+
+use std::path::Path;
+
+use rustls_pki_types::pem::{self, PemObject};
+use rustls_pki_types::{CertificateDer, PrivateKeyDer};
+
+/// Why a PEM file cannot be used.
+#[derive(Debug, Clone, thiserror::Error)]
+pub enum PemError {
+    /// The file cannot be read.
+    #[error("cannot read {file}: {cause}; check the path and its permissions")]
+    Unreadable {
+        /// Its path.
+        file: String,
+        /// What the system reports.
+        cause: String,
+    },
+    /// It does not contain what is expected.
+    #[error("{file} contains no {expected}: {cause}; specify a PEM file")]
+    Missing {
+        /// Its path.
+        file: String,
+        /// `certificate` or `private key`.
+        expected: &'static str,
+        /// What the parser reports.
+        cause: String,
+    },
+}
+
+/// All certificates of a file, at least one.
+pub(super) fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, PemError> {
+    let read = CertificateDer::pem_file_iter(file).and_then(Iterator::collect::<Result<Vec<_>, _>>);
+    let certificates = read.map_err(|error| pem_error(file, "certificate", &error))?;
+    if certificates.is_empty() {
+        return Err(pem_error(file, "certificate", &pem::Error::NoItemsFound));
+    }
+    Ok(certificates)
+}
+
+/// The first private key of a file.
+pub(super) fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, PemError> {
+    PrivateKeyDer::from_pem_file(file).map_err(|error| pem_error(file, "private key", &error))
+}
+
+fn pem_error(file: &Path, expected: &'static str, error: &pem::Error) -> PemError {
+    let file = file.display().to_string();
+    match error {
+        pem::Error::Io(cause) => PemError::Unreadable {
+            file,
+            cause: cause.to_string(),
+        },
+        cause => PemError::Missing {
+            file,
+            expected,
+            cause: cause.to_string(),
+        },
+    }
+}
