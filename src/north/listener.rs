@@ -127,6 +127,7 @@ pub(super) async fn bind(
 
 #[cfg(test)]
 mod tests {
+    use tokio::io::AsyncReadExt;
     use tokio::sync::mpsc;
 
     use super::*;
@@ -155,10 +156,10 @@ mod tests {
             self.0.send("refused").unwrap();
         }
 
-        async fn serve(self: Arc<Self>, stream: TcpStream, _: SocketAddr, permit: ConnectionPermit) {
+        async fn serve(self: Arc<Self>, mut stream: TcpStream, _: SocketAddr, permit: ConnectionPermit) {
             self.0.send("served").unwrap();
             // Until the client closes.
-            let _ = stream.readable().await;
+            let _ = stream.read(&mut [0]).await;
             drop(permit);
             self.0.send("ended").unwrap();
         }

@@ -87,7 +87,7 @@ impl Shutdown {
             let name = name(stop.drive);
             match &stop.state {
                 State::Acknowledged => None,
-                State::Refused(why) => Some(format!("`{name}` was not told to stop ({why})")),
+                State::Refused(why) => Some(format!("`{name}` was not sent its stop command ({why})")),
                 State::Due(_) | State::Ordered(_) => Some(format!("`{name}` did not acknowledge its stop")),
             }
         });
