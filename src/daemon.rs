@@ -133,8 +133,8 @@ impl Daemon {
     /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// A bus or a server cannot start. Everything runs as before, unless the error says that the previous servers cannot
-    /// be restarted.
+    /// A bus or a server cannot start. Everything runs as before, unless the error says that the previous servers
+    /// cannot be restarted.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
         let before = self.settings.clone();
         // Everything that can fail comes before anything that runs is stopped for good.
@@ -246,7 +246,8 @@ impl Daemon {
         self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await
     }
 
-    /// Shuts down in order: no new Modbus TCP commands, the configured stop commands, the buses, the last MQTT messages.
+    /// Shuts down in order: no new Modbus TCP commands, the configured stop commands, the buses, the last MQTT
+    /// messages.
     pub async fn stop(mut self) {
         self.modbus_tcp.stop().await;
         self.stop_drives().await;

@@ -5,11 +5,11 @@ mod connection_limit;
 pub mod http;
 mod listener;
 mod log_throttle;
-pub mod metrics;
+pub(crate) mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 mod pem;
-pub mod register_map;
+pub(crate) mod register_map;
 mod stats;
 
 use std::io;

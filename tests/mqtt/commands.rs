@@ -181,9 +181,9 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
     let file = bench.broker.dir.path().join("long");
     std::fs::write(&file, long).unwrap();
     for (topic, payload, code, text) in [
-        (SET, "run", "bad_value", "is no JSON"),
-        (SET, "", "bad_value", "is no JSON"),
-        (SET, "[true]", "bad_value", "is no JSON object"),
+        (SET, "run", "bad_value", "is not JSON"),
+        (SET, "", "bad_value", "is not JSON"),
+        (SET, "[true]", "bad_value", "is not a JSON object"),
         (SET, "{}", "bad_value", "names no point"),
         (
             SET,
@@ -197,19 +197,14 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
             "not_writable",
             "`ready` is read-only",
         ),
-        (
-            SET,
-            r#"{"speed_reference": "10"}"#,
-            "bad_value",
-            "leave the quotes away",
-        ),
+        (SET, r#"{"speed_reference": "10"}"#, "bad_value", "remove the quotes"),
         (
             SET,
             r#"{"speed_reference": 80.1}"#,
             "bad_value",
             "outside the limits 0 to 80",
         ),
-        (SET, r#"{"speed_reference": NaN}"#, "bad_value", "is no JSON"),
+        (SET, r#"{"speed_reference": NaN}"#, "bad_value", "is not JSON"),
         (
             SET,
             r#"{"run": true, "expires_ms": -1}"#,

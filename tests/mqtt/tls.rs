@@ -63,7 +63,7 @@ fn mutual_tls() {
     for (bad, why) in [
         (foreign_ca, "UnknownIssuer"),
         (no_certificate, "CertificateRequired"),
-        (missing_file, "nowhere.crt: no certificate can be read"),
+        (missing_file, "nowhere.crt: No such file or directory"),
         (system_roots, "UnknownIssuer"),
     ] {
         let gateway = Gateway::start(bad, plant(&["p1"]));

@@ -1,7 +1,7 @@
 //! HTTP: status page, Prometheus metrics, health and the JSON interface. GET and HEAD only.
 //!
-//! The connections are app by hyper directly, because axum's own loop gives a client unlimited time to
-//! send its request. Everything ends on the cancellation token, open event streams included.
+//! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
+//! The cancellation ends everything, including open event streams.
 
 mod api;
 mod page;
@@ -28,26 +28,26 @@ use super::log_throttle::LogThrottle;
 use super::{NorthStats, ServerError};
 use crate::plant::SharedPlant;
 
-/// Connections at one time; a client beyond that is told to come back.
+/// Maximum number of open connections; further clients get 503.
 pub const MAX_CONNECTIONS: usize = 128;
 
-/// Listeners of event streams at one time; each holds a connection for long.
+/// Maximum number of open event streams; each occupies a connection for a long time.
 pub const MAX_LISTENERS: usize = 32;
 
-/// Time for the head of a request, counted from the connection or from the reply before: bounds slow
-/// senders and idle connections.
+/// Time limit for the head of a request, from the connection or from the previous reply on. It bounds slow senders and
+/// idle connections.
 const HEAD_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Bytes of the head of a request.
+/// Maximum length of the head of a request, bytes.
 const MAX_HEAD: usize = 16 * 1024;
 
-/// Time until a client that acknowledges nothing, or takes no bytes, is dropped.
+/// Time after which a client that acknowledges nothing or accepts no bytes is disconnected.
 const USER_TIMEOUT: Duration = Duration::from_secs(30);
 
-/// Time that replies under way get when the gateway stops.
+/// Time for pending replies when the gateway stops.
 const GRACE: Duration = Duration::from_millis(500);
 
-/// What the HTTP server is told.
+/// Configuration of the HTTP server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// Address to listen on.

@@ -1,4 +1,4 @@
-//! What is app where.
+//! The routes of the HTTP server.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -25,11 +25,11 @@ pub(super) struct AppState {
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthStats>,
     pub(super) cancel: CancellationToken,
-    /// Places for listeners of event streams.
+    /// Permits for event streams.
     pub(super) listeners: Arc<Semaphore>,
 }
 
-/// Everything that is app.
+/// All routes.
 pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Router {
     let app = Arc::new(AppState {
         plant,
@@ -62,7 +62,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .layer(middleware::from_fn(guard))
 }
 
-/// Refuses all methods that could change something, and sets the headers of every reply.
+/// Refuses all methods that could change something and sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
     let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
         next.run(request).await
@@ -123,7 +123,7 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-/// Why the gateway is not ready: buses that are not open and drives that were not tried yet, each by name.
+/// Why the gateway is not ready: buses that are not open and drives that were not tried yet.
 fn unready(plant: &Plant) -> Vec<String> {
     let mut reasons = Vec::new();
     for bus in &plant.buses {
@@ -132,7 +132,7 @@ fn unready(plant: &Plant) -> Vec<String> {
         if !health.up {
             let why = health
                 .reason
-                .unwrap_or_else(|| "its port was not opened yet".to_string());
+                .unwrap_or_else(|| "its port has not been opened yet".to_string());
             reasons.push(format!("bus {name}: {why}"));
         }
         for drive in &bus.image.drives {
@@ -186,7 +186,7 @@ async fn unknown(uri: Uri) -> Response {
     (StatusCode::NOT_FOUND, text).into_response()
 }
 
-/// A reply 404 that tells the names there are.
+/// A 404 reply that lists the known names.
 pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
     (StatusCode::NOT_FOUND, Json(api::ErrorReply { error, known })).into_response()
 }

@@ -1,4 +1,4 @@
-//! The families of series and what they are made of.
+//! The families of series and their values.
 
 use std::sync::atomic::Ordering;
 use std::time::Instant;
@@ -10,7 +10,7 @@ use crate::drive::{PollClass, State};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, Plant};
 
-/// Commit the program was built from, set by whoever builds a release.
+/// Commit of the build, set for releases.
 const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");
 
 /// Label names and values.
@@ -29,7 +29,7 @@ pub(super) enum Kind {
 pub(super) enum SeriesValue {
     /// Of a gauge.
     Value(f64),
-    /// Of a counter of things.
+    /// Of a counter of events.
     Count(u64),
     /// Of a counter of seconds.
     Total(f64),
@@ -67,7 +67,7 @@ impl Family {
     }
 }
 
-/// All families; those without a series are left out of the text.
+/// All families; those without a series are omitted from the text.
 pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
     let mut all = Vec::new();
     drives(plant, now, &mut all);
@@ -114,7 +114,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     );
     let mut unsupervised = gauge(
         "drivegate_drive_unsupervised",
-        "Whether a drive with supervision ran, and no client was heard of since the gateway started: 1, else 0.",
+        "Whether a drive with supervision runs that no client has commanded since the gateway started: 1, else 0.",
     );
     for drive in plant.drives() {
         let image = &drive.image;
@@ -208,7 +208,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     let mut transactions = Family::new(
         Kind::Histogram,
         "drivegate_bus_transaction_seconds",
-        "Time of whole exchanges on the bus.",
+        "Duration of exchanges on the bus.",
     );
     let mut queue = Family::new(
         Kind::Gauge,
@@ -236,7 +236,7 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
     let mut results = Family::new(
         Kind::Counter,
         "drivegate_writes_total",
-        "Commands answered, by where they came from and how they ended.",
+        "Commands answered, by source and result.",
     );
     for ((source, result), count) in plant.writes.results() {
         let labels = vec![("source", source.name().to_string()), ("result", result.to_string())];
@@ -271,7 +271,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     let mut refused = Family::new(
         Kind::Counter,
         "drivegate_modbus_tcp_refused_total",
-        "Modbus TCP clients that were not let in, by reason.",
+        "Modbus TCP clients refused, by reason.",
     );
     for (reason, count) in stats.modbus_tcp.refused_connections().filter(|(_, count)| *count > 0) {
         refused.add(vec![("reason", reason.name().to_string())], SeriesValue::Count(count));
@@ -287,7 +287,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(Family::of(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages that the MQTT broker took.",
+        "Messages that the MQTT broker acknowledged.",
         SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(
@@ -307,7 +307,7 @@ fn build(plant: &Plant) -> Family {
     let mut family = Family::new(
         Kind::Gauge,
         "drivegate_build_info",
-        "Always 1; what was built, and the name of the gateway.",
+        "Always 1; version and commit of the build, and the name of the gateway.",
     );
     family.add(labels, SeriesValue::Value(1.0));
     family

@@ -1,8 +1,8 @@
-//! ProcessStats of the process itself, from /proc. What cannot be read is left out.
+//! Statistics of the process, from /proc. What cannot be read is omitted.
 
 use std::fs;
 
-/// ProcessStats of the process.
+/// Statistics of the process.
 #[derive(Debug, Default, PartialEq)]
 pub(super) struct ProcessStats {
     pub(super) cpu_seconds: Option<f64>,
@@ -15,14 +15,14 @@ pub(super) struct ProcessStats {
     pub(super) threads: Option<f64>,
 }
 
-/// The figures now.
+/// The statistics now.
 pub(super) fn read() -> ProcessStats {
     let ticks = rustix::param::clock_ticks_per_second() as f64;
     let page = rustix::param::page_size() as f64;
     let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let boot = fs::read_to_string("/proc/stat").ok().and_then(|text| boot_time(&text));
     let mut figures = of_stat(&stat, ticks, page, boot);
-    // The listing itself holds one descriptor.
+    // Listing the directory opens a descriptor itself.
     figures.open_fds = fs::read_dir("/proc/self/fd")
         .ok()
         .map(|entries| entries.count().saturating_sub(1) as f64);
@@ -32,8 +32,8 @@ pub(super) fn read() -> ProcessStats {
     figures
 }
 
-/// ProcessStats of a line of /proc/PID/stat. The second field is the program's name in parentheses and can hold
-/// anything, so fields count from its last parenthesis: the first after it is field 3 (proc(5)).
+/// Statistics from a line of /proc/PID/stat. The second field is the program's name in parentheses and can contain
+/// anything, so fields are counted from the last parenthesis: the first one after it is field 3 (proc(5)).
 fn of_stat(stat: &str, ticks: f64, page: f64, boot: Option<f64>) -> ProcessStats {
     let rest = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
     let fields: Vec<&str> = rest.split_ascii_whitespace().collect();

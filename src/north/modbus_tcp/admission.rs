@@ -142,7 +142,8 @@ fn contains(networks: &[IpNet], address: IpAddr) -> bool {
     networks.iter().any(|network| network.contains(&address))
 }
 
-/// Sends answers without delay and detects peers that disappeared. A client is served even if the system refuses either.
+/// Sends answers without delay and detects peers that disappeared. A client is served even if the system refuses
+/// either.
 fn set_socket_options(stream: &TcpStream) {
     use rustix::net::sockopt;
     let failed = |what: &str, error: &dyn std::fmt::Display| tracing::debug!("Modbus TCP: cannot set {what}: {error}");

@@ -1,4 +1,4 @@
-//! One connection: bytes in, frames to the session, answers out.
+//! One connection: reads requests from the socket and writes the answers, with time limits.
 
 use std::convert::Infallible;
 use std::io;
@@ -16,35 +16,35 @@ use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
 use super::session::ClientSession;
 
-/// Time for the rest of a frame.
+/// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time for the client to take some of its answers.
+/// Time limit for the client to accept part of its answers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time for requests under way when the gateway stops, and for a farewell on the wire.
+/// Time for pending requests when the gateway stops, and for closing the connection.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Requests after which other clients get their turn, should this one send on and on.
+/// Number of requests after which a client that sends without pause yields to the others.
 const TURN: usize = 128;
 
 /// Why a connection ended.
 #[derive(Debug, thiserror::Error)]
 enum End {
-    #[error("the client has closed the connection")]
+    #[error("the client closed the connection")]
     Client,
-    #[error("the gateway stops")]
+    #[error("the gateway is stopping")]
     Cancelled,
     #[error("closed: not Modbus TCP: {0}")]
     NotModbus(#[from] NotModbus),
-    #[error("closed: the client did not finish a frame within {FRAME_TIMEOUT:?}")]
+    #[error("closed: the client did not complete a frame within {FRAME_TIMEOUT:?}")]
     HalfFrame,
     #[error("closed: no request for {0:?} (`idle_timeout`)")]
     Idle(Duration),
-    #[error("closed: the client took none of its answers within {WRITE_TIMEOUT:?}")]
+    #[error("closed: the client accepted none of its answers within {WRITE_TIMEOUT:?}")]
     NotReading,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it leaves, misbehaves, is silent for `idle_timeout` or the gateway stops.
+/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or the gateway stops.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     session: ClientSession,
@@ -67,7 +67,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     if matches!(end, End::Cancelled) {
         connection.farewell().await;
     }
-    // A TLS client wants to hear that this is the end and no cut.
+    // With TLS, a close notification distinguishes the end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
         let _ = tokio::time::timeout(FAREWELL, connection.stream.shutdown()).await;
     }
@@ -77,9 +77,9 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
 struct Connection<S> {
     stream: S,
     dialogue: Dialogue,
-    /// The time, as of the last wait: read once a request.
+    /// The time as of the last wait; the clock is read once per request.
     now: Instant,
-    /// Requests since others had their turn.
+    /// Requests since the last yield.
     since_yield: usize,
     idle: Option<Idle>,
 }
@@ -88,7 +88,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn run(&mut self, cancel: &CancellationToken) -> Result<Infallible, End> {
         let mut client_done = false;
         let mut half_frame_since: Option<Instant> = None;
-        // One future for all turns: it enters the token's list once, not with every request.
+        // One future for the whole connection, so that it registers with the token once and not with every request.
         let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
             let worked = self.dialogue.work(self.now.into_std());
@@ -118,13 +118,17 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             if client_done && !self.dialogue.is_waiting() {
                 return Err(End::Client);
             }
-            // While it is the gateway that does not read on, a half frame is nobody's fault.
+            // While the gateway itself does not read, an incomplete frame is not the client's fault.
             let half = self.dialogue.has_input() && !full && !client_done;
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
-            let reads = !full && !client_done;
+            let reading = if full || client_done {
+                Reading::Paused
+            } else {
+                Reading::On
+            };
             let event = tokio::select! {
                 biased;
-                event = self.next(reads, half_frame_since) => event?,
+                event = self.next(reading, half_frame_since) => event?,
                 () = &mut cancelled => return Err(End::Cancelled),
             };
             self.now = Instant::now();
@@ -139,14 +143,15 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
     }
 
-    /// Waits for input, if the connection `reads`, and for answers of the bus.
-    async fn next(&mut self, reads: bool, half_frame_since: Option<Instant>) -> Result<Event, End> {
+    /// Waits for answers of the bus and, with `Reading::On`, for input.
+    async fn next(&mut self, reading: Reading, half_frame_since: Option<Instant>) -> Result<Event, End> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
+        let reads = reading == Reading::On;
         if reads && let Some(count) = self.stream.read(space).now_or_never() {
             return Ok(Event::Input(count?));
         }
-        // A client that waits does not flood the gateway: no need to yield.
+        // A client that waits does not flood the gateway, so it need not yield.
         self.since_yield = 0;
         tokio::select! {
             biased;
@@ -157,14 +162,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
     }
 
-    /// The client uses its connection.
+    /// Restarts the idle timeout.
     fn touch(&mut self) {
         if let Some(idle) = &mut self.idle {
             idle.since = self.now;
         }
     }
 
-    /// Lets the other clients have the processor after so many requests of this one.
+    /// Yields to other clients after [`TURN`] requests.
     async fn give_way(&mut self, frames: usize) {
         self.since_yield += frames;
         if self.since_yield >= TURN {
@@ -173,7 +178,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
     }
 
-    /// Gives the requests under way a last chance to be answered.
+    /// Gives pending requests a last chance to be answered.
     async fn farewell(&mut self) {
         let answered = async {
             flush(&mut self.stream, &mut self.dialogue).await?;
@@ -183,20 +188,28 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             }
             Ok::<(), End>(())
         };
-        // Who does not answer or listen within that time has been waited for long enough.
+        // A client that is too slow for this is not waited for.
         let _ = tokio::time::timeout(FAREWELL, answered).await;
     }
 }
 
-/// What a connection waits for.
+/// Whether a connection reads input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reading {
+    On,
+    /// The client has finished, or too many of its requests wait.
+    Paused,
+}
+
+/// What a connection waited for.
 enum Event {
-    /// An answer from the bus.
+    /// The bus has answered.
     Answer(AnsweredRequest),
-    /// So many bytes from the client, 0 at its end.
+    /// Number of bytes from the client; 0 at the end of the stream.
     Input(usize),
 }
 
-/// How long the client has been silent. The timer is set anew only when it runs out, not with each request.
+/// The idle time of the client. The timer is reset only when it fires, not with each request.
 struct Idle {
     timeout: Duration,
     since: Instant,
@@ -212,7 +225,7 @@ impl Idle {
         }
     }
 
-    /// Waits until the client was silent for the whole time; for good without a limit.
+    /// Waits until the client was idle for the whole timeout; forever without one.
     async fn over(idle: Option<&mut Idle>) -> Duration {
         let Some(idle) = idle else {
             return std::future::pending().await;
@@ -228,7 +241,7 @@ impl Idle {
     }
 }
 
-/// Writes the output if the stream takes all of it without waiting, as it nearly always does: no timer, no registration.
+/// Writes the output if the stream accepts all of it at once, as it usually does: no timer, no registration.
 fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<bool, End> {
     let output = &mut dialogue.output;
     while !output.is_empty() {
@@ -245,11 +258,11 @@ fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue)
     Ok(true)
 }
 
-/// Writes the output; when it is dropped half way, the output keeps what was not written.
+/// Writes the output; if this future is dropped, the unwritten part stays in the output.
 async fn flush<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<(), End> {
     let output = &mut dialogue.output;
     while !output.is_empty() {
-        // The time runs anew with every byte taken: a slow line is no reason to give a client up.
+        // The time limit restarts with every byte accepted: a slow network is not a stalled client.
         let written = tokio::time::timeout(WRITE_TIMEOUT, stream.write(output)).await;
         match written.map_err(|_| End::NotReading)?? {
             0 => return Err(io::Error::from(io::ErrorKind::WriteZero).into()),

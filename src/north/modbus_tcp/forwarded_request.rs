@@ -1,4 +1,4 @@
-//! Requests whose answers the cache does not have: they go to the drive.
+//! Requests that the process image cannot answer and that are forwarded to the drive.
 
 use std::future::Future;
 use std::pin::Pin;
@@ -13,63 +13,63 @@ use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
 use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
 use crate::plant::{DriveHandle, Placed};
 
-/// A request on its way to a drive.
+/// A request that is forwarded to a drive.
 #[derive(Debug)]
 pub(super) struct ForwardedRequest {
     pub(super) header: Header,
     pub(super) drive: DriveHandle,
     pub(super) request: RequestPdu,
-    /// The order carries a fault reset that came by 0x8100.
+    /// Whether the command includes a fault reset by 0x8100.
     pub(super) resets: bool,
     read: Option<PartialRead>,
 }
 
-/// What there is to do.
+/// What a forwarded request asks the bus for.
 #[derive(Debug)]
 pub(super) enum BusWork {
     Order(Order),
-    /// There is no order; it is refused, which the audit shows.
+    /// Nothing, because it is refused; the refusal is audited.
     Refused(Refusal),
-    /// A read object by object.
+    /// A read that is split by object.
     Parts(Vec<ReadPart>),
 }
 
 /// Part of a read.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) enum ReadPart {
-    /// The cache has it.
+    /// Words from the process image.
     Known(Vec<u16>),
-    /// The drive is asked for an object; so many of its items are left out, so many taken.
+    /// A read of one object: the first `skip` of its items are dropped, the next `take` are used.
     Ask { pdu: RequestPdu, skip: usize, take: usize },
 }
 
-/// How far a read object by object has come.
+/// A read that is split by object.
 #[derive(Debug)]
 struct PartialRead {
     words: Vec<u16>,
     left: std::vec::IntoIter<ReadPart>,
-    /// Of the object that the drive is asked for now: so many items are left out, so many taken.
+    /// Items of the object being read to skip, and to use.
     asked: (usize, usize),
 }
 
-/// What becomes of an forwarded.
+/// State of a forwarded request.
 #[derive(Debug)]
 pub(super) enum Progress {
-    /// An order of it is in the queue.
+    /// A command of it is in the queue.
     Pending(PendingRequest),
-    /// Its answer is known.
+    /// Its outcome is known.
     Done(Box<ForwardedRequest>, Outcome),
 }
 
-/// An forwarded that waits for the bus. Its order is in the queue; waiting is all that is left.
+/// A forwarded request whose command is in the queue; nothing is left to do but wait.
 #[derive(Debug)]
 pub(super) struct PendingRequest {
-    /// Gone once it is answered.
+    /// `None` once it is answered.
     forwarded: Option<Box<ForwardedRequest>>,
     placed: Placed,
 }
 
-/// The bus has answered an order of the forwarded.
+/// A forwarded request of which the bus has answered a command.
 #[derive(Debug)]
 pub(super) struct AnsweredRequest {
     forwarded: Box<ForwardedRequest>,
@@ -94,17 +94,17 @@ impl Future for PendingRequest {
 }
 
 impl ForwardedRequest {
-    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu, resets: bool) -> ForwardedRequest {
+    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu) -> ForwardedRequest {
         ForwardedRequest {
             header,
             drive: drive.clone(),
             request,
-            resets,
+            resets: false,
             read: None,
         }
     }
 
-    /// Sends it: its order, or its first one, is in the queue when this returns.
+    /// Queues its command, or the first one of several, before this returns.
     pub(super) fn send(self, work: BusWork, client: &Client, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
@@ -133,7 +133,7 @@ impl ForwardedRequest {
         })
     }
 
-    /// Asks for the next object of a read, if any is left.
+    /// Requests the next object of a read, if any is left.
     fn read_on(mut self: Box<Self>, client: &Client, now: Instant) -> Progress {
         let Some(read) = &mut self.read else {
             return Progress::Done(self, Outcome::Exception(Exception::DEVICE_FAILURE));
@@ -159,7 +159,7 @@ impl ForwardedRequest {
 }
 
 impl AnsweredRequest {
-    /// What comes of the forwarded now: a read object by object asks for the next one, until one fails.
+    /// Continues a read with its next object, until one fails; any other request is done.
     pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Progress {
         let Some(read) = &mut self.forwarded.read else {
             return Progress::Done(self.forwarded, self.outcome);
@@ -180,11 +180,11 @@ impl AnsweredRequest {
     }
 }
 
-/// A read that the cache cannot answer as a whole, object by object, where it is objects that the drive reads (N2: one in
-/// a transaction); `None` where it reads registers, and the request goes to it as it is.
+/// Splits a read that the process image cannot answer as a whole by object, for protocols that read one object per
+/// transaction (N2); `None` for protocols that read registers, where the request is forwarded unchanged.
 ///
 /// # Errors
-/// What the client is told at once: part of it is stale, was refused by the drive, or cannot be an object.
+/// The exception if part of the read is stale, was refused by the drive, or is not an object.
 pub(super) fn read_parts(
     protocol: Protocol,
     reading: &Reading<'_>,
@@ -221,7 +221,7 @@ pub(super) fn read_parts(
     Ok(Some(read_parts))
 }
 
-/// First address and items of the object that has that address.
+/// First address and number of items of the object that contains the address.
 fn object_around(table: Table, address: u16) -> Option<(u16, u16)> {
     let (first, object) = [address, address.saturating_sub(1)]
         .into_iter()

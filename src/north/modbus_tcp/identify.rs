@@ -1,11 +1,11 @@
-//! Function 43/14: who answers under a unit id. Pure.
+//! Function 43/14: device identification of the units.
 
 use crate::codec::{Exception, Reply};
 use crate::drive::profile::Digest;
 
-/// Longest text of an object: six of them fit one reply with room to spare.
+/// Maximum length of the text of an object: six of them fit into one reply.
 const MAX_TEXT: usize = 40;
-/// Basic and regular objects, or extended ones too, one at a time or as a stream.
+/// Conformity levels: basic and regular objects, or extended ones as well; both as single objects and as a stream.
 const CONFORMITY_REGULAR: u8 = 0x82;
 const CONFORMITY_EXTENDED: u8 = 0x83;
 /// Read device id codes.
@@ -13,19 +13,19 @@ const BASIC: u8 = 1;
 const REGULAR: u8 = 2;
 const EXTENDED: u8 = 3;
 const SINGLE: u8 = 4;
-/// Last object of the basic category, and of the regular one.
+/// Last object of the basic and of the regular category.
 const LAST_BASIC: u8 = 2;
 const LAST_REGULAR: u8 = 0x7F;
 
 /// VendorName of every unit.
 pub(crate) const VENDOR: &str = "drivegate";
-/// Objects by which another program of this kind knows who answers.
+/// Objects by which another drivegate recognises a unit.
 pub(crate) const VENDOR_NAME: u8 = 0;
 pub(crate) const PRODUCT_CODE: u8 = 1;
 pub(crate) const MODEL_NAME: u8 = 5;
 pub(crate) const PROFILE_DIGEST: u8 = 0x80;
 
-/// What a unit tells of itself.
+/// The identification of a unit.
 #[derive(Debug)]
 pub(super) struct Identity<'t> {
     /// ProductCode: name of the profile, or `gateway`.
@@ -39,12 +39,12 @@ pub(super) struct Identity<'t> {
 }
 
 impl Identity<'_> {
-    /// The answer to read device id code `code` from object `object` on. Without extended objects code 3 gets the
-    /// regular ones; a stream from an unknown object begins at the first one (Modbus Application Protocol 1.1b3,
-    /// 6.21).
+    /// The reply to read device id code `code`, starting at `object`. Without extended objects, code 3 returns the
+    /// regular ones; a stream that starts at an unknown object begins with the first one (Modbus Application Protocol
+    /// 1.1b3, 6.21).
     ///
     /// # Errors
-    /// 03 for a code that is not 1 to 4, 02 for a single object that does not exist.
+    /// 03 for a code other than 1 to 4, 02 for a single object that does not exist.
     pub(super) fn reply(&self, code: u8, object: u8) -> Result<Reply, Exception> {
         let digest = self.digest.map(|digest| digest.to_string());
         let objects = [
@@ -73,7 +73,7 @@ impl Identity<'_> {
             SINGLE => return Err(Exception::ADDRESS),
             _ => return Err(Exception::VALUE),
         };
-        // No more follows, next object 0.
+        // "More follows" and "next object" are 0.
         let mut body = vec![code, conformity, 0, 0, wanted.len() as u8];
         for (id, text) in wanted {
             let text = ascii(text);
@@ -84,12 +84,12 @@ impl Identity<'_> {
     }
 }
 
-/// A text as an object holds it.
+/// A text as it is transmitted in an object.
 pub(crate) fn as_told(text: &str) -> String {
     ascii(text).into_iter().map(char::from).collect()
 }
 
-/// Objects are ASCII.
+/// Texts of objects are ASCII.
 fn ascii(text: &str) -> Vec<u8> {
     let one = |c: char| {
         if c.is_ascii_graphic() || c == ' ' {

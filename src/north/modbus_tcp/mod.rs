@@ -1,9 +1,8 @@
-//! Modbus TCP server: MBAP framing and connections here, the meaning of requests in `session`, the public
-//! register map in [`super::register_map`].
+//! Modbus TCP server: listeners and connections. What requests mean is decided in `session`; the public register map is
+//! in [`super::register_map`].
 //!
-//! Requests may be pipelined. All that the cache answers goes out in one write; what needs the bus is waited
-//! for beside it and answered when it is done, so replies can overtake one another and carry their
-//! transaction ids.
+//! Requests may be pipelined. Answers from the process image are sent in one write. A request that needs the bus does
+//! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
 mod certificate;
@@ -43,29 +42,29 @@ pub use self::tls::{Identity, IdentityFault, IdentityProblem, Role, Tls, TlsFile
 
 /// Name in messages.
 const PROTOCOL: &str = "Modbus TCP";
-/// Files that the gateway needs open beside the connections: ports, queues, other servers, their clients.
+/// Files that the gateway needs beside those of the connections: ports, queues, other servers and their clients.
 const OTHER_FILES: u64 = 512;
 
-/// What the Modbus TCP server is told.
+/// Configuration of the Modbus TCP server.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
-    /// Where clients connect without TLS, and what they may do there.
+    /// Listeners without TLS, with the rights of their clients.
     pub listeners: Vec<Listener>,
-    /// Where clients connect with TLS.
+    /// The TLS listener.
     pub tls: Option<Tls>,
-    /// Connections at one time, of all listeners together.
+    /// Maximum number of open connections to all listeners.
     pub max_connections: usize,
-    /// Connections at one time from one address.
+    /// Maximum number of open connections from one address.
     pub max_connections_per_address: Option<usize>,
-    /// Time without a request after which a connection is closed.
+    /// Time without a request after which a connection is closed; `None` never closes it.
     pub idle_timeout: Option<Duration>,
-    /// What happens to raw reads outside the plan.
+    /// How raw reads outside the poll plan are handled.
     pub uncached: Uncached,
 }
 
 impl Options {
-    /// Whether `other` differs in the content of certificate files only, which a running server can take over.
-    pub fn differs_in_certificates_only(&self, other: &Options) -> bool {
+    /// Whether `other` differs only in the content of certificate files, which a running server can apply.
+    pub(crate) fn differs_in_certificates_only(&self, other: &Options) -> bool {
         let mut same = other.clone();
         if let (Some(tls), Some(own)) = (&mut same.tls, &self.tls) {
             tls.identity = own.identity.clone();
@@ -74,10 +73,10 @@ impl Options {
     }
 }
 
-/// A listener without TLS: who may connect, who may write, what is shown.
+/// A listener without TLS.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Listener {
-    /// Its section of the configuration, for messages: `[modbus_tcp]`.
+    /// Section of the configuration, for messages: `[modbus_tcp]`.
     pub section: String,
     /// Addresses to listen on.
     pub listen: Vec<SocketAddr>,
@@ -85,16 +84,16 @@ pub struct Listener {
     pub allow: Vec<IpNet>,
     /// Networks that may write.
     pub write: Vec<IpNet>,
-    /// Names of the buses whose drives are shown; `None` shows all.
+    /// Names of the visible buses; `None` for all.
     pub buses: Option<Vec<String>>,
 }
 
-/// What happens to raw reads outside the plan.
+/// How raw reads outside the poll plan are handled.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Uncached {
-    /// They are asked of the drive.
+    /// They are forwarded to the drive.
     Forward,
-    /// They are refused with 02.
+    /// They are refused with exception 02.
     Refuse,
 }
 
@@ -108,20 +107,20 @@ pub struct Server {
 }
 
 impl Server {
-    /// Where it listens without TLS; a port 0 of the options is the real one here.
+    /// The addresses without TLS, with the port that the system chose if port 0 was configured.
     pub fn addresses(&self) -> &[SocketAddr] {
         &self.addresses
     }
 
-    /// Where it listens with TLS.
+    /// The addresses with TLS.
     pub fn tls_addresses(&self) -> &[SocketAddr] {
         &self.tls_addresses
     }
 
-    /// Takes the certificates of `options` for clients that connect from now on; nobody is disconnected.
+    /// Uses the certificates of `options` for new connections; open connections stay.
     ///
     /// # Errors
-    /// When they cannot be used; the old ones stay.
+    /// The certificates cannot be used; the previous ones stay in use.
     pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
         match (&self.authenticator, &options.tls) {
             (Some(authenticator), Some(tls)) => Ok(authenticator.renew(&tls.identity)?),
@@ -129,7 +128,7 @@ impl Server {
         }
     }
 
-    /// Waits until every listener and connection has ended, after the token was cancelled.
+    /// Waits until all listeners and connections have ended, after the cancellation.
     pub async fn stopped(&self) {
         self.tasks.wait().await;
     }
@@ -241,9 +240,9 @@ async fn open(
     })
 }
 
-/// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes, which
-/// take a millisecond of computing, do not delay these clients; and a single thread serves more of them than several that
-/// hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
+/// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
+/// which take a millisecond of computing, do not delay these clients; and a single thread serves more of them than
+/// several that hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
 fn own_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     let tasks = tasks.clone();
@@ -263,7 +262,7 @@ fn own_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
     runtime.map_err(ServerError::Thread)
 }
 
-/// Many connections need many files; what the system lets a process have by default is often 1024.
+/// Raises the limit of open files, which is often 1024 by default, as far as `connections` require.
 fn raise_file_limit(connections: usize) {
     use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
     let wanted = connections as u64 + OTHER_FILES;
@@ -278,11 +277,11 @@ fn raise_file_limit(connections: usize) {
     };
     let why = match setrlimit(Resource::Nofile, raised) {
         Ok(()) if reached == wanted => return,
-        Ok(()) => "the hard limit is in the way".to_string(),
+        Ok(()) => "the hard limit is lower".to_string(),
         Err(why) => why.to_string(),
     };
     tracing::warn!(
-        "Modbus TCP: {connections} connections want {wanted} open files and only {reached} are granted: {why}; raise \
+        "Modbus TCP: {connections} connections require {wanted} open files, but the limit is {reached}: {why}; raise \
          LimitNOFILE of the service or lower `max_connections` of [modbus_tcp]"
     );
 }

@@ -1,4 +1,4 @@
-//! The server without sockets and runtime, for whoever has bytes instead of a connection: tests, fuzz targets, virtual time.
+//! The server without sockets and runtime, for tests, fuzz targets and virtual time.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
@@ -13,17 +13,17 @@ use crate::command::Authority;
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
 
-/// One client of a server that has no sockets. Time is what [`Offline::receive`] is told.
+/// One client of a server without sockets. Time is an argument of [`Offline::receive`].
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
-    /// What the dialogue had no room for yet.
+    /// Input that the dialogue has no room for yet.
     backlog: Vec<u8>,
     closed: bool,
 }
 
 impl Offline {
-    /// A client at `peer` that sees the whole plant. Of the options only `uncached` matters.
+    /// A client at `peer` that sees the whole plant. Of the options only `uncached` is used.
     pub fn new(
         options: Options,
         plant: SharedPlant,
@@ -49,8 +49,8 @@ impl Offline {
         }
     }
 
-    /// The bytes that are answered to `bytes` so far; requests that wait for the bus are answered by a later call, with
-    /// or without further bytes. Orders are in the queue of their bus when this returns.
+    /// Processes `bytes` and returns the answers available so far; requests that wait for the bus are answered by a
+    /// later call, with or without further input. Commands are in the queue of their bus when this returns.
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         self.backlog.extend_from_slice(bytes);
         let mut answers = Vec::new();
@@ -73,7 +73,7 @@ impl Offline {
         answers
     }
 
-    /// Whether a server would have closed the connection: what came is no Modbus.
+    /// Whether a server would have closed the connection, because the input was not Modbus.
     pub fn is_closed(&self) -> bool {
         self.closed
     }

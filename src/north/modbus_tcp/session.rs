@@ -1,4 +1,4 @@
-//! What the requests of one client mean, and what is answered.
+//! Decides what the requests of one client mean and how they are answered.
 
 use std::sync::Arc;
 use std::time::Instant;
@@ -18,21 +18,21 @@ use crate::command::{Authority, Order, Outcome};
 use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
 use crate::north::log_throttle::LogThrottle;
-use crate::north::register_map::{self, BusFigures, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
+use crate::north::register_map::{self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
 use crate::plant::{BusHandle, DriveHandle};
 
-/// Function codes that change something.
+/// Function codes that write.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
-/// Function codes that every drive has here, by the blocks from 0x8000 on and the identification.
+/// Function codes that every drive supports, through the blocks from 0x8000 on and the device identification.
 const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
 
-/// What becomes of a request.
+/// How a request is handled.
 enum Decision {
-    /// AnsweredRequest at once.
+    /// Answered at once.
     Reply(RequestPdu, Reply),
     /// Refused at once.
     Exception(Exception),
-    /// The drive is asked, or a command refused on the way to it.
+    /// Forwarded to the drive, or refused on the way.
     Drive(ForwardedRequest, BusWork),
 }
 
@@ -42,7 +42,7 @@ impl From<Exception> for Decision {
     }
 }
 
-/// One client.
+/// One connected client.
 #[derive(Debug)]
 pub(super) struct ClientSession {
     state: Arc<ServerState>,
@@ -59,7 +59,7 @@ impl Drop for ClientSession {
 }
 
 impl ClientSession {
-    /// A client has connected; it has left when the session is dropped.
+    /// Counts the client as connected until the session is dropped.
     pub(super) fn new(state: Arc<ServerState>, view: Arc<PlantView>, client: Client) -> ClientSession {
         state.stats.modbus_tcp.connected();
         let routes = view.routes();
@@ -72,12 +72,12 @@ impl ClientSession {
         }
     }
 
-    /// Another client has connected to the same server.
+    /// A session for another client of the same server.
     pub(super) fn beside(&self, client: Client) -> ClientSession {
         ClientSession::new(self.state.clone(), self.view.clone(), client)
     }
 
-    /// The client, for the log.
+    /// Name of the client for the log.
     pub(super) fn who(&self) -> &str {
         &self.client.who
     }
@@ -86,15 +86,15 @@ impl ClientSession {
         &self.state.stats.modbus_tcp
     }
 
-    /// Takes over a plant that a reload has put in place.
+    /// Uses the current plant, which a reload may have replaced.
     pub(super) fn refresh(&mut self) {
         if !self.view.is_current(&self.routes) {
             self.routes = self.view.routes();
         }
     }
 
-    /// Answers a request into `out`, or gives what its answer waits for. An order has been queued when this
-    /// returns, so orders reach the bus in the order of their frames.
+    /// Answers a request into `out`, or returns the pending request. Its command is in the queue when this returns, so
+    /// commands reach the bus in the order of their frames.
     pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
         match self.decide(frame, now) {
             Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
@@ -113,8 +113,8 @@ impl ClientSession {
         None
     }
 
-    /// The bus has answered: appends the answer to the request, or gives what it waits for next. A read part by part
-    /// has its next order in the queue when this returns.
+    /// Appends the answer to a request that the bus has answered, or returns it if it waits for its next part, whose
+    /// command is in the queue when this returns.
     pub(super) fn finish(
         &mut self,
         answered: AnsweredRequest,
@@ -171,7 +171,7 @@ impl ClientSession {
         self.stats().answered(function, code.0);
     }
 
-    /// A code of the drive's own is answered as 04; the log has the original.
+    /// Logs an exception code that only this drive uses; the client gets 04.
     fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
         if let Some(suppressed) = self.foreign_codes.permit(now) {
             tracing::warn!(drive, client = %self.client.who, suppressed,
@@ -188,7 +188,7 @@ impl ClientSession {
         };
         let profile = &drive.image.spec.profile;
         let decoded = RequestPdu::decode(frame.pdu);
-        // Authority comes before everything that the request could be wrong in.
+        // Authority is checked before anything else that could be wrong with the request.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
                 Ok(request) => forwarded(
@@ -245,7 +245,7 @@ impl ClientSession {
         self.client.authority == Authority::Write && drive.image.spec.access == Access::Control
     }
 
-    /// Unit 255: input registers; holding registers alike, since many clients read nothing else.
+    /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
     fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
         if WRITES.contains(&frame.function) {
             return Err(Exception::FUNCTION);
@@ -303,7 +303,7 @@ impl ClientSession {
         }
     }
 
-    /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
+    /// A write to the blocks from 0x8000 on by a client that may write to the drive.
     fn command(
         &self,
         header: Header,
@@ -322,34 +322,38 @@ impl ClientSession {
             *last = write.word.or(*last);
             Ok((write, resets))
         });
-        let (work, resets) = match write {
-            // A heartbeat alone is no command: it is answered at once and not audited.
+        let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
+        let work = match write {
+            // A heartbeat alone is not a command: it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.image.renew_lease(now);
                 return Decision::Reply(request, Reply::Written);
             }
-            Ok((CommandWrite { points, .. }, resets)) => (BusWork::Order(Order::Points(points)), resets),
-            Err(refusal) => (BusWork::Refused(refusal), false),
+            Ok((CommandWrite { points, .. }, resets)) => {
+                forwarded.resets = resets;
+                BusWork::Order(Order::Points(points))
+            }
+            Err(refusal) => BusWork::Refused(refusal),
         };
-        Decision::Drive(ForwardedRequest::new(header, drive, request, resets), work)
+        Decision::Drive(forwarded, work)
     }
 }
 
 fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
-    Decision::Drive(ForwardedRequest::new(header, drive, request, false), work)
+    Decision::Drive(ForwardedRequest::new(header, drive, request), work)
 }
 
 fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
     let reading = drive.reading(now);
-    DriveView::new(&reading, drive.bus_up())
+    let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
+    DriveView::new(&reading, bus)
         .registers(start, count)
         .map_or_else(Decision::from, |words| {
             Decision::Reply(request, Reply::Registers(words))
         })
 }
 
-/// Whether a raw request with that function makes sense to the family: it has the table. No family has the
-/// functions 22 and 23.
+/// Whether the family has the table that a function code accesses. No family supports 22 and 23.
 fn has_function(profile: &Profile, function: u8) -> bool {
     let table = match function {
         1 | 5 | 15 => Table::Coil,
@@ -361,7 +365,7 @@ fn has_function(profile: &Profile, function: u8) -> bool {
     profile.ranges.iter().any(|r| r.table == table)
 }
 
-/// Items that the drive gives in one read of that span, by the ranges of the profile that it touches.
+/// Maximum number of items in one read of this span, by the ranges of the profile that it touches.
 fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
     let table = profile.canonical(table);
     let last = start.saturating_add(count.saturating_sub(1));
@@ -372,7 +376,7 @@ fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
     touched.map(|r| r.read).min().unwrap_or(table.max_read())
 }
 
-/// Whether a drive's reply is one to the request.
+/// Whether the reply of a drive has the form that the request expects.
 fn answers(request: &RequestPdu, reply: &Reply) -> bool {
     match (request, reply) {
         (RequestPdu::Read { table, count, .. }, Reply::Bits(bits)) => {

@@ -1,4 +1,4 @@
-//! The task that owns outbox, journal and publisher, and puts them to a connection while there is one.
+//! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
 use std::collections::BTreeSet;
 use std::hash::{BuildHasher, RandomState};
@@ -24,19 +24,19 @@ use crate::event::Event;
 use crate::north::NorthStats;
 use crate::plant::{Plant, SharedPlant};
 
-/// First and longest wait between two attempts to connect.
+/// First and longest wait between two connection attempts.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
-/// A connection that held this long was a good one: the next attempt comes soon.
+/// After a connection that lasted this long, the next attempt follows after the shortest wait.
 const STEADY: Duration = Duration::from_secs(5);
-/// No sign of life for this long: the connection is dead, whatever the socket says.
+/// Without a packet from the broker for this long, the connection is considered lost.
 const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
-/// Time for the broker to answer a subscription.
+/// Time limit for the broker to answer the subscription.
 const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Topics that are logged when the broker takes no messages on them.
-const REFUSED_TOLD: usize = 100;
-/// Time for the good-bye.
+/// Maximum number of topics that are logged because the broker refuses messages on them.
+const REFUSED_LOGGED: usize = 100;
+/// Time for the orderly disconnect.
 const FAREWELL: Duration = Duration::from_millis(500);
-/// Time within it for results of commands that are under way.
+/// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
 
 /// Runs the MQTT client until `cancel`.
@@ -63,7 +63,7 @@ pub(super) async fn run(
     client.farewell().await;
 }
 
-/// What the connection tells next; waits for ever while there is none. May be cancelled without loss.
+/// The next event of the connection; pending while there is none. Cancel safe.
 async fn next(link: &mut BrokerLink) -> ConnectionEvent {
     match link {
         BrokerLink::Away { .. } => std::future::pending().await,
@@ -73,9 +73,9 @@ async fn next(link: &mut BrokerLink) -> ConnectionEvent {
 
 #[derive(Debug)]
 enum BrokerLink {
-    /// No connection; the next attempt comes then.
+    /// No connection; the next attempt follows at `until`.
     Away { until: Instant },
-    /// A connection, not necessarily taken by the broker yet.
+    /// A connection that the broker may not have accepted yet.
     Open(BrokerSession),
 }
 
@@ -83,7 +83,7 @@ enum BrokerLink {
 struct BrokerSession {
     connection: Connection,
     phase: Phase,
-    /// When the broker was last heard of.
+    /// Time of the last packet from the broker.
     heard: Instant,
 }
 
@@ -97,7 +97,7 @@ enum Phase {
 struct Client {
     options: Options,
     plant: SharedPlant,
-    /// The plant that the publisher watches.
+    /// The plant that the publisher observes.
     watched: Arc<Plant>,
     stats: Arc<NorthStats>,
     events: Receiver<Arc<Event>>,
@@ -107,15 +107,15 @@ struct Client {
     store: EventStore,
     commands: Commands,
     link: BrokerLink,
-    /// Wait before the next attempt.
+    /// Wait before the next connection attempt.
     back_off: Duration,
-    /// Why there is no connection, as it was last logged.
+    /// Why there is no connection, as last logged.
     trouble: Option<String>,
-    /// Events that came too fast.
+    /// Number of events lost because they arrived too fast.
     missed: u64,
-    dropped_told: u64,
-    /// Topics on which the broker took no messages, as far as they were logged.
-    refused_told: BTreeSet<Arc<str>>,
+    dropped_logged: u64,
+    /// Topics that were logged because the broker refuses messages on them.
+    refused_logged: BTreeSet<Arc<str>>,
 }
 
 impl Client {
@@ -133,8 +133,8 @@ impl Client {
             back_off: BACK_OFF.0,
             trouble: None,
             missed: 0,
-            dropped_told: 0,
-            refused_told: BTreeSet::new(),
+            dropped_logged: 0,
+            refused_logged: BTreeSet::new(),
             options,
             plant,
             watched,
@@ -145,7 +145,7 @@ impl Client {
         }
     }
 
-    /// Fine enough that `min_interval` is met closely.
+    /// Short enough to keep `min_interval` accurately.
     fn tick_interval(&self) -> Duration {
         (self.options.min_interval / 4).clamp(Duration::from_millis(10), Duration::from_millis(25))
     }
@@ -154,14 +154,14 @@ impl Client {
         match event {
             Ok(event) => self.take_event(&event),
             Err(RecvError::Lagged(lost)) => self.missed(lost),
-            // The plant that told them is gone; there is a new one.
+            // The plant was replaced.
             Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
         }
-        self.take_told();
+        self.take_pending_events();
     }
 
-    /// Takes in at once what was told: who falls behind loses events.
-    fn take_told(&mut self) {
+    /// Stores all pending events at once, before newer ones displace them.
+    fn take_pending_events(&mut self) {
         loop {
             match self.events.try_recv() {
                 Ok(event) => self.take_event(&event),
@@ -174,7 +174,7 @@ impl Client {
     fn missed(&mut self, lost: u64) {
         self.missed += lost;
         tracing::error!(
-            "{lost} events came faster than they could be taken and are lost, {} since the start; the log has them",
+            "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
             self.missed
         );
     }
@@ -198,7 +198,7 @@ impl Client {
             ConnectionEvent::Subscribed(refused) => {
                 if let Some(why) = refused {
                     tracing::error!(
-                        "the broker refuses the set topics ({why}): no commands by MQTT; allow the client to subscribe to {}",
+                        "the broker refuses the set topics ({why}): no commands over MQTT; allow the client to subscribe to {}",
                         self.topics.set_filters().join(" and ")
                     );
                 }
@@ -219,7 +219,7 @@ impl Client {
             ConnectionEvent::Refused(packet, why) => {
                 let acked = self.outbox.acked(packet);
                 if let Some(Acknowledged { topic, .. }) = &acked {
-                    self.tell_refused(topic, &format!("the broker refuses it: {why}"));
+                    self.log_refused(topic, &format!("the broker refuses it: {why}"));
                 }
                 self.done(acked);
             }
@@ -229,14 +229,14 @@ impl Client {
         }
     }
 
-    /// Once for each topic and connection.
-    fn tell_refused(&mut self, topic: &Arc<str>, why: &str) {
-        if self.refused_told.len() < REFUSED_TOLD && self.refused_told.insert(topic.clone()) {
-            tracing::warn!("a message on {topic} is dropped: {why}");
+    /// Logs once per topic and connection.
+    fn log_refused(&mut self, topic: &Arc<str>, why: &str) {
+        if self.refused_logged.len() < REFUSED_LOGGED && self.refused_logged.insert(topic.clone()) {
+            tracing::warn!("dropped a message on {topic}: {why}");
         }
     }
 
-    /// An entry left the outbox: the disk need not keep it.
+    /// Removes the record of a message that left the outbox.
     fn done(&mut self, acked: Option<Acknowledged>) {
         if let Some(record) = acked.and_then(|a| a.record) {
             self.store.acknowledge(record);
@@ -251,14 +251,14 @@ impl Client {
         if !self.options.commands {
             self.ready(limits, since);
         } else if session.connection.subscribe(self.topics.set_filters()) {
-            // Who reads `online` may command: first the subscription, then the birth.
+            // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
             self.lost("the subscription could not be sent");
         }
     }
 
-    /// Birth: status first, then everything there is.
+    /// Publishes the status, then everything else.
     fn ready(&mut self, limits: BrokerLimits, since: Instant) {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
@@ -267,8 +267,8 @@ impl Client {
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
         self.trouble = None;
-        self.dropped_told = self.dropped();
-        self.refused_told.clear();
+        self.dropped_logged = self.dropped();
+        self.refused_logged.clear();
         self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
         self.publisher.restart();
     }
@@ -287,7 +287,7 @@ impl Client {
         }
         let wait = jittered(self.back_off, RandomState::new().hash_one(0));
         self.back_off = (self.back_off * 2).min(BACK_OFF.1);
-        // Dropping the session ends its task and closes the socket.
+        // Dropping the session aborts its task and closes the socket.
         self.link = BrokerLink::Away { until: now + wait };
         self.outbox.lost();
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
@@ -300,9 +300,7 @@ impl Client {
             } else {
                 ""
             };
-            tracing::warn!(
-                "no connection to the broker at {host}:{port}: {why}{hint}; trying again until there is one"
-            );
+            tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
             self.trouble = Some(why.to_string());
         }
     }
@@ -346,7 +344,7 @@ impl Client {
                     self.lost("the broker does not answer the subscription");
                 }
                 _ if now.saturating_duration_since(session.heard) > SILENCE => {
-                    self.lost("the broker gives no sign of life");
+                    self.lost("the broker is silent");
                 }
                 Phase::Ready { .. } => {
                     for update in self.publisher.tick(now, SystemTime::now()) {
@@ -357,10 +355,10 @@ impl Client {
             },
         }
         self.store.sync(now);
-        self.tell_dropped();
+        self.log_dropped();
     }
 
-    /// After a reload there is another plant.
+    /// Observes the current plant, which a reload may have replaced.
     fn follow_plant(&mut self) {
         let plant = self.plant.load_full();
         if Arc::ptr_eq(&plant, &self.watched) {
@@ -368,7 +366,7 @@ impl Client {
         }
         let events = plant.events.subscribe();
         if !events.same_channel(&self.events) {
-            self.take_told();
+            self.take_pending_events();
             self.events = events;
         }
         self.publisher.adopt(&plant);
@@ -378,7 +376,7 @@ impl Client {
     async fn connect(&mut self) {
         let now = Instant::now();
         let options = self.options.clone();
-        // Read anew for each attempt: a renewed certificate is taken without a restart.
+        // Read for each attempt, so that renewed certificates are used without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
@@ -394,7 +392,7 @@ impl Client {
         }
     }
 
-    /// Hands over to the connection what may go.
+    /// Publishes from the outbox as far as the connection allows.
     fn pump(&mut self) {
         self.store.refill(&mut self.outbox);
         if let BrokerLink::Open(BrokerSession {
@@ -416,7 +414,7 @@ impl Client {
             }
             for acked in oversized {
                 if let Some(Acknowledged { topic, .. }) = &acked {
-                    self.tell_refused(topic, &format!("the broker takes packets of {most} bytes at most"));
+                    self.log_refused(topic, &format!("the broker accepts at most {most} bytes per packet"));
                 }
                 self.done(acked);
             }
@@ -429,23 +427,23 @@ impl Client {
         self.outbox.dropped() + self.store.dropped()
     }
 
-    /// Once for each time that the broker is away.
-    fn tell_dropped(&mut self) {
+    /// Logs once per connection outage.
+    fn log_dropped(&mut self) {
         let dropped = self.dropped();
-        if dropped > self.dropped_told && self.dropped_told != u64::MAX {
-            tracing::warn!("the buffer is full or damaged: the oldest events or results are dropped");
-            self.dropped_told = u64::MAX;
+        if dropped > self.dropped_logged && self.dropped_logged != u64::MAX {
+            tracing::warn!("the buffer is full or damaged: dropping the oldest events or results");
+            self.dropped_logged = u64::MAX;
         }
     }
 
-    /// Sends what waits, then `offline`, then says good-bye; all within half a second.
+    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second.
     async fn farewell(mut self) {
-        self.take_told();
+        self.take_pending_events();
         let begun = tokio::time::Instant::now();
-        // When the time is over the connection is cut, and the broker publishes the last will.
+        // After that time the connection is closed, and the broker publishes the last will.
         let in_time = tokio::time::timeout_at(begun + FAREWELL, self.say_goodbye(begun + LAST_RESULTS)).await;
         if in_time.is_err() {
-            tracing::warn!("the broker did not take the good-bye in time; it publishes the last will");
+            tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
     }
@@ -482,7 +480,7 @@ impl Client {
     }
 }
 
-/// Three quarters to all of `wait`, by a random number: gateways that lost one broker do not come back in step.
+/// 75 to 100 % of `wait`, by a random number, so that gateways do not reconnect to a broker at the same time.
 fn jittered(wait: Duration, random: u64) -> Duration {
     wait.mul_f64(0.75 + 0.25 * (random as f64 / u64::MAX as f64))
 }

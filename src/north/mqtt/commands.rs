@@ -1,5 +1,5 @@
-//! The set topics: from a message to one order, and from its answer to one result. Pure: time is an argument, and
-//! waiting is all that is left to a task.
+//! The set topics: turns a message into one command, and the answer to that command into one result. Time is an
+//! argument; a task only has to wait.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -19,40 +19,40 @@ use crate::document::nearest;
 use crate::drive::ModelPoint;
 use crate::plant::{Placed, Plant};
 
-/// Commands that wait for their answer from the bus, and bytes that are kept for their results. Only stops can be so many:
-/// of all else the queues of the buses take fewer.
+/// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
+/// commands.
 const WAITING: QueueLimit = QueueLimit {
     most: 4096,
     bytes: 8 << 20,
 };
-/// The same of commands that the drive acknowledged and that wait for the read that shows their effect.
+/// Limits of the commands that the drive acknowledged and whose effect has not been read yet.
 const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
-/// Messages remembered to recognise a repetition.
+/// Number of recent commands in which a repetition is recognised.
 const REMEMBERED: usize = 256;
-/// Time for which a command with an `id` is recognised when it comes again.
+/// Time for which a command with an `id` is recognised when it is repeated.
 const REPLAYED: Duration = Duration::from_secs(60);
 
-/// Takes commands and gives their results.
+/// Processes commands and returns their results.
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
-    /// All that comes over the connection to the broker is one client.
+    /// Everything from the connection to the broker counts as one client.
     client: Arc<str>,
-    /// In the order in which they were taken.
+    /// In the order of acceptance.
     waiting: PendingCommands,
-    /// In the order in which they were acknowledged.
+    /// In the order of acknowledgement.
     confirming: PendingCommands,
     hasher: RandomState,
-    /// Commands taken, oldest first.
+    /// Accepted commands, oldest first.
     recent: VecDeque<RecentCommand>,
-    /// Commands taken so far: their numbers.
+    /// Number of commands accepted so far.
     taken: u64,
 }
 
-/// A command under way.
+/// A command that is not finished.
 #[derive(Debug)]
 struct PendingCommand {
     number: u64,
@@ -61,7 +61,7 @@ struct PendingCommand {
     placed: Placed,
 }
 
-/// A command of which all is known that its result tells.
+/// A command whose result is known.
 #[derive(Debug)]
 pub(super) struct FinishedCommand {
     number: u64,
@@ -71,18 +71,18 @@ pub(super) struct FinishedCommand {
     confirmed: Option<Duration>,
 }
 
-/// A command that was taken.
+/// An accepted command.
 #[derive(Debug)]
 struct RecentCommand {
     number: u64,
     fingerprint: u64,
     packet: u16,
-    /// Hash of topic and `id`, where it has one.
+    /// Hash of topic and `id`, if it has one.
     identity: Option<u64>,
-    /// Stops of the drive by then.
+    /// Number of stops of the drive at that time.
     stops: u64,
     at: Instant,
-    /// Once it is there.
+    /// `None` until it is finished.
     result: Option<Message>,
 }
 
@@ -99,16 +99,16 @@ impl Commands {
         }
     }
 
-    /// Whether more may be taken. While not, messages stay with the broker, whoever sends them: no stop is refused for
-    /// want of room here.
+    /// Whether another message may be processed. If not, messages stay with the broker, so that no stop is refused for
+    /// lack of room.
     pub(super) fn has_room(&self) -> bool {
         !self.waiting.is_full(WAITING)
     }
 
-    /// Takes a message at `now`, which is `time` on the calendar; returns its result if it is there at once, else its
-    /// order is in the queue of the bus. A repetition of a command is answered from memory and not carried out again: one
-    /// that the broker marks as such, or the same message with the same `id` within a minute. A stop is carried out
-    /// whenever it comes.
+    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
+    /// otherwise its command is in the queue of the bus. A repeated command is answered with the previous result and
+    /// not executed again: one that the broker marks as repeated, or the same message with the same `id` within a
+    /// minute. A stop is always executed.
     pub(super) fn take(
         &mut self,
         incoming: Incoming,
@@ -118,7 +118,7 @@ impl Commands {
     ) -> Option<Message> {
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
-            return None; // somebody takes a retained message away
+            return None; // a retained message was cleared
         }
         let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
         let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, incoming.topic.as_str());
@@ -147,8 +147,9 @@ impl Commands {
             if known.stops == drive.stops() {
                 return known.result.clone();
             }
-            // The motor was stopped since: the old result would be untrue, and to do it again would start it.
-            let why = "it repeats an earlier command, and a stop came since; send it anew, with another `id`";
+            // The motor was stopped since: the previous result is no longer true, and a repetition would start it
+            // again.
+            let why = "it repeats an earlier command, but a stop was received since; send it with another `id`";
             let answer = drive.refuse(&what(), Refusal::NotAllowed(why.to_string()), origin, now);
             return Some(reply.message(request.id, &answer, None, time));
         }
@@ -162,7 +163,7 @@ impl Commands {
         self.follow(pending, time)
     }
 
-    /// What was refused has its result at once; all else waits.
+    /// Returns the result of a refused command; any other waits.
     fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
         match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
             Some(answer) => Some(self.result(pending.end(answer, None), time)),
@@ -184,7 +185,7 @@ impl Commands {
         self.hasher.hash_one((topic, payload, response_topic, correlation))
     }
 
-    /// The command that a message repeats. An `id` that was used for something else since is no sign of a repetition.
+    /// The command that a message repeats. An `id` that has been used for another command since does not count.
     fn repeated(
         &self,
         incoming: &Incoming,
@@ -226,12 +227,12 @@ impl Commands {
         self.taken
     }
 
-    /// The next command that ends; waits for ever when none is under way. May be cancelled without loss.
+    /// The next command that finishes; pending while there is none. Cancel safe.
     pub(super) async fn finished(&mut self) -> FinishedCommand {
         poll_fn(|cx| self.poll_finished(cx)).await
     }
 
-    /// The next command that has finished, if there is one.
+    /// A command that has finished, if there is one.
     pub(super) fn try_finished(&mut self) -> Option<FinishedCommand> {
         match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
             Poll::Ready(finished) => Some(finished),
@@ -239,8 +240,8 @@ impl Commands {
         }
     }
 
-    /// Those that the drive acknowledged make room for those that wait for the bus; if too many wait for the read that
-    /// shows their effect, the oldest stays "acknowledged".
+    /// An acknowledged command no longer occupies the queue for the bus. If too many wait for confirmation, the oldest
+    /// finishes as "acknowledged".
     fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
         while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
             match pending.placed.answer() {
@@ -260,7 +261,7 @@ impl Commands {
         finished.map_or(Poll::Pending, Poll::Ready)
     }
 
-    /// The one result of a command that finished, at `time`.
+    /// The one result of a finished command, at `time`.
     pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
         let message = finished
             .reply
@@ -271,7 +272,7 @@ impl Commands {
         message
     }
 
-    /// Whether no command is under way.
+    /// Whether all commands are finished.
     pub(super) fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.confirming.is_empty()
     }
@@ -288,20 +289,20 @@ impl PendingCommand {
         }
     }
 
-    /// Bytes that a client may make long.
+    /// Number of bytes whose length the client controls.
     fn bytes(&self) -> usize {
         self.reply.bytes() + self.id.as_ref().and_then(Json::as_str).map_or(0, str::len)
     }
 }
 
-/// How much a row may hold.
+/// Limits of a queue.
 #[derive(Debug, Clone, Copy)]
 struct QueueLimit {
     most: usize,
     bytes: usize,
 }
 
-/// Commands in their order.
+/// Commands in order.
 #[derive(Debug, Default)]
 struct PendingCommands {
     commands: VecDeque<PendingCommand>,
@@ -314,7 +315,7 @@ impl PendingCommands {
         self.commands.push_back(pending);
     }
 
-    /// Takes out the first one that `is_it`.
+    /// Removes the first command for which `is_it` holds.
     fn take(&mut self, is_it: impl FnMut(&mut PendingCommand) -> bool) -> Option<PendingCommand> {
         let place = self.commands.iter_mut().position(is_it)?;
         let pending = self.commands.remove(place)?;

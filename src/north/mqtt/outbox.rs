@@ -1,22 +1,22 @@
-//! What is sent next, and what waits for its acknowledgement. Pure.
+//! Decides what is sent next, and tracks what waits for its acknowledgement.
 //!
-//! Telemetry: the latest value per topic, the newest wins, one message per topic under way. Events and
-//! results: bounded queues in order. An entry leaves on its PubAck only. At most `limit` messages are under
-//! way: half the inflight window of the connection, so that packet ids are never used twice at one time.
+//! Telemetry: only the latest value of a topic waits, and one message per topic is in flight. Events and results:
+//! bounded queues in order. An entry leaves only when it is acknowledged (PUBACK). At most `limit` messages are in
+//! flight: half the inflight window of the connection, so that no packet id is used twice at a time.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
 
 use super::journal::RecordId;
 
-/// Results that may wait, as many as commands may, and their bytes; the oldest is dropped.
+/// Maximum number of waiting results, the same as that of commands, and their size in bytes; the oldest is dropped.
 const RESULTS: usize = 4096;
 const RESULT_BYTES: usize = 32 << 20;
-/// Events that may wait in memory; with a buffer on disk the rest waits there.
+/// Maximum number of events waiting in memory; with a buffer, the others wait on disk.
 const EVENTS: usize = crate::event::BURST;
-/// Events loaded from the disk at one time.
+/// Maximum number of events loaded from disk at a time.
 const LOADED: usize = 64;
-/// Connections that may break under a result before it is given up: its response topic may be the cause.
+/// Number of lost connections after which a result is dropped: its response topic may be the cause.
 const RESULT_ATTEMPTS: u8 = 2;
 
 /// A message for the broker, QoS 1.
@@ -30,7 +30,7 @@ pub(super) struct Message {
 }
 
 impl Message {
-    /// A message that the broker does not keep.
+    /// A message that is not retained.
     pub(super) fn not_retained(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
         Message {
             topic: topic.into(),
@@ -45,18 +45,18 @@ impl Message {
     }
 }
 
-/// Names an entry while its message is under way.
+/// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
-    /// Telemetry of that topic.
+    /// Telemetry of this topic.
     Latest(Arc<str>),
-    /// Result of that serial number.
+    /// Result with this serial number.
     Result(u64),
-    /// Event of that serial number.
+    /// Event with this serial number.
     Event(u64),
 }
 
-/// What was acknowledged.
+/// An entry whose message was acknowledged.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Acknowledged {
     /// Topic of the message.
@@ -67,7 +67,7 @@ pub(super) struct Acknowledged {
 
 #[derive(Debug, Default)]
 struct Slot {
-    /// The newest payload that was not handed over yet.
+    /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
     under_way: bool,
 }
@@ -81,28 +81,28 @@ struct Entry {
     attempts: u8,
 }
 
-/// Everything that is to be published.
+/// All messages that wait or are in flight.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     latest: BTreeMap<Arc<str>, Slot>,
-    /// Topics with a payload to hand over, oldest change first.
+    /// Topics with a waiting payload, oldest change first.
     order: VecDeque<Arc<str>>,
     results: VecDeque<Entry>,
     events: VecDeque<Entry>,
     serial: u64,
-    /// Handed over, packet id not known yet.
+    /// Published, packet id not known yet.
     handed: VecDeque<Key>,
-    /// Handed over, by packet id.
+    /// Published, by packet id.
     flying: HashMap<u16, Key>,
-    /// The first topic of `order` goes before everything else.
+    /// The first topic of `order` is published before everything else.
     lead: bool,
-    /// Whose turn it is of events and telemetry.
+    /// Whether events come before telemetry next time.
     events_turn: bool,
     dropped: u64,
 }
 
 impl Outbox {
-    /// Telemetry: replaces what waits for that topic.
+    /// Adds telemetry; replaces the waiting payload of the topic.
     pub(super) fn put(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         let slot = self.latest.entry(topic.clone()).or_default();
         if slot.waiting.replace(payload).is_none() {
@@ -110,7 +110,7 @@ impl Outbox {
         }
     }
 
-    /// Telemetry that goes before everything else.
+    /// Adds telemetry that is published before everything else.
     pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         self.latest.entry(topic.clone()).or_default().waiting = Some(payload);
         self.order.retain(|t| *t != topic);
@@ -118,7 +118,7 @@ impl Outbox {
         self.lead = true;
     }
 
-    /// A result; when too many wait the oldest is dropped.
+    /// Adds a result; if too many wait, the oldest is dropped.
     pub(super) fn push_result(&mut self, message: Message) {
         self.serial += 1;
         let full = |results: &VecDeque<Entry>| {
@@ -128,40 +128,40 @@ impl Outbox {
         self.dropped += push(&mut self.results, self.serial, message, None, full);
     }
 
-    /// An event, with its record when it is on disk; when too many wait the oldest is dropped.
+    /// Adds an event, with its record if it is on disk; if too many wait, the oldest is dropped.
     pub(super) fn push_event(&mut self, message: Message, record: Option<RecordId>) {
         self.serial += 1;
         let full = |events: &VecDeque<Entry>| events.len() >= EVENTS;
         self.dropped += push(&mut self.events, self.serial, message, record, full);
     }
 
-    /// How many events may be loaded from the disk now.
+    /// Number of events that may be loaded from disk now.
     pub(super) fn room(&self) -> usize {
         LOADED.saturating_sub(self.events.len())
     }
 
-    /// Events and results that wait, those under way included.
+    /// Number of events and results that wait or are in flight.
     pub(super) fn waiting(&self) -> usize {
         self.results.len() + self.events.len()
     }
 
-    /// Whether telemetry of that topic waits or is under way.
+    /// Whether telemetry of that topic waits or is in flight.
     pub(super) fn has_telemetry(&self, topic: &str) -> bool {
         self.latest.contains_key(topic)
     }
 
-    /// Events and results that were dropped because too many waited.
+    /// Number of events and results dropped because too many waited.
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// Messages handed over and not acknowledged.
+    /// Number of messages in flight.
     pub(super) fn under_way(&self) -> usize {
         self.handed.len() + self.flying.len()
     }
 
-    /// The message to be handed over next: a leading one, then results, then events and telemetry by turns.
-    /// It stays here: tell with [`Outbox::handed_over`] that it was taken.
+    /// The message to publish next: the leading one, then results, then events and telemetry alternately. It stays in
+    /// the outbox; confirm with [`Outbox::handed_over`] that it was published.
     pub(super) fn next(&self, limit: usize) -> Option<(Key, Message)> {
         if self.under_way() >= limit {
             return None;
@@ -195,7 +195,7 @@ impl Outbox {
         })
     }
 
-    /// The message of `key` was handed over to the connection.
+    /// The message of `key` was published on the connection.
     pub(super) fn handed_over(&mut self, key: Key) {
         match &key {
             Key::Latest(topic) => {
@@ -203,7 +203,7 @@ impl Outbox {
                     slot.waiting = None;
                     slot.under_way = true;
                 }
-                // Found at or near the front: before it lie only topics that are under way.
+                // At or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
@@ -219,27 +219,27 @@ impl Outbox {
         self.handed.push_back(key);
     }
 
-    /// The connection gave the oldest message handed over this packet id.
+    /// The connection assigned this packet id to the oldest published message.
     ///
     /// # Errors
-    /// When the books do not agree: the connection must be given up.
+    /// The state is inconsistent; the connection must be closed.
     pub(super) fn numbered(&mut self, packet: u16) -> Result<(), &'static str> {
         let key = self
             .handed
             .pop_front()
-            .ok_or("a message was sent that nobody handed over")?;
+            .ok_or("a message was sent that was not published by the outbox")?;
         match self.flying.insert(packet, key) {
             None => Ok(()),
             Some(_) => Err("a packet id was used twice"),
         }
     }
 
-    /// The broker acknowledged a message: its entry leaves.
+    /// The broker acknowledged a message; its entry is removed.
     pub(super) fn acked(&mut self, packet: u16) -> Option<Acknowledged> {
         self.settle(self.flying.get(&packet).cloned()?, Some(packet))
     }
 
-    /// Gives up the message of `key`, which cannot be sent.
+    /// Drops the message of `key`, which cannot be sent.
     pub(super) fn give_up(&mut self, key: Key) -> Option<Acknowledged> {
         if let Key::Latest(topic) = &key {
             self.latest.get_mut(topic)?.waiting = None;
@@ -266,8 +266,8 @@ impl Outbox {
         }
     }
 
-    /// The connection is lost. Events and results that were under way wait again, in their order; telemetry
-    /// is forgotten: the process image knows better by then.
+    /// The connection is lost. Events and results in flight wait again, in their order; telemetry is dropped, since the
+    /// process image has newer values.
     pub(super) fn lost(&mut self) {
         self.latest.clear();
         self.order.clear();
@@ -283,7 +283,7 @@ impl Outbox {
         self.dropped += (before - self.results.len()) as u64;
     }
 
-    /// Telemetry is not sent any more.
+    /// Stops sending telemetry.
     pub(super) fn drop_telemetry(&mut self) {
         self.order.clear();
         self.latest.retain(|_, slot| {
@@ -293,8 +293,8 @@ impl Outbox {
     }
 }
 
-/// Appends an entry; returns how many were dropped to make room. One that is under way is dropped last: it is
-/// probably delivered.
+/// Appends an entry and returns the number of entries dropped to make room. Entries in flight are dropped last: they
+/// have probably been delivered.
 fn push(
     queue: &mut VecDeque<Entry>,
     serial: u64,

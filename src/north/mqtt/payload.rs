@@ -1,4 +1,4 @@
-//! What is said: topics and payloads. Pure.
+//! The topics and payloads.
 
 use std::time::{Duration, SystemTime};
 
@@ -9,7 +9,7 @@ use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::BusHandle;
 
-/// Keys of the state object that are no points; a profile point of that name is left out of it.
+/// Keys of the state object that are not points; a profile point of that name is omitted.
 const STATE_KEYS: [&str; 6] = ["state", "quality", "time", "age_ms", "fault_text", "point_quality"];
 
 /// The topics of one gateway.
@@ -72,7 +72,7 @@ pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
     points
 }
 
-/// What the state object of a drive tells, its times apart: a change of it is worth a message.
+/// The state object of a drive without its times; a change of it is published.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct StateContent {
     /// `None` while it is not known.
@@ -82,7 +82,7 @@ pub(super) struct StateContent {
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
 
-/// The text beside a point's value: its key and, while the value is good, the text of it.
+/// The key and the text of an enumeration; the text is empty unless the value is good.
 pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String, &str)> {
     let text = value.and_then(|value| point.text_of(value)).unwrap_or_default();
     (!point.texts.is_empty()).then(|| (format!("{}_text", point.name), text))
@@ -112,7 +112,7 @@ pub(super) struct StateObject<'s> {
     pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
     pub(super) age: Option<Duration>,
-    /// The time of day now.
+    /// Time of day.
     pub(super) wall: SystemTime,
 }
 
@@ -146,7 +146,7 @@ impl Serialize for StateObject<'_> {
     }
 }
 
-/// A negative zero is a zero.
+/// Turns a negative zero into zero.
 fn tidy(value: Value) -> Value {
     match value {
         Value::Number(n) => Value::Number(n + 0.0),
@@ -157,11 +157,11 @@ fn tidy(value: Value) -> Value {
 /// The payload of a point topic.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub(super) enum PointPayload {
-    /// Nothing good is known: an empty payload, which takes the retained value away.
+    /// Nothing good is known: an empty payload, which clears the retained value.
     Nothing,
     /// A value.
     Value(Value),
-    /// The drive in one word.
+    /// The state of the drive.
     State(State),
     /// The text of this fault code.
     FaultText(i64),
@@ -173,7 +173,7 @@ impl PointPayload {
         value.map_or(PointPayload::Nothing, PointPayload::Value)
     }
 
-    /// The drive in one word, if that is known.
+    /// The state of the drive, if it is known.
     pub(super) fn state(state: Option<State>) -> PointPayload {
         state.map_or(PointPayload::Nothing, PointPayload::State)
     }
@@ -197,7 +197,7 @@ impl PointPayload {
     }
 }
 
-/// What a bus message tells at once when it changes.
+/// The part of a bus message whose changes are published at once.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusState {
     up: bool,
@@ -206,7 +206,7 @@ pub(super) struct BusState {
     online: usize,
 }
 
-/// What a bus message tells besides; these change all the time.
+/// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
     load: f64,
@@ -217,7 +217,7 @@ pub(super) struct BusFigures {
     queue: usize,
 }
 
-/// State and figures of a bus now.
+/// State and figures of a bus.
 pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
     let BusHealth {
         up,
@@ -262,10 +262,10 @@ pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTim
     object.to_string().into_bytes()
 }
 
-/// The event object; `None` for an event of a whole bus, which its bus topic tells.
+/// The event object; `None` for an event of a whole bus, which is part of the bus topic.
 pub(super) fn event(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
     let drive = event.drive.as_deref()?;
-    // Strings and figures only: this cannot fail.
+    // Strings and numbers can always be serialized.
     let payload = serde_json::to_vec(event).ok()?;
     Some((topics.drive(drive, "event"), payload))
 }
@@ -358,13 +358,13 @@ mod tests {
             };
             serde_json::to_value(&object).unwrap()
         };
-        let told = state(Some(3));
-        assert_eq!((&told["mode"], &told["mode_text"]), (&3.into(), &"auto".into()));
-        let told = state(Some(4));
-        assert_eq!((&told["mode"], &told["mode_text"]), (&4.into(), &"".into()));
-        let told = state(None);
+        let object = state(Some(3));
+        assert_eq!((&object["mode"], &object["mode_text"]), (&3.into(), &"auto".into()));
+        let object = state(Some(4));
+        assert_eq!((&object["mode"], &object["mode_text"]), (&4.into(), &"".into()));
+        let object = state(None);
         assert_eq!(
-            (&told["mode"], &told["mode_text"]),
+            (&object["mode"], &object["mode_text"]),
             (&serde_json::Value::Null, &"".into())
         );
     }
@@ -395,16 +395,16 @@ mod tests {
             age: None,
             wall: SystemTime::UNIX_EPOCH,
         };
-        let told = serde_json::to_value(&object).unwrap();
+        let object = serde_json::to_value(&object).unwrap();
         assert_eq!(
-            (&told["state"], &told["quality"]),
+            (&object["state"], &object["quality"]),
             (&serde_json::Value::Null, &"bad".into())
         );
         assert_eq!(
-            (&told["running"], &told["ready"]),
+            (&object["running"], &object["ready"]),
             (&serde_json::Value::Null, &true.into())
         );
-        assert_eq!(told["point_quality"], serde_json::json!({"ready": "good"}));
+        assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
         assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
         let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
@@ -414,7 +414,7 @@ mod tests {
     #[test]
     fn events_of_drives_go_to_their_topic() {
         let topics = Topics::new("drivegate", "hall");
-        let mut told = Event {
+        let mut object = Event {
             id: 4,
             time: SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
             kind: crate::event::EventKind::FaultEnd,
@@ -423,13 +423,13 @@ mod tests {
             fault_code: Some(53),
             text: "gone".to_string(),
         };
-        let (topic, payload) = event(&topics, &told).unwrap();
+        let (topic, payload) = event(&topics, &object).unwrap();
         assert_eq!(topic, "drivegate/hall/drive/p1/event");
         let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
         let expected = serde_json::json!({"id": 4, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
         assert_eq!(payload, expected);
-        told.drive = None;
-        assert_eq!(event(&topics, &told), None);
+        object.drive = None;
+        assert_eq!(event(&topics, &object), None);
     }
 }

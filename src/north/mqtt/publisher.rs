@@ -1,5 +1,5 @@
-//! When something is said: on change, not more often than `min_interval`, at least every `max_interval`.
-//! Pure; time is an argument.
+//! Decides when a topic is published: on change, but not before `min_interval`, and at the latest after `max_interval`.
+//! Time is an argument.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
@@ -9,7 +9,7 @@ use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, Sta
 use crate::drive::ModelPoint;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 
-/// Counters and load of a bus change all the time: they are no reason to publish more often than this.
+/// Minimum time between publications because counters or load of a bus changed, which they do all the time.
 const FIGURES_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A retained message to be published.
@@ -19,16 +19,16 @@ pub(super) struct Update {
     pub(super) payload: Vec<u8>,
 }
 
-/// Watches the process image and tells what is to be published.
+/// Observes the process image and returns what is to be published.
 #[derive(Debug)]
 pub(super) struct Publisher {
     topics: Topics,
     pace: PublishInterval,
     drives: Vec<DriveTopics>,
     buses: Vec<BusTopic>,
-    /// Topics of drives and buses that are not configured any more, for the broker to forget.
+    /// Topics of drives and buses that are no longer configured, to be cleared at the broker.
     vanished: BTreeSet<Arc<str>>,
-    vanished_told: bool,
+    vanished_cleared: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -38,10 +38,11 @@ struct PublishInterval {
 }
 
 impl PublishInterval {
-    fn due(self, last: Option<Instant>, now: Instant, changed: bool) -> bool {
-        last.is_none_or(|last| {
-            let since = now.saturating_duration_since(last);
-            since >= self.max || changed && since >= self.min
+    /// Whether `current` is published now, if the last publication and its time were `last`.
+    fn is_due<T: PartialEq>(self, last: Option<&(T, Instant)>, current: &T, now: Instant) -> bool {
+        last.is_none_or(|(last, at)| {
+            let since = now.saturating_duration_since(*at);
+            since >= self.max || last != current && since >= self.min
         })
     }
 }
@@ -66,7 +67,7 @@ struct PointTopic {
 
 #[derive(Debug, Clone, Copy)]
 enum PointSource {
-    /// Place in [`StateContent::points`].
+    /// Index in [`StateContent::points`].
     Point(usize),
     State,
     FaultText,
@@ -76,7 +77,9 @@ enum PointSource {
 struct BusTopic {
     bus: BusHandle,
     topic: Arc<str>,
-    last: Option<(BusState, BusFigures, Instant)>,
+    /// As last published.
+    state: Option<(BusState, Instant)>,
+    figures: Option<(BusFigures, Instant)>,
 }
 
 impl Publisher {
@@ -88,12 +91,11 @@ impl Publisher {
             drives: Vec::new(),
             buses: Vec::new(),
             vanished: BTreeSet::new(),
-            vanished_told: false,
+            vanished_cleared: false,
         }
     }
 
-    /// Watches this plant from now on; everything is published anew, and the topics that no longer exist are
-    /// cleared.
+    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
     pub(super) fn adopt(&mut self, plant: &Plant) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
         self.drives = plant
@@ -103,13 +105,14 @@ impl Publisher {
         let bus_topic = |bus: &BusHandle| BusTopic {
             bus: bus.clone(),
             topic: self.topics.bus(&bus.image.spec.name).into(),
-            last: None,
+            state: None,
+            figures: None,
         };
         self.buses = plant.buses.iter().map(bus_topic).collect();
         let present: BTreeSet<Arc<str>> = self.all_topics().cloned().collect();
         self.vanished.extend(old);
         self.vanished.retain(|topic| !present.contains(topic));
-        self.vanished_told = false;
+        self.vanished_cleared = false;
     }
 
     fn all_topics(&self) -> impl Iterator<Item = &Arc<str>> {
@@ -120,20 +123,20 @@ impl Publisher {
         drives.chain(self.buses.iter().map(|b| &b.topic))
     }
 
-    /// Everything is to be published again: the broker may have forgotten it.
+    /// Publishes everything again, since the broker may have lost it.
     pub(super) fn restart(&mut self) {
-        self.vanished_told = false;
+        self.vanished_cleared = false;
         for drive in &mut self.drives {
             drive.last = None;
             drive.points.iter_mut().for_each(|p| p.last = None);
         }
-        self.buses.iter_mut().for_each(|b| b.last = None);
+        self.buses.iter_mut().for_each(|b| (b.state, b.figures) = (None, None));
     }
 
-    /// What is to be published now; `wall` is the time of day at `now`.
+    /// The messages to publish now; `wall` is the time of day at `now`.
     pub(super) fn tick(&mut self, now: Instant, wall: SystemTime) -> Vec<Update> {
         let mut updates = Vec::new();
-        if !std::mem::replace(&mut self.vanished_told, true) {
+        if !std::mem::replace(&mut self.vanished_cleared, true) {
             updates.extend(self.vanished.iter().map(|topic| Update {
                 topic: topic.clone(),
                 payload: Vec::new(),
@@ -194,8 +197,7 @@ impl DriveTopics {
                 });
             }
         }
-        let changed = self.last.as_ref().is_none_or(|(last, _)| *last != shown);
-        if pace.due(self.last.as_ref().map(|(_, at)| *at), now, changed) {
+        if pace.is_due(self.last.as_ref(), &shown, now) {
             let object = StateObject {
                 shown: &shown,
                 names: &self.names,
@@ -205,7 +207,7 @@ impl DriveTopics {
                 age: reading.age(),
                 wall,
             };
-            // Strings, figures and null only: this cannot fail.
+            // Strings, numbers and null can always be serialized.
             if let Ok(payload) = serde_json::to_vec(&object) {
                 updates.push(Update {
                     topic: self.state.clone(),
@@ -218,14 +220,11 @@ impl DriveTopics {
 }
 
 impl PointTopic {
-    /// A value that is not good any more is taken away at once, and once only.
+    /// A value that is no longer good is cleared at once, and only once.
     fn due(&self, pace: PublishInterval, now: Instant, payload: PointPayload) -> bool {
         match (&self.last, payload) {
             (Some((last, _)), PointPayload::Nothing) => *last != PointPayload::Nothing,
-            (last, _) => {
-                let changed = last.as_ref().is_none_or(|(last, _)| *last != payload);
-                pace.due(last.as_ref().map(|(_, at)| *at), now, changed)
-            }
+            (last, _) => pace.is_due(last.as_ref(), &payload, now),
         }
     }
 }
@@ -233,19 +232,17 @@ impl PointTopic {
 impl BusTopic {
     fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let (state, figures) = payload::bus_now(&self.bus);
-        let due = self.last.as_ref().is_none_or(|(last_state, last_figures, at)| {
-            let slower = PublishInterval {
-                min: pace.min.max(FIGURES_INTERVAL),
-                ..pace
-            };
-            pace.due(Some(*at), now, *last_state != state) || slower.due(Some(*at), now, *last_figures != figures)
-        });
-        if due {
+        let slower = PublishInterval {
+            min: pace.min.max(FIGURES_INTERVAL),
+            ..pace
+        };
+        let due = pace.is_due(self.state.as_ref(), &state, now);
+        if due || slower.is_due(self.figures.as_ref(), &figures, now) {
             updates.push(Update {
                 topic: self.topic.clone(),
                 payload: payload::bus_object(&state, &figures, wall),
             });
-            self.last = Some((state, figures, now));
+            (self.state, self.figures) = (Some((state, now)), Some((figures, now)));
         }
     }
 }
@@ -308,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn the_state_object_tells_values_quality_and_time() {
+    fn the_state_object_has_values_quality_and_time() {
         let mut bench = Bench::new();
         let all = bench.after(20);
         let state: Json = serde_json::from_str(payload(&all, "drive/p1/state").unwrap()).unwrap();
@@ -428,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bus_tells_changes_at_once_and_figures_every_second() {
+    fn bus_changes_are_published_at_once_and_figures_every_second() {
         let mut bench = Bench::new();
         let first: Json = serde_json::from_str(payload(&bench.after(0), "bus/line1").unwrap()).unwrap();
         assert_eq!(

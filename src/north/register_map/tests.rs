@@ -39,7 +39,7 @@ fn running(now: Instant) -> DriveImage {
 }
 
 fn read(image: &DriveImage, now: Instant, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
-    DriveView::new(&image.reading(now, STALE_AFTER), true).registers(start, count)
+    DriveView::new(&image.reading(now, STALE_AFTER), BusState::Up).registers(start, count)
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn spans_that_leave_a_block() {
 }
 
 #[test]
-fn a_stale_drive_tells_why_and_nothing_else() {
+fn a_stale_drive_has_status_and_age_but_no_values() {
     let now = Instant::now();
     let late = now + Duration::from_millis(1001);
     let image = running(now);
@@ -150,7 +150,7 @@ fn a_stale_drive_tells_why_and_nothing_else() {
 
     let reading = image.reading(now, STALE_AFTER);
     nothing(
-        &DriveView::new(&reading, false).registers(0x8000, 19).unwrap(),
+        &DriveView::new(&reading, BusState::Down).registers(0x8000, 19).unwrap(),
         STALE,
         0,
     );
@@ -234,7 +234,7 @@ fn bits_that_are_not_known() {
     assert_eq!(
         read(&image, now, 0x8100, 1),
         Ok(vec![0xFFFF]),
-        "it may be told to turn the other way"
+        "it may be commanded to reverse"
     );
     assert_eq!(read(&image, now, 0x8000, 2), Ok(vec![all, 3]));
 }

@@ -103,7 +103,7 @@ fn a_response_topic_gets_the_result_and_the_correlation() {
 }
 
 #[test]
-fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
+fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
     let mut bench = Bench::new();
     for (incoming, code) in [
         (set("p1/set", "{"), "bad_value"),
@@ -197,7 +197,7 @@ fn a_repetition_is_answered_from_memory() {
     bench.now += REPLAYED;
     assert_eq!(bench.take(again), None);
     bench.acknowledge();
-    // Without an id only the broker's mark tells a repetition.
+    // Without an id only the mark of the broker shows a repetition.
     let bare = set("p1/set", r#"{"speed_reference": 5}"#);
     for _ in 0..2 {
         assert_eq!(bench.take(bare.clone()), None);
@@ -332,7 +332,7 @@ fn what_cannot_be_kept_stays_with_the_broker() {
 }
 
 #[test]
-fn a_refusal_of_the_queue_tells_its_reason() {
+fn a_refusal_of_the_queue_has_its_reason() {
     let mut bench = Bench::new();
     let results: Vec<Json> = (0..crate::command::CAPACITY + 2)
         .filter_map(|_| bench.take(set("p1/set/run", "1")))
