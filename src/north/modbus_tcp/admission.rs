@@ -100,7 +100,7 @@ impl ConnectionHandler for Admission {
                 } else {
                     Authority::ReadOnly
                 };
-                self.converse(stream, Client::new(peer, None, authority)).await;
+                self.serve_client(stream, Client::new(peer, None, authority)).await;
             }
             WriteAccess::ByCertificate(authenticator) => {
                 match self
@@ -109,12 +109,12 @@ impl ConnectionHandler for Admission {
                     .await
                 {
                     None => {}
-                    Some(Ok((stream, known))) => {
-                        let authority = match known.role {
+                    Some(Ok((stream, identified))) => {
+                        let authority = match identified.role {
                             Role::Control => Authority::Write,
                             Role::Monitor => Authority::ReadOnly,
                         };
-                        self.converse(stream, Client::new(peer, Some(&known.name), authority))
+                        self.serve_client(stream, Client::new(peer, Some(&identified.name), authority))
                             .await;
                     }
                     Some(Err(error)) => {
@@ -131,7 +131,7 @@ impl ConnectionHandler for Admission {
 }
 
 impl Admission {
-    async fn converse(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client) {
+    async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client) {
         let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
         let idle_timeout = self.state.options.idle_timeout;
         connection::serve(stream, session, idle_timeout, self.cancel.child_token()).await;

@@ -21,7 +21,7 @@ const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time limit for the client to accept part of its answers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for pending requests when the gateway stops, and for closing the connection.
-const FAREWELL: Duration = Duration::from_millis(500);
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
 /// Number of requests after which a client that sends without pause yields to the others.
 const TURN: usize = 128;
 
@@ -65,11 +65,11 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
         Err(end) => end,
     };
     if matches!(end, End::Cancelled) {
-        connection.farewell().await;
+        connection.finish_pending().await;
     }
     // With TLS, a close notification distinguishes the end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
-        let _ = tokio::time::timeout(FAREWELL, connection.stream.shutdown()).await;
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.stream.shutdown()).await;
     }
     tracing::debug!(client = connection.dialogue.who(), "Modbus TCP: {end}");
 }
@@ -91,7 +91,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         // One future for the whole connection, so that it registers with the token once and not with every request.
         let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
-            let worked = self.dialogue.work(self.now.into_std());
+            let worked = self.dialogue.process(self.now.into_std());
             self.dialogue.collect(self.now.into_std());
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
@@ -104,8 +104,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             let consumed = worked?;
             if consumed.frames > 0 {
                 half_frame_since = None;
-                self.touch();
-                self.give_way(consumed.frames).await;
+                self.restart_idle();
+                self.yield_if_due(consumed.frames).await;
                 if self.since_yield == 0 && cancel.is_cancelled() {
                     return Err(End::Cancelled);
                 }
@@ -135,7 +135,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             match event {
                 Event::Answer(answered) => {
                     self.dialogue.finish(answered, self.now.into_std());
-                    self.touch();
+                    self.restart_idle();
                 }
                 Event::Input(0) => client_done = true,
                 Event::Input(count) => self.dialogue.received(count),
@@ -163,14 +163,14 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 
     /// Restarts the idle timeout.
-    fn touch(&mut self) {
+    fn restart_idle(&mut self) {
         if let Some(idle) = &mut self.idle {
             idle.since = self.now;
         }
     }
 
     /// Yields to other clients after [`TURN`] requests.
-    async fn give_way(&mut self, frames: usize) {
+    async fn yield_if_due(&mut self, frames: usize) {
         self.since_yield += frames;
         if self.since_yield >= TURN {
             self.since_yield = 0;
@@ -179,7 +179,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 
     /// Gives pending requests a last chance to be answered.
-    async fn farewell(&mut self) {
+    async fn finish_pending(&mut self) {
         let answered = async {
             flush(&mut self.stream, &mut self.dialogue).await?;
             while let Some(answered) = self.dialogue.parts().1.next().await {
@@ -189,7 +189,7 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             Ok::<(), End>(())
         };
         // A client that is too slow for this is not waited for.
-        let _ = tokio::time::timeout(FAREWELL, answered).await;
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, answered).await;
     }
 }
 

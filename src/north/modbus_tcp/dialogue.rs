@@ -21,7 +21,7 @@ pub(super) const MOST_WAITING: usize = 16;
 /// Number of requests processed before other clients are served.
 const TURN: usize = 128;
 
-/// What one call of [`Dialogue::work`] consumed.
+/// What one call of [`Dialogue::process`] consumed.
 #[derive(Debug, Default, Clone, Copy)]
 pub(super) struct Consumed {
     pub(super) bytes: usize,
@@ -58,7 +58,7 @@ impl Dialogue {
         self.session.who()
     }
 
-    /// The free part of the input buffer, and the requests that wait for the bus. After [`Dialogue::work`] there is
+    /// The free part of the input buffer, and the requests that wait for the bus. After [`Dialogue::process`] there is
     /// free space unless the dialogue is full or has more input: a frame is shorter than the buffer.
     pub(super) fn parts(&mut self) -> (&mut [u8], &mut FuturesUnordered<PendingRequest>) {
         (self.input.get_mut(self.filled..).unwrap_or_default(), &mut self.waiting)
@@ -84,7 +84,7 @@ impl Dialogue {
     ///
     /// # Errors
     /// The input is not Modbus. The requests before it are answered.
-    pub(super) fn work(&mut self, now: Instant) -> Result<Consumed, NotModbus> {
+    pub(super) fn process(&mut self, now: Instant) -> Result<Consumed, NotModbus> {
         let mut consumed = Consumed::default();
         self.session.refresh();
         let result = loop {

@@ -40,7 +40,7 @@ pub(super) enum ReadPart {
     /// Words from the process image.
     Known(Vec<u16>),
     /// A read of one object: the first `skip` of its items are dropped, the next `take` are used.
-    Ask { pdu: RequestPdu, skip: usize, take: usize },
+    Object { pdu: RequestPdu, skip: usize, take: usize },
 }
 
 /// A read that is split by object.
@@ -141,7 +141,7 @@ impl ForwardedRequest {
         for part in read.left.by_ref() {
             match part {
                 ReadPart::Known(known) => read.words.extend(known),
-                ReadPart::Ask { pdu, skip, take } => {
+                ReadPart::Object { pdu, skip, take } => {
                     read.asked = (skip, take);
                     return self.place(Order::Read(pdu), client, Authority::ReadOnly, now);
                 }
@@ -205,7 +205,7 @@ pub(super) fn read_parts(
             Ok(words) => read_parts.push(ReadPart::Known(words)),
             Err(Unavailable::Refused(code)) => return Err(code),
             Err(Unavailable::Stale) => return Err(Exception::GATEWAY_TARGET),
-            Err(Unavailable::NotPolled) => read_parts.push(ReadPart::Ask {
+            Err(Unavailable::NotPolled) => read_parts.push(ReadPart::Object {
                 pdu: RequestPdu::Read {
                     table,
                     start: first,

@@ -203,7 +203,7 @@ async fn open(
             cancel: cancel.clone(),
         }
     };
-    let (own, here) = (own_thread(tasks)?, Handle::current());
+    let (own, here) = (start_thread(tasks)?, Handle::current());
     let (mut loops, mut addresses, mut tls_addresses) = (Vec::new(), Vec::new(), Vec::new());
     for listener in &state.options.listeners {
         let write = WriteAccess::ByAddress(listener.write.clone());
@@ -243,7 +243,7 @@ async fn open(
 /// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
 /// which take a millisecond of computing, do not delay these clients; and a single thread serves more of them than
 /// several that hand work to each other: a fifth more on two processors with 16 clients (`benches/modbus_tcp`).
-fn own_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
+fn start_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
     let (sender, receiver) = std::sync::mpsc::sync_channel(1);
     let tasks = tasks.clone();
     let serve = move || match Builder::new_current_thread().enable_all().build() {

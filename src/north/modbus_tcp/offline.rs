@@ -63,7 +63,7 @@ impl Offline {
                 }
                 self.dialogue.received(count);
             }
-            self.closed = self.dialogue.work(now).is_err();
+            self.closed = self.dialogue.process(now).is_err();
             self.dialogue.collect(now);
             answers.append(&mut self.dialogue.output);
             if self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {

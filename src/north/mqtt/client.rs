@@ -27,7 +27,7 @@ use crate::plant::{Plant, SharedPlant};
 /// First and longest wait between two connection attempts.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
 /// After a connection that lasted this long, the next attempt follows after the shortest wait.
-const STEADY: Duration = Duration::from_secs(5);
+const STABLE: Duration = Duration::from_secs(5);
 /// Without a packet from the broker for this long, the connection is considered lost.
 const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
 /// Time limit for the broker to answer the subscription.
@@ -35,7 +35,7 @@ const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of topics that are logged because the broker refuses messages on them.
 const REFUSED_LOGGED: usize = 100;
 /// Time for the orderly disconnect.
-const FAREWELL: Duration = Duration::from_millis(500);
+const DISCONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 /// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
 
@@ -58,23 +58,23 @@ pub(super) async fn run(
             ended = client.commands.finished() => client.on_ended(ended),
             _ = ticks.tick() => client.on_tick().await,
         }
-        client.pump();
+        client.publish_waiting();
     }
-    client.farewell().await;
+    client.shut_down().await;
 }
 
 /// The next event of the connection; pending while there is none. Cancel safe.
 async fn next(link: &mut BrokerLink) -> ConnectionEvent {
     match link {
-        BrokerLink::Away { .. } => std::future::pending().await,
+        BrokerLink::Disconnected { .. } => std::future::pending().await,
         BrokerLink::Open(session) => session.connection.next().await,
     }
 }
 
 #[derive(Debug)]
 enum BrokerLink {
-    /// No connection; the next attempt follows at `until`.
-    Away { until: Instant },
+    /// No connection; the next attempt follows then.
+    Disconnected { retry_at: Instant },
     /// A connection that the broker may not have accepted yet.
     Open(BrokerSession),
 }
@@ -84,7 +84,7 @@ struct BrokerSession {
     connection: Connection,
     phase: Phase,
     /// Time of the last packet from the broker.
-    heard: Instant,
+    last_packet: Instant,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -98,7 +98,7 @@ struct Client {
     options: Options,
     plant: SharedPlant,
     /// The plant that the publisher observes.
-    watched: Arc<Plant>,
+    observed: Arc<Plant>,
     stats: Arc<NorthStats>,
     events: Receiver<Arc<Event>>,
     topics: Topics,
@@ -110,7 +110,7 @@ struct Client {
     /// Wait before the next connection attempt.
     back_off: Duration,
     /// Why there is no connection, as last logged.
-    trouble: Option<String>,
+    last_error: Option<String>,
     /// Number of events lost because they arrived too fast.
     missed: u64,
     dropped_logged: u64,
@@ -120,24 +120,24 @@ struct Client {
 
 impl Client {
     async fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, events: Receiver<Arc<Event>>) -> Client {
-        let watched = plant.load_full();
-        let topics = Topics::new(&options.base, &watched.gateway);
+        let observed = plant.load_full();
+        let topics = Topics::new(&options.base, &observed.gateway);
         let mut publisher = Publisher::new(topics.clone(), options.min_interval, options.max_interval);
-        publisher.adopt(&watched);
+        publisher.adopt(&observed);
         let now = Instant::now();
         Client {
             store: EventStore::open(options.buffer.clone()).await,
             commands: Commands::new(topics.clone()),
             outbox: Outbox::default(),
-            link: BrokerLink::Away { until: now },
+            link: BrokerLink::Disconnected { retry_at: now },
             back_off: BACK_OFF.0,
-            trouble: None,
+            last_error: None,
             missed: 0,
             dropped_logged: 0,
             refused_logged: BTreeSet::new(),
             options,
             plant,
-            watched,
+            observed,
             stats,
             events,
             topics,
@@ -152,7 +152,7 @@ impl Client {
 
     fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
         match event {
-            Ok(event) => self.take_event(&event),
+            Ok(event) => self.store_event(&event),
             Err(RecvError::Lagged(lost)) => self.missed(lost),
             // The plant was replaced.
             Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
@@ -164,7 +164,7 @@ impl Client {
     fn take_pending_events(&mut self) {
         loop {
             match self.events.try_recv() {
-                Ok(event) => self.take_event(&event),
+                Ok(event) => self.store_event(&event),
                 Err(TryRecvError::Lagged(lost)) => self.missed(lost),
                 Err(TryRecvError::Empty | TryRecvError::Closed) => return,
             }
@@ -179,7 +179,7 @@ impl Client {
         );
     }
 
-    fn take_event(&mut self, event: &Event) {
+    fn store_event(&mut self, event: &Event) {
         let Some((topic, payload)) = payload::event(&self.topics, event) else {
             return;
         };
@@ -191,7 +191,7 @@ impl Client {
             return;
         };
         if !matches!(event, ConnectionEvent::Sent(_)) {
-            session.heard = Instant::now();
+            session.last_packet = Instant::now();
         }
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
@@ -266,7 +266,7 @@ impl Client {
         session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
-        self.trouble = None;
+        self.last_error = None;
         self.dropped_logged = self.dropped();
         self.refused_logged.clear();
         self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
@@ -282,16 +282,16 @@ impl Client {
             }) => now.saturating_duration_since(*since),
             _ => Duration::ZERO,
         };
-        if held >= STEADY {
+        if held >= STABLE {
             self.back_off = BACK_OFF.0;
         }
         let wait = jittered(self.back_off, RandomState::new().hash_one(0));
         self.back_off = (self.back_off * 2).min(BACK_OFF.1);
         // Dropping the session aborts its task and closes the socket.
-        self.link = BrokerLink::Away { until: now + wait };
+        self.link = BrokerLink::Disconnected { retry_at: now + wait };
         self.outbox.lost();
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
-        if self.trouble.as_deref() == Some(why) {
+        if self.last_error.as_deref() == Some(why) {
             tracing::debug!("no connection to the broker: {why}");
         } else {
             let (host, port) = (&self.options.host, self.options.port);
@@ -301,7 +301,7 @@ impl Client {
                 ""
             };
             tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
-            self.trouble = Some(why.to_string());
+            self.last_error = Some(why.to_string());
         }
     }
 
@@ -335,15 +335,15 @@ impl Client {
 
     async fn on_tick(&mut self) {
         let now = Instant::now();
-        self.follow_plant();
+        self.update_plant();
         match &self.link {
-            BrokerLink::Away { until } if now >= *until => self.connect().await,
-            BrokerLink::Away { .. } => {}
+            BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
+            BrokerLink::Disconnected { .. } => {}
             BrokerLink::Open(session) => match session.phase {
                 Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
                     self.lost("the broker does not answer the subscription");
                 }
-                _ if now.saturating_duration_since(session.heard) > SILENCE => {
+                _ if now.saturating_duration_since(session.last_packet) > SILENCE => {
                     self.lost("the broker is silent");
                 }
                 Phase::Ready { .. } => {
@@ -359,9 +359,9 @@ impl Client {
     }
 
     /// Observes the current plant, which a reload may have replaced.
-    fn follow_plant(&mut self) {
+    fn update_plant(&mut self) {
         let plant = self.plant.load_full();
-        if Arc::ptr_eq(&plant, &self.watched) {
+        if Arc::ptr_eq(&plant, &self.observed) {
             return;
         }
         let events = plant.events.subscribe();
@@ -370,7 +370,7 @@ impl Client {
             self.events = events;
         }
         self.publisher.adopt(&plant);
-        self.watched = plant;
+        self.observed = plant;
     }
 
     async fn connect(&mut self) {
@@ -385,7 +385,7 @@ impl Client {
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
-                    heard: now,
+                    last_packet: now,
                 });
             }
             Err(why) => self.lost(&why),
@@ -393,7 +393,7 @@ impl Client {
     }
 
     /// Publishes from the outbox as far as the connection allows.
-    fn pump(&mut self) {
+    fn publish_waiting(&mut self) {
         self.store.refill(&mut self.outbox);
         if let BrokerLink::Open(BrokerSession {
             connection,
@@ -407,7 +407,7 @@ impl Client {
                 if connection::packet_size(&message) > most {
                     oversized.push(self.outbox.give_up(key));
                 } else if connection.publish(message) {
-                    self.outbox.handed_over(key);
+                    self.outbox.mark_published(key);
                 } else {
                     break;
                 }
@@ -437,38 +437,38 @@ impl Client {
     }
 
     /// Sends what is waiting, publishes `offline` and disconnects, all within half a second.
-    async fn farewell(mut self) {
+    async fn shut_down(mut self) {
         self.take_pending_events();
         let begun = tokio::time::Instant::now();
         // After that time the connection is closed, and the broker publishes the last will.
-        let in_time = tokio::time::timeout_at(begun + FAREWELL, self.say_goodbye(begun + LAST_RESULTS)).await;
+        let in_time = tokio::time::timeout_at(begun + DISCONNECT_TIMEOUT, self.disconnect(begun + LAST_RESULTS)).await;
         if in_time.is_err() {
             tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
     }
 
-    async fn say_goodbye(&mut self, last_results: tokio::time::Instant) {
+    async fn disconnect(&mut self, last_results: tokio::time::Instant) {
         let status = self.topics.status();
         self.options.commands = false;
         self.outbox.drop_telemetry();
-        let mut offline_put = false;
+        let mut offline_queued = false;
         while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
-            self.pump();
+            self.publish_waiting();
             let quiet = self.commands.is_idle() && self.outbox.waiting() == 0;
-            if !offline_put && (quiet || tokio::time::Instant::now() >= last_results) {
+            if !offline_queued && (quiet || tokio::time::Instant::now() >= last_results) {
                 self.outbox.put_first(status.as_str().into(), b"offline".to_vec());
-                offline_put = true;
+                offline_queued = true;
                 continue;
             }
-            if offline_put && !self.outbox.has_telemetry(&status) {
+            if offline_queued && !self.outbox.has_telemetry(&status) {
                 break;
             }
             tokio::select! {
                 event = next(&mut self.link), if self.commands.has_room() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
-                () = tokio::time::sleep_until(last_results), if !offline_put => {}
+                () = tokio::time::sleep_until(last_results), if !offline_queued => {}
             }
         }
         if let BrokerLink::Open(session) = &mut self.link

@@ -69,7 +69,7 @@ pub(super) struct Acknowledged {
 struct Slot {
     /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
-    under_way: bool,
+    in_flight: bool,
 }
 
 #[derive(Debug)]
@@ -77,7 +77,7 @@ struct Entry {
     serial: u64,
     message: Message,
     record: Option<RecordId>,
-    under_way: bool,
+    in_flight: bool,
     attempts: u8,
 }
 
@@ -91,11 +91,11 @@ pub(super) struct Outbox {
     events: VecDeque<Entry>,
     serial: u64,
     /// Published, packet id not known yet.
-    handed: VecDeque<Key>,
+    published: VecDeque<Key>,
     /// Published, by packet id.
-    flying: HashMap<u16, Key>,
+    unacknowledged: HashMap<u16, Key>,
     /// The first topic of `order` is published before everything else.
-    lead: bool,
+    has_leader: bool,
     /// Whether events come before telemetry next time.
     events_turn: bool,
     dropped: u64,
@@ -115,7 +115,7 @@ impl Outbox {
         self.latest.entry(topic.clone()).or_default().waiting = Some(payload);
         self.order.retain(|t| *t != topic);
         self.order.push_front(topic);
-        self.lead = true;
+        self.has_leader = true;
     }
 
     /// Adds a result; if too many wait, the oldest is dropped.
@@ -156,20 +156,20 @@ impl Outbox {
     }
 
     /// Number of messages in flight.
-    pub(super) fn under_way(&self) -> usize {
-        self.handed.len() + self.flying.len()
+    pub(super) fn in_flight(&self) -> usize {
+        self.published.len() + self.unacknowledged.len()
     }
 
     /// The message to publish next: the leading one, then results, then events and telemetry alternately. It stays in
-    /// the outbox; confirm with [`Outbox::handed_over`] that it was published.
+    /// the outbox; confirm with [`Outbox::mark_published`] that it was published.
     pub(super) fn next(&self, limit: usize) -> Option<(Key, Message)> {
-        if self.under_way() >= limit {
+        if self.in_flight() >= limit {
             return None;
         }
-        if self.lead
-            && let Some(lead) = self.next_latest()
+        if self.has_leader
+            && let Some(leader) = self.next_latest()
         {
-            return Some(lead);
+            return Some(leader);
         }
         next_entry(&self.results, Key::Result).or_else(|| {
             let events = || next_entry(&self.events, Key::Event);
@@ -184,7 +184,7 @@ impl Outbox {
 
     fn next_latest(&self) -> Option<(Key, Message)> {
         self.order.iter().find_map(|topic| {
-            let slot = self.latest.get(topic).filter(|slot| !slot.under_way)?;
+            let slot = self.latest.get(topic).filter(|slot| !slot.in_flight)?;
             let message = Message {
                 topic: topic.clone(),
                 payload: slot.waiting.clone()?,
@@ -196,18 +196,18 @@ impl Outbox {
     }
 
     /// The message of `key` was published on the connection.
-    pub(super) fn handed_over(&mut self, key: Key) {
+    pub(super) fn mark_published(&mut self, key: Key) {
         match &key {
             Key::Latest(topic) => {
                 if let Some(slot) = self.latest.get_mut(topic) {
                     slot.waiting = None;
-                    slot.under_way = true;
+                    slot.in_flight = true;
                 }
                 // At or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
-                self.lead = false;
+                self.has_leader = false;
                 self.events_turn = true;
             }
             Key::Result(serial) => mark(&mut self.results, *serial),
@@ -216,7 +216,7 @@ impl Outbox {
                 self.events_turn = false;
             }
         }
-        self.handed.push_back(key);
+        self.published.push_back(key);
     }
 
     /// The connection assigned this packet id to the oldest published message.
@@ -225,10 +225,10 @@ impl Outbox {
     /// The state is inconsistent; the connection must be closed.
     pub(super) fn numbered(&mut self, packet: u16) -> Result<(), &'static str> {
         let key = self
-            .handed
+            .published
             .pop_front()
             .ok_or("a message was sent that was not published by the outbox")?;
-        match self.flying.insert(packet, key) {
+        match self.unacknowledged.insert(packet, key) {
             None => Ok(()),
             Some(_) => Err("a packet id was used twice"),
         }
@@ -236,7 +236,7 @@ impl Outbox {
 
     /// The broker acknowledged a message; its entry is removed.
     pub(super) fn acked(&mut self, packet: u16) -> Option<Acknowledged> {
-        self.settle(self.flying.get(&packet).cloned()?, Some(packet))
+        self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }
 
     /// Drops the message of `key`, which cannot be sent.
@@ -250,12 +250,12 @@ impl Outbox {
 
     fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acknowledged> {
         if let Some(packet) = packet {
-            self.flying.remove(&packet);
+            self.unacknowledged.remove(&packet);
         }
         match key {
             Key::Latest(topic) => {
                 let slot = self.latest.get_mut(&topic)?;
-                slot.under_way = false;
+                slot.in_flight = false;
                 if slot.waiting.is_none() {
                     self.latest.remove(&topic);
                 }
@@ -271,12 +271,12 @@ impl Outbox {
     pub(super) fn lost(&mut self) {
         self.latest.clear();
         self.order.clear();
-        self.handed.clear();
-        self.flying.clear();
-        self.lead = false;
+        self.published.clear();
+        self.unacknowledged.clear();
+        self.has_leader = false;
         for entry in self.results.iter_mut().chain(&mut self.events) {
-            entry.attempts = entry.attempts.saturating_add(u8::from(entry.under_way));
-            entry.under_way = false;
+            entry.attempts = entry.attempts.saturating_add(u8::from(entry.in_flight));
+            entry.in_flight = false;
         }
         let before = self.results.len();
         self.results.retain(|entry| entry.attempts < RESULT_ATTEMPTS);
@@ -288,7 +288,7 @@ impl Outbox {
         self.order.clear();
         self.latest.retain(|_, slot| {
             slot.waiting = None;
-            slot.under_way
+            slot.in_flight
         });
     }
 }
@@ -304,7 +304,7 @@ fn push(
 ) -> u64 {
     let mut dropped = 0;
     while is_full(queue) {
-        let victim = queue.iter().position(|e| !e.under_way).unwrap_or(0);
+        let victim = queue.iter().position(|e| !e.in_flight).unwrap_or(0);
         queue.remove(victim);
         dropped += 1;
     }
@@ -312,20 +312,20 @@ fn push(
         serial,
         message,
         record,
-        under_way: false,
+        in_flight: false,
         attempts: 0,
     });
     dropped
 }
 
 fn next_entry(queue: &VecDeque<Entry>, key: fn(u64) -> Key) -> Option<(Key, Message)> {
-    let entry = queue.iter().find(|e| !e.under_way)?;
+    let entry = queue.iter().find(|e| !e.in_flight)?;
     Some((key(entry.serial), entry.message.clone()))
 }
 
 fn mark(queue: &mut VecDeque<Entry>, serial: u64) {
     if let Some(entry) = queue.iter_mut().find(|e| e.serial == serial) {
-        entry.under_way = true;
+        entry.in_flight = true;
     }
 }
 
@@ -353,7 +353,7 @@ mod tests {
     fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
         let mut sent = Vec::new();
         while let Some((key, message)) = outbox.next(limit) {
-            outbox.handed_over(key);
+            outbox.mark_published(key);
             sent.push((message.topic.to_string(), message.payload));
         }
         sent
@@ -389,7 +389,7 @@ mod tests {
             outbox.push_event(event("e"), None);
         }
         assert_eq!(drain(&mut outbox, 3).len(), 3);
-        assert_eq!(outbox.under_way(), 3);
+        assert_eq!(outbox.in_flight(), 3);
         outbox.numbered(1).unwrap();
         outbox.acked(1);
         assert_eq!(drain(&mut outbox, 3).len(), 1);
@@ -422,7 +422,7 @@ mod tests {
         assert_eq!(outbox.acked(2).unwrap().topic.as_ref(), "e1");
         outbox.lost();
         assert_eq!(outbox.waiting(), 2);
-        assert_eq!(outbox.under_way(), 0);
+        assert_eq!(outbox.in_flight(), 0);
         assert!(
             outbox.acked(3).is_none(),
             "an acknowledgement of the lost connection means nothing"

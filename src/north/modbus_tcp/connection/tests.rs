@@ -133,7 +133,7 @@ async fn a_stopped_client_does_not_hold_up_the_end() {
     let begin = Instant::now();
     bench.cancel.cancel();
     bench.server.await.unwrap();
-    assert!(begin.elapsed() <= FAREWELL, "{:?}", begin.elapsed());
+    assert!(begin.elapsed() <= CLOSE_TIMEOUT, "{:?}", begin.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
