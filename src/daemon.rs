@@ -30,22 +30,12 @@ pub enum StartError {
     /// A server cannot start.
     #[error(transparent)]
     Server(#[from] ServerError),
-    /// The system does not provide a thread or a file descriptor for a bus.
-    #[error("cannot start bus `{bus}`: {cause}; free memory or file descriptors")]
-    Bus {
-        /// Its name.
-        bus: String,
-        /// What the system reports.
-        cause: std::io::Error,
-    },
+    /// The system does not provide a thread or a file descriptor for the bus of that name.
+    #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
+    Bus(String, std::io::Error),
     /// A server cannot start, and the previous servers cannot be started again.
-    #[error("{error}; the previous servers cannot be restarted: {restart}")]
-    NotRestored {
-        /// Why the reload failed.
-        error: ServerError,
-        /// Why the previous state cannot be restored.
-        restart: ServerError,
-    },
+    #[error("{0}; the previous servers cannot be restarted: {1}")]
+    NotRestored(ServerError, ServerError),
 }
 
 /// A running gateway.
@@ -142,7 +132,7 @@ impl Daemon {
         if let Err(error) = self.apply_servers(&settings).await {
             return Err(match self.apply_servers(&before).await {
                 Ok(()) => error.into(),
-                Err(restart) => StartError::NotRestored { error, restart },
+                Err(restart) => StartError::NotRestored(error, restart),
             });
         }
         self.replace_buses(&settings, prepared);
@@ -212,10 +202,7 @@ impl Daemon {
     }
 
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
-        let failed = |cause| StartError::Bus {
-            bus: bus.spec.name.clone(),
-            cause,
-        };
+        let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
         let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle));
         let drives = bus.drives.iter().map(image).collect();

@@ -15,7 +15,6 @@ mod stats;
 use std::io;
 use std::net::SocketAddr;
 
-pub use pem::PemError;
 pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
 
 /// Why a server cannot start.

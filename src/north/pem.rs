@@ -6,24 +6,14 @@ use rustls_pki_types::pem::{self, PemObject};
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 
 /// Why a PEM file cannot be used.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum PemError {
-    /// The file cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum PemError {
     #[error("cannot read {file}: {cause}; check the path and its permissions")]
-    Unreadable {
-        /// Its path.
-        file: String,
-        /// What the system reports.
-        cause: String,
-    },
-    /// It does not contain what is expected.
+    Unreadable { file: String, cause: String },
     #[error("{file} contains no {expected}: {cause}; specify a PEM file")]
     Missing {
-        /// Its path.
         file: String,
-        /// `certificate` or `private key`.
         expected: &'static str,
-        /// What the parser reports.
         cause: String,
     },
 }

@@ -262,16 +262,16 @@ mod tests {
         assert_eq!(bus_of("bus=line1"), Ok(Some("line1".to_string())));
         assert_eq!(bus_of("&bus=line%201&"), Ok(Some("line 1".to_string())));
         assert!(bus_of("line=1").is_err());
-        assert!(bus_of("bus=%ff").is_ok(), "no name, but no harm either");
+        assert!(bus_of("bus=%ff").is_ok(), "not a name, but valid");
     }
 
     #[test]
-    fn ids_of_other_runs_count_for_nothing() {
+    fn event_ids_of_other_runs_are_ignored() {
         assert_eq!(last_seen("a1-7", "a1"), Some(7));
         assert_eq!(last_seen("a2-7", "a1"), None);
         assert_eq!(last_seen("7", "a1"), Some(7));
-        for rubbish in ["", "-", "a1-", "a1-x", "x"] {
-            assert_eq!(last_seen(rubbish, "a1"), None, "{rubbish}");
+        for invalid in ["", "-", "a1-", "a1-x", "x"] {
+            assert_eq!(last_seen(invalid, "a1"), None, "{invalid}");
         }
     }
 

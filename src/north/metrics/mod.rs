@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn open_metrics_only_for_those_that_ask() {
+    fn open_metrics_only_on_request() {
         let prometheus = "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;\
             q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1";
         assert_eq!(Format::accepted(prometheus), Format::OpenMetrics);

@@ -71,7 +71,7 @@ mod tests {
     }
 
     #[test]
-    fn this_process_has_figures() {
+    fn statistics_of_this_process() {
         let figures = read();
         assert!(figures.cpu_seconds.is_some() && figures.start_seconds.is_some());
         assert!(figures.resident_bytes.is_some_and(|b| b > 0.0));

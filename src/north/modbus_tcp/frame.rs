@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_modbus_is_known_early() {
+    fn invalid_headers_are_recognised_early() {
         assert_eq!(decode(&[0, 1, 0, 7]), Err(NotModbus::Protocol(7)));
         assert_eq!(decode(b"GET / HTTP/1.1"), Err(NotModbus::Protocol(0x5420)));
         for length in [0, 1, 255, 65_535] {

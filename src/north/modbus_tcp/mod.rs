@@ -38,7 +38,7 @@ use crate::north::{NorthStats, ServerError};
 use crate::plant::SharedPlant;
 
 pub use self::offline::Offline;
-pub use self::tls::{Identity, IdentityFault, IdentityProblem, Role, Tls, TlsFile};
+pub use self::tls::{Identity, IdentityFault, Role, Tls, TlsFile};
 
 /// Name in messages.
 const PROTOCOL: &str = "Modbus TCP";

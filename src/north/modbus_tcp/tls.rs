@@ -67,64 +67,34 @@ pub enum TlsFile {
     ClientCa,
 }
 
-/// A fault of one of the files, or a warning about it.
-#[derive(Debug, Clone, thiserror::Error)]
+/// A fault of one of the files, or a warning about it: what is wrong and what to do.
+#[derive(Debug, thiserror::Error)]
 #[error("{problem}")]
 pub struct IdentityFault {
     /// The file.
     pub file: TlsFile,
-    /// What is wrong with it, and what to do.
-    pub problem: IdentityProblem,
+    problem: IdentityProblem,
 }
 
-/// What can be wrong with certificates and keys.
-#[derive(Debug, Clone, thiserror::Error)]
-pub enum IdentityProblem {
-    /// The file cannot be read as PEM.
+#[derive(Debug, thiserror::Error)]
+enum IdentityProblem {
     #[error(transparent)]
     Pem(#[from] PemError),
-    /// The PEM file contains something else.
     #[error("{0} contains data that is not a certificate; specify a PEM file")]
     NotACertificate(String),
-    /// The certificate is no longer valid.
     #[error("certificate `{name}` in {file} expired on {end}; renew it")]
-    Expired {
-        /// Its common name.
-        name: String,
-        /// The file.
-        file: String,
-        /// End of its validity.
-        end: String,
-    },
-    /// The certificate is not valid yet.
+    Expired { name: String, file: String, end: String },
     #[error("certificate `{name}` in {file} is not valid before {begin}; check the clock of this machine")]
-    NotYetValid {
-        /// Its common name.
-        name: String,
-        /// The file.
-        file: String,
-        /// Beginning of its validity.
-        begin: String,
-    },
-    /// A warning: the certificate expires within 30 days.
+    NotYetValid { name: String, file: String, begin: String },
+    /// A warning: within 30 days.
     #[error("certificate `{name}` in {file} expires on {end}; renew it")]
-    ExpiresSoon {
-        /// Its common name.
-        name: String,
-        /// The file.
-        file: String,
-        /// End of its validity.
-        end: String,
-    },
-    /// rustls does not accept the certificate of the CA.
+    ExpiresSoon { name: String, file: String, end: String },
     #[error("not a usable CA certificate: {0}; specify the PEM file of the CA")]
     UnusableCa(String),
-    /// The key is not that of the certificate.
     #[error("the key does not match the certificate; specify the key of the certificate")]
     KeyMismatch,
-    /// rustls does not accept certificate and key.
     #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
-    Unusable(String),
+    Unusable(rustls::Error),
 }
 
 impl TlsFile {
@@ -186,7 +156,7 @@ impl Identity {
             .map_err(|error| unusable_ca(&error))?;
         let unusable = |error: rustls::Error| match error {
             rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(IdentityProblem::KeyMismatch),
-            error => TlsFile::Certificate.fault(IdentityProblem::Unusable(error.to_string())),
+            error => TlsFile::Certificate.fault(IdentityProblem::Unusable(error)),
         };
         let mut config = ServerConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()

@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_acknowledged_is_there_after_a_restart() {
+    fn unacknowledged_events_survive_a_restart() {
         let dir = tempfile::tempdir().unwrap();
         let mut journal = Journal::open(dir.path(), BIG).unwrap();
         (1..=4).for_each(|n| journal.append(&event(n)).unwrap());
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_torn_or_damaged_tail_is_cut_off() {
+    fn an_incomplete_or_damaged_tail_is_truncated() {
         let whole = encode(&event(9)).unwrap();
         let mut damaged = whole.clone();
         damaged[HEADER + 4] ^= 1;
@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_segment_goes_when_the_buffer_is_full() {
+    fn a_full_buffer_drops_its_oldest_segment() {
         let dir = tempfile::tempdir().unwrap();
         let max = 4000;
         let mut journal = Journal::open(dir.path(), max).unwrap();
@@ -469,7 +469,7 @@ mod tests {
     }
 
     #[test]
-    fn an_acknowledgement_after_the_segment_was_dropped_means_nothing() {
+    fn an_acknowledgement_for_a_dropped_segment_is_ignored() {
         let dir = tempfile::tempdir().unwrap();
         let mut journal = Journal::open(dir.path(), 500).unwrap();
         journal.append(&event(0)).unwrap();
@@ -484,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn one_process_a_directory() {
+    fn a_directory_belongs_to_one_process() {
         let dir = tempfile::tempdir().unwrap();
         let _journal = Journal::open(dir.path(), BIG).unwrap();
         let error = Journal::open(dir.path(), BIG).unwrap_err();
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn crc_of_the_catalogue() {
+    fn crc_32_check_value() {
         assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
     }
 }

@@ -349,7 +349,7 @@ mod tests {
         Message::not_retained(name, Vec::new())
     }
 
-    /// Hands everything over that may go; returns topics and payloads.
+    /// Publishes everything allowed; returns topics and payloads.
     fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
         let mut sent = Vec::new();
         while let Some((key, message)) = outbox.next(limit) {
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn newest_telemetry_wins_and_one_message_per_topic_is_under_way() {
+    fn newest_telemetry_wins_and_one_message_per_topic_is_in_flight() {
         let mut outbox = Outbox::default();
         outbox.put(topic("a"), vec![1]);
         outbox.put(topic("b"), vec![1]);
@@ -372,7 +372,7 @@ mod tests {
         assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![2]), ("b".into(), vec![1])]);
         outbox.put(topic("a"), vec![3]);
         outbox.put(topic("a"), vec![4]);
-        assert!(outbox.next(10).is_none(), "a is under way");
+        assert!(outbox.next(10).is_none(), "a is in flight");
         outbox.numbered(1).unwrap();
         outbox.numbered(2).unwrap();
         assert!(outbox.acked(2).is_some(), "acknowledgements come in any order");
@@ -382,7 +382,7 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_bounds_what_is_under_way() {
+    fn the_limit_bounds_what_is_in_flight() {
         let mut outbox = Outbox::default();
         for i in 0..10 {
             outbox.put(topic(&format!("t{i}")), Vec::new());
@@ -396,7 +396,7 @@ mod tests {
     }
 
     #[test]
-    fn results_first_then_events_and_telemetry_by_turns_but_the_leader_leads() {
+    fn leader_then_results_then_events_and_telemetry_alternately() {
         let mut outbox = Outbox::default();
         for i in 1..=3 {
             outbox.put(topic(&format!("t{i}")), Vec::new());
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_loss_events_come_again_in_order_and_telemetry_does_not() {
+    fn after_a_lost_connection_events_are_sent_again_in_order() {
         let mut outbox = Outbox::default();
         outbox.put(topic("t"), Vec::new());
         for name in ["e1", "e2", "e3"] {
@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_result_that_breaks_connections_is_given_up() {
+    fn a_result_that_breaks_connections_is_dropped() {
         let mut outbox = Outbox::default();
         outbox.push_result(event("bad"));
         for _ in 0..2 {
@@ -458,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn long_results_are_fewer() {
+    fn results_are_bounded_by_size() {
         let mut outbox = Outbox::default();
         let long = Message {
             correlation: Some(vec![0; 60_000]),
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn books_that_do_not_agree_are_noticed() {
+    fn inconsistent_packet_ids_are_detected() {
         let mut outbox = Outbox::default();
         assert!(outbox.numbered(1).is_err());
         for name in ["a", "b"] {
@@ -483,7 +483,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_sent_is_given_up() {
+    fn messages_that_cannot_be_sent_are_dropped() {
         let mut outbox = Outbox::default();
         outbox.put(topic("big"), vec![0; 10]);
         let (key, _) = outbox.next(1).unwrap();

@@ -349,7 +349,7 @@ mod tests {
         }
         assert_eq!(payload(&all, "drive/p2/point/running"), Some(""));
         assert_eq!(payload(&all, "drive/p2/point/state"), Some("offline"));
-        // Stale after 1 s: taken away at once, and once only.
+        // Stale after 1 s: cleared at once, and only once.
         let stale = bench.after(1001);
         assert_eq!(payload(&stale, "drive/p1/point/output_frequency"), Some(""));
         assert_eq!(payload(&stale, "drive/p1/point/state"), Some("offline"));
@@ -363,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn changes_wait_for_the_least_interval() {
+    fn changes_wait_for_min_interval() {
         let mut bench = Bench::new();
         bench.after(0);
         bench.read(0x0023, 2501);
@@ -381,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_good_is_repeated_at_the_longest_interval() {
+    fn good_values_are_repeated_after_max_interval() {
         let mut bench = Bench::new();
         bench.after(0);
         bench.now += Duration::from_secs(60);

@@ -455,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn the_life_of_the_message_bounds_its_expiry() {
+    fn message_expiry_limits_command_expiry() {
         let expiry = |payload: &str, life| {
             let incoming = Incoming {
                 expiry: Some(life),
@@ -472,7 +472,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_for_people_stay_short() {
+    fn excerpts_are_short() {
         let long = format!(r#"{{"{}": 1}}"#, "n".repeat(60_000));
         let (_, text) = code(set(&long));
         assert!(text.len() < 400, "{}", text.len());

@@ -250,7 +250,7 @@ fn a_refused_point_is_not_available() {
 }
 
 #[test]
-fn what_does_not_fit_is_not_available() {
+fn values_out_of_range_are_not_available() {
     let one = |form: Form, value: f64, per_unit| form.registers_of(Some(value), per_unit)[0];
     assert_eq!(one(Form::I16, 327.67, 100.0), 32_767);
     assert_eq!(one(Form::I16, 327.68, 100.0), NO_I16);
@@ -344,7 +344,7 @@ fn before(word: u16, fault: bool) -> CommandContext {
 }
 
 #[test]
-fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
+fn fault_resets() {
     for (word, last, fault, resets) in [
         (4, 0, false, true),
         (4, 0, true, true),
