@@ -35,7 +35,7 @@ pub enum StartError {
     Bus(String, std::io::Error),
     /// A server cannot start, and the previous servers cannot be started again.
     #[error("{0}; the previous servers cannot be restarted: {1}")]
-    NotRestored(ServerError, ServerError),
+    NotRestored(Box<ServerError>, Box<ServerError>),
 }
 
 /// A running gateway.
@@ -132,7 +132,7 @@ impl Daemon {
         if let Err(error) = self.apply_servers(&settings).await {
             return Err(match self.apply_servers(&before).await {
                 Ok(()) => error.into(),
-                Err(restart) => StartError::NotRestored(error, restart),
+                Err(restart) => StartError::NotRestored(error.into(), restart.into()),
             });
         }
         self.replace_buses(&settings, prepared);

@@ -10,8 +10,10 @@ use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 pub(super) enum PemError {
     #[error("cannot read {file}: {cause}; check the path and its permissions")]
     Unreadable { file: String, cause: String },
-    #[error("{file} contains no {expected}: {cause}; specify a PEM file")]
-    Missing {
+    #[error("{file} contains no {expected}; specify a PEM file")]
+    Missing { file: String, expected: &'static str },
+    #[error("{file} contains no valid {expected}: {cause}; specify a PEM file")]
+    Invalid {
         file: String,
         expected: &'static str,
         cause: String,
@@ -40,7 +42,8 @@ fn pem_error(file: &Path, expected: &'static str, error: &pem::Error) -> PemErro
             file,
             cause: cause.to_string(),
         },
-        cause => PemError::Missing {
+        pem::Error::NoItemsFound => PemError::Missing { file, expected },
+        cause => PemError::Invalid {
             file,
             expected,
             cause: cause.to_string(),

@@ -163,9 +163,9 @@ fn nothing_of_a_bad_command_reaches_a_drive() {
     let bench = bench();
     let mut wrong: Vec<String> = Vec::new();
     for (topic, payload, code, text) in [
-        ("pump/set", r#"{"speed_reference": NaN}"#, "bad_value", "no JSON"),
-        ("pump/set", r#"{"speed_reference": -Infinity}"#, "bad_value", "no JSON"),
-        ("pump/set", r#"{"speed_reference": 1e999}"#, "bad_value", "no JSON"),
+        ("pump/set", r#"{"speed_reference": NaN}"#, "bad_value", "not JSON"),
+        ("pump/set", r#"{"speed_reference": -Infinity}"#, "bad_value", "not JSON"),
+        ("pump/set", r#"{"speed_reference": 1e999}"#, "bad_value", "not JSON"),
         ("pump/set", r#"{"speed_reference": "50"}"#, "bad_value", "quotes"),
         (
             "pump/set",

@@ -227,7 +227,7 @@ fn confirmed_repeated_refused_and_audited() {
     // A later command of the same client shows that the repetitions were seen and not carried out.
     for (payload, why) in [
         ("{\"speed_reference\": 50, \"frequency_reference\": 30}", "twice"),
-        ("{\"speed_reference\": NaN}", "no JSON"),
+        ("{\"speed_reference\": NaN}", "not JSON"),
         ("{\"speed_reference\": \"50\"}", "quotes"),
         ("{\"speed_reference\": 1000}", "outside the limits"),
     ] {

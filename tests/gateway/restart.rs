@@ -266,7 +266,7 @@ fn a_reload_that_cannot_listen_changes_nothing() {
     std::fs::write(&file, other).unwrap();
     gateway.signal("HUP");
     let log = gateway.until_printed("the new configuration is not taken");
-    assert!(log.contains("another program has it"), "{log}");
+    assert!(log.contains("another program uses it"), "{log}");
     until("the old address", || mbpoll_read(modbus, 1, 2100, 1).ok());
     assert_eq!(api(http, "pump-1")["online"], true);
     drop(line);

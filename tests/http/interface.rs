@@ -115,7 +115,7 @@ async fn ready_once_all_buses_are_open_and_all_drives_were_tried() {
     };
     assert_eq!(
         unready().await,
-        "not ready\nbus line1: its port was not opened yet\n\
+        "not ready\nbus line1: its port has not been opened yet\n\
          drive pump-1 on bus line1: not tried yet\ndrive fan-2 on bus line1: not tried yet\n"
     );
     bus.image

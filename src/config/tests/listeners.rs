@@ -162,17 +162,21 @@ fn faults_of_certificates_are_told_with_file_and_key() {
         (
             "gateway.crt",
             file("gateway.key"),
-            "gateway.key holds no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; give a PEM file",
+            "gateway.key contains no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify a PEM file",
         ),
         (
             "gateway.crt",
             file("other.crt"),
-            "the key does not belong to the certificate; /etc/drivegate/t.toml:19, \
-          modbus_tcp.tls.key; give the key that the certificate was made for",
+            "the key does not match the certificate; /etc/drivegate/t.toml:19, \
+          modbus_tcp.tls.key; specify the key of the certificate",
         ),
-        ("gateway.key", file("gateway.crt"), "gateway.crt holds no private key: "),
+        (
+            "gateway.key",
+            file("gateway.crt"),
+            "gateway.crt contains no private key",
+        ),
         ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
-        ("gateway.crt", file("expired.crt"), "has expired on "),
+        ("gateway.crt", file("expired.crt"), "expired on "),
     ] {
         let told = of(from, &to);
         assert!(told.contains(wanted), "{wanted}\nis not in\n{told}");
