@@ -199,6 +199,7 @@ mod tests {
         }
 
         fn update(&self, old: &Self::Options, new: &Self::Options) -> Result<bool, ServerError> {
+            LOG.lock().unwrap().push(format!("update {}", new.1));
             match new.1 {
                 0 => Err(ServerError::Thread(io::ErrorKind::InvalidInput.into())),
                 _ => Ok(old.0 == new.0),
@@ -227,11 +228,16 @@ mod tests {
             (None, true, false, &[][..]),
             (Some(("a", 1)), true, true, &["start a 1"]),
             (Some(("a", 1)), true, true, &[]),
+            (Some(("a", 2)), true, true, &["update 2"]),
+            (Some(("a", 0)), false, true, &["update 0"]),
             (Some(("a", 2)), true, true, &[]),
-            (Some(("a", 0)), false, true, &[]),
-            (Some(("a", 2)), true, true, &[]),
-            (Some(("b", 2)), true, true, &["stopped", "start b 2"]),
-            (Some(("taken", 2)), false, false, &["stopped", "start taken 2"]),
+            (Some(("b", 2)), true, true, &["update 2", "stopped", "start b 2"]),
+            (
+                Some(("taken", 2)),
+                false,
+                false,
+                &["update 2", "stopped", "start taken 2"],
+            ),
             (Some(("b", 2)), true, true, &["start b 2"]),
             (None, true, false, &["stopped"]),
         ] {
