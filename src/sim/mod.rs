@@ -12,7 +12,6 @@
 //! - [`framing`]: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
-//! - [`bare_master`]: a measuring rod for benches, not a master to build on.
 //! - [`broker`]: a small MQTT broker for the demo and for tests.
 //!
 //! Everything but [`wire`], its endpoints, the measuring rod and the broker is pure and takes the time as an argument,
@@ -21,7 +20,6 @@
 use std::time::Duration;
 
 pub mod autopilot;
-pub mod bare_master;
 pub mod broker;
 pub mod cx;
 pub mod drive;

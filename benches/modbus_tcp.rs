@@ -6,35 +6,29 @@
 //! rounds of a bus at 115200 baud, without and with that load on the daemon in turns eight times as long, since one round in
 //! a hundred counts; `--rounds 15` measures these alone, so often.
 
-mod client;
-#[path = "../common/mod.rs"]
 mod common;
-mod servers;
+mod modbus_tcp {
+    pub(crate) mod client;
+    pub(crate) mod servers;
+}
 
 use std::error::Error;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use client::{Load, load};
 use common::{median, option};
-use servers::Process;
+use modbus_tcp::client::{Load, load};
+use modbus_tcp::servers::{self, Process};
 
 /// Connections and requests in a batch.
 const LOADS: [(usize, usize); 3] = [(1, 1), (16, 1), (16, 8)];
 
 fn main() -> ExitCode {
     let serve = std::env::args().skip_while(|argument| argument != "--serve").nth(1);
-    let outcome = match serve {
+    common::exit(match serve {
         Some(name) => servers::serve(&name),
         None => measure(),
-    };
-    match outcome {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    })
 }
 
 fn measure() -> Result<(), Box<dyn Error>> {
