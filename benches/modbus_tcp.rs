@@ -134,10 +134,10 @@ fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
     println!(
         "\n| load on the daemon | written: cycle p50, ms | p99 | heard by the drives: p50 | p99 |\n|---|---|---|---|---|"
     );
-    let told = format!("16 × 1, {:.0} requests/s", median(&rates));
+    let loaded_row = format!("16 × 1, {:.0} requests/s", median(&rates));
     let column =
         |found: &[Vec<f64>], at: usize| -> Vec<f64> { found.iter().filter_map(|f| f.get(at).copied()).collect() };
-    for (load, found) in ["none", &told].iter().zip(&found) {
+    for (load, found) in ["none", &loaded_row].iter().zip(&found) {
         let figures: Vec<String> = (0..4).map(|at| format!("{:.3}", median(&column(found, at)))).collect();
         println!("| {load} | {} |", figures.join(" | "));
     }

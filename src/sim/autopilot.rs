@@ -1,4 +1,4 @@
-//! Somebody who runs a drive of the demo: starts, ramps, reverses, stops, and now and then the drive faults.
+//! Operates a drive of the demo: starts, ramps, reverses, stops, and now and then trips it.
 //!
 //! Pure and reproducible: the seed fixes what happens when. It acts as another master on the fieldbus would, through
 //! control word and reference, until the drive is commanded over the bus; then it lets go for good.
@@ -18,7 +18,7 @@ enum Next {
     ResetOff,
 }
 
-/// Runs one drive by itself.
+/// Operates one drive.
 #[derive(Debug, Clone)]
 pub struct Autopilot {
     random: Random,

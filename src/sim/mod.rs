@@ -8,7 +8,7 @@
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
 //! - [`n2`]: the N2 board that a drive may have in the place of its Modbus board.
-//! - [`faults`]: what goes wrong on a line, by chance or by script.
+//! - [`faults`]: faults on a line, random or scripted.
 //! - [`framing`]: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
