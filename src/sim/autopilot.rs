@@ -20,7 +20,7 @@ enum Next {
 
 /// Operates one drive.
 #[derive(Debug, Clone)]
-pub struct Autopilot {
+pub(crate) struct Autopilot {
     random: Random,
     next: Next,
     at: SimTime,
@@ -31,7 +31,7 @@ pub struct Autopilot {
 
 impl Autopilot {
     /// An autopilot that begins within a few seconds after `now`.
-    pub fn new(seed: u64, now: SimTime) -> Autopilot {
+    pub(crate) fn new(seed: u64, now: SimTime) -> Autopilot {
         let mut random = Random::new(seed);
         let at = now + Duration::from_millis(random.within(500..=4000));
         Autopilot {
@@ -44,12 +44,12 @@ impl Autopilot {
     }
 
     /// When it acts next.
-    pub fn next_at(&self) -> SimTime {
+    pub(crate) fn next_at(&self) -> SimTime {
         self.at
     }
 
     /// Does what is due at `now`.
-    pub fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
+    pub(crate) fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
         match self.next {
             Next::Start => {
                 self.changes = self.random.within(2..=5);

@@ -19,24 +19,24 @@
 
 use std::time::Duration;
 
-pub mod autopilot;
+pub(crate) mod autopilot;
 pub mod broker;
-pub mod cx;
+pub(crate) mod cx;
 pub mod drive;
 pub mod endpoint;
 pub mod faults;
-pub mod framing;
+pub(crate) mod framing;
 pub mod half_duplex;
-pub mod model;
-pub mod motor;
-pub mod n2;
+pub(crate) mod model;
+pub(crate) mod motor;
+pub(crate) mod n2;
 pub mod nx;
-pub mod parameter_set;
-pub mod pty;
+pub(crate) mod parameter_set;
+pub(crate) mod pty;
 pub mod random;
 pub mod slave;
 pub mod statistics;
-pub mod teco;
+pub(crate) mod teco;
 pub mod wire;
 
 /// Time since the simulated line was switched on.

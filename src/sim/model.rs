@@ -13,7 +13,7 @@ pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
 /// Output and reference closer than this count as reached, Hz: below what a register can show.
-pub const AT_REFERENCE_BAND: f64 = 0.005;
+pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 
 /// Run, direction and speed from whoever commands a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -45,7 +45,7 @@ pub struct DriveState {
 
 /// What every drive has, whatever its model.
 #[derive(Debug, Clone)]
-pub struct Body {
+pub(crate) struct Body {
     pub(super) motor: Motor,
     pub(super) latch: Latch,
     /// A run command is obeyed.
@@ -90,7 +90,7 @@ impl Body {
 /// A simulated drive with its Modbus board.
 ///
 /// Pure: the time is an argument and never runs backwards. No method panics, whatever it is given.
-pub trait Model: fmt::Debug {
+pub(crate) trait Model: fmt::Debug {
     /// What it has in common with all drives.
     fn body(&self) -> &Body;
 

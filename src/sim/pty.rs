@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// A pseudo-terminal; dropping it takes path and link away.
 #[derive(Debug)]
-pub struct Pty {
+pub(crate) struct Pty {
     /// The drives' end.
     pub(super) master: OwnedFd,
     /// The master's end, kept open: without it reads at the drives' end fail while no master is connected.
@@ -26,7 +26,7 @@ impl Pty {
     /// # Errors
     /// No pseudo-terminal is available, or the link cannot be made. Anything but a symbolic link at its path is left alone
     /// and is an error.
-    pub fn open(link: Option<&Path>) -> io::Result<Pty> {
+    pub(crate) fn open(link: Option<&Path>) -> io::Result<Pty> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;
         grantpt(&master)?;
@@ -50,7 +50,7 @@ impl Pty {
     }
 
     /// What a master opens: the link when there is one.
-    pub fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.link.as_deref().unwrap_or(&self.path)
     }
 

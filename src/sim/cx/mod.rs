@@ -9,8 +9,8 @@ mod registers;
 #[cfg(test)]
 mod tests;
 
-pub use diagnostics::Counters;
-pub use options::{AddressOffset, CxOptions, Limits, OutOfRange};
+pub(crate) use diagnostics::Counters;
+pub(crate) use options::{AddressOffset, CxOptions, OutOfRange};
 
 use self::diagnostics::{Diagnostics, count};
 use self::parameters::Parameters;

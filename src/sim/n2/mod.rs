@@ -4,14 +4,14 @@
 //! The drive behind it is asked through the same requests as by Modbus, see [`maps`]. What no manual says is an option
 //! or stands in [`crate::codec::n2::assumptions`].
 
-pub mod maps;
+pub(crate) mod maps;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-pub use maps::{Entry, Map};
+pub(crate) use maps::{Entry, Map};
 
 use self::maps::{Beyond, Place};
 use super::SimTime;
@@ -21,7 +21,7 @@ use crate::codec::n2::{Answer, Command, Object, Region};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Without a poll for that time a drive takes itself for alone (drives.md 6.5).
-pub const ALONE: Duration = Duration::from_secs(600);
+pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
 /// Options of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -51,7 +51,7 @@ impl Default for BoardOptions {
 }
 
 /// The drive behind a board; it may stay silent.
-pub type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
+pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 
 /// The board of one drive.
 #[derive(Debug, Clone)]
@@ -403,7 +403,7 @@ fn store(address: u16, value: u16, model: Model<'_>) -> Result<(), u8> {
 }
 
 /// The board's code for what the drive says on Modbus.
-pub fn code_of(exception: Exception) -> u8 {
+pub(crate) fn code_of(exception: Exception) -> u8 {
     match exception.0 {
         0x01 => UNKNOWN,
         // A parameter of TECO that is written in DRIVE mode.

@@ -10,7 +10,7 @@ mod signals;
 #[cfg(test)]
 mod tests;
 
-pub use options::{DetectionLevels, Digits, Mode, TecoOptions};
+pub(crate) use options::{Mode, TecoOptions};
 
 use self::parameters::{Parameters, function};
 use super::SimTime;
@@ -19,39 +19,39 @@ use super::motor::{Feed, Ratings};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Bits of the operation signals, register 0001H (drives.md 5.3).
-pub mod operation {
+pub(crate) mod operation {
     /// Run.
-    pub const RUN: u16 = 1 << 0;
+    pub(crate) const RUN: u16 = 1 << 0;
     /// Reverse.
-    pub const REVERSE: u16 = 1 << 1;
+    pub(crate) const REVERSE: u16 = 1 << 1;
     /// External fault.
-    pub const EXTERNAL_FAULT: u16 = 1 << 2;
+    pub(crate) const EXTERNAL_FAULT: u16 = 1 << 2;
     /// Fault reset.
-    pub const RESET: u16 = 1 << 3;
+    pub(crate) const RESET: u16 = 1 << 3;
     /// Multifunction reference 1; 2 to 4 follow.
-    pub const MULTIFUNCTION_1: u16 = 1 << 4;
+    pub(crate) const MULTIFUNCTION_1: u16 = 1 << 4;
 }
 
 /// Bits of the fault contents, register 0021H (drives.md 5.4).
-pub mod fault {
+pub(crate) mod fault {
     /// Overcurrent or ground fault.
-    pub const OVERCURRENT: u16 = 1 << 0;
+    pub(crate) const OVERCURRENT: u16 = 1 << 0;
     /// Overvoltage.
-    pub const OVERVOLTAGE: u16 = 1 << 1;
+    pub(crate) const OVERVOLTAGE: u16 = 1 << 1;
     /// Inverter overload.
-    pub const INVERTER_OVERLOAD: u16 = 1 << 2;
+    pub(crate) const INVERTER_OVERLOAD: u16 = 1 << 2;
     /// Inverter overheat.
-    pub const OVERHEAT: u16 = 1 << 3;
+    pub(crate) const OVERHEAT: u16 = 1 << 3;
     /// External fault.
-    pub const EXTERNAL: u16 = 1 << 7;
+    pub(crate) const EXTERNAL: u16 = 1 << 7;
     /// Control circuit.
-    pub const CONTROL_CIRCUIT: u16 = 1 << 8;
+    pub(crate) const CONTROL_CIRCUIT: u16 = 1 << 8;
     /// Motor overload.
-    pub const MOTOR_OVERLOAD: u16 = 1 << 9;
+    pub(crate) const MOTOR_OVERLOAD: u16 = 1 << 9;
     /// Undervoltage or power loss.
-    pub const POWER: u16 = 1 << 12;
+    pub(crate) const POWER: u16 = 1 << 12;
     /// All bits with a meaning.
-    pub const ALL: u16 =
+    pub(crate) const ALL: u16 =
         OVERCURRENT | OVERVOLTAGE | INVERTER_OVERLOAD | OVERHEAT | EXTERNAL | CONTROL_CIRCUIT | MOTOR_OVERLOAD | POWER;
 }
 
