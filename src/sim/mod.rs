@@ -2,14 +2,14 @@
 //!
 //! The pieces, from the drive to the port:
 //!
-//! - [`motor`], [`parameter_set`], [`model`]: what all drives have, and what a drive is to the line.
-//! - [`nx`] (Vacon NX, Eaton SVX and HVX), [`cx`] (Vacon CX), [`teco`] (TECO 7300PA): what the drives with their boards
-//!   do, asked by Modbus PDUs (pure); and [`autopilot`], which runs one in a demo.
+//! - `motor`, `parameter_set`, `model`: what all drives have, and what a drive is to the line.
+//! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): what the drives with their boards
+//!   do, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
-//! - [`n2`]: the N2 board that a drive may have in the place of its Modbus board.
+//! - `n2`: the N2 board that a drive may have in the place of its Modbus board.
 //! - [`faults`]: faults on a line, random or scripted.
-//! - [`framing`]: where a frame begins and ends, by protocol (pure).
+//! - `framing`: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
 //! - [`broker`]: a small MQTT broker for the demo and for tests.

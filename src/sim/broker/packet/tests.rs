@@ -1,5 +1,6 @@
 //! What is read is what was written, and nothing panics.
 
+use super::writer::{packet, variable};
 use super::*;
 use proptest::prelude::*;
 use rumqttc::v5::mqttbytes::v5::{Packet, PubAck};
