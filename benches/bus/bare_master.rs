@@ -4,8 +4,8 @@
 //! It schedules nothing, retries nothing and trusts whatever comes; its rate on a simulated line is what operating system
 //! and pseudo-terminal leave of the wire's limit, and so the rate that a bus task is measured against.
 
-use crate::codec::{Decoded, LineFormat, Request, rtu};
-use crate::line::{poll_until, sharpen_timers, wait_until};
+use drivegate::codec::{Decoded, LineFormat, Request, rtu};
+use drivegate::line::{poll_until, sharpen_timers, wait_until};
 use rustix::event::{PollFd, PollFlags};
 use std::fs::{File, OpenOptions};
 use std::io::{self, ErrorKind, Read, Write};
@@ -15,37 +15,19 @@ use std::time::{Duration, Instant};
 
 /// How the bare master measures.
 #[derive(Debug, Clone, Copy)]
-pub struct BareOptions {
+pub(crate) struct BareOptions {
     /// Format of the line.
-    pub format: LineFormat,
+    pub(crate) format: LineFormat,
     /// Silence between the end of a reply and the next request.
-    pub silence: Duration,
+    pub(crate) silence: Duration,
     /// Time for a reply after the request's last character.
-    pub timeout: Duration,
+    pub(crate) timeout: Duration,
     /// Part of the silence in which it watches the clock instead of sleeping.
-    pub spin: Duration,
-}
-
-/// What it reached.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BareReport {
-    /// Exchanges with a sound reply.
-    pub replies: u64,
-    /// Exchanges without one.
-    pub failures: u64,
-    /// Time that all took.
-    pub elapsed: Duration,
-}
-
-impl BareReport {
-    /// Sound replies a second.
-    pub fn rate(&self) -> f64 {
-        self.replies as f64 / self.elapsed.as_secs_f64().max(f64::MIN_POSITIVE)
-    }
+    pub(crate) spin: Duration,
 }
 
 /// The rate that the wire allows: request, 3.5 characters until the drive knows its end, turnaround, reply, silence.
-pub fn wire_limit(options: &BareOptions, request: &Request, turnaround: Duration) -> f64 {
+pub(crate) fn wire_limit(options: &BareOptions, request: &Request, turnaround: Duration) -> f64 {
     let characters = request.pdu.encoded_len() + request.pdu.reply_len() + 2 * rtu::OVERHEAD;
     let format = &options.format;
     let exchange = format.chars(characters) + format.silence_chars() + turnaround + options.silence;
@@ -56,7 +38,7 @@ pub fn wire_limit(options: &BareOptions, request: &Request, turnaround: Duration
 ///
 /// # Errors
 /// The port cannot be opened, or it is gone.
-pub fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Duration) -> io::Result<BareReport> {
+pub(crate) fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Duration) -> io::Result<()> {
     sharpen_timers();
     let flags = rustix::fs::OFlags::NOCTTY | rustix::fs::OFlags::NONBLOCK;
     let mut port = OpenOptions::new()
@@ -64,11 +46,6 @@ pub fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Durat
         .write(true)
         .custom_flags(flags.bits() as i32)
         .open(port)?;
-    let mut report = BareReport {
-        replies: 0,
-        failures: 0,
-        elapsed: Duration::ZERO,
-    };
     let mut frame = Vec::new();
     let mut reply = Vec::with_capacity(512);
     let start = Instant::now();
@@ -79,24 +56,20 @@ pub fn run(port: &Path, options: &BareOptions, requests: &[Request], time: Durat
         frame.clear();
         rtu::encode_request(request, &mut frame);
         reply.clear();
-        let sound = exchange(&mut port, options, request, &frame, &mut reply)?;
-        let ended = Instant::now();
-        report.replies += u64::from(sound);
-        report.failures += u64::from(!sound);
-        wait_until(ended + options.silence, options.spin);
+        exchange(&mut port, options, request, &frame, &mut reply)?;
+        wait_until(Instant::now() + options.silence, options.spin);
     }
-    report.elapsed = start.elapsed();
-    Ok(report)
+    Ok(())
 }
 
-/// One exchange; whether a sound reply came in time.
+/// One exchange, which ends with a reply, a corrupt frame or the timeout: what came is in the transcript of the line.
 fn exchange(
     port: &mut File,
     options: &BareOptions,
     request: &Request,
     frame: &[u8],
     reply: &mut Vec<u8>,
-) -> io::Result<bool> {
+) -> io::Result<()> {
     port.write_all(frame)?;
     let characters = frame.len() + request.pdu.reply_len() + rtu::OVERHEAD;
     let deadline = Instant::now() + options.format.chars(characters) + options.timeout;
@@ -104,7 +77,7 @@ fn exchange(
     loop {
         let mut fds = [PollFd::new(port, PollFlags::IN)];
         if !poll_until(&mut fds, deadline)? && Instant::now() >= deadline {
-            return Ok(false);
+            return Ok(());
         }
         match port.read(&mut buffer) {
             Ok(0) => return Err(io::Error::new(ErrorKind::UnexpectedEof, "the port is gone")),
@@ -113,9 +86,8 @@ fn exchange(
             Err(error) => return Err(error),
         }
         match rtu::decode_reply(request, reply) {
-            Decoded::Reply { .. } => return Ok(true),
             Decoded::Incomplete | Decoded::Foreign { .. } => {}
-            Decoded::Corrupt(_) => return Ok(false),
+            Decoded::Reply { .. } | Decoded::Corrupt(_) => return Ok(()),
         }
     }
 }

@@ -5,10 +5,12 @@
 //! sides are read meanwhile. The masters take turns, run by run; the figures are medians of the runs, and all are taken
 //! from the transcript of the simulated line.
 
-#[path = "../common/mod.rs"]
 mod common;
-mod gateway;
-mod peers;
+mod bus {
+    pub(crate) mod bare_master;
+    pub(crate) mod gateway;
+    pub(crate) mod peers;
+}
 
 use std::error::Error;
 use std::path::Path;
@@ -16,14 +18,14 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use drivegate::codec::{LineFormat, Request, RequestPdu, Table};
-use drivegate::sim::bare_master::{self, BareOptions};
-use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::statistics::{Direction, Statistics};
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate::sim::wire::SimulatedBus;
 
+use bus::bare_master::{self, BareOptions};
+use bus::gateway;
+use bus::peers::{self, Libmodbus};
 use common::{median, option, rate, starts};
-use peers::Libmodbus;
 
 const DRIVES: std::ops::RangeInclusive<u8> = 1..=10;
 const BAUDS: [u32; 5] = [9_600, 19_200, 38_400, 57_600, 115_200];
@@ -85,13 +87,7 @@ struct Run {
 }
 
 fn main() -> ExitCode {
-    match measure() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    common::exit(measure())
 }
 
 fn measure() -> Result<(), Box<dyn Error>> {
@@ -178,8 +174,7 @@ fn run(
     time: Duration,
     libmodbus: Option<&Libmodbus>,
 ) -> Result<Run, Box<dyn Error>> {
-    let drives = DRIVES.map(DriveOptions::nx).collect();
-    let line = SimulatedBus::start(SimulatedBusOptions::new("bench", LineRules::new(format), drives))?;
+    let line = common::gateway::line(format.baud, *DRIVES.end())?;
     let port = line.address();
     let pause = |wanted: bool| if wanted { format.silence_chars() } else { Duration::ZERO };
     let before = match master {

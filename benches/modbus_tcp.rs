@@ -6,35 +6,29 @@
 //! rounds of a bus at 115200 baud, without and with that load on the daemon in turns eight times as long, since one round in
 //! a hundred counts; `--rounds 15` measures these alone, so often.
 
-mod client;
-#[path = "../common/mod.rs"]
 mod common;
-mod servers;
+mod modbus_tcp {
+    pub(crate) mod client;
+    pub(crate) mod servers;
+}
 
 use std::error::Error;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use client::{Load, load};
 use common::{median, option};
-use servers::Process;
+use modbus_tcp::client::{Load, load};
+use modbus_tcp::servers::{self, Process};
 
 /// Connections and requests in a batch.
 const LOADS: [(usize, usize); 3] = [(1, 1), (16, 1), (16, 8)];
 
 fn main() -> ExitCode {
     let serve = std::env::args().skip_while(|argument| argument != "--serve").nth(1);
-    let outcome = match serve {
+    common::exit(match serve {
         Some(name) => servers::serve(&name),
         None => measure(),
-    };
-    match outcome {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    })
 }
 
 fn measure() -> Result<(), Box<dyn Error>> {
@@ -140,10 +134,10 @@ fn rounds(time: Duration, runs: usize) -> Result<(), Box<dyn Error>> {
     println!(
         "\n| load on the daemon | written: cycle p50, ms | p99 | heard by the drives: p50 | p99 |\n|---|---|---|---|---|"
     );
-    let told = format!("16 × 1, {:.0} requests/s", median(&rates));
+    let loaded_row = format!("16 × 1, {:.0} requests/s", median(&rates));
     let column =
         |found: &[Vec<f64>], at: usize| -> Vec<f64> { found.iter().filter_map(|f| f.get(at).copied()).collect() };
-    for (load, found) in ["none", &told].iter().zip(&found) {
+    for (load, found) in ["none", &loaded_row].iter().zip(&found) {
         let figures: Vec<String> = (0..4).map(|at| format!("{:.3}", median(&column(found, at)))).collect();
         println!("| {load} | {} |", figures.join(" | "));
     }
