@@ -23,9 +23,10 @@ use crate::codec::{LineFormat, Protocol};
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, Value};
 
 /// Whether a drive may be commanded.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Access {
     /// Every write is refused.
+    #[default]
     Monitor,
     /// Writes are passed on.
     Control,
@@ -54,9 +55,10 @@ pub struct Supervision {
 }
 
 /// What is done with a drive when the gateway stops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnShutdown {
     /// Nothing is written.
+    #[default]
     Hold,
     /// The stop is written and its acknowledgement awaited.
     Stop,

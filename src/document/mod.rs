@@ -1,11 +1,10 @@
-//! TOML documents that know the place of every value, for the configuration and the profiles.
+//! TOML documents that keep the place of every value, for the configuration and the profiles.
 //!
-//! A [`Reader`] hands out the keys of one table. What is missing, of the wrong type or unknown is
-//! collected as a [`Problem`] with file, line and key, so that one run reports every fault of a
-//! file. A key is known when somebody asked for it: [`Reader::finish`] reports the others, with
-//! the nearest known one.
+//! A [`Reader`] returns the keys of one table. Keys that are missing, unknown or have the wrong type are collected as
+//! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
+//! asked for: [`Reader::finish`] reports the others, each with the nearest known key.
 //!
-//! The values themselves are in `tree`, the types that they can be read as in `value`.
+//! `tree` holds the values, `value` the types they can be read as.
 
 mod file;
 mod reader;
@@ -16,17 +15,49 @@ use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::fmt;
 
-use serde::Serialize;
+use serde::ser::{Serialize, SerializeStruct, Serializer};
 
-use tree::entries;
+use tree::{OverrideError, entries};
 
 pub use file::read_file;
 pub use reader::{Reader, nearest};
 pub use tree::{Entry, Node, Raw};
-pub use value::{FromNode, format_duration, parse_duration, parse_size};
+pub use value::{FromNode, ValueError, format_duration, parse_duration, parse_size};
 
-/// One fault of a document: what, where, and what to do.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+/// What is wrong and what to do about it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// What is wrong.
+    pub what: String,
+    /// What to do; empty where there is nothing to add.
+    pub remedy: String,
+}
+
+impl Finding {
+    /// Both parts.
+    pub fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        Finding {
+            what: what.into(),
+            remedy: remedy.into(),
+        }
+    }
+}
+
+impl fmt::Display for Finding {
+    /// `what; what to do`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)?;
+        match self.remedy.as_str() {
+            "" => Ok(()),
+            remedy => write!(f, "; {remedy}"),
+        }
+    }
+}
+
+impl std::error::Error for Finding {}
+
+/// A finding and its place.
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Problem {
     /// File, or the environment variable that overrides it.
     pub file: String,
@@ -34,32 +65,49 @@ pub struct Problem {
     pub line: Option<usize>,
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
-    /// What is wrong and what to do, separated by `; `.
-    pub message: String,
+    /// What is wrong and what to do.
+    pub finding: Finding,
+}
+
+impl Problem {
+    /// A problem of a whole file, or of `key` in it, without a line.
+    pub fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
+        Problem {
+            file: file.into(),
+            line: None,
+            key: key.to_string(),
+            finding,
+        }
+    }
 }
 
 impl fmt::Display for Problem {
     /// `what; file:line, key; what to do`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (what, remedy) = match self.message.split_once("; ") {
-            Some((what, remedy)) => (what, Some(remedy)),
-            None => (self.message.as_str(), None),
-        };
-        write!(f, "{what}; {}", self.file)?;
+        let mut place = self.file.clone();
         if let Some(line) = self.line {
-            write!(f, ":{line}")?;
+            place += &format!(":{line}");
         }
         if !self.key.is_empty() {
-            write!(f, ", {}", self.key)?;
+            place += &format!(", {}", self.key);
         }
-        match remedy {
-            Some(remedy) => write!(f, "; {remedy}"),
-            None => Ok(()),
-        }
+        let what = format!("{}; {place}", self.finding.what);
+        Finding::new(what, self.finding.remedy.as_str()).fmt(f)
     }
 }
 
-/// Where a value stands.
+impl Serialize for Problem {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let mut fields = serializer.serialize_struct("Problem", 4)?;
+        fields.serialize_field("file", &self.file)?;
+        fields.serialize_field("line", &self.line)?;
+        fields.serialize_field("key", &self.key)?;
+        fields.serialize_field("message", &self.finding.to_string())?;
+        fields.end()
+    }
+}
+
+/// Where a value comes from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct Place {
     /// Line of the file, from 1.
@@ -81,7 +129,7 @@ pub struct Document {
 }
 
 impl Document {
-    /// Parses `source`, the text of `file`. Syntax errors become problems; what could be read is kept.
+    /// Parses `source`, the text of `file`. Syntax errors become problems; whatever can be read is kept.
     pub fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let document = Document {
@@ -96,7 +144,7 @@ impl Document {
                 line,
                 ..Place::default()
             };
-            document.problem(&place, format!("not valid TOML: {message}"));
+            document.problem(&place, format!("not valid TOML: {message}"), "");
         }
         document
     }
@@ -112,7 +160,7 @@ impl Document {
     }
 
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
-    /// The section must be there, tables inside it need not.
+    /// The section must exist, tables inside it need not.
     pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
@@ -126,18 +174,12 @@ impl Document {
                 .first()
                 .filter(|section| path.len() > 1 && !self.has_section(section));
             let outcome = match absent {
-                Some(section) => Err(format!(
-                    "there is no `{section}` in the file to override; add the section to the file first"
-                )),
+                Some(section) => Err(OverrideError::NoSection(section.clone())),
                 None => tree::set(&mut self.root, &path, &name, value),
             };
-            if let Err(message) = outcome {
-                let problem = Problem {
-                    file: name,
-                    line: None,
-                    key: path.join("."),
-                    message,
-                };
+            if let Err(error) = outcome {
+                let finding = Finding::new(error.to_string(), error.remedy());
+                let problem = Problem::of_file(name, &path.join("."), finding);
                 self.problems.get_mut().push(problem);
             }
         }
@@ -148,7 +190,7 @@ impl Document {
         &self.root
     }
 
-    /// Puts another tree in the place of the one that was parsed.
+    /// Replaces the parsed tree.
     pub fn set_root(&mut self, root: Node) {
         self.root = root;
     }
@@ -159,21 +201,23 @@ impl Document {
     }
 
     /// Adds a problem.
-    pub fn problem(&self, place: &Place, message: impl Into<String>) {
-        self.problems.borrow_mut().push(self.finding(place, message.into()));
+    pub fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+        let problem = self.at(place, Finding::new(what, remedy));
+        self.problems.borrow_mut().push(problem);
     }
 
-    /// Adds a warning: the document can be used, but something in it will not do what it seems to.
-    pub fn warning(&self, place: &Place, message: impl Into<String>) {
-        self.warnings.borrow_mut().push(self.finding(place, message.into()));
+    /// Adds a warning: the document can be used, but part of it will not do what it seems to.
+    pub fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+        let warning = self.at(place, Finding::new(what, remedy));
+        self.warnings.borrow_mut().push(warning);
     }
 
-    fn finding(&self, place: &Place, message: String) -> Problem {
+    fn at(&self, place: &Place, finding: Finding) -> Problem {
         Problem {
             file: place.env.clone().unwrap_or_else(|| self.file.clone()),
             line: place.line,
             key: place.key.clone(),
-            message,
+            finding,
         }
     }
 
@@ -181,8 +225,8 @@ impl Document {
         entries(&self.root).iter().any(|(key, _, _)| key == name)
     }
 
-    /// Every key that any reader of this document asked for, as a path without the numbers of array
-    /// elements: `bus[].drive[].address`.
+    /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
+    /// `bus[].drive[].address`.
     pub fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()
     }
@@ -192,17 +236,12 @@ impl Document {
         self.problems.borrow().is_empty()
     }
 
-    /// The file's name as it was given.
-    pub fn file(&self) -> &str {
-        &self.file
-    }
-
-    /// Takes the problems, in the order of the lines.
+    /// The problems, in the order of the lines.
     pub fn into_problems(self) -> Vec<Problem> {
         self.into_findings().0
     }
 
-    /// Takes problems and warnings, each in the order of the lines.
+    /// Problems and warnings, each in the order of the lines.
     pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         let sorted = |mut found: Vec<Problem>| {
             found.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
@@ -226,7 +265,7 @@ mod tests {
     }
 
     #[test]
-    fn every_fault_is_told_with_its_place() {
+    fn every_error_has_its_place() {
         let text = "nmae = \"x\"\nport = 5\n\n[[bus]]\nbaud = \"fast\"\n[[bus]]\nbaud = -1\n";
         let found = problems(text, |r| {
             let _: Option<String> = r.required("name");
@@ -240,7 +279,7 @@ mod tests {
             found,
             [
                 "unknown key `nmae`; f.toml:1, nmae; did you mean `name`?",
-                "an integer stands here; f.toml:2, port; write a string in quotes",
+                "wrong type: an integer; f.toml:2, port; write a string in quotes",
                 "`fast` is not a whole number from 0 to 4294967295; f.toml:5, bus[0].baud; write a whole number from 0 to 4294967295",
                 "-1 is out of range; f.toml:7, bus[1].baud; write a whole number from 0 to 4294967295",
                 "`name` is missing; f.toml, name; write a string in quotes",

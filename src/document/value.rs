@@ -1,9 +1,75 @@
-//! The types that a value can be read as, and the texts of durations and sizes.
+//! The types a value can be read as, and the notation of durations and sizes.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::{Node, Raw};
+use super::{Finding, Node, Raw};
+
+/// Why a value cannot be read. `wanted` is what to write.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ValueError {
+    /// A number or boolean in quotes.
+    #[error("`\"{text}\"` is a string")]
+    Quoted {
+        /// The text between the quotes.
+        text: String,
+        /// What to write, without quotes.
+        wanted: String,
+    },
+    /// Text that does not have the wanted form.
+    #[error("`{text}` is not {wanted}")]
+    Text {
+        /// The text.
+        text: String,
+        /// What to write.
+        wanted: String,
+    },
+    /// A value of another type.
+    #[error("wrong type: {kind}")]
+    Type {
+        /// Its type: `an integer`.
+        kind: &'static str,
+        /// What to write.
+        wanted: String,
+    },
+    /// An integer outside the range of the type.
+    #[error("{value} is out of range")]
+    OutOfRange {
+        /// The integer.
+        value: i64,
+        /// What to write.
+        wanted: String,
+    },
+    /// An infinite number, or NaN.
+    #[error("{value} is not a finite number")]
+    NotFinite {
+        /// The number.
+        value: f64,
+        /// What to write.
+        wanted: String,
+    },
+    /// Text without the form of a duration.
+    #[error("`{0}` is not a duration")]
+    Duration(String),
+    /// Text without the form of a size in bytes.
+    #[error("`{0}` is not a size")]
+    Size(String),
+}
+
+impl From<ValueError> for Finding {
+    fn from(error: ValueError) -> Finding {
+        let remedy = match &error {
+            ValueError::Quoted { wanted, .. } => format!("write {wanted}, without quotes"),
+            ValueError::Text { wanted, .. }
+            | ValueError::Type { wanted, .. }
+            | ValueError::OutOfRange { wanted, .. }
+            | ValueError::NotFinite { wanted, .. } => format!("write {wanted}"),
+            ValueError::Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
+            ValueError::Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
+        };
+        Finding::new(error.to_string(), remedy)
+    }
+}
 
 /// A type that a value can be read as.
 pub trait FromNode: Sized {
@@ -13,25 +79,36 @@ pub trait FromNode: Sized {
     /// Reads the value.
     ///
     /// # Errors
-    /// What is wrong and what to write instead.
-    fn from_node(node: &Node) -> Result<Self, String>;
+    /// The value has another type, another form, or is out of range.
+    fn from_node(node: &Node) -> Result<Self, ValueError>;
 }
 
-fn wrong<T: FromNode>(node: &Node) -> String {
+fn wrong<T: FromNode>(node: &Node) -> ValueError {
+    not(node, T::WANTED.to_string())
+}
+
+fn not(node: &Node, wanted: String) -> ValueError {
     let is_quoted = |text: &str| text.parse::<f64>().is_ok() || text.parse::<bool>().is_ok();
     match &node.value {
-        Raw::Text(text) if is_quoted(text) && !T::WANTED.contains("quotes") => {
-            format!("`\"{text}\"` is text; write {}, without quotes", T::WANTED)
+        Raw::Text(text) if is_quoted(text) && !wanted.contains("quotes") => {
+            let text = text.clone();
+            ValueError::Quoted { text, wanted }
         }
-        Raw::Env(text) | Raw::Text(text) => format!("`{text}` is not {}; write {}", T::WANTED, T::WANTED),
-        other => format!("{} stands here; write {}", other.kind(), T::WANTED),
+        Raw::Env(text) | Raw::Text(text) => {
+            let text = text.clone();
+            ValueError::Text { text, wanted }
+        }
+        other => {
+            let kind = other.kind();
+            ValueError::Type { kind, wanted }
+        }
     }
 }
 
 impl FromNode for String {
     const WANTED: &'static str = "a string in quotes";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Text(text) | Raw::Env(text) => Ok(text.clone()),
             _ => Err(wrong::<Self>(node)),
@@ -42,7 +119,7 @@ impl FromNode for String {
 impl FromNode for PathBuf {
     const WANTED: &'static str = "a path in quotes";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         String::from_node(node)
             .map(PathBuf::from)
             .map_err(|_| wrong::<Self>(node))
@@ -52,7 +129,7 @@ impl FromNode for PathBuf {
 impl FromNode for bool {
     const WANTED: &'static str = "true or false";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Bool(value) => Ok(*value),
             Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
@@ -64,7 +141,7 @@ impl FromNode for bool {
 impl FromNode for i64 {
     const WANTED: &'static str = "a whole number";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Integer(value) => Ok(*value),
             Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
@@ -78,10 +155,10 @@ macro_rules! from_integer {
         impl FromNode for $type {
             const WANTED: &'static str = $wanted;
 
-            fn from_node(node: &Node) -> Result<Self, String> {
+            fn from_node(node: &Node) -> Result<Self, ValueError> {
                 let value = i64::from_node(node).map_err(|_| wrong::<Self>(node))?;
                 <$type>::try_from(value)
-                    .map_err(|_| format!("{value} is out of range; write {}", Self::WANTED))
+                    .map_err(|_| ValueError::OutOfRange { value, wanted: Self::WANTED.to_string() })
             }
         }
     )*};
@@ -93,7 +170,7 @@ from_integer!(u8: "a whole number from 0 to 255", u16: "a whole number from 0 to
 impl FromNode for f64 {
     const WANTED: &'static str = "a number";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         let value = match &node.value {
             Raw::Float(value) => *value,
             Raw::Integer(value) => *value as f64,
@@ -103,7 +180,8 @@ impl FromNode for f64 {
         if value.is_finite() {
             Ok(value)
         } else {
-            Err(format!("{value} is no finite number; write {}", Self::WANTED))
+            let wanted = Self::WANTED.to_string();
+            Err(ValueError::NotFinite { value, wanted })
         }
     }
 }
@@ -111,7 +189,7 @@ impl FromNode for f64 {
 impl FromNode for Duration {
     const WANTED: &'static str = "a duration in quotes, such as \"10ms\", \"1.5s\" or \"2min\"";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Text(text) | Raw::Env(text) => parse_duration(text),
             _ => Err(wrong::<Self>(node)),
@@ -122,7 +200,7 @@ impl FromNode for Duration {
 impl<T: FromNode> FromNode for Vec<T> {
     const WANTED: &'static str = "a list in brackets";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Array(items) => items.iter().map(T::from_node).collect(),
             Raw::Env(text) => text
@@ -136,7 +214,7 @@ impl<T: FromNode> FromNode for Vec<T> {
                     })
                 })
                 .collect(),
-            _ => Err(format!("{}, each {}", wrong::<Self>(node), T::WANTED)),
+            _ => Err(not(node, format!("{}, each {}", Self::WANTED, T::WANTED))),
         }
     }
 }
@@ -144,9 +222,9 @@ impl<T: FromNode> FromNode for Vec<T> {
 /// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min`, `h`.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub fn parse_duration(text: &str) -> Result<Duration, String> {
-    let bad = || format!("`{text}` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min");
+/// The text is not a duration.
+pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
+    let bad = || ValueError::Duration(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed
         .find(|c: char| !c.is_ascii_digit() && c != '.')
@@ -164,7 +242,7 @@ pub fn parse_duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
 }
 
-/// The text that [`parse_duration`] reads as `time`, in the unit that makes it short.
+/// The shortest text that [`parse_duration`] reads as `time`.
 pub fn format_duration(time: Duration) -> String {
     match (time.as_secs(), time.subsec_nanos()) {
         (0, 0) => "0s".to_string(),
@@ -178,9 +256,9 @@ pub fn format_duration(time: Duration) -> String {
 /// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub fn parse_size(text: &str) -> Result<u64, String> {
-    let bad = || format!("`{text}` is no size; write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"");
+/// The text is not a size.
+pub fn parse_size(text: &str) -> Result<u64, ValueError> {
+    let bad = || ValueError::Size(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed.find(|c: char| !c.is_ascii_digit()).ok_or_else(bad)?;
     let (number, unit) = trimmed.split_at(digits);

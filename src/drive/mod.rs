@@ -10,14 +10,14 @@ pub mod profile;
 mod profile_file;
 
 pub use derive::{Bound, Derived};
-pub use model::{ModelPoint, Quality, Sample, State, Value};
+pub use model::{ModelPoint, Quality, Sample, State, Value, tidy};
 pub use plan::{Plan, PlannedRead};
-pub use profile::{Point, PollClass, Profile, Raw, Source};
+pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
 
-/// Name of the point that tells how a drive itself responds to a silent master; 0 is no response. For Vacon NX
-/// parameter P2.7.22.
+/// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
+/// P2.7.22.
 pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
-/// Name of the point that tells after how many seconds without a request a drive responds to a silent master; 0 is
-/// never. For drives that have a register for it.
+/// Name of the point with the time without a request, in seconds, after which a drive responds to a silent master; 0 is
+/// never. For drives with a register for it.
 pub const COMMUNICATION_TIMEOUT: &str = "communication_timeout";

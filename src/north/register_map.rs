@@ -13,7 +13,7 @@ pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, BusRegister, gateway};
 
 use crate::cache::Reading;
 use crate::codec::Exception;
-use crate::drive::profile::tidy;
+use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
 
 /// First address that is not the drive's own.

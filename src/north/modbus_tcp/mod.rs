@@ -89,9 +89,10 @@ pub struct Listener {
 }
 
 /// What happens to raw reads outside the plan.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Uncached {
     /// They are asked of the drive.
+    #[default]
     Forward,
     /// They are refused with 02.
     Refuse,
