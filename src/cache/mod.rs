@@ -32,21 +32,21 @@ pub enum Access {
     Control,
 }
 
-/// What is done when nobody renews a drive's lease any more.
+/// What is done when a drive's lease runs out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LeaseAction {
     /// Stop the drive.
     Stop,
-    /// Only tell.
+    /// Only raise the event.
     Hold,
     /// Set the speed reference, percent.
     SpeedReference(f64),
 }
 
-/// Lease of a drive: a commanding client must be heard of within `timeout`.
+/// Lease of a drive, renewed by commands that reach the wire and by accepted heartbeats.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Supervision {
-    /// Time without any accepted write or heartbeat.
+    /// Time without renewal after which the lease runs out.
     pub timeout: Duration,
     /// What is done then, once.
     pub action: LeaseAction,

@@ -15,8 +15,7 @@ mod shutdown;
 mod unique;
 mod values;
 
-pub use log::{LogFormat, LogSettings};
-pub use shutdown::{OTHER_STOP_TIME, ShutdownTime, UNIT_STOP_TIME};
+pub(crate) use log::{LogFormat, LogSettings};
 
 pub(crate) use bus::{check_port, default_format};
 pub(crate) use drive::{addresses, unknown_profile};
@@ -35,7 +34,7 @@ use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
-pub const ENVIRONMENT: &str = "DRIVEGATE";
+pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
 
 /// A valid configuration. Parts compare equal when a reload changes nothing in them.
 #[derive(Debug, Clone, PartialEq)]
@@ -76,7 +75,7 @@ pub struct BusSettings {
 impl BusSettings {
     /// The fast and slow cadence that staleness is measured by: those of the configuration, or the best the line can
     /// carry.
-    pub fn achievable(&self) -> (Duration, Duration) {
+    pub(crate) fn achievable(&self) -> (Duration, Duration) {
         let prediction = self.predict();
         let spec = &self.spec;
         (
@@ -86,7 +85,7 @@ impl BusSettings {
     }
 
     /// Expected wire times, cycles and load.
-    pub fn predict(&self) -> Prediction {
+    pub(crate) fn predict(&self) -> Prediction {
         predict::predict(&self.spec, self.options.silence, &self.drives)
     }
 }
@@ -124,7 +123,7 @@ impl Settings {
 
 /// The variables of this process that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
 /// [`Settings::load`] refuses.
-pub fn environment() -> impl Iterator<Item = (String, String)> {
+pub(crate) fn environment() -> impl Iterator<Item = (String, String)> {
     std::env::vars_os().filter_map(|(name, value)| {
         let name = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT))?;
         Some((name, value.to_string_lossy().into_owned()))

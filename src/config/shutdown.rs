@@ -9,13 +9,13 @@ use crate::document::Finding;
 use crate::drive::plan::WireTime;
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
-pub const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
+pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
 /// The part of it that servers, broker and ports may take.
-pub const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
+pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
 /// How long the stops of one bus take, one after another, from the end of the current exchange.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ShutdownTime {
+pub(crate) struct ShutdownTime {
     /// Drives to stop.
     pub drives: usize,
     /// Every one of them answers, after its turnaround.
@@ -26,7 +26,7 @@ pub struct ShutdownTime {
 
 impl ShutdownTime {
     /// The warning about that bus if the service manager may kill the gateway before every drive got its stop.
-    pub fn beyond_unit(&self, bus: &str) -> Option<Finding> {
+    pub(crate) fn beyond_unit(&self, bus: &str) -> Option<Finding> {
         let wanted = self.unanswered + OTHER_STOP_TIME;
         let seconds = |time: Duration| time.as_secs_f64().ceil();
         let drives = match self.drives {
@@ -53,7 +53,7 @@ impl ShutdownTime {
 impl BusSettings {
     /// How long the stops of `on_shutdown = "stop"` take. A stop is one write; if the run command is a bit of a word, the
     /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
-    pub fn shutdown_time(&self) -> ShutdownTime {
+    pub(crate) fn shutdown_time(&self) -> ShutdownTime {
         let mut time = ShutdownTime::default();
         for drive in self.drives.iter().filter(|drive| is_stopped(drive)) {
             let Some((read, write)) = stop_of(drive) else { continue };

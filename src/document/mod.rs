@@ -19,10 +19,10 @@ use serde::ser::{Serialize, SerializeStruct, Serializer};
 
 use tree::{OverrideError, entries};
 
-pub use file::read_file;
-pub use reader::{Reader, nearest};
-pub use tree::{Entry, Node, Raw};
-pub use value::{FromNode, ValueError, format_duration, parse_duration, parse_size};
+pub(crate) use file::read_file;
+pub(crate) use reader::{Reader, nearest};
+pub(crate) use tree::{Entry, Node, Raw};
+pub(crate) use value::{FromNode, format_duration, parse_duration, parse_size};
 
 /// What is wrong and what to do about it.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,7 +35,7 @@ pub struct Finding {
 
 impl Finding {
     /// Both parts.
-    pub fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
+    pub(crate) fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
         Finding {
             what: what.into(),
             remedy: remedy.into(),
@@ -71,7 +71,7 @@ pub struct Problem {
 
 impl Problem {
     /// A problem of a whole file, or of `key` in it, without a line.
-    pub fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
+    pub(crate) fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
         Problem {
             file: file.into(),
             line: None,
@@ -109,7 +109,7 @@ impl Serialize for Problem {
 
 /// Where a value comes from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Place {
+pub(crate) struct Place {
     /// Line of the file, from 1.
     pub line: Option<usize>,
     /// Environment variable that set the value instead of the file.
@@ -120,7 +120,7 @@ pub struct Place {
 
 /// A parsed file and the problems found in it so far.
 #[derive(Debug)]
-pub struct Document {
+pub(crate) struct Document {
     file: String,
     root: Node,
     problems: RefCell<Vec<Problem>>,
@@ -130,7 +130,7 @@ pub struct Document {
 
 impl Document {
     /// Parses `source`, the text of `file`. Syntax errors become problems; whatever can be read is kept.
-    pub fn parse(file: impl Into<String>, source: &str) -> Document {
+    pub(crate) fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let document = Document {
             file: file.into(),
@@ -150,7 +150,7 @@ impl Document {
     }
 
     /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
-    pub fn ensure_section(&mut self, name: &str) {
+    pub(crate) fn ensure_section(&mut self, name: &str) {
         let Raw::Table(entries) = &mut self.root.value else {
             return;
         };
@@ -161,7 +161,7 @@ impl Document {
 
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
     /// The section must exist, tables inside it need not.
-    pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
+    pub(crate) fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
             .into_iter()
@@ -186,28 +186,28 @@ impl Document {
     }
 
     /// The whole tree.
-    pub fn root(&self) -> &Node {
+    pub(crate) fn root(&self) -> &Node {
         &self.root
     }
 
     /// Replaces the parsed tree.
-    pub fn set_root(&mut self, root: Node) {
+    pub(crate) fn set_root(&mut self, root: Node) {
         self.root = root;
     }
 
     /// The reader of the whole document.
-    pub fn reader(&self) -> Reader<'_> {
+    pub(crate) fn reader(&self) -> Reader<'_> {
         Reader::of(self, &self.root, Place::default())
     }
 
     /// Adds a problem.
-    pub fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+    pub(crate) fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let problem = self.at(place, Finding::new(what, remedy));
         self.problems.borrow_mut().push(problem);
     }
 
     /// Adds a warning: the document can be used, but part of it will not do what it seems to.
-    pub fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+    pub(crate) fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let warning = self.at(place, Finding::new(what, remedy));
         self.warnings.borrow_mut().push(warning);
     }
@@ -227,22 +227,22 @@ impl Document {
 
     /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
     /// `bus[].drive[].address`.
-    pub fn known_keys(&self) -> BTreeSet<String> {
+    pub(crate) fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()
     }
 
     /// Whether no problem was found so far.
-    pub fn is_sound(&self) -> bool {
+    pub(crate) fn is_sound(&self) -> bool {
         self.problems.borrow().is_empty()
     }
 
     /// The problems, in the order of the lines.
-    pub fn into_problems(self) -> Vec<Problem> {
+    pub(crate) fn into_problems(self) -> Vec<Problem> {
         self.into_findings().0
     }
 
     /// Problems and warnings, each in the order of the lines.
-    pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
+    pub(crate) fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         let sorted = |mut found: Vec<Problem>| {
             found.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
             found

@@ -3,11 +3,11 @@
 use toml::de::{DeTable, DeValue};
 
 /// One key of a table: the key, its line, the value.
-pub type Entry = (String, Option<usize>, Node);
+pub(crate) type Entry = (String, Option<usize>, Node);
 
 /// A value and its place.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Node {
+pub(crate) struct Node {
     /// The value.
     pub value: Raw,
     pub(super) line: Option<usize>,
@@ -16,31 +16,31 @@ pub struct Node {
 
 impl Node {
     /// The value of `key`, if this is a table that has it.
-    pub fn entry(&self, key: &str) -> Option<&Node> {
+    pub(crate) fn entry(&self, key: &str) -> Option<&Node> {
         entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
     }
 
     /// Line of the file, from 1.
-    pub fn line(&self) -> Option<usize> {
+    pub(crate) fn line(&self) -> Option<usize> {
         self.line
     }
 
     /// Takes over the place of another value: problems of this one are reported there.
-    pub fn move_to(&mut self, other: &Node) {
+    pub(crate) fn move_to(&mut self, other: &Node) {
         self.line = other.line;
         self.env = other.env.clone();
     }
 
     /// A copy for a document of another file: its problems name `source` instead of a line.
-    pub fn from_source(&self, source: &str) -> Node {
+    pub(crate) fn with_source(&self, source: &str) -> Node {
         let value = match &self.value {
             Raw::Table(entries) => {
                 let copies = entries
                     .iter()
-                    .map(|(key, _, node)| (key.clone(), None, node.from_source(source)));
+                    .map(|(key, _, node)| (key.clone(), None, node.with_source(source)));
                 Raw::Table(copies.collect())
             }
-            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.from_source(source)).collect()),
+            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.with_source(source)).collect()),
             other => other.clone(),
         };
         Node {
@@ -51,7 +51,7 @@ impl Node {
     }
 
     /// The content in canonical form: independent of comments, line breaks, notation and the order of keys.
-    pub fn canonical(&self) -> String {
+    pub(crate) fn canonical(&self) -> String {
         let mut text = String::new();
         self.write_canonical(&mut text);
         text
@@ -88,7 +88,7 @@ impl Node {
     }
 
     /// A table without keys.
-    pub fn empty_table(env: Option<String>) -> Node {
+    pub(crate) fn empty_table(env: Option<String>) -> Node {
         Node {
             value: Raw::Table(Vec::new()),
             line: None,
@@ -99,7 +99,7 @@ impl Node {
 
 /// A TOML value.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Raw {
+pub(crate) enum Raw {
     /// A string.
     Text(String),
     /// A 64-bit integer.

@@ -7,7 +7,7 @@ use super::{Finding, Node, Raw};
 
 /// Why a value cannot be read. `wanted` is what to write.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub enum ValueError {
+pub(crate) enum ValueError {
     /// A number or boolean in quotes.
     #[error("`\"{text}\"` is a string")]
     Quoted {
@@ -72,7 +72,7 @@ impl From<ValueError> for Finding {
 }
 
 /// A type that a value can be read as.
-pub trait FromNode: Sized {
+pub(crate) trait FromNode: Sized {
     /// What to write, for messages: `a string`.
     const WANTED: &'static str;
 
@@ -223,7 +223,7 @@ impl<T: FromNode> FromNode for Vec<T> {
 ///
 /// # Errors
 /// The text is not a duration.
-pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
+pub(crate) fn parse_duration(text: &str) -> Result<Duration, ValueError> {
     let bad = || ValueError::Duration(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed
@@ -243,7 +243,7 @@ pub fn parse_duration(text: &str) -> Result<Duration, ValueError> {
 }
 
 /// The shortest text that [`parse_duration`] reads as `time`.
-pub fn format_duration(time: Duration) -> String {
+pub(crate) fn format_duration(time: Duration) -> String {
     match (time.as_secs(), time.subsec_nanos()) {
         (0, 0) => "0s".to_string(),
         (seconds, 0) if seconds % 3600 == 0 => format!("{}h", seconds / 3600),
@@ -257,7 +257,7 @@ pub fn format_duration(time: Duration) -> String {
 ///
 /// # Errors
 /// The text is not a size.
-pub fn parse_size(text: &str) -> Result<u64, ValueError> {
+pub(crate) fn parse_size(text: &str) -> Result<u64, ValueError> {
     let bad = || ValueError::Size(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed.find(|c: char| !c.is_ascii_digit()).ok_or_else(bad)?;

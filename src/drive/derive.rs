@@ -61,7 +61,8 @@ pub enum Derived {
 }
 
 impl Derived {
-    /// The name in profiles and output.
+    /// The name in profiles.
+    #[cfg(test)]
     pub fn name(&self) -> &'static str {
         match self {
             Derived::Band { .. } => "band",
@@ -74,7 +75,7 @@ impl Derived {
     }
 
     /// The point that a command to this one is converted to, with the ends of the band.
-    pub fn band(&self) -> Option<(usize, Bound, Bound)> {
+    pub(crate) fn band(&self) -> Option<(usize, Bound, Bound)> {
         match *self {
             Derived::Band { of, minimum, maximum } | Derived::Percent { of, minimum, maximum } => {
                 Some((of, minimum, maximum))
@@ -84,7 +85,7 @@ impl Derived {
     }
 
     /// The points that the value itself is derived from, without the ends of a band.
-    pub fn sources(&self) -> Vec<usize> {
+    pub(crate) fn sources(&self) -> Vec<usize> {
         match self {
             Derived::Band { of, .. }
             | Derived::Percent { of, .. }
@@ -96,14 +97,14 @@ impl Derived {
     }
 
     /// All points that it depends on, including the ends of a band.
-    pub fn rests_on(&self) -> Vec<usize> {
+    pub(crate) fn rests_on(&self) -> Vec<usize> {
         let mut points = self.sources();
         points.extend(self.ends());
         points
     }
 
     /// The points that are the ends of its band.
-    pub fn ends(&self) -> impl Iterator<Item = usize> {
+    pub(crate) fn ends(&self) -> impl Iterator<Item = usize> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
@@ -112,7 +113,7 @@ impl Derived {
     }
 
     /// The value for these values of the sources; `None` if it cannot be computed.
-    pub fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
+    pub(crate) fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
         let first = sources.first()?;
         match self {
             Derived::Band { .. } => {
@@ -142,7 +143,7 @@ impl Derived {
     }
 
     /// The value of the source for which this point is `value`; `None` if it cannot be commanded.
-    pub fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
+    pub(crate) fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
         let (low, high) = band;
         match self {
             _ if high <= low => None,
@@ -153,7 +154,7 @@ impl Derived {
     }
 
     /// The sample derived from those of the sources: the worst quality, the oldest time.
-    pub fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
+    pub(crate) fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
         let values: Option<Vec<Value>> = sources.iter().map(|s| s.value).collect();
         let value = values.and_then(|values| self.value(&values, band));
         let Some(value) = value else { return Sample::NONE };

@@ -13,7 +13,7 @@ use super::model::{Kind, ModelPoint, Value};
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::Node;
 
-pub use raw::{Form, Raw, Unwritable, WordOrder};
+pub use raw::{Form, Raw, WordOrder};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
@@ -66,7 +66,7 @@ pub struct Profile {
 
 /// Distinguishes profiles of the same name: FNV-1a, 64 bits, of the content merged with that of the base.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Digest(u64);
+pub(crate) struct Digest(u64);
 
 impl Digest {
     /// The digest of a profile's tree. Comments, blanks and the order of keys change nothing.
@@ -132,7 +132,7 @@ pub struct Expected {
 
 impl Probe {
     /// The request.
-    pub fn pdu(&self) -> RequestPdu {
+    pub(crate) fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {
             table: self.table,
             start: self.start,
@@ -222,7 +222,7 @@ impl Point {
     }
 
     /// What a value of an enumeration, or a bit with texts, means.
-    pub fn text_of(&self, value: Value) -> Option<&str> {
+    pub(crate) fn text_of(&self, value: Value) -> Option<&str> {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
@@ -242,12 +242,12 @@ impl Point {
 
 impl Profile {
     /// Digest of the content, by which two programs detect whether they use the same profile.
-    pub fn digest(&self) -> Digest {
+    pub(crate) fn digest(&self) -> Digest {
         self.digest
     }
 
     /// Index of a model point.
-    pub fn model_index(&self, point: ModelPoint) -> Option<usize> {
+    pub(crate) fn model_index(&self, point: ModelPoint) -> Option<usize> {
         self.model.get(point.index()).copied().flatten()
     }
 
@@ -262,14 +262,14 @@ impl Profile {
     }
 
     /// The range that holds `address`.
-    pub fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
+    pub(crate) fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
         self.ranges
             .iter()
             .find(|r| r.table == table && r.addresses.contains(&address))
     }
 
     /// The table that a read of `table` addresses in this family.
-    pub fn canonical(&self, table: Table) -> Table {
+    pub(crate) fn canonical(&self, table: Table) -> Table {
         if table == Table::Input && self.input_is_holding {
             Table::Holding
         } else {
@@ -278,7 +278,7 @@ impl Profile {
     }
 
     /// Text of a fault code; a code without text is shown as a plain number.
-    pub fn fault_text(&self, code: i64) -> String {
+    pub(crate) fn fault_text(&self, code: i64) -> String {
         let known = u16::try_from(code).ok().and_then(|c| self.faults.get(&c));
         match known {
             Some(fault) => fault.text.clone(),
@@ -288,7 +288,7 @@ impl Profile {
     }
 
     /// The run bit: its register or coil, its number, and whether it is inverted.
-    pub fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
+    pub(crate) fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
         let raw = self.model_point(ModelPoint::Run)?.raw()?;
         match raw.form {
             Form::Bit { bit, invert } => Some((raw, bit, invert)),
@@ -298,7 +298,7 @@ impl Profile {
 
     /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
     /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
-    pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
+    pub(crate) fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
         let spared = |address: u16| {
             let covers = |p: &&Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, address));
             let mut points = self.points.iter().filter(covers).peekable();
@@ -312,12 +312,12 @@ impl Profile {
     }
 
     /// Whether a write to that table is released afterwards: an analog output of N2.
-    pub fn releases(&self, table: Table) -> bool {
+    pub(crate) fn releases(&self, table: Table) -> bool {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
-    pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
+    pub(crate) fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
         })
@@ -330,7 +330,7 @@ pub struct Profiles(BTreeMap<String, Arc<Profile>>);
 
 impl Profiles {
     /// Adds a profile; one of the same name is replaced.
-    pub fn insert(&mut self, profile: Profile) {
+    pub(crate) fn insert(&mut self, profile: Profile) {
         self.0.insert(profile.name.clone(), Arc::new(profile));
     }
 

@@ -23,7 +23,7 @@ pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {
 
 /// Merges the document into the tree of its base, the profile `name`.
 pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
-    let mut merged = base.from_source(&format!("profile {name}"));
+    let mut merged = base.with_source(&format!("profile {name}"));
     let own = document.root().clone();
     if let Raw::Table(entries) = &mut merged.value {
         // The name is the file's own.
