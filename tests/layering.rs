@@ -160,9 +160,9 @@ fn the_modules_of_drive_have_no_circle() {
     let drive = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/drive");
     let mut found = Vec::new();
     for file in rust_files(&drive) {
-        let module = modules_of(file.strip_prefix(&drive).unwrap()).swap_remove(0);
-        if DRIVE.contains(&module.as_str()) {
-            found.extend(arrows_back(&module, &fs::read_to_string(&file).unwrap()));
+        let modules = modules_of(file.strip_prefix(&drive).unwrap());
+        if let Some(module) = modules.first().filter(|module| DRIVE.contains(&module.as_str())) {
+            found.extend(arrows_back(module, &fs::read_to_string(&file).unwrap()));
         }
     }
     assert_eq!(found, Vec::<String>::new());

@@ -24,6 +24,14 @@ pub(crate) enum ValueError {
         /// What to write.
         wanted: String,
     },
+    /// Text where a list is expected.
+    #[error("`{text}` is not a list")]
+    List {
+        /// The text.
+        text: String,
+        /// What each item is.
+        item: &'static str,
+    },
     /// A value of another type.
     #[error("wrong type: {kind}")]
     Type {
@@ -64,6 +72,7 @@ impl From<ValueError> for Finding {
             | ValueError::Type { wanted, .. }
             | ValueError::OutOfRange { wanted, .. }
             | ValueError::NotFinite { wanted, .. } => format!("write {wanted}"),
+            ValueError::List { item, .. } => format!("write a list in brackets, each {item}"),
             ValueError::Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
             ValueError::Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
         };
@@ -84,11 +93,8 @@ pub(crate) trait FromNode: Sized {
 }
 
 fn wrong<T: FromNode>(node: &Node) -> ValueError {
-    not(node, T::WANTED.to_string())
-}
-
-fn not(node: &Node, wanted: String) -> ValueError {
     let is_quoted = |text: &str| text.parse::<f64>().is_ok() || text.parse::<bool>().is_ok();
+    let wanted = T::WANTED.to_string();
     match &node.value {
         Raw::Text(text) if is_quoted(text) && !wanted.contains("quotes") => {
             let text = text.clone();
@@ -214,7 +220,14 @@ impl<T: FromNode> FromNode for Vec<T> {
                     })
                 })
                 .collect(),
-            _ => Err(not(node, format!("{}, each {}", Self::WANTED, T::WANTED))),
+            Raw::Text(text) => Err(ValueError::List {
+                text: text.clone(),
+                item: T::WANTED,
+            }),
+            other => Err(ValueError::Type {
+                kind: other.kind(),
+                wanted: format!("{}, each {}", Self::WANTED, T::WANTED),
+            }),
         }
     }
 }
