@@ -15,7 +15,7 @@ use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::fmt;
 
-use serde::ser::{Serialize, SerializeStruct, Serializer};
+use serde::{Serialize, Serializer};
 
 use tree::{OverrideError, entries};
 
@@ -57,7 +57,7 @@ impl fmt::Display for Finding {
 impl std::error::Error for Finding {}
 
 /// A finding and its place.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Problem {
     /// File, or the environment variable that overrides it.
     pub file: String,
@@ -66,6 +66,7 @@ pub struct Problem {
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
     /// What is wrong and what to do.
+    #[serde(rename = "message", serialize_with = "as_text")]
     pub finding: Finding,
 }
 
@@ -96,15 +97,8 @@ impl fmt::Display for Problem {
     }
 }
 
-impl Serialize for Problem {
-    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
-        let mut fields = serializer.serialize_struct("Problem", 4)?;
-        fields.serialize_field("file", &self.file)?;
-        fields.serialize_field("line", &self.line)?;
-        fields.serialize_field("key", &self.key)?;
-        fields.serialize_field("message", &self.finding.to_string())?;
-        fields.end()
-    }
+fn as_text<S: Serializer>(finding: &Finding, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(finding)
 }
 
 /// Where a value comes from.

@@ -5,76 +5,36 @@ use std::time::Duration;
 
 use super::{Finding, Node, Raw};
 
-/// Why a value cannot be read. `wanted` is what to write.
+/// Why a value cannot be read: the value or its type, then what to write.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub(crate) enum ValueError {
-    /// A number or boolean in quotes.
-    #[error("`\"{text}\"` is a string")]
-    Quoted {
-        /// The text between the quotes.
-        text: String,
-        /// What to write, without quotes.
-        wanted: String,
-    },
-    /// Text that does not have the wanted form.
-    #[error("`{text}` is not {wanted}")]
-    Text {
-        /// The text.
-        text: String,
-        /// What to write.
-        wanted: String,
-    },
-    /// Text where a list is expected.
-    #[error("`{text}` is not a list")]
-    List {
-        /// The text.
-        text: String,
-        /// What each item is.
-        item: &'static str,
-    },
-    /// A value of another type.
-    #[error("wrong type: {kind}")]
-    Type {
-        /// Its type: `an integer`.
-        kind: &'static str,
-        /// What to write.
-        wanted: String,
-    },
-    /// An integer outside the range of the type.
-    #[error("{value} is out of range")]
-    OutOfRange {
-        /// The integer.
-        value: i64,
-        /// What to write.
-        wanted: String,
-    },
-    /// An infinite number, or NaN.
-    #[error("{value} is not a finite number")]
-    NotFinite {
-        /// The number.
-        value: f64,
-        /// What to write.
-        wanted: String,
-    },
-    /// Text without the form of a duration.
+    #[error("`\"{0}\"` is a string")]
+    Quoted(String, &'static str),
+    #[error("`{0}` is not {1}")]
+    Text(String, &'static str),
+    #[error("`{0}` is not a list")]
+    NotAList(String, String),
+    #[error("wrong type: {0}")]
+    Type(&'static str, String),
+    #[error("{0} is out of range")]
+    OutOfRange(i64, &'static str),
+    #[error("{0} is not a finite number")]
+    NotFinite(f64, &'static str),
     #[error("`{0}` is not a duration")]
     Duration(String),
-    /// Text without the form of a size in bytes.
     #[error("`{0}` is not a size")]
     Size(String),
 }
 
 impl From<ValueError> for Finding {
     fn from(error: ValueError) -> Finding {
+        use ValueError::{Duration, NotAList, NotFinite, OutOfRange, Quoted, Size, Text, Type};
         let remedy = match &error {
-            ValueError::Quoted { wanted, .. } => format!("write {wanted}, without quotes"),
-            ValueError::Text { wanted, .. }
-            | ValueError::Type { wanted, .. }
-            | ValueError::OutOfRange { wanted, .. }
-            | ValueError::NotFinite { wanted, .. } => format!("write {wanted}"),
-            ValueError::List { item, .. } => format!("write a list in brackets, each {item}"),
-            ValueError::Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
-            ValueError::Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
+            Quoted(_, wanted) => format!("write {wanted}, without quotes"),
+            Text(_, wanted) | OutOfRange(_, wanted) | NotFinite(_, wanted) => format!("write {wanted}"),
+            NotAList(_, wanted) | Type(_, wanted) => format!("write {wanted}"),
+            Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
+            Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
         };
         Finding::new(error.to_string(), remedy)
     }
@@ -94,20 +54,12 @@ pub(crate) trait FromNode: Sized {
 
 fn wrong<T: FromNode>(node: &Node) -> ValueError {
     let is_quoted = |text: &str| text.parse::<f64>().is_ok() || text.parse::<bool>().is_ok();
-    let wanted = T::WANTED.to_string();
     match &node.value {
-        Raw::Text(text) if is_quoted(text) && !wanted.contains("quotes") => {
-            let text = text.clone();
-            ValueError::Quoted { text, wanted }
+        Raw::Text(text) if is_quoted(text) && !T::WANTED.contains("quotes") => {
+            ValueError::Quoted(text.clone(), T::WANTED)
         }
-        Raw::Env(text) | Raw::Text(text) => {
-            let text = text.clone();
-            ValueError::Text { text, wanted }
-        }
-        other => {
-            let kind = other.kind();
-            ValueError::Type { kind, wanted }
-        }
+        Raw::Env(text) | Raw::Text(text) => ValueError::Text(text.clone(), T::WANTED),
+        other => ValueError::Type(other.kind(), T::WANTED.to_string()),
     }
 }
 
@@ -164,7 +116,7 @@ macro_rules! from_integer {
             fn from_node(node: &Node) -> Result<Self, ValueError> {
                 let value = i64::from_node(node).map_err(|_| wrong::<Self>(node))?;
                 <$type>::try_from(value)
-                    .map_err(|_| ValueError::OutOfRange { value, wanted: Self::WANTED.to_string() })
+                    .map_err(|_| ValueError::OutOfRange(value, Self::WANTED))
             }
         }
     )*};
@@ -186,8 +138,7 @@ impl FromNode for f64 {
         if value.is_finite() {
             Ok(value)
         } else {
-            let wanted = Self::WANTED.to_string();
-            Err(ValueError::NotFinite { value, wanted })
+            Err(ValueError::NotFinite(value, Self::WANTED))
         }
     }
 }
@@ -220,16 +171,15 @@ impl<T: FromNode> FromNode for Vec<T> {
                     })
                 })
                 .collect(),
-            Raw::Text(text) => Err(ValueError::List {
-                text: text.clone(),
-                item: T::WANTED,
-            }),
-            other => Err(ValueError::Type {
-                kind: other.kind(),
-                wanted: format!("{}, each {}", Self::WANTED, T::WANTED),
-            }),
+            Raw::Text(text) => Err(ValueError::NotAList(text.clone(), each::<T>())),
+            other => Err(ValueError::Type(other.kind(), each::<T>())),
         }
     }
+}
+
+/// What to write for a list.
+fn each<T: FromNode>() -> String {
+    format!("{}, each {}", Vec::<T>::WANTED, T::WANTED)
 }
 
 /// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min`, `h`.
