@@ -116,7 +116,7 @@ fn errors_and_warnings_go_to_stderr_in_the_form_of_the_contract() {
     let unknown = run(&["profiles", "show", "vacon-xn"]);
     assert_eq!(
         unknown.err,
-        "error: unknown profile `vacon-xn`; command line, NAME; did you mean `vacon-nx`? known are eaton-hvx, eaton-hvx-n2, eaton-svx, \
+        "error: unknown profile `vacon-xn`; command line, NAME; did you mean `vacon-nx`? known profiles: eaton-hvx, eaton-hvx-n2, eaton-svx, \
          teco-7300pa, teco-7300pa-n2, vacon-cx, vacon-nx, vacon-nx-n2\n"
     );
     let (_dir, path) = sound();
@@ -130,8 +130,8 @@ fn a_file_that_is_no_text_is_told_as_such() {
     let path = file.to_str().unwrap();
     let wanted = |byte: &str, line: usize, column: usize| {
         format!(
-            "error: the file is no text: byte 0x{byte} at line {line}, column {column}; {path}:{line}; \
-             save it as UTF-8 text, or name the file that was meant\n"
+            "error: the file is not text: byte 0x{byte} at line {line}, column {column}; {path}:{line}; \
+             save it as UTF-8 text, or name the intended file\n"
         )
     };
     fs::write(&file, b"[gateway]\nname = \"a\" # 20 \xB0C\n").unwrap();
@@ -290,7 +290,7 @@ fn the_environment_overrides_the_file() {
         (bad.code, bad.err.as_str()),
         (
             Some(78),
-            "error: the variable is no UTF-8 text; DRIVEGATE__MQTT__PASSWORD; set it again\n"
+            "error: the variable is not UTF-8 text; DRIVEGATE__MQTT__PASSWORD; set it again\n"
         )
     );
 }
@@ -429,9 +429,9 @@ fn a_bad_log_level_of_the_demo_is_a_wrong_command_line() {
     for (level, wanted) in [
         (
             "verbose",
-            "unknown word `verbose`; write \"off\" or \"error\" or \"warn\" or \"info\" or \"debug\" or \"trace\"",
+            "unknown word `verbose`; write \"off\", \"error\", \"warn\", \"info\", \"debug\" or \"trace\"",
         ),
-        ("nonsense=1", "unknown word `1`; write \"off\" or \"error\""),
+        ("nonsense=1", "unknown word `1`; write \"off\", \"error\""),
         ("inof", "did you mean \"info\"?"),
     ] {
         // A demo that started would not end by itself.
@@ -457,15 +457,15 @@ fn what_is_wrong_on_a_command_line_is_told_in_its_own_words() {
     for (args, wanted) in [
         (
             &["scan", "--port", "tcp://foo"][..],
-            "`tcp://foo` is no device server; write \"tcp://host:port\"",
+            "`tcp://foo` is not the address of a device server; write \"tcp://host:port\"",
         ),
         (
             &["scan", "--port", "/dev/x", "--timeout", "5"],
-            "`5` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min",
+            "`5` is not a duration; write a number with its unit, such as 10ms, 1.5s or 2min",
         ),
         (
             &["simulate", "--turnaround", "5"],
-            "`5` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min",
+            "`5` is not a duration; write a number with its unit, such as 10ms, 1.5s or 2min",
         ),
         (
             &["simulate", "--listen", "foo"],

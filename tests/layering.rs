@@ -139,6 +139,35 @@ fn a_path_attribute_moves_a_file() {
     assert_eq!(faults, ["src/bus/plan_tests.rs:1: `bus` must not name `north`"]);
 }
 
+/// Modules of `drive`: each uses only those before it.
+const DRIVE: [&str; 6] = ["model", "derive", "profile", "plan", "identify", "profile_file"];
+
+/// `module: later` for each module of `drive` that names a later one.
+fn arrows_back(module: &str, text: &str) -> Vec<String> {
+    let rank = DRIVE.iter().position(|m| *m == module).unwrap();
+    let names = |later: &&&str| {
+        ["super::", "drive::"]
+            .iter()
+            .any(|up| text.contains(&format!("{up}{later}::")))
+    };
+    let later = DRIVE[rank + 1..].iter().filter(names);
+    later.map(|later| format!("{module}: {later}")).collect()
+}
+
+#[test]
+fn the_modules_of_drive_have_no_circle() {
+    assert_eq!(arrows_back("derive", "use super::profile::tidy;"), ["derive: profile"]);
+    let drive = Path::new(env!("CARGO_MANIFEST_DIR")).join("src/drive");
+    let mut found = Vec::new();
+    for file in rust_files(&drive) {
+        let modules = modules_of(file.strip_prefix(&drive).unwrap());
+        if let Some(module) = modules.first().filter(|module| DRIVE.contains(&module.as_str())) {
+            found.extend(arrows_back(module, &fs::read_to_string(&file).unwrap()));
+        }
+    }
+    assert_eq!(found, Vec::<String>::new());
+}
+
 fn rust_files(dir: &Path) -> Vec<PathBuf> {
     let mut files = Vec::new();
     for entry in fs::read_dir(dir).unwrap() {

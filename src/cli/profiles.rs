@@ -70,12 +70,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Some(profile) if *toml => report::print(&profile.text),
         Some(profile) => report::print(&show(profile)),
         None => {
-            report::errors(&[Problem {
-                file: "command line".to_string(),
-                line: None,
-                key: "NAME".to_string(),
-                message: unknown_profile(name, &profiles, false),
-            }]);
+            let unknown = unknown_profile(name, &profiles, false);
+            report::errors(&[Problem::of_file("command line", "NAME", unknown)]);
             ExitCode::from(EXIT_USAGE)
         }
     }

@@ -2,12 +2,13 @@
 
 use std::io::{self, Write};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use comfy_table::{ContentArrangement, Table, TableComponent, presets};
 
 use super::EXIT_FAILED;
 use crate::config::Loaded;
-use crate::document::Problem;
+use crate::document::{Finding, Problem, parse_duration};
 
 /// Prints `text` to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
@@ -22,6 +23,11 @@ pub(super) fn print(text: &str) -> ExitCode {
             ExitCode::from(EXIT_FAILED)
         }
     }
+}
+
+/// A duration of the command line.
+pub(super) fn duration(text: &str) -> Result<Duration, Finding> {
+    Ok(parse_duration(text)?)
 }
 
 /// Prints `error: what; where; what to do` to stderr.

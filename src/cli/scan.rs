@@ -18,9 +18,9 @@ use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 use crate::config;
-use crate::document::parse_duration;
-use crate::drive::identify::{self, Probe};
+use crate::document::Finding;
 use crate::drive::profile::Profiles;
+use crate::drive::{Probe, identify};
 use crate::line::{Line, Rs485};
 
 /// Bauds that are tried when none is named; the drives of the built-in profiles leave the works with one of them.
@@ -53,7 +53,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = super::addresses::parse_addresses)]
     addresses: super::addresses::Addresses,
     /// Time for the first byte of a reply; without it that of the protocol.
-    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    #[arg(long, value_name = "TIME", value_parser = report::duration)]
     timeout: Option<Duration>,
     /// Tries for each address.
     #[arg(long, value_name = "COUNT", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10))]
@@ -100,7 +100,7 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
 }
 
 /// The port as a configuration takes it, seen from here.
-fn parse_port(text: &str) -> Result<String, String> {
+fn parse_port(text: &str) -> Result<String, Finding> {
     config::check_port(text, Path::new(""))
 }
 

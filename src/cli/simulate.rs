@@ -7,7 +7,7 @@ use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::cache::DriveSpec;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
-use crate::document::{nearest, parse_duration};
+use crate::document::nearest;
 use crate::drive::profile::{Profile, Profiles};
 use crate::sim::cx::AddressOffset;
 use crate::sim::drive::{DriveOptions, ModelOptions};
@@ -61,7 +61,7 @@ pub(super) struct Args {
     #[arg(long, value_name = "FORMAT")]
     pub format: Option<String>,
     /// Time between the end of a request and the reply [default: what the drive's manual tells, else 0.5ms]
-    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    #[arg(long, value_name = "TIME", value_parser = report::duration)]
     pub turnaround: Option<Duration>,
     /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
     #[arg(long, value_name = "LIST", default_value = "")]

@@ -12,7 +12,7 @@ pub(crate) use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
 use crate::cache::Reading;
 use crate::codec::Exception;
-use crate::drive::profile::tidy;
+use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
 
 /// First address that does not belong to the drive.

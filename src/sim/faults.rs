@@ -3,7 +3,7 @@
 use super::framing;
 use super::random::Random;
 use crate::codec::{Protocol, RequestPdu, Table};
-use crate::document::parse_duration;
+use crate::document::{Finding, parse_duration};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
@@ -64,7 +64,9 @@ impl FromStr for Fault {
             .split_once(':')
             .map_or((text, None), |(name, argument)| (name, Some(argument)));
         let fault = match (name, argument) {
-            ("late", argument) => Fault::Late(parse_duration(argument.unwrap_or("50ms"))?),
+            ("late", argument) => Fault::Late(
+                parse_duration(argument.unwrap_or("50ms")).map_err(|error| Finding::from(error).to_string())?,
+            ),
             ("exception", Some(code)) => Fault::Exception(exception_code(code)?),
             (_, Some(_)) => {
                 return Err(format!(

@@ -89,9 +89,10 @@ pub struct Listener {
 }
 
 /// How raw reads outside the poll plan are handled.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Uncached {
     /// They are forwarded to the drive.
+    #[default]
     Forward,
     /// They are refused with exception 02.
     Refuse,
