@@ -14,7 +14,7 @@ use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::north::{NorthStats, http, modbus_tcp, mqtt};
+use crate::north::{NorthStats, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 
 /// Time beyond that of its stops after which a bus is not waited for any more.
@@ -39,6 +39,7 @@ pub struct Daemon {
     modbus_tcp: Option<(CancellationToken, modbus_tcp::Server)>,
     mqtt: Option<(CancellationToken, mqtt::Mqtt)>,
     http: Option<(CancellationToken, http::Http)>,
+    local: Option<(CancellationToken, local::Local)>,
     beats: BTreeMap<String, u64>,
 }
 
@@ -71,6 +72,7 @@ impl Daemon {
             modbus_tcp: None,
             mqtt: None,
             http: None,
+            local: None,
             beats: BTreeMap::new(),
         };
         // First whoever keeps events, so that none is missed; last the servers that tell whether all is ready.
@@ -78,6 +80,7 @@ impl Daemon {
         let begins = daemon.prepare_buses(&settings)?;
         daemon.take_buses(&settings, begins);
         daemon.take_servers(&settings).await?;
+        daemon.take_local(&settings).await;
         daemon.settings = settings;
         Ok(daemon)
     }
@@ -98,6 +101,11 @@ impl Daemon {
             .as_ref()
             .map(|(_, server)| server.addresses().to_vec())
             .unwrap_or_default()
+    }
+
+    /// Where the local socket is.
+    pub fn socket(&self) -> Option<&std::path::Path> {
+        self.local.as_ref().map(|(_, server)| server.path())
     }
 
     /// Whether every bus has moved since the last call; a bus that hangs must not be hidden by a watchdog that is fed.
@@ -133,6 +141,7 @@ impl Daemon {
         }
         self.take_buses(&settings, begins);
         self.take_mqtt(&settings).await;
+        self.take_local(&settings).await;
         self.settings = settings;
         Ok(())
     }
@@ -279,8 +288,33 @@ impl Daemon {
         }
     }
 
+    /// Opens the local socket where it is wanted. The gateway runs without it where it cannot be had; a reload tries again.
+    async fn take_local(&mut self, settings: &Settings) {
+        if self.local.is_some() && settings.socket == self.settings.socket {
+            return;
+        }
+        self.stop_local().await;
+        let cancel = CancellationToken::new();
+        match local::start(&settings.socket, self.plant.clone(), cancel.clone()).await {
+            Ok(server) => self.local = server.map(|server| (cancel, server)),
+            Err(error) => tracing::warn!(
+                target: "drivegate::local",
+                "{error}; `drivegate read` and `drivegate write` cannot go through this gateway; set `socket` of [gateway], \
+                 or socket = \"\" to do without"
+            ),
+        }
+    }
+
+    async fn stop_local(&mut self) {
+        if let Some((cancel, server)) = self.local.take() {
+            cancel.cancel();
+            within(STOP_SERVER, "the local socket", server.stopped()).await;
+        }
+    }
+
     /// Stops in order: no new commands, the stops that are configured, the buses, the last messages.
     pub async fn stop(mut self) {
+        self.stop_local().await;
         if let Some((cancel, server)) = self.modbus_tcp.take() {
             cancel.cancel();
             within(STOP_SERVER, "Modbus TCP", server.stopped()).await;

@@ -237,7 +237,8 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
 
 fn configuration(ports: &[String], sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
-    let mut text = "[gateway]\nname = \"demo\"\n".to_string();
+    // The demo has no configuration file, which `read` and `write` would need to find its drives.
+    let mut text = "[gateway]\nname = \"demo\"\nsocket = \"\"\n".to_string();
     let mut unit = 0;
     for (line, port) in LINES.iter().zip(ports) {
         let DemoLine { name, baud, format, .. } = line;

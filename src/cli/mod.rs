@@ -7,9 +7,9 @@ mod addresses;
 mod check;
 mod client;
 mod demo;
+mod drive_access;
 mod log;
 mod map;
-mod oneshot;
 mod profiles;
 mod read;
 mod report;
@@ -91,6 +91,15 @@ struct ConfigFile {
 /// Reads the command line, does what it says and returns the exit code.
 pub fn main() -> ExitCode {
     Cli::parse().command.run()
+}
+
+/// The runtime of a command that has one thing to do.
+fn runtime() -> Result<tokio::runtime::Runtime, String> {
+    let built = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build();
+    built.map_err(|why| format!("cannot start: {why}; the runtime; free memory, threads or file descriptors"))
 }
 
 /// Runs `command` on a runtime of its own.

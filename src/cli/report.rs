@@ -29,6 +29,11 @@ pub(super) fn error(message: &str) {
     line("error", message);
 }
 
+/// Prints a note to stderr.
+pub(super) fn note(message: &str) {
+    line("note", message);
+}
+
 /// Prints errors to stderr.
 pub(super) fn errors(problems: &[Problem]) {
     for problem in problems {
@@ -45,7 +50,7 @@ pub(super) fn problems(loaded: &Loaded) {
 }
 
 fn line(kind: &str, message: &str) {
-    // There is nowhere left to tell that stderr is gone.
+    // With stderr gone there is nowhere left to report that.
     let _ = writeln!(io::stderr().lock(), "{kind}: {message}");
 }
 

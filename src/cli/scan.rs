@@ -214,7 +214,7 @@ fn addresses(args: &Args, setting: Setting) -> impl Iterator<Item = u8> {
 /// Ctrl-C ends the search; what was found is printed all the same.
 fn stop_on_signal(stop: Arc<AtomicBool>) {
     std::thread::spawn(move || {
-        let Ok(runtime) = super::read::runtime() else { return };
+        let Ok(runtime) = super::runtime() else { return };
         // Without a handler Ctrl-C ends the process, which is harmless: nothing was written.
         if runtime.block_on(tokio::signal::ctrl_c()).is_ok() {
             stop.store(true, Ordering::Relaxed);

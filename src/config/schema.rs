@@ -44,6 +44,13 @@ fn gateway() -> Value {
         [
             ("name", name("Name of the gateway: MQTT topics, metric label.", "-")),
             (
+                "socket",
+                text(
+                    "Path of the local socket through which read and write reach the running gateway; \"\": none. Default: \
+                     drivegate.sock in the runtime directory.",
+                ),
+            ),
+            (
                 "profile_dirs",
                 list(
                     "Directories of your own profiles (*.toml); one with the name of a built-in profile replaces it.",

@@ -1,7 +1,8 @@
-//! The north sides: Modbus TCP, MQTT and HTTP. They read the process image and queue commands; they never
+//! The north sides: Modbus TCP, MQTT, HTTP and the local socket. They read the process image and queue commands; they never
 //! name the bus.
 
 pub mod http;
+pub mod local;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;

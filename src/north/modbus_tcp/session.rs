@@ -217,7 +217,6 @@ impl Session {
                     product: &profile.name,
                     title: &profile.title,
                     name: &drive.image.spec.name,
-                    digest: Some(profile.digest()),
                 };
                 identity
                     .reply(code, object)
@@ -250,7 +249,6 @@ impl Session {
                     product: "gateway",
                     title: "drivegate",
                     name: &plant.gateway,
-                    digest: None,
                 };
                 identity.reply(code, object)?
             }

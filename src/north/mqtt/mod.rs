@@ -39,6 +39,7 @@ use crate::plant::SharedPlant;
 
 pub use self::offline::{Offline, Published};
 pub use self::request::Incoming;
+pub(super) use self::request::resolve as point_value;
 
 /// A secret that does not show in logs.
 #[derive(Clone, PartialEq, Eq)]
