@@ -1,4 +1,4 @@
-//! What commands print. A reader that closes the pipe early ends the output, not the program.
+//! What commands print. A pipe that is closed early ends the output without an error.
 
 use std::io::{self, Write};
 use std::process::ExitCode;
@@ -17,7 +17,7 @@ pub(super) fn print(text: &str) -> ExitCode {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(why) => {
             error(&format!(
-                "cannot write the output: {why}; stdout; give it a place that can take it"
+                "cannot write the output: {why}; stdout; free space, or redirect it"
             ));
             ExitCode::from(EXIT_FAILED)
         }

@@ -417,7 +417,7 @@ fn what_a_search_prints_passes_check() {
     ]);
     assert_eq!(nobody.code, 1);
     assert!(
-        nobody.out.is_empty() && nobody.err.contains("no drive has answered"),
+        nobody.out.is_empty() && nobody.err.contains("no drive answered"),
         "{}",
         nobody.err
     );

@@ -275,7 +275,7 @@ impl Family {
         let modbus = free_port();
         let config = directory.path().join("drivegate.toml");
         let text = format!(
-            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\n{line}\
+            "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nresponse_timeout = \"2s\"\n{line}\
              [[bus.drive]]\nname = \"fan-1\"\naddress = 2\nprofile = \"{profile}\"\naccess = \"control\"\n{more}\n\
              [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n"
         );
@@ -360,7 +360,7 @@ impl Family {
 
 #[test]
 fn a_command_without_run_never_carries_it_on_any_family() {
-    let fast = "baud = 19200\ncycle = \"50ms\"\n";
+    let fast = "baud = 19200\ncycle = \"200ms\"\n";
     let ascii = "protocol = \"modbus-ascii\"\nbaud = 19200\ncycle = \"100ms\"\n";
     let n2 = "protocol = \"n2\"\ncycle = \"500ms\"\nslow_cycle = \"2s\"\n";
     std::thread::scope(|scope| {

@@ -265,7 +265,7 @@ fn a_reload_that_cannot_listen_changes_nothing() {
         .replace("pump-1", "pump-2");
     std::fs::write(&file, other).unwrap();
     gateway.signal("HUP");
-    let log = gateway.until_printed("the new configuration is not taken");
+    let log = gateway.until_printed("reload rejected");
     assert!(log.contains("another program has it"), "{log}");
     until("the old address", || mbpoll_read(modbus, 1, 2100, 1).ok());
     assert_eq!(api(http, "pump-1")["online"], true);
@@ -322,11 +322,11 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
     for silence in ["chars", "spec"] {
         let old = text.replace("[modbus_tcp]", &format!("{more}[modbus_tcp]"));
         std::fs::write(&file, old.replace("\"chars\"", &format!("\"{silence}\""))).unwrap();
-        let refused = gateway.output().matches("the new configuration is not taken").count();
+        let refused = gateway.output().matches("reload rejected").count();
         leave_room_for(gateway.pid(), Some(3));
         gateway.signal("HUP");
         until("the refusal", || {
-            (gateway.output().matches("the new configuration is not taken").count() > refused).then_some(())
+            (gateway.output().matches("reload rejected").count() > refused).then_some(())
         });
         leave_room_for(gateway.pid(), None);
         let log = gateway.output();
