@@ -21,7 +21,7 @@ const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
 const SILENCE: Duration = Duration::from_secs(35);
 /// Longest reply that is not a stream, longest line of a stream.
 const MOST_BYTES: usize = 1 << 20;
-/// Longest document: some thousand drives with all their points.
+/// Largest document: some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;
 
 /// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.

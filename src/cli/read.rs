@@ -17,9 +17,9 @@ the port itself.")]
 pub(super) struct Args {
     #[command(flatten)]
     config: super::ConfigFile,
-    /// The drive.
+    /// Name of the drive.
     drive: String,
-    /// Points by name.
+    /// Names of points.
     points: Vec<String>,
     /// JSON instead of a table.
     #[arg(long)]
@@ -64,14 +64,14 @@ fn print(args: &Args, rows: &[PointValue]) -> ExitCode {
         return ExitCode::from(EXIT_FAILED);
     }
     let printed = report::print(&if args.json { json(rows) } else { table(rows) });
-    // What was asked for by name must be there.
+    // Points requested by name must have a value.
     if none || (!all && !args.points.is_empty()) {
         return ExitCode::from(EXIT_FAILED);
     }
     printed
 }
 
-/// Why none of several points has a value, where that is one reason for all: once is enough.
+/// The reason why no point has a value, if all of several points have the same one: it is printed once.
 fn only_reason(rows: &[PointValue]) -> Option<&str> {
     let (first, others) = rows.split_first().filter(|(_, others)| !others.is_empty())?;
     let same = |row: &PointValue| !row.is_good() && row.why == first.why;

@@ -315,7 +315,7 @@ fn line(frame: &Frame, with_bus: bool, colours: bool) -> String {
     text.join(" ").trim_end().to_string()
 }
 
-/// Without what could command a terminal.
+/// Replaces control characters, which could command a terminal.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }

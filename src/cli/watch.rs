@@ -60,7 +60,7 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
             Err(why) => format!("{why}\n\ntrying again\n"),
         };
         let mut stdout = io::stdout().lock();
-        // From the top, each line cleared behind its end, the rest of the screen below.
+        // Redraws from the top, clearing the rest of each line and of the screen.
         let text = text.replace('\n', "\x1b[K\r\n");
         if write!(stdout, "\x1b[H{text}\x1b[J")
             .and_then(|()| stdout.flush())

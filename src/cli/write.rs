@@ -16,12 +16,12 @@ use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, Wri
   drivegate write --config drivegate.toml pump-1 run=false
   drivegate write --config drivegate.toml pump-1 fault_reset=true
 
-Several points are one command, in the order that is safe. The drive must have access = \"control\"; limits hold.
+Several points are sent as one command, in a safe order. The drive must have access = \"control\"; limits hold.
 Without a gateway nothing supervises a motor that the command has started.")]
 pub(super) struct Args {
     #[command(flatten)]
     config: super::ConfigFile,
-    /// The drive.
+    /// Name of the drive.
     drive: String,
     /// What to set.
     #[arg(required = true, value_name = "POINT=VALUE")]

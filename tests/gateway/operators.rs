@@ -212,7 +212,7 @@ fn metrics_please_promtool_and_a_bad_reload_changes_nothing() {
     );
     std::fs::write(&configuration, good.replace("name = \"pump-2\"", "name = \"pump-two\"")).unwrap();
     plant.gateway.signal("HUP");
-    plant.gateway.until_printed("the new configuration is taken");
+    plant.gateway.until_printed("configuration reloaded");
     until("the new name", || {
         get(plant.http, "/api/v1/drives/pump-two").filter(|(status, _)| *status == 200)
     });

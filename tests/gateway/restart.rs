@@ -221,7 +221,7 @@ fn a_reload_that_opens_the_line_anew_writes_no_control_word() {
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     until("the control word was read again", || {
         (crate::process::point(http, "pump-1", "run") == true).then_some(())
     });
@@ -283,7 +283,7 @@ fn a_reload_does_not_end_supervision() {
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     gateway.until_printed("no commanding client of pump-1");
     until("the stop", || {
         (crate::process::point(http, "pump-1", "run") == false).then_some(())
@@ -339,7 +339,7 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
         assert!(crate::process::point(http, "pump-1", "output_frequency").is_number());
     }
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     until("the bus with its new settings", || {
         crate::process::mbpoll_write(modbus, 1, 33_024, &[0]).ok()
     });
@@ -364,7 +364,7 @@ fn a_reload_carries_stale_after_to_the_buses_that_run() {
     until("stale values", || (!is_good()).then_some(()));
     assert!(!gateway.output().contains("the bus ends"));
     std::fs::write(&file, slow).unwrap();
-    let taken = || gateway.output().matches("the new configuration is taken").count();
+    let taken = || gateway.output().matches("configuration reloaded").count();
     gateway.signal("HUP");
     until("the old file again", || (taken() == 2).then_some(()));
     assert!(is_good(), "three rounds of this bus are six seconds");

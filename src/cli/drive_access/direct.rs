@@ -35,7 +35,7 @@ impl Direct {
     /// What is wrong, where, and what to do.
     pub(super) async fn start(target: &Target, not_found: &NotFound) -> Result<Direct, String> {
         let mut spec = target.spec.clone();
-        // What was commanded stays as it is when the command ends.
+        // The drive keeps what was commanded when this process ends.
         spec.on_shutdown = OnShutdown::Hold;
         spec.supervision = None;
         let name = spec.name.clone();

@@ -23,7 +23,7 @@ pub(super) struct NotFound(pub(super) String);
 /// Sends the request to the gateway of the target's configuration, if one runs.
 ///
 /// # Errors
-/// When one runs and there is no outcome: nothing is tried on the line then.
+/// When one runs but gives no outcome; the line must not be tried then.
 pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Outcome, NotFound>, String> {
     let paths = target.settings.socket.of_client(&RuntimeDirectories::of_this_process());
     let (mut reasons, mut others) = (Vec::new(), Vec::new());
