@@ -16,7 +16,7 @@ use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::north::{NorthStats, ServerError, http, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
@@ -50,6 +50,7 @@ pub struct Daemon {
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
+    local: ServerSlot<local::Local>,
     /// Beats of the bus threads at the last check, by bus.
     beats: BTreeMap<String, u64>,
 }
@@ -78,6 +79,7 @@ impl Daemon {
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
+            local: ServerSlot::default(),
             beats: BTreeMap::new(),
         };
         // MQTT first, so that it misses no event; the servers that report readiness last.
@@ -85,6 +87,7 @@ impl Daemon {
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.replace_buses(&settings, prepared);
         daemon.apply_servers(&settings).await?;
+        daemon.apply_local(&settings).await;
         Ok(daemon)
     }
 
@@ -102,6 +105,11 @@ impl Daemon {
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
         let server = self.modbus_tcp.server();
         server.map(|server| server.addresses().to_vec()).unwrap_or_default()
+    }
+
+    /// Path of the local socket, if it is open.
+    pub fn socket(&self) -> Option<&std::path::Path> {
+        self.local.server().map(local::Local::path)
     }
 
     /// Whether every bus thread has run since the last call. If not, the watchdog keep-alive must be withheld.
@@ -137,6 +145,7 @@ impl Daemon {
         }
         self.replace_buses(&settings, prepared);
         self.apply_mqtt(&settings).await?;
+        self.apply_local(&settings).await;
         self.settings = settings;
         Ok(())
     }
@@ -233,9 +242,23 @@ impl Daemon {
         self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await
     }
 
-    /// Shuts down in order: no new Modbus TCP commands, the configured stop commands, the buses, the last MQTT
-    /// messages.
+    /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
+    /// again.
+    async fn apply_local(&mut self, settings: &Settings) {
+        let socket = Some(&settings.socket).filter(|socket| **socket != local::SocketPath::Off);
+        if let Err(error) = self.local.apply(socket, &self.plant, &self.stats).await {
+            tracing::warn!(
+                target: "drivegate::local",
+                "{error}; `drivegate read` and `drivegate write` cannot use this gateway; set `socket` of [gateway], or \
+                 socket = \"\" to do without"
+            );
+        }
+    }
+
+    /// Shuts down in order: no new commands of local and Modbus TCP clients, the configured stop commands, the buses,
+    /// the last MQTT messages.
     pub async fn stop(mut self) {
+        self.local.stop().await;
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);

@@ -33,7 +33,7 @@
 //! - [`sim`]: simulated drives of every family on a simulated wire, and the broker of the demo.
 //! - [`config`]: file and environment to settings, every fault in one run.
 //! - [`daemon`]: wiring, reload, the order of stopping.
-//! - [`cli`]: one file a command; `read` and `write` are a client of a running gateway, or a bus of their own without one.
+//! - [`cli`]: one file a command; `read` and `write` are a client of a running gateway's local socket, or a bus of their own without one.
 //!
 //! # Deliberately absent
 //!

@@ -240,7 +240,7 @@ fn the_tables_name_every_request() {
     let (_dir, path) = sound();
     let ran = run(&["check", "--config", &path]);
     let wanted = [
-        "Bus line1: /dev/ttyUSB9 (not there now), modbus-rtu, 38400 8N1, silence 0.91 ms",
+        "Bus line1: /dev/ttyUSB9 (not present), modbus-rtu, 38400 8N1, silence 0.91 ms",
         " pump-1  fast   03 read holding     2100     11    11.44",
         " pump-2  slow   03 read holding      100      2",
         " pump-2  once   03 read holding      102      2",
@@ -262,7 +262,7 @@ fn stops_at_shutdown_are_told_with_their_time() {
     );
     let path = "tests/doubtful/shutdown.toml";
     let ran = run(&["check", "--config", path]);
-    let wanted = "  shutdown    3 drives stopped in 0.15 s, 108.86 s where none answers\n";
+    let wanted = "  shutdown    3 drives stopped in 0.15 s, 108.86 s if none answers\n";
     assert!(ran.out.contains(wanted), "{}", ran.out);
     let bus = &json(&run(&["check", "--json", "--config", path]))["buses"][0];
     let seconds = |key: &str| bus[key].as_f64().unwrap() / 1e3;
@@ -469,7 +469,7 @@ fn what_is_wrong_on_a_command_line_is_told_in_its_own_words() {
         ),
         (
             &["simulate", "--listen", "foo"],
-            "`foo` is no address to listen on; write host:port, such as 127.0.0.1:4001",
+            "`foo` is not an address to listen on; write host:port, such as 127.0.0.1:4001",
         ),
         (
             &["simulate", "--addresses", "250"],

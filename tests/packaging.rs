@@ -273,6 +273,18 @@ fn the_image_is_small_and_not_root() {
 }
 
 #[test]
+fn the_local_socket_has_its_directory() {
+    assert!(read("systemd/drivegate.service").contains("\nRuntimeDirectory=drivegate\n"));
+    let image = read("deploy/Dockerfile");
+    let owned = image.lines().find(|line| line.contains("chown 65532:65532")).unwrap();
+    assert!(owned.contains("/image/run/drivegate"), "{owned}");
+    let service = &yaml("deploy/compose.yaml")["services"]["drivegate"];
+    assert_eq!(service["read_only"], true);
+    let writable = service["tmpfs"][0].as_str().unwrap();
+    assert!(writable.starts_with("/run/drivegate:uid=65532,"), "{writable}");
+}
+
+#[test]
 fn mosquitto_takes_its_configuration() {
     let dir = TempDir::new().unwrap();
     let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();

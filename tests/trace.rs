@@ -329,10 +329,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     let output = tools::run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--bus", "hall 1"]);
     assert_eq!(output.status.code(), Some(1));
     let told = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(
-        told,
-        format!("error: there is no bus `hall 1`; {url}; there is line1\n")
-    );
+    assert_eq!(told, format!("error: there is no bus `hall 1`; {url}; known: line1\n"));
 
     // A capture that cannot be written.
     let output = tools::run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--pcap", "/dev/null/x"]);
@@ -347,7 +344,7 @@ fn it_ends_as_it_is_told_and_says_why() {
     assert!(plant.gateway.ended().0.success());
     let (status, _) = trace.ended();
     assert_eq!(status.code(), Some(1));
-    trace.until_printed("error: the gateway has ended the stream");
+    trace.until_printed("error: the gateway ended the stream");
 
     // None there any more.
     let began = Instant::now();
@@ -378,7 +375,7 @@ fn one_that_is_no_gateway_is_told_from_one() {
     let output = tools::run(Path::new(DRIVEGATE), &["trace", "--url", &url]);
     assert_eq!(output.status.code(), Some(1));
     let told = String::from_utf8(output.stderr).unwrap();
-    assert!(told.starts_with("error: no HTTP reply"), "{told}");
+    assert!(told.starts_with("error: not an HTTP reply"), "{told}");
     answer.join().unwrap();
 
     let plant = Plant::start();

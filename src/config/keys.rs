@@ -138,6 +138,10 @@ keys! {
     GATEWAY: Gateway {
         /// Name of the gateway, in MQTT topics and in the metric `drivegate_build_info`.
         name: String = Name("-"), required;
+        /// Path of the local socket, mode 0660, by which `drivegate read` and `drivegate write` [reach the running
+        /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and the
+        /// gateway runs without it.
+        socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
         /// Directories of your own [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
         profile_dirs: Vec<PathBuf> = List { parse: values::path, empty: None, range: "directories" }, or "none";

@@ -30,6 +30,7 @@ use crate::bus::predict::{self, Prediction};
 use crate::cache::{Access, BusSpec, DriveSpec};
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
+use crate::north::local::SocketPath;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
@@ -41,6 +42,8 @@ pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
 pub struct Settings {
     /// Name of the gateway.
     pub gateway: String,
+    /// Where `drivegate read` and `drivegate write` reach the gateway.
+    pub socket: SocketPath,
     /// Directories of the user's profiles.
     pub profile_dirs: Vec<PathBuf>,
     /// Built-in profiles and the user's.
@@ -161,12 +164,12 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
 
 fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
     let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
-    let (name, profile_dirs, profiles) = match gateway {
+    let (name, socket, profile_dirs, profiles) = match gateway {
         Some(gateway) => {
             profile_errors.extend(gateway.errors);
-            (gateway.name, gateway.profile_dirs, gateway.profiles)
+            (gateway.name, gateway.socket, gateway.profile_dirs, gateway.profiles)
         }
-        None => (None, Vec::new(), Profiles::built_in()),
+        None => (None, SocketPath::Default, Vec::new(), Profiles::built_in()),
     };
     let broken = !profile_errors.is_empty();
     let tables = ROOT.bus.tables(reader);
@@ -200,6 +203,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
 
     Some(Settings {
         gateway: name?,
+        socket,
         profile_dirs,
         profiles,
         stale_after: match &modbus_tcp {
@@ -257,6 +261,7 @@ fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
 
 struct Gateway {
     name: Option<String>,
+    socket: SocketPath,
     profile_dirs: Vec<PathBuf>,
     profiles: Profiles,
     errors: Vec<Problem>,
@@ -264,6 +269,11 @@ struct Gateway {
 
 fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     let name = GATEWAY.name.read(reader);
+    let socket = match GATEWAY.socket.written(reader) {
+        None => SocketPath::Default,
+        Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
+        Some(path) => SocketPath::At(values::resolved(base, path)),
+    };
     let mut profiles = Profiles::built_in();
     let mut errors = Vec::new();
     let dirs = GATEWAY.profile_dirs.get(reader);
@@ -281,6 +291,7 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     reader.finish();
     Gateway {
         name,
+        socket,
         profile_dirs,
         profiles,
         errors,

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::north::{NorthStats, ServerError, http, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::SharedPlant;
 
 /// Time limit for a server to stop.
@@ -128,6 +128,24 @@ impl Server for modbus_tcp::Server {
 
     async fn stopped(self) {
         modbus_tcp::Server::stopped(&self).await;
+    }
+}
+
+impl Server for local::Local {
+    const NAME: &'static str = "the local socket";
+    type Options = local::SocketPath;
+
+    async fn start(
+        options: Self::Options,
+        plant: SharedPlant,
+        _stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Self, ServerError> {
+        local::start(&options, plant, cancel).await.map_err(ServerError::Local)
+    }
+
+    async fn stopped(self) {
+        local::Local::stopped(self).await;
     }
 }
 

@@ -50,43 +50,6 @@ impl Node {
         }
     }
 
-    /// The content in canonical form: independent of comments, line breaks, notation and the order of keys.
-    pub(crate) fn canonical(&self) -> String {
-        let mut text = String::new();
-        self.write_canonical(&mut text);
-        text
-    }
-
-    fn write_canonical(&self, out: &mut String) {
-        match &self.value {
-            Raw::Text(text) => out.push_str(&format!("{text:?}")),
-            Raw::Env(text) => out.push_str(&format!("env {text:?}")),
-            Raw::Integer(number) => out.push_str(&number.to_string()),
-            Raw::Float(number) => out.push_str(&format!("{number:?}")),
-            Raw::Bool(state) => out.push_str(&state.to_string()),
-            Raw::Other => out.push('?'),
-            Raw::Array(items) => {
-                out.push('[');
-                for item in items {
-                    item.write_canonical(out);
-                    out.push(',');
-                }
-                out.push(']');
-            }
-            Raw::Table(entries) => {
-                let mut entries: Vec<&Entry> = entries.iter().collect();
-                entries.sort_by(|(a, ..), (b, ..)| a.cmp(b));
-                out.push('{');
-                for (key, _, value) in entries {
-                    out.push_str(&format!("{key:?}="));
-                    value.write_canonical(out);
-                    out.push(',');
-                }
-                out.push('}');
-            }
-        }
-    }
-
     /// A table without keys.
     pub(crate) fn empty_table(env: Option<String>) -> Node {
         Node {

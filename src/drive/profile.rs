@@ -3,7 +3,6 @@
 mod raw;
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
@@ -60,26 +59,6 @@ pub struct Profile {
     pub text: String,
     /// The file merged with its base, for profiles based on this one.
     pub(super) tree: Node,
-    /// Digest of `tree`.
-    pub(super) digest: Digest,
-}
-
-/// Distinguishes profiles of the same name: FNV-1a, 64 bits, of the content merged with that of the base.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub(crate) struct Digest(u64);
-
-impl Digest {
-    /// The digest of a profile's tree. Comments, blanks and the order of keys change nothing.
-    pub(super) fn of(tree: &Node) -> Digest {
-        let one = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
-        Digest(tree.canonical().bytes().fold(0xCBF2_9CE4_8422_2325, one))
-    }
-}
-
-impl fmt::Display for Digest {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:016x}", self.0)
-    }
 }
 
 /// Text of a fault code.
@@ -241,11 +220,6 @@ impl Point {
 }
 
 impl Profile {
-    /// Digest of the content, by which two programs detect whether they use the same profile.
-    pub(crate) fn digest(&self) -> Digest {
-        self.digest
-    }
-
     /// Index of a model point.
     pub(crate) fn model_index(&self, point: ModelPoint) -> Option<usize> {
         self.model.get(point.index()).copied().flatten()

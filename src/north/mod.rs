@@ -1,9 +1,10 @@
-//! The north sides: Modbus TCP, MQTT and HTTP. They read the process image and queue commands; they never
+//! The north sides: Modbus TCP, MQTT, HTTP and the local socket. They read the process image and queue commands; they never
 //! name the bus.
 
 mod connection_limit;
 pub mod http;
 mod listener;
+pub mod local;
 mod log_throttle;
 pub(crate) mod metrics;
 pub mod modbus_tcp;
@@ -35,6 +36,9 @@ pub enum ServerError {
     /// The system does not provide a thread.
     #[error("cannot start the Modbus TCP thread: {0}; free memory, threads or file descriptors")]
     Thread(io::Error),
+    /// The local socket cannot be opened.
+    #[error("{0}")]
+    Local(io::Error),
     /// The certificates of the server cannot be used.
     #[error("TLS of Modbus TCP: {0}")]
     Tls(#[from] modbus_tcp::IdentityFault),

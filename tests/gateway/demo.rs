@@ -89,6 +89,6 @@ fn a_second_demo_takes_other_ports() {
     ] {
         assert_ne!(port(&printed, mark), port(&taken, mark), "{what}");
     }
-    assert!(printed.contains(" is taken; "), "it says so:\n{printed}");
+    assert!(printed.contains(" is in use; "), "it says so:\n{printed}");
     until_ready(port(&printed, "http://127.0.0.1:"));
 }

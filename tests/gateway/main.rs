@@ -10,8 +10,9 @@
 mod bad_commands;
 mod commands;
 mod demo;
+mod drive_access;
 mod flood;
-mod oneshot;
+mod local_socket;
 mod operators;
 mod process;
 mod restart;

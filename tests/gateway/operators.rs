@@ -205,14 +205,14 @@ fn metrics_please_promtool_and_a_bad_reload_changes_nothing() {
     let good = std::fs::read_to_string(&configuration).unwrap();
     std::fs::write(&configuration, good.replace("baud = 38400", "bawd = 38400")).unwrap();
     plant.gateway.signal("HUP");
-    plant.gateway.until_printed("everything runs on as before");
+    plant.gateway.until_printed("keeping the current configuration");
     assert!(
         plant.gateway.output().contains("did you mean `baud`?"),
         "and it says why"
     );
     std::fs::write(&configuration, good.replace("name = \"pump-2\"", "name = \"pump-two\"")).unwrap();
     plant.gateway.signal("HUP");
-    plant.gateway.until_printed("the new configuration is taken");
+    plant.gateway.until_printed("configuration reloaded");
     until("the new name", || {
         get(plant.http, "/api/v1/drives/pump-two").filter(|(status, _)| *status == 200)
     });

@@ -21,13 +21,17 @@ pub(crate) struct Running {
 impl Running {
     /// Starts a program; its output is kept.
     pub(crate) fn start(program: &Path, arguments: &[&str]) -> Running {
-        let mut child = Command::new(program)
-            .args(arguments)
+        Running::spawn(Command::new(program).args(arguments))
+    }
+
+    /// Starts what is prepared; its output is kept.
+    pub(crate) fn spawn(command: &mut Command) -> Running {
+        let mut child = command
             .stdin(Stdio::null())
             .stdout(Stdio::piped())
             .stderr(Stdio::piped())
             .spawn()
-            .unwrap_or_else(|error| panic!("cannot start {}: {error}", program.display()));
+            .unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
         let output = Arc::new(Mutex::new(String::new()));
         keep(child.stdout.take().unwrap(), &output);
         keep(child.stderr.take().unwrap(), &output);
@@ -36,7 +40,7 @@ impl Running {
 
     /// Starts drivegate.
     pub(crate) fn drivegate(arguments: &[&str]) -> Running {
-        Running::start(Path::new(env!("CARGO_BIN_EXE_drivegate")), arguments)
+        Running::spawn(&mut drivegate(arguments))
     }
 
     /// What it has printed.
@@ -84,6 +88,16 @@ impl Drop for Running {
             eprintln!("--- output of process {}\n{}", self.child.id(), self.output());
         }
     }
+}
+
+/// The program, with runtime files away from those of gateways on this machine.
+pub(crate) fn drivegate(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_drivegate"));
+    command
+        .args(arguments)
+        .env_remove("RUNTIME_DIRECTORY")
+        .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"));
+    command
 }
 
 fn keep(stream: impl Read + Send + 'static, output: &Arc<Mutex<String>>) {

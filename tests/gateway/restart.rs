@@ -221,7 +221,7 @@ fn a_reload_that_opens_the_line_anew_writes_no_control_word() {
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     until("the control word was read again", || {
         (crate::process::point(http, "pump-1", "run") == true).then_some(())
     });
@@ -265,7 +265,7 @@ fn a_reload_that_cannot_listen_changes_nothing() {
         .replace("pump-1", "pump-2");
     std::fs::write(&file, other).unwrap();
     gateway.signal("HUP");
-    let log = gateway.until_printed("the new configuration is not taken");
+    let log = gateway.until_printed("reload rejected");
     assert!(log.contains("another program uses it"), "{log}");
     until("the old address", || mbpoll_read(modbus, 1, 2100, 1).ok());
     assert_eq!(api(http, "pump-1")["online"], true);
@@ -283,7 +283,7 @@ fn a_reload_does_not_end_supervision() {
     let text = std::fs::read_to_string(&file).unwrap();
     std::fs::write(&file, text.replace("silence = \"chars\"", "silence = \"spec\"")).unwrap();
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     gateway.until_printed("no commanding client of pump-1");
     until("the stop", || {
         (crate::process::point(http, "pump-1", "run") == false).then_some(())
@@ -322,11 +322,11 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
     for silence in ["chars", "spec"] {
         let old = text.replace("[modbus_tcp]", &format!("{more}[modbus_tcp]"));
         std::fs::write(&file, old.replace("\"chars\"", &format!("\"{silence}\""))).unwrap();
-        let refused = gateway.output().matches("the new configuration is not taken").count();
+        let refused = gateway.output().matches("reload rejected").count();
         leave_room_for(gateway.pid(), Some(3));
         gateway.signal("HUP");
         until("the refusal", || {
-            (gateway.output().matches("the new configuration is not taken").count() > refused).then_some(())
+            (gateway.output().matches("reload rejected").count() > refused).then_some(())
         });
         leave_room_for(gateway.pid(), None);
         let log = gateway.output();
@@ -339,7 +339,7 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
         assert!(crate::process::point(http, "pump-1", "output_frequency").is_number());
     }
     gateway.signal("HUP");
-    gateway.until_printed("the new configuration is taken");
+    gateway.until_printed("configuration reloaded");
     until("the bus with its new settings", || {
         crate::process::mbpoll_write(modbus, 1, 33_024, &[0]).ok()
     });
@@ -364,7 +364,7 @@ fn a_reload_carries_stale_after_to_the_buses_that_run() {
     until("stale values", || (!is_good()).then_some(()));
     assert!(!gateway.output().contains("stopping the bus"));
     std::fs::write(&file, slow).unwrap();
-    let taken = || gateway.output().matches("the new configuration is taken").count();
+    let taken = || gateway.output().matches("configuration reloaded").count();
     gateway.signal("HUP");
     until("the old file again", || (taken() == 2).then_some(()));
     assert!(is_good(), "three rounds of this bus are six seconds");

@@ -452,7 +452,7 @@ async fn the_daemon_takes_new_certificates() {
 
     std::fs::write(at("server.key"), "no key").unwrap();
     daemon.signal("HUP");
-    daemon.until_printed("everything runs on as before");
+    daemon.until_printed("keeping the current configuration");
     assert!(
         daemon.output().contains("server.key contains no private key"),
         "{}",

@@ -16,7 +16,7 @@ use std::sync::LazyLock;
 use std::time::Duration;
 
 use super::model::ModelPoint;
-use super::profile::{AddressRange, Digest, FaultText, Point, Profile, Profiles};
+use super::profile::{AddressRange, FaultText, Point, Profile, Profiles};
 use crate::codec::Protocol;
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
@@ -163,7 +163,6 @@ impl Profile {
         match profile {
             Some(profile) if problems.is_empty() => Ok(Profile {
                 text: source.to_string(),
-                digest: Digest::of(&tree),
                 tree,
                 ..profile
             }),
@@ -247,7 +246,6 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         model,
         text: String::new(),
         tree: Node::empty_table(None),
-        digest: Digest::default(),
     };
     reader.finish();
     name.map(|_| profile)

@@ -471,22 +471,6 @@ fn the_page_names_every_key() {
 }
 
 #[test]
-fn the_digest_distinguishes_profiles_of_one_name() {
-    let digest = |source: &str| Profile::parse("m", source, false).unwrap().digest().to_string();
-    let point = "[[point]]\nname = \"a\"\nat = \"holding 1\"\nscale = 0.1\nunit = \"V\"\n";
-    let own = digest(&format!("{HEAD}{point}"));
-    let rewritten =
-        format!("# Ours.\n\n{HEAD}[[point]]\nunit = 'V'\nscale = 1e-1\nname = \"a\" # a\nat = \"holding 1\"\n");
-    assert_eq!(digest(&rewritten), own, "the same in other words");
-    for (from, to) in [("0.1", "1.0"), ("holding 1", "holding 2"), ("\"V\"", "\"A\"")] {
-        let other = format!("{HEAD}{}", point.replace(from, to));
-        assert_ne!(digest(&other), own, "{from}");
-    }
-    let over = |base: &str| digest(&format!("name = \"x\"\nbase = \"{base}\"\n"));
-    assert_ne!(over("eaton-svx"), over("eaton-hvx"), "the base counts");
-}
-
-#[test]
 fn mistakes_of_identify() {
     let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[identify]]\nread = \"holding x\"\nanswer = \"yes\"\n\
         [[identify]]\nanswer = \"values\"\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\

@@ -224,7 +224,6 @@ impl ClientSession {
                     product: &profile.name,
                     title: &profile.title,
                     name: &drive.image.spec.name,
-                    digest: Some(profile.digest()),
                 };
                 identity
                     .reply(code, object)
@@ -262,7 +261,6 @@ impl ClientSession {
                     product: "gateway",
                     title: "drivegate",
                     name: &plant.gateway,
-                    digest: None,
                 };
                 identity.reply(code, object)?
             }

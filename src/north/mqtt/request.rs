@@ -144,7 +144,7 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
 }
 
 /// The point of that name with its value. Limits are checked with the command.
-fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
+pub(in crate::north) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
         let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
         let all = || profile.points.iter().map(|p| p.name.as_str());
