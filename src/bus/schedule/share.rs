@@ -78,9 +78,10 @@ impl CommandShare {
         !command_waits || self.unread >= COMMANDS_IN_A_ROW
     }
 
-    /// Whether it goes before a poll that is due: two of them never do.
+    /// Whether it goes before a poll that is due: two of them never do, and none on top of stops that have all their half.
     pub(super) fn reads_before_polls(&self) -> bool {
-        !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && self.all.has_room()
+        let room = self.all.has_room() && self.stops.has_room();
+        !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && room
     }
 
     /// A command, or a step of one, took that time.
