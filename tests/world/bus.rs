@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use drivegate::bus::BusOptions;
 use drivegate::bus::core::{Action, BusCore};
 use drivegate::bus::master::{Handover, Purpose};
+use drivegate::bus::predict::predict;
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
@@ -59,6 +60,8 @@ pub struct WorldBus {
     /// It was asked to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
+    /// The fast cycle of the line when it is saturated with polls, as predicted.
+    pub round: Duration,
     began: Instant,
     until: Instant,
     commands: bool,
@@ -119,6 +122,10 @@ impl WorldBus {
             rs485: Rs485::Off,
         };
         let handle = handle(index, line, &profile, format);
+        let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
+        let round = predict(&handle.image.spec, parts.silence, &specs)
+            .fast_cycle
+            .unwrap_or_default();
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         rules.delivery = parts.delivery;
@@ -145,6 +152,7 @@ impl WorldBus {
             open: true,
             ending: false,
             exchanges: 0,
+            round,
             began: now,
             until: now,
             commands: true,

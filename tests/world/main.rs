@@ -3,7 +3,8 @@
 //! wires. A seed decides who sends what when, what the wire does to it, and what befalls drives and ports. Every step is
 //! checked against what must always hold (see `checks`); a seed that fails prints itself and the end of its history.
 //!
-//! `make check` runs fixed seeds. `make world SEEDS=n` runs n new ones, `WORLD_SEED=n` one again with its history.
+//! `make check` runs fixed seeds. `make world SEEDS=n` runs n new ones, `WORLD_SEED=n` one again with its history. With
+//! `WORLD_FLOOD=1` clients that flood a drive do so without pauses.
 
 #![allow(
     unreachable_pub,
@@ -33,10 +34,22 @@ use self::world::{Figures, World};
 
 /// Seeds of every test run.
 const FIXED: u64 = 400;
+/// Seeds beyond those that found faults of the core.
+const PINNED: [u64; 9] = [882, 1358, 2994, 3527, 4700, 4827, 5228, 5527, 7008];
+/// Seeds that found faults where clients flood without a pause.
+const FLOODED: [u64; 4] = [35, 161, 186, 507];
 
 /// One world from its beginning to the end of its gateway.
 fn run(seed: u64) -> Figures {
-    World::new(Scenario::of(seed)).run()
+    run_with(seed, std::env::var_os("WORLD_FLOOD").is_some())
+}
+
+fn run_with(seed: u64, floods: bool) -> Figures {
+    World::new(Scenario {
+        floods,
+        ..Scenario::of(seed)
+    })
+    .run()
 }
 
 fn run_all(seeds: impl Iterator<Item = u64>) {
@@ -81,7 +94,14 @@ fn fixed_seeds() {
             println!("seeds {first} to {}", first + count - 1);
             run_all(first..first + count);
         }
-        (None, None) => run_all(0..FIXED),
+        (None, None) => run_all((0..FIXED).chain(PINNED)),
+    }
+}
+
+#[test]
+fn floods_without_a_pause() {
+    for seed in FLOODED {
+        run_with(seed, true);
     }
 }
 

@@ -18,6 +18,8 @@ pub struct Scenario {
     pub incidents: Option<Duration>,
     /// Whether the gateway takes a new configuration now and then.
     pub reloads: bool,
+    /// Clients that flood a drive seldom pause.
+    pub floods: bool,
 }
 
 /// One line with its drives.
@@ -116,6 +118,7 @@ impl Scenario {
             clients,
             incidents: (!calm).then(|| Duration::from_millis(dice.within(700..=8_000))),
             reloads: !calm && dice.chance(0.3),
+            floods: false,
         }
     }
 }

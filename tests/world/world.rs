@@ -427,6 +427,7 @@ impl World {
         let falls_silent = match habit {
             // It comes back so often that it would be silent most of the time.
             Habit::StopsInALoop => 0.000_3,
+            Habit::Floods if self.scenario.floods => 0.000_3,
             _ => 0.01,
         };
         if habit != Habit::Steady && self.dice.chance(falls_silent) {
@@ -1061,7 +1062,8 @@ impl World {
     fn check_polls(&self) {
         let sound = |bus: &&WorldBus| bus.open && bus.line.faults.is_empty() && self.scenario.incidents.is_none();
         for bus in self.buses.iter().filter(sound) {
-            let round = bus.handle.image.health().fast.last.unwrap_or_default();
+            // Until two rounds began, the cycle is the predicted one.
+            let round = bus.handle.image.health().fast.last.unwrap_or(bus.round);
             for (drive, truth) in bus.handle.image.drives.iter().zip(&self.truths[bus.index]) {
                 let settled = |at: Instant| self.now - at > Duration::from_secs(3);
                 let age = drive.snapshot().fast_at.map(|at| self.now - at);
