@@ -13,7 +13,7 @@ use std::io;
 use std::net::SocketAddr;
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant, SystemTime};
 
 use axum::Router;
 use hyper::server::conn::http1;
@@ -27,7 +27,7 @@ use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
 use super::NorthStats;
-use crate::plant::SharedPlant;
+use crate::plant::{DriveHandle, SharedPlant};
 
 /// Connections at one time; a client beyond that is told to come back.
 pub const MAX_CONNECTIONS: usize = 128;
@@ -101,6 +101,14 @@ pub async fn start(
     tracing::info!(target: "drivegate::http", %address, "HTTP listens");
     let task = tokio::spawn(accept(listener, router, cancel));
     Ok(Http { address, task })
+}
+
+/// What `/api/v1/drives/{name}` says of a drive at `now`, which is `wall` on the calendar. Pure.
+///
+/// # Errors
+/// None is known; a value that JSON cannot express would be one.
+pub fn drive_json(drive: &DriveHandle, now: Instant, wall: SystemTime) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, api::Clock::new(now, wall)))
 }
 
 /// Takes connections in until `cancel`, then waits for those that are open.
