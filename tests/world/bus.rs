@@ -17,8 +17,8 @@ use drivegate::line::Rs485;
 use drivegate::plant::BusHandle;
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
-use drivegate::sim::random::Random;
 use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
+use drivegate::sim::random::Random;
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
 
@@ -182,7 +182,10 @@ impl WorldBus {
             return None;
         }
         let index = self.profile.point_index("maximum_frequency")?;
-        let raw = self.profile.points[index].raw().filter(|raw| raw.form.items() == 1)?.clone();
+        let raw = self.profile.points[index]
+            .raw()
+            .filter(|raw| raw.form.items() == 1)?
+            .clone();
         let sim = self.sim(now);
         let drive = self.wire.slaves().drive(address)?;
         if let Some(hertz) = new {
@@ -191,11 +194,13 @@ impl WorldBus {
             drive.answer(&RequestPdu::WriteRegister { address, value }, sim)?;
         }
         let (table, start) = (raw.table, raw.address);
-        let words = drive.answer(&RequestPdu::Read { table, start, count: 1 }, sim)?.words()?;
+        let words = drive
+            .answer(&RequestPdu::Read { table, start, count: 1 }, sim)?
+            .words()?;
         Some(raw.decode(&words, drivegate::drive::model::Kind::Number)?.as_f64())
     }
 
-    fn sim(&self, now: Instant) -> Duration {
+    pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
 

@@ -92,6 +92,17 @@ impl Servers {
         Servers { plant, modbus_tcp }
     }
 
+    /// A connection of a Modbus TCP client. Those of [`Habit::Shares`] are of two clients, one of them with a certificate.
+    pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Offline {
+        let (host, name) = match habit {
+            Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),
+            Habit::Shares => (252, None),
+            _ => (index as u8, None),
+        };
+        self.modbus_tcp
+            .beside(address(host, index as u16), name, Authority::Write)
+    }
+
     pub fn client(&self, index: usize, habit: Habit, now: Instant) -> Client {
         let way = match habit {
             Habit::Mqtt => {
@@ -99,13 +110,7 @@ impl Servers {
                 Way::Mqtt(Box::new(gateway), Broker::default())
             }
             Habit::ModbusTcp | Habit::StopsInALoop | Habit::Shares => {
-                // Two clients with many connections, one of them with a certificate.
-                let (host, name) = match habit {
-                    Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),
-                    Habit::Shares => (252, None),
-                    _ => (index as u8, None),
-                };
-                let client = self.modbus_tcp.beside(address(host, index as u16), name, Authority::Write);
+                let client = self.connection(habit, index);
                 Way::ModbusTcp(Box::new(client), BTreeMap::new(), 0)
             }
             Habit::Plain | Habit::Floods | Habit::Crowds | Habit::Duels | Habit::Operates | Habit::Steady => {

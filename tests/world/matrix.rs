@@ -571,7 +571,9 @@ fn n2() {
 fn late_replies_that_are_mangled_settle_nothing() {
     for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
         let mut watched = Watched::of(protocol, rig(protocol, Delivery::Whole, PAIRS));
-        watched.rig.set_faults(FaultPlan::new("late:106ms=0.3,late:130ms=0.2".parse().unwrap(), 7));
+        watched
+            .rig
+            .set_faults(FaultPlan::new("late:106ms=0.3,late:130ms=0.2".parse().unwrap(), 7));
         watched.rig.bus.flips = 0.3;
         watched.run(10 * STORM, true);
         assert!(watched.wrong.is_empty(), "{protocol:?}: {:?}", watched.wrong);

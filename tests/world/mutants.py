@@ -20,6 +20,7 @@ import tomllib
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 COPY = ROOT / "target/mutants"
+VERSION = rb'name = "drivegate"\nversion = "[0-9.]+'
 SWITCH = """
 /// Whether that fault is switched on.
 pub fn mutant(name: &str) -> bool {
@@ -76,6 +77,9 @@ def put_in(tree, mutants):
             text = text[:begin] + new + text[end:]
         tree[name] = text.encode()
     tree["src/lib.rs"] += SWITCH.encode()
+    # A version of its own: cargo, which shares the built dependencies, must not take one tree's program for the other's.
+    for name in ("Cargo.toml", "Cargo.lock"):
+        tree[name] = re.sub(VERSION, rb'\g<0>-mutants', tree[name], count=1)
 
 
 def build():

@@ -118,7 +118,11 @@ pub fn converts_hertz(profile: &Profile) -> bool {
 /// What the order of that number that is converted writes to a drive with that maximum frequency.
 pub fn converted(profile: &Profile, number: usize, maximum: f64) -> Option<Unique> {
     let (_, value, _) = unique_reference(profile, number);
-    let percent = if converts_hertz(profile) { value.as_f64() * 100.0 / maximum } else { value.as_f64() };
+    let percent = if converts_hertz(profile) {
+        value.as_f64() * 100.0 / maximum
+    } else {
+        value.as_f64()
+    };
     percent_reference(profile, percent, maximum)
 }
 
@@ -127,7 +131,11 @@ pub fn converted(profile: &Profile, number: usize, maximum: f64) -> Option<Uniqu
 pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Option<Unique> {
     let (_, point) = reference_point(profile);
     let raw = point.raw()?;
-    let own = if point.unit == "%" { percent } else { percent * maximum / 100.0 };
+    let own = if point.unit == "%" {
+        percent
+    } else {
+        percent * maximum / 100.0
+    };
     let own = Value::Number((own * 100.0).round() / 100.0);
     Some((raw.table, raw.address, raw.encode(own, 0).ok()?))
 }
@@ -170,7 +178,11 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
         Wish::Reset => model(ModelPoint::FaultReset, Value::Bool(true)),
         Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number % 2 == 0)),
         Wish::Converted => {
-            let point = if converts_hertz(profile) { ModelPoint::FrequencyReference } else { ModelPoint::SpeedReference };
+            let point = if converts_hertz(profile) {
+                ModelPoint::FrequencyReference
+            } else {
+                ModelPoint::SpeedReference
+            };
             let writes = |index: &usize| profile.points[*index].write && !profile.name.ends_with("n2");
             let index = profile.model_index(point).filter(writes)?;
             Some((Order::Points(vec![(index, value)]), None))

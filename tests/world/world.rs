@@ -128,7 +128,9 @@ impl World {
             Truth::new(maximum.map(|hertz| (now, hertz)))
         };
         let mut buses = buses;
-        let truths = buses.iter_mut().map(|bus| (1..=bus.line.drives).map(|address| truth(bus, address)).collect());
+        let truths = buses
+            .iter_mut()
+            .map(|bus| (1..=bus.line.drives).map(|address| truth(bus, address)).collect());
         let truths: Vec<Vec<Truth>> = truths.collect();
         let plant = plant_of(&buses, &events, &writes);
         let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));

@@ -24,7 +24,13 @@ impl World {
             Habit::StopsInALoop => 0.000_3,
             _ => 0.01,
         };
-        let always = [Habit::Steady, Habit::Crowds, Habit::Duels, Habit::Operates, Habit::Shares];
+        let always = [
+            Habit::Steady,
+            Habit::Crowds,
+            Habit::Duels,
+            Habit::Operates,
+            Habit::Shares,
+        ];
         if !always.contains(&habit) && self.dice.chance(falls_silent) {
             self.clients[index].silent_until = now + ms(self.dice.within(500..=6_000));
         }
@@ -34,11 +40,19 @@ impl World {
         }
         let (bus, drive) = match habit {
             Habit::StopsInALoop | Habit::Floods | Habit::Duels => (0, index % usize::from(self.buses[0].line.drives)),
-            Habit::Crowds => (0, self.dice.within(0..=u64::from(self.buses[0].line.drives) - 1) as usize),
-            Habit::Operates if self.clients[index].burst.2 > 0 => (self.clients[index].burst.0, self.clients[index].burst.1),
+            Habit::Crowds => (
+                0,
+                self.dice.within(0..=u64::from(self.buses[0].line.drives) - 1) as usize,
+            ),
+            Habit::Operates if self.clients[index].burst.2 > 0 => {
+                (self.clients[index].burst.0, self.clients[index].burst.1)
+            }
             Habit::Shares => {
                 let bus = self.buses.len() - 1;
-                (bus, self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize)
+                (
+                    bus,
+                    self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize,
+                )
             }
             Habit::Steady => {
                 let bus = self.buses.len() - 1;
@@ -69,13 +83,24 @@ impl World {
             Habit::Steady => self.plain(index, bus, drive, Wish::Reference, ms(2_000)),
             Habit::Duels if self.clients[index].open > 1 => {}
             Habit::Duels => {
-                let wish = if self.records.len() % 2 == 0 { Wish::Run } else { Wish::Stop };
+                let wish = if self.records.len() % 2 == 0 {
+                    Wish::Run
+                } else {
+                    Wish::Stop
+                };
                 self.plain(index, bus, drive, wish, ms(2_000));
             }
             Habit::Operates => self.operate(index, bus, drive),
             Habit::Floods | Habit::Crowds if self.clients[index].open > 200 => {}
             Habit::Crowds => {
-                let wishes = [Wish::RunAtReference, Wish::Run, Wish::Reset, Wish::Reverse, Wish::RawRead, Wish::RawRun];
+                let wishes = [
+                    Wish::RunAtReference,
+                    Wish::Run,
+                    Wish::Reset,
+                    Wish::Reverse,
+                    Wish::RawRead,
+                    Wish::RawRun,
+                ];
                 let wish = wishes[self.dice.within(0..=5) as usize];
                 let wish = if self.dice.chance(0.02) { Wish::Stop } else { wish };
                 self.plain(index, bus, drive, wish, ms(2_000));
@@ -86,7 +111,11 @@ impl World {
             }
             Habit::Plain => {
                 let converted = self.dice.chance(0.1);
-                let wish = if converted { Wish::Converted } else { Wish::of(&mut self.dice) };
+                let wish = if converted {
+                    Wish::Converted
+                } else {
+                    Wish::of(&mut self.dice)
+                };
                 let expiry = [ms(2_000), ms(2_000), ms(400), ms(60)][self.dice.within(0..=3) as usize];
                 self.plain(index, bus, drive, wish, expiry);
                 if self.dice.chance(0.1) {
@@ -113,7 +142,11 @@ impl World {
         };
         self.plain(index, bus, drive, wish, ms(2_000));
         if left == 1 {
-            let timeout = self.buses[bus].line.supervision.as_ref().map_or(ms(1_000), |s| s.timeout);
+            let timeout = self.buses[bus]
+                .line
+                .supervision
+                .as_ref()
+                .map_or(ms(1_000), |s| s.timeout);
             let silence = if self.dice.chance(0.7) {
                 // The same drive again: it may be back just in time, or just not.
                 self.clients[index].burst.2 = self.dice.within(1..=3);
@@ -212,13 +245,17 @@ impl World {
         let now = self.now;
         let lost = self.scenario.incidents.is_some() && self.dice.chance(0.02);
         let until = now + Duration::from_millis(self.dice.within(100..=5_000));
-        let Way::Mqtt(_, broker) = &mut self.clients[client].way else { return };
+        let Way::Mqtt(_, broker) = &mut self.clients[client].way else {
+            return;
+        };
         match broker.away_until {
             Some(back) if now < back => broker.waiting = (broker.waiting + 1).min(8),
             Some(_) => {
                 let (again, waiting) = (broker.resume(), std::mem::take(&mut broker.waiting));
                 self.note(move || format!("client {client}: the broker is back"));
-                again.into_iter().for_each(|(id, message)| self.repeat(client, id, message));
+                again
+                    .into_iter()
+                    .for_each(|(id, message)| self.repeat(client, id, message));
                 (0..waiting).for_each(|_| self.by_mqtt(client, bus, drive));
             }
             None if lost => {

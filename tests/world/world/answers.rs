@@ -74,7 +74,8 @@ impl World {
     /// Whether a result is that of a message that the broker delivered once more: as the first time, or a refusal.
     fn is_of_repetition(&mut self, id: usize, code: &str) -> bool {
         let record = &self.records[id];
-        let (Some((first, _)), Some(left)) = (&record.answer, self.repeats.get_mut(&id).filter(|left| **left > 0)) else {
+        let (Some((first, _)), Some(left)) = (&record.answer, self.repeats.get_mut(&id).filter(|left| **left > 0))
+        else {
             return false;
         };
         *left -= 1;
@@ -241,13 +242,18 @@ impl World {
         });
         let mut words = recent.filter_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
         let done = words.any(|words| {
-            let wrote = |did: &RequestPdu, answered: Option<&Vec<u16>>| sets(did, &words) || has_already(did, answered, &words);
+            let wrote =
+                |did: &RequestPdu, answered: Option<&Vec<u16>>| sets(did, &words) || has_already(did, answered, &words);
             truth.did(record.accepted, wrote)
         });
         assert!(
             done || truth.maxima.is_empty(),
             "order {id} rests on an old frequency range; the drive had {:?}",
-            truth.maxima.iter().map(|(since, hz)| (*since - self.began, *hz)).collect::<Vec<_>>()
+            truth
+                .maxima
+                .iter()
+                .map(|(since, hz)| (*since - self.began, *hz))
+                .collect::<Vec<_>>()
         );
     }
 

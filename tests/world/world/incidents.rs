@@ -101,7 +101,9 @@ impl World {
     fn at_the_panel(&mut self, bus: usize, address: u8) {
         let hertz = [50.0, 60.0, 80.0, 100.0][self.dice.within(0..=3) as usize];
         if let Some(hertz) = self.buses[bus].maximum_frequency(address, Some(hertz), self.now) {
-            self.truths[bus][usize::from(address) - 1].maxima.push((self.now, hertz));
+            self.truths[bus][usize::from(address) - 1]
+                .maxima
+                .push((self.now, hertz));
             self.note(move || format!("line{bus} drive {address} has a maximum frequency of {hertz} Hz now"));
         }
     }
@@ -118,10 +120,18 @@ impl World {
         self.buses[index].restart(index, &self.events, &self.writes, self.now);
         let plant = plant_of(&self.buses, &self.events, &self.writes);
         self.plant.store(Arc::new(plant));
-        let timeout = self.buses[index].line.supervision.as_ref().map(|supervision| supervision.timeout);
+        let timeout = self.buses[index]
+            .line
+            .supervision
+            .as_ref()
+            .map(|supervision| supervision.timeout);
         for truth in &mut self.truths[index] {
             truth.found_anew_until = Some(self.now + AFTERMATH);
-            let held = truth.heard.0.zip(timeout).is_some_and(|(heard, timeout)| heard + timeout > self.now);
+            let held = truth
+                .heard
+                .0
+                .zip(timeout)
+                .is_some_and(|(heard, timeout)| heard + timeout > self.now);
             if held && truth.running_since.is_some() {
                 truth.carried = Some(self.now);
             }

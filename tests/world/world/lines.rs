@@ -100,14 +100,28 @@ impl World {
     pub(super) fn no_stop_is_overtaken(&mut self, bus: usize, drive: usize) {
         self.collect();
         let now = self.now;
-        let open: Vec<&Record> = self.open.get(&(bus, drive)).into_iter().flatten().map(|id| &self.records[*id]).collect();
-        let Some(run) = open.iter().filter(|record| record.wish.is_run()).map(|record| record.place).max() else {
+        let open: Vec<&Record> = self
+            .open
+            .get(&(bus, drive))
+            .into_iter()
+            .flatten()
+            .map(|id| &self.records[*id])
+            .collect();
+        let Some(run) = open
+            .iter()
+            .filter(|record| record.wish.is_run())
+            .map(|record| record.place)
+            .max()
+        else {
             return;
         };
         for stop in open.iter().filter(|record| record.wish.is_stop() && record.place < run) {
             // By MQTT the answer of an order that is done waits for its confirmation.
             let by_mqtt = self.clients[stop.client].habit == Habit::Mqtt;
-            assert!(by_mqtt || stop.accepted == now, "a run goes out before an older stop: {stop:?}");
+            assert!(
+                by_mqtt || stop.accepted == now,
+                "a run goes out before an older stop: {stop:?}"
+            );
         }
     }
 

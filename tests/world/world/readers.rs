@@ -68,17 +68,29 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
             }
             Source::Derived(derived) if derived.band().is_none() => {
                 let reading = drive.reading(now);
-                let known = derived.sources().into_iter().all(|of| reading.sample(of).quality == Quality::Good);
+                let known = derived
+                    .sources()
+                    .into_iter()
+                    .all(|of| reading.sample(of).quality == Quality::Good);
                 assert!(known, "{name}: `{own}` is good, and not all that it rests on is");
             }
             Source::Derived(_) => {}
         }
     }
     for point in [ModelPoint::Running, ModelPoint::Ready] {
-        let known = profile.model_index(point).is_none_or(|index| is_good(json, profile, index));
-        assert!(known || json["state"] != point.name(), "{name}: {} is not known, and the state", point.name());
+        let known = profile
+            .model_index(point)
+            .is_none_or(|index| is_good(json, profile, index));
+        assert!(
+            known || json["state"] != point.name(),
+            "{name}: {} is not known, and the state",
+            point.name()
+        );
     }
-    assert!(json["quality"] != "good" || !json["state"].is_null(), "{name}: all is good but the state");
+    assert!(
+        json["quality"] != "good" || !json["state"].is_null(),
+        "{name}: all is good but the state"
+    );
 }
 
 /// A point that is not good has no sample.
@@ -87,9 +99,13 @@ fn check_metrics(drive: &DriveHandle, json: &Json, text: &str) {
     let of_drive = format!("drive=\"{name}\"");
     for (index, point) in profile.points.iter().enumerate() {
         let label = format!("point=\"{}\"", point.name);
-        let sample = text
-            .lines()
-            .any(|line| line.starts_with("drivegate_point_value{") && line.contains(&of_drive) && line.contains(&label));
-        assert!(!sample || is_good(json, profile, index), "{name}: `{}` is not good, and has a sample", point.name);
+        let sample = text.lines().any(|line| {
+            line.starts_with("drivegate_point_value{") && line.contains(&of_drive) && line.contains(&label)
+        });
+        assert!(
+            !sample || is_good(json, profile, index),
+            "{name}: `{}` is not good, and has a sample",
+            point.name
+        );
     }
 }
