@@ -255,7 +255,7 @@ fn stops_and_runs_among_late_and_lost_replies() {
     let modbus = line("vacon-nx", Protocol::ModbusRtu, 115_200, 1);
     let n2 = line("vacon-nx-n2", Protocol::N2, 9600, 1);
     for seed in 0..4 {
-        let stops = Duel::fight(&modbus, "late:110ms=0.15,late:180ms=0.15,deaf=0.25", seed, 60 * SECOND);
+        let stops = Duel::fight(&modbus, "late:150ms=0.2,late:180ms=0.2,deaf=0.3", seed, 240 * SECOND);
         assert!(stops > 20, "{stops} stops were acknowledged");
         let stops = Duel::fight(&n2, "late:300ms=0.15,late:450ms=0.1,deaf=0.2", seed, 240 * SECOND);
         assert!(stops > 20, "{stops} stops were acknowledged");
