@@ -220,7 +220,7 @@ impl World {
                 "order {id}: {code}, but the drive was not told to run"
             );
         }
-        if record.wish == Wish::Converted {
+        if record.wish == Wish::Converted && profile.name != "vacon-cx" {
             self.check_converted(id, record);
         }
         if let Some(unique) = record.unique.as_ref().filter(|_| !n2 && profile.name != "vacon-cx") {
