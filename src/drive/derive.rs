@@ -75,7 +75,7 @@ impl Derived {
     }
 
     /// The point that a command to this one is converted to, with the ends of the band.
-    pub(crate) fn band(&self) -> Option<(usize, Bound, Bound)> {
+    pub fn band(&self) -> Option<(usize, Bound, Bound)> {
         match *self {
             Derived::Band { of, minimum, maximum } | Derived::Percent { of, minimum, maximum } => {
                 Some((of, minimum, maximum))
@@ -85,7 +85,7 @@ impl Derived {
     }
 
     /// The points that the value itself is derived from, without the ends of a band.
-    pub(crate) fn sources(&self) -> Vec<usize> {
+    pub fn sources(&self) -> Vec<usize> {
         match self {
             Derived::Band { of, .. }
             | Derived::Percent { of, .. }

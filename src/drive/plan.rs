@@ -23,7 +23,7 @@ pub struct PlannedRead {
 
 impl PlannedRead {
     /// The request.
-    pub(crate) fn pdu(&self) -> RequestPdu {
+    pub fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {
             table: self.table,
             start: self.start,

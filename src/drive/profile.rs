@@ -221,7 +221,7 @@ impl Point {
 
 impl Profile {
     /// Index of a model point.
-    pub(crate) fn model_index(&self, point: ModelPoint) -> Option<usize> {
+    pub fn model_index(&self, point: ModelPoint) -> Option<usize> {
         self.model.get(point.index()).copied().flatten()
     }
 
@@ -262,7 +262,7 @@ impl Profile {
     }
 
     /// The run bit: its register or coil, its number, and whether it is inverted.
-    pub(crate) fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
+    pub fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
         let raw = self.model_point(ModelPoint::Run)?.raw()?;
         match raw.form {
             Form::Bit { bit, invert } => Some((raw, bit, invert)),
@@ -291,7 +291,7 @@ impl Profile {
     }
 
     /// Whether writing `value` to that register (or coil) clears the run command: a stop.
-    pub(crate) fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
+    pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
         })

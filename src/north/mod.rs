@@ -6,7 +6,7 @@ pub mod http;
 mod listener;
 pub mod local;
 mod log_throttle;
-pub(crate) mod metrics;
+pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 mod pem;

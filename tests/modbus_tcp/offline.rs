@@ -97,7 +97,9 @@ fn the_next_piece_of_a_read_is_queued_when_the_last_one_is_finished() {
 #[test]
 fn clients_of_one_server_share_the_command_word() {
     let mut bench = Bench::of(plant());
-    let mut other = bench.client.beside(([10, 0, 0, 10], 4711).into(), Authority::Write);
+    let mut other = bench
+        .client
+        .beside(([10, 0, 0, 10], 4711).into(), None, Authority::Write);
     bench.receive(&frame(1, 1, &words(6, &[0x8100, 0])));
     bench.serve();
     let reset = frame(2, 1, &words(6, &[0x8100, 4]));

@@ -19,6 +19,7 @@ use drivegate::plant::BusHandle;
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
+use drivegate::sim::random::Random;
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
 
@@ -62,6 +63,9 @@ pub struct WorldBus {
     pub exchanges: u64,
     /// The fast cycle of the line when it is saturated with polls, as predicted.
     pub round: Duration,
+    /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
+    pub flips: f64,
+    dice: Random,
     began: Instant,
     until: Instant,
     commands: bool,
@@ -73,6 +77,7 @@ pub struct Parts {
     pub profile: Arc<Profile>,
     pub drives: Vec<DriveOptions>,
     pub faults: FaultPlan,
+    pub flips: f64,
     pub delivery: Delivery,
     pub silence: Silence,
 }
@@ -97,6 +102,7 @@ impl Parts {
         Parts {
             drives: drives.collect(),
             faults,
+            flips: line.flips,
             delivery: Delivery::Whole,
             silence: Silence::Spec,
             profile,
@@ -153,6 +159,8 @@ impl WorldBus {
             ending: false,
             exchanges: 0,
             round,
+            flips: parts.flips,
+            dice: Random::new(index as u64 ^ 0xF11B),
             began: now,
             until: now,
             commands: true,
@@ -175,7 +183,32 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    fn sim(&self, now: Instant) -> Duration {
+    /// The maximum frequency of a drive, in Hz, as it has it; set to `new` first, as at its panel. None where the
+    /// family has none in a register of its own, or the drive is off.
+    pub fn maximum_frequency(&mut self, address: u8, new: Option<f64>, now: Instant) -> Option<f64> {
+        if self.line.protocol == Protocol::N2 {
+            return None;
+        }
+        let index = self.profile.point_index("maximum_frequency")?;
+        let raw = self.profile.points[index]
+            .raw()
+            .filter(|raw| raw.form.items() == 1)?
+            .clone();
+        let sim = self.sim(now);
+        let drive = self.wire.slaves().drive(address)?;
+        if let Some(hertz) = new {
+            let value = *raw.encode(drivegate::drive::Value::Number(hertz), 0).ok()?.first()?;
+            let address = raw.address;
+            drive.answer(&RequestPdu::WriteRegister { address, value }, sim)?;
+        }
+        let (table, start) = (raw.table, raw.address);
+        let words = drive
+            .answer(&RequestPdu::Read { table, start, count: 1 }, sim)?
+            .words()?;
+        Some(raw.decode(&words, drivegate::drive::model::Kind::Number)?.as_f64())
+    }
+
+    pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
 
@@ -259,6 +292,10 @@ impl WorldBus {
         self.note_acts(seen);
         let mut bytes = Vec::new();
         while self.wire.take_due(sim, &mut bytes).is_some() {}
+        if !bytes.is_empty() && self.dice.chance(self.flips) {
+            let place = self.dice.within(0..=bytes.len() as u64 - 1) as usize;
+            bytes[place] ^= 1 << self.dice.within(0..=7);
+        }
         if self.open && !bytes.is_empty() {
             seen.push(Seen::Heard(bytes.clone()));
             self.core.heard(&bytes, now);
@@ -301,7 +338,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
         protocol: line.protocol,
         format,
         cycle: line.cycle,
-        slow_cycle: Duration::from_secs(1),
+        slow_cycle: line.slow_cycle,
     };
     let drive = |address: u8| {
         let spec = DriveSpec {
@@ -313,7 +350,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
             ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
         };
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+        Arc::new(DriveImage::new(spec, line.slow_cycle))
     };
     BusHandle {
         image: Arc::new(BusImage::new(spec, (1..=line.drives).map(drive).collect())),

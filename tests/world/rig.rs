@@ -3,12 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use arc_swap::ArcSwap;
 use drivegate::cache::{OnShutdown, Outcome as Counted};
 use drivegate::codec::{Protocol, RequestPdu};
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind, WriteStats};
 use drivegate::drive::PollClass;
 use drivegate::event::Events;
-use drivegate::plant::{DriveHandle, Placed, Plant};
+use drivegate::plant::{DriveHandle, Placed, Plant, SharedPlant};
 use drivegate::sim::faults::FaultPlan;
 
 use super::bus::{Parts, Seen, WorldBus};
@@ -60,7 +61,9 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
         response_timeout: protocol.usual_timeout(),
         retries: if protocol == Protocol::N2 { 2 } else { 1 },
         cycle: Duration::from_millis(10),
+        slow_cycle: Duration::from_secs(1),
         faults: String::new(),
+        flips: 0.0,
         supervision: None,
         on_shutdown: OnShutdown::Hold,
         dead: Vec::new(),
@@ -116,12 +119,37 @@ impl Rig {
 
     /// Gives an order at the present time.
     pub fn place(&mut self, address: u8, order: Order) -> Placed {
-        let origin = Origin::new(SourceKind::Mqtt, "test");
+        self.place_as("test", address, order)
+    }
+
+    /// The same for that client.
+    pub fn place_as(&mut self, client: &str, address: u8, order: Order) -> Placed {
+        let origin = Origin::new(SourceKind::Mqtt, client);
         let placed = self
             .drive(address)
             .place(order, origin, Authority::Write, DEFAULT_EXPIRY, self.now);
         self.bus.command_came(self.now);
         placed
+    }
+
+    /// The bus is started anew, as by a reload.
+    pub fn restart(&mut self) {
+        while self.bus.core.asked().is_some() {
+            self.step(self.now + Duration::from_secs(1));
+        }
+        self.bus.restart(0, &self.plant.events, &self.plant.writes, self.now);
+        self.plant.buses = vec![self.bus.handle.clone()];
+    }
+
+    /// The plant as servers have it.
+    pub fn shared_plant(&self) -> SharedPlant {
+        Arc::new(ArcSwap::from_pointee(Plant {
+            gateway: self.plant.gateway.clone(),
+            stale_after: self.plant.stale_after,
+            buses: self.plant.buses.clone(),
+            events: self.plant.events.clone(),
+            writes: self.plant.writes.clone(),
+        }))
     }
 
     pub fn set_faults(&mut self, faults: FaultPlan) {

@@ -85,7 +85,7 @@ impl WordOrder {
 
 impl Form {
     /// Number of registers or bits of the value.
-    pub(crate) fn items(self) -> u16 {
+    pub fn items(self) -> u16 {
         match self {
             Form::U32(_) | Form::I32(_) | Form::F32(_) => 2,
             Form::Bit { .. } | Form::Bits { .. } | Form::U16 | Form::I16 => 1,
@@ -129,7 +129,7 @@ impl Form {
 
 /// Why a value cannot be written to a point.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
-pub(crate) enum Unwritable {
+pub enum Unwritable {
     /// The value does not fit the type of the register.
     #[error("{value} does not fit the register, which holds {least} to {most}")]
     Type {
@@ -145,7 +145,7 @@ pub(crate) enum Unwritable {
 impl Raw {
     /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them,
     /// or a float is not a finite number.
-    pub(crate) fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
+    pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
         let &word = words.first()?;
         let count = match self.form {
             Form::Bit { bit, invert } => return Some(Value::Bool(((word >> bit) & 1 == 1) != invert)),
@@ -166,7 +166,7 @@ impl Raw {
     ///
     /// # Errors
     /// The value does not fit the register's type. Nothing is clamped.
-    pub(crate) fn encode(&self, value: Value, old: u16) -> Result<Vec<u16>, Unwritable> {
+    pub fn encode(&self, value: Value, old: u16) -> Result<Vec<u16>, Unwritable> {
         if let Form::Bit { bit, invert } = self.form {
             let set = value.as_bool() != invert;
             return Ok(vec![if set { old | (1 << bit) } else { old & !(1 << bit) }]);
@@ -204,7 +204,7 @@ impl Raw {
     }
 
     /// Whether it includes that register or bit.
-    pub(crate) fn covers(&self, table: Table, address: u16) -> bool {
+    pub fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address
                 .checked_sub(self.address)

@@ -11,7 +11,7 @@ mod streams;
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use axum::Router;
 use hyper::server::conn::http1;
@@ -26,7 +26,7 @@ use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached};
 use super::listener::{AcceptLoop, ConnectionHandler, bind};
 use super::log_throttle::LogThrottle;
 use super::{NorthStats, ServerError};
-use crate::plant::SharedPlant;
+use crate::plant::{DriveHandle, SharedPlant};
 
 /// Maximum number of open connections; further clients get 503.
 pub const MAX_CONNECTIONS: usize = 128;
@@ -159,4 +159,12 @@ fn set_socket_options(stream: &TcpStream) {
     let _ = stream.set_nodelay(true);
     let millis = u32::try_from(USER_TIMEOUT.as_millis()).unwrap_or(u32::MAX);
     let _ = rustix::net::sockopt::set_tcp_user_timeout(stream, millis);
+}
+
+/// What `/api/v1/drives/{name}` says of a drive at `now`, which is `wall` on the calendar. Pure.
+///
+/// # Errors
+/// None is known; a value that JSON cannot express would be one.
+pub fn drive_json(drive: &DriveHandle, now: Instant, wall: SystemTime) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, api::Clock::new(now, wall)))
 }

@@ -21,7 +21,7 @@ use crate::plant::Plant;
 
 /// Text formats of an exposition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Format {
+pub enum Format {
     /// Prometheus text format 0.0.4: the family of a counter is named like its series.
     Prometheus,
     /// OpenMetrics 1.0.0: the family of a counter is named without the `_total` of its series; ends with `# EOF`.
@@ -72,7 +72,7 @@ fn weight(range: &str, wanted: &[&str]) -> Option<f64> {
 ///
 /// # Errors
 /// The encoder fails, which it does not when it writes to a string.
-pub(crate) fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -> Result<String, fmt::Error> {
+pub fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(Scrape {
         families: families::collect(plant, stats, now),

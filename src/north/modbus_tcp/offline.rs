@@ -36,9 +36,9 @@ impl Offline {
         Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))
     }
 
-    /// Another client of the same server.
-    pub fn beside(&self, peer: SocketAddr, authority: Authority) -> Offline {
-        Offline::of(self.dialogue.session().beside(Client::new(peer, None, authority)))
+    /// Another client of the same server, by the `name` in its certificate if it has shown one.
+    pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Offline {
+        Offline::of(self.dialogue.session().beside(Client::new(peer, name, authority)))
     }
 
     fn of(session: ClientSession) -> Offline {
