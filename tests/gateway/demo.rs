@@ -1,10 +1,9 @@
 //! `drivegate demo`, as the README promises it.
 
 use std::process::Command;
-use std::time::Duration;
 
-use crate::process::{Running, api, get, mbpoll_read, mbpoll_write, point, until, until_ready};
-use crate::tools::tool;
+use crate::support::process::{Running, api, get, mbpoll_read, mbpoll_write, point, until, until_ready};
+use crate::support::tools::tool;
 
 /// The number behind `mark` in what the demo printed.
 fn port(printed: &str, mark: &str) -> u16 {
@@ -71,9 +70,8 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
     });
 
     demo.signal("INT");
-    let (status, took) = demo.ended();
+    let status = demo.ended();
     assert!(status.success(), "{status}");
-    assert!(took < Duration::from_secs(10), "it took {took:?}");
 }
 
 #[test]

@@ -5,9 +5,9 @@ use std::process::Command;
 
 use tempfile::TempDir;
 
-use crate::process::{Running, api, free_port, until, until_ready};
-use crate::restart::line_of;
-use crate::tools::{root, tool};
+use crate::support::process::{Running, api, free_port, until, until_ready};
+use crate::support::site::line_of;
+use crate::support::tools::{root, tool};
 
 /// How a command ended, what it printed and what it complained of.
 struct Ran {
@@ -48,7 +48,7 @@ impl Line {
             modbus: free_port(),
         };
         let text = format!(
-            "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\n\
+            "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nresponse_timeout = \"1s\"\n\
              [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
              limits = {{ speed_reference = [0.0, 80.0] }}\n\
              [[bus.drive]]\nname = \"pump-5\"\naddress = 5\nprofile = \"vacon-nx\"\n\
@@ -346,7 +346,7 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
         format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n")
     });
     let text = format!(
-        "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\n{}\
+        "[gateway]\nname = \"plant\"\n[[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nresponse_timeout = \"1s\"\n{}\
          [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\n[http]\nlisten = \"127.0.0.1:{http}\"\n",
         drives.concat()
     );

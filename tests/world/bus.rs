@@ -167,7 +167,8 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    fn sim(&self, now: Instant) -> Duration {
+    /// The time of the line.
+    pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
 
@@ -296,7 +297,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
         slow_cycle: Duration::from_secs(1),
     };
     let drive = |address: u8| {
-        let spec = DriveSpec {
+        let mut spec = DriveSpec {
             access: Access::Control,
             unit: index as u8 * 40 + address,
             supervision: line.supervision.clone(),
@@ -305,6 +306,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
             ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
         };
+        (line.spec)(&mut spec);
         Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
     };
     BusHandle {

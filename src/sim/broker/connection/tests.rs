@@ -1,4 +1,4 @@
-//! One client with a clock in the hand of the test; the sockets are in `tests/broker.rs`.
+//! One client with a clock in the hand of the test; the sockets are in `tests/north/broker.rs`.
 
 use std::pin::pin;
 use std::task::{Context, Poll, Waker};
