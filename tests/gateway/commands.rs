@@ -33,7 +33,7 @@ fn plant(baud: &str, keys: &str) -> Plant {
 
 #[test]
 fn a_client_that_is_killed_leaves_a_lease_that_runs_out() {
-    let Plant { site, .. } = plant("38400", "supervision = { timeout = \"3s\", action = \"stop\" }");
+    let Plant { site, .. } = &plant("38400", "supervision = { timeout = \"3s\", action = \"stop\" }");
     // A program that holds its connection and commands the motor to run until it is killed.
     let script = format!(
         "exec 3<>/dev/tcp/127.0.0.1/{}; while :; do printf '\\0\\1\\0\\0\\0\\6\\1\\6\\201\\0\\0\\1' >&3; sleep 0.5; done",
@@ -57,7 +57,7 @@ fn a_client_that_is_killed_leaves_a_lease_that_runs_out() {
 #[test]
 fn a_stop_under_a_full_queue_comes_first() {
     // Slow enough that the flood waits.
-    let Plant { site, .. } = plant("2400", "");
+    let Plant { site, .. } = &plant("2400", "");
     mbpoll_write(site.modbus, 1, 33_024, &[1]).unwrap();
     site.until_state("pump-1", "running");
     let mut flood = TcpStream::connect(("127.0.0.1", site.modbus)).unwrap();
@@ -90,7 +90,7 @@ fn a_stop_under_a_full_queue_comes_first() {
 
 #[test]
 fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
-    let Plant { site, .. } = plant("2400", "");
+    let Plant { site, .. } = &plant("2400", "");
     let broker = site.broker();
     site.until_connected(true);
     site.publish(&["-t", SET, "-m", "{\"id\": 1, \"speed_reference\": 10}"]);
@@ -119,7 +119,7 @@ fn nothing_that_was_sent_while_the_broker_was_away_moves_a_drive() {
 
 #[test]
 fn confirmed_repeated_refused_and_audited() {
-    let Plant { site, gateway, .. } = plant("38400", "");
+    let Plant { site, gateway, .. } = &plant("38400", "");
     let _broker = site.broker();
     site.until_connected(true);
     site.until_point("pump-1", "run", false);

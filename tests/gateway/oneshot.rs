@@ -363,7 +363,7 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     for (drive, wanted) in [("pump-1", "stale"), ("pump-2", "bad")] {
         let told = until("a drive that is away", || {
             let told = api(http, drive);
-            (told["state"] == "offline").then_some(told)
+            (told["online"] == false).then_some(told)
         });
         let ran = drivegate(&["read", "--json", "--config", &config, drive]);
         assert_eq!(ran.code, 1, "{}", ran.err);
