@@ -52,7 +52,7 @@ impl Line {
              [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
              limits = {{ speed_reference = [0.0, 80.0] }}\n\
              [[bus.drive]]\nname = \"pump-5\"\naddress = 5\nprofile = \"vacon-nx\"\n\
-             [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\n",
+             [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n",
             line.modbus
         );
         std::fs::write(line.config(), text).unwrap();

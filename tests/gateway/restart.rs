@@ -228,13 +228,13 @@ fn a_reload_without_room_for_a_new_bus_changes_nothing() {
 fn a_reload_carries_stale_after_to_the_buses_that_run() {
     let site = site("");
     let _line = site.line(&[1]);
-    // Three rounds of this bus are three hours.
     let slow = LINE1.replace("silence =", "cycle = \"1h\"\nsilence =");
-    site.configure(&[&slow, &controlled("pump-1", 1, ""), MODBUS_TCP, HTTP]);
+    let patient = MODBUS_TCP.replace("1min", "1h");
+    site.configure(&[&slow, &controlled("pump-1", 1, ""), &patient, HTTP]);
     let gateway = site.run_ready();
     let is_good = || site.point("pump-1", "output_frequency").is_number();
     until("values", || is_good().then_some(()));
-    let before = site.change("[modbus_tcp]", "[modbus_tcp]\nstale_after = \"100ms\"");
+    let before = site.change("stale_after = \"1h\"", "stale_after = \"100ms\"");
     gateway.signal("HUP");
     until("stale values", || (!is_good()).then_some(()));
     site.configure(&[&before]);

@@ -17,7 +17,9 @@ use super::tools::{run, run_well, tool};
 /// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
      [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nsilence = \"chars\"\nresponse_timeout = \"2s\"\n";
-pub(crate) const MODBUS_TCP: &str = "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n";
+/// Nothing is stale because this machine is busy.
+pub(crate) const MODBUS_TCP: &str =
+    "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
 pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n";
 pub(crate) const HTTP: &str = "[http]\nlisten = \"127.0.0.1:{http}\"\n";
 
