@@ -4,7 +4,7 @@ use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 use drivegate::sim::wire::SimulatedBus;
 
-use crate::support::process::{Running, api, get, mbpoll_read, mbpoll_write, until, until_ready};
+use crate::support::process::{Running, api, get, mbpoll_read, until, until_ready, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, MQTT, Site, controlled, functions};
 use crate::support::tools::{run_well, tool};
 
@@ -15,7 +15,7 @@ fn site(keys: &str) -> Site {
 
 /// Writes the control word as soon as that can be done.
 fn command(site: &Site, word: u16) {
-    until("a command", || mbpoll_write(site.modbus, 1, 33_024, &[word]).ok());
+    write_registers(site.modbus, 1, 33_024, &[word]);
 }
 
 #[test]

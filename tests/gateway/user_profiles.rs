@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use crate::support::process::{Running, api, free_port, get, mbpoll_read, mbpoll_write, until};
+use crate::support::process::{Running, api, free_port, get, mbpoll_write, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 use crate::support::tools::{python, root, run_well};
 
@@ -80,9 +80,9 @@ fn the_energy_meter_of_the_page_is_served() {
     }
     assert!(!metrics.contains("neutral_current"), "{metrics}");
     // The common model and the meter's own registers, through Modbus TCP; 32 bits with the high word first.
-    assert_eq!(mbpoll_read(modbus, 7, 0x800D, 2).unwrap(), [0, 1235]);
-    assert_eq!(mbpoll_read(modbus, 7, 256, 2).unwrap(), [40, 15]);
-    mbpoll_write(modbus, 7, 256, &[100]).unwrap();
+    assert_eq!(read_registers(modbus, 7, 0x800D, 2), [0, 1235]);
+    assert_eq!(read_registers(modbus, 7, 256, 2), [40, 15]);
+    write_registers(modbus, 7, 256, &[100]);
     site.until_point("meter", "current_transformer_ratio", 100.0);
     let refused = mbpoll_write(modbus, 7, 256, &[501]).unwrap_err();
     assert!(refused.contains("Illegal data value"), "{refused}");

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::support::process::{Running, get, mbpoll_read, mbpoll_write, until};
+use crate::support::process::{Running, get, mbpoll_read, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 use crate::support::tools::{python, root, run, run_well, tool};
 
@@ -88,13 +88,14 @@ fn reads_and_writes_pymodbus(protocol: &str, framer: &str, format: &str) {
     // Alone: the command opens the line itself.
     let read = |points: &[&str]| -> Value {
         let arguments = [&["read", "--config", &file, "drive", "--json"], points].concat();
-        let output = run(Path::new(DRIVEGATE), &arguments);
-        assert!(output.status.success(), "{output:?}");
+        let output = until("values", || {
+            Some(run(Path::new(DRIVEGATE), &arguments)).filter(|output| output.status.success())
+        });
         serde_json::from_slice(&output.stdout).unwrap()
     };
     let text = read(&["measured", "door"]).to_string();
     assert!(text.contains("207") && text.contains("true"), "{text}");
-    drivegate(&["write", "--config", &file, "drive", "set_point=4711"]);
+    command(&site, &["set_point=4711"]);
 
     let gateway = site.run_ready();
     let value = |name: &str| site.point("drive", name);
@@ -115,9 +116,8 @@ fn reads_and_writes_pymodbus(protocol: &str, framer: &str, format: &str) {
     until("the new values", || {
         (value("set_point").as_f64() == Some(815.0) && value("relay") == true).then_some(())
     });
-    until("a raw write", || mbpoll_write(site.modbus, 1, 0, &[1, 2, 3]).ok());
-    let read = until("a raw read", || mbpoll_read(site.modbus, 1, 0, 4).ok());
-    assert_eq!(read, [1, 2, 3, 815]);
+    write_registers(site.modbus, 1, 0, &[1, 2, 3]);
+    assert_eq!(read_registers(site.modbus, 1, 0, 4), [1, 2, 3, 815]);
     let refused = mbpoll_read(site.modbus, 1, 30, 1).unwrap_err();
     assert!(refused.contains("Illegal data address"), "{refused}");
     assert_eq!(counted(site.http, "corrupt"), 0.0, "{}", gateway.output());

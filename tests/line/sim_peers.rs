@@ -7,8 +7,10 @@ use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::nx::{NxOptions, StatusBits, UPDATE_PERIOD, status_word};
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use std::path::Path;
-use std::process::Command;
-use std::time::{Duration, Instant};
+use std::time::Duration;
+
+use crate::support::process::until;
+use crate::support::tools::{python, root, run, run_well, tool};
 
 /// Drives 1 (showing the status bits of the worked frames) and 2 on a line at 38400 8N1.
 fn line() -> SimulatedBus {
@@ -34,25 +36,20 @@ fn line_of(protocol: Protocol, format: &str) -> SimulatedBus {
     SimulatedBus::start(options).unwrap()
 }
 
-fn run(command: &mut Command, hint: &str) -> (bool, String) {
-    let output = command
-        .output()
-        .unwrap_or_else(|error| panic!("cannot run {command:?}: {error}; {hint}"));
-    let text = String::from_utf8_lossy(&output.stdout) + String::from_utf8_lossy(&output.stderr);
-    (output.status.success(), text.into_owned())
+/// What a program printed, stdout first, whether it ended well or not.
+fn printed(program: &Path, arguments: &[&str]) -> String {
+    let output = run(program, arguments);
+    String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned()
 }
 
-fn mbpoll(line: &SimulatedBus, arguments: &str) -> (bool, String) {
-    let address = line.address();
-    let mut words: Vec<&str> = arguments.split_whitespace().collect();
-    // The device stands before the values to write.
-    let values = words.iter().position(|word| *word == "--").unwrap_or(words.len());
-    words.insert(values, &address);
-    let mut command = Command::new("mbpoll");
-    command
-        .args(["-m", "rtu", "-b", "38400", "-P", "none", "-0", "-1", "-o", "5"])
-        .args(words);
-    run(&mut command, "install the Debian package mbpoll")
+/// What mbpoll printed; values to write stand behind `--`.
+fn mbpoll(line: &SimulatedBus, arguments: &str) -> String {
+    let (options, values) = arguments.split_once(" -- ").unwrap_or((arguments, ""));
+    let line = line.address();
+    let always = ["-m", "rtu", "-b", "38400", "-P", "none", "-0", "-1", "-o", "5"];
+    let words = always.into_iter().chain(options.split_whitespace());
+    let words: Vec<&str> = words.chain([line.as_str()]).chain(values.split_whitespace()).collect();
+    printed(&tool("mbpoll"), &words)
 }
 
 /// The values that mbpoll printed, as `[2100]: 35`.
@@ -77,38 +74,30 @@ fn frames(line: &SimulatedBus) -> Vec<String> {
 
 /// Waits until drive 1 is at its reference, and the torque of its ramp is gone.
 fn until_at_reference(line: &SimulatedBus) {
-    let since = Instant::now();
-    let status = || {
-        line.with_drive(1, |drive, _| drive.as_nx().unwrap().state().status)
-            .unwrap()
-    };
-    while status() & status_word::AT_REFERENCE == 0 {
-        assert!(
-            since.elapsed() < Duration::from_secs(60),
-            "the drive does not reach its reference"
-        );
-        std::thread::sleep(Duration::from_millis(50));
-    }
+    let status = || line.with_drive(1, |drive, _| drive.as_nx().unwrap().state().status);
+    until("the reference", || {
+        (status()? & status_word::AT_REFERENCE != 0).then_some(())
+    });
     std::thread::sleep(2 * UPDATE_PERIOD);
 }
 
 #[test]
 fn mbpoll_runs_the_start_up_test() {
     let line = line();
-    let (_, text) = mbpoll(&line, "-a 1 -r 2100 -c 11");
+    let text = mbpoll(&line, "-a 1 -r 2100 -c 11");
     assert_eq!(values(&text), [1, 0x2000, 0, 0, 0, 0, 0, 0, 0, 560, 0], "{text}");
-    let (_, text) = mbpoll(&line, "-a 1 -r 2000 -- 1 0 5000");
+    let text = mbpoll(&line, "-a 1 -r 2000 -- 1 0 5000");
     assert!(text.contains("Written 3 references"), "{text}");
     until_at_reference(&line);
-    let (_, text) = mbpoll(&line, "-a 1 -r 2100 -c 11");
+    let text = mbpoll(&line, "-a 1 -r 2100 -c 11");
     assert_eq!(
         values(&text),
         [0x23, 0x2000, 5000, 2500, 750, 12, 105, 53, 2000, 560, 0],
         "{text}"
     );
-    let (_, text) = mbpoll(&line, "-a 1 -r 2102 -c 2 -t 3");
+    let text = mbpoll(&line, "-a 1 -r 2102 -c 2 -t 3");
     assert_eq!(values(&text), [5000, 2500], "{text}");
-    let (_, text) = mbpoll(&line, "-a 1 -r 6000 -c 5 -t 3");
+    let text = mbpoll(&line, "-a 1 -r 6000 -c 5 -t 3");
     assert!(text.contains("Illegal data address"), "{text}");
 
     let worked = [
@@ -131,12 +120,12 @@ fn mbpoll_runs_the_start_up_test() {
 fn mbpoll_resets_a_fault_and_meets_a_dead_drive() {
     let line = line();
     line.with_drive(1, |drive, _| drive.trip(53));
-    let (_, text) = mbpoll(&line, "-a 1 -r 98 -c 1");
+    let text = mbpoll(&line, "-a 1 -r 98 -c 1");
     assert_eq!(values(&text), [53], "{text}");
     mbpoll(&line, "-a 1 -r 2000 -- 4");
     std::thread::sleep(Duration::from_millis(50));
     mbpoll(&line, "-a 1 -r 2000 -- 0");
-    let (_, text) = mbpoll(&line, "-a 1 -r 98 -c 1");
+    let text = mbpoll(&line, "-a 1 -r 98 -c 1");
     assert_eq!(values(&text), [0], "{text}");
     assert_eq!(
         frames(&line).get(..2),
@@ -148,9 +137,9 @@ fn mbpoll_resets_a_fault_and_meets_a_dead_drive() {
     );
 
     line.set_alive(1, false);
-    let (_, text) = mbpoll(&line, "-a 1 -r 98 -c 1 -o 0.2");
+    let text = mbpoll(&line, "-a 1 -r 98 -c 1 -o 0.2");
     assert!(text.contains("timed out"), "{text}");
-    let (_, text) = mbpoll(&line, "-a 2 -r 2100 -c 1");
+    let text = mbpoll(&line, "-a 2 -r 2100 -c 1");
     assert_eq!(values(&text), [0x541], "{text}");
 }
 
@@ -177,12 +166,8 @@ fn as_text(frame: &drivegate::sim::statistics::Recorded) -> String {
 }
 
 fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut command = Command::new(root.join(".tools/venv/bin/python"));
-    command
-        .arg(root.join("tests/peers/simulated_line.py"))
-        .args([&line.address(), framer]);
-    let (done, text) = run(&mut command, "make the Python environment .tools/venv with pymodbus");
+    let script = root().join("tests/peers/simulated_line.py").display().to_string();
+    let text = run_well(&python(), &[&script, &line.address(), framer]);
     let minus = |value: i16| (value as u16).to_string();
     let running = format!(
         "1959 8192 {} {} {} 12 {} 53 2000 560 0",
@@ -193,7 +178,6 @@ fn pymodbus_commands(line: &SimulatedBus, framer: &str) {
     );
     let actual = format!("{} {} 12 {} 53 2000 560 ", minus(-2500), minus(-750), minus(-105));
     let seen: Vec<&str> = text.lines().collect();
-    assert!(done, "{text}");
     assert_eq!(seen.len(), 12, "{text}");
     assert_eq!(seen[..3], ["1345 8192", "", running.as_str()]);
     assert!(seen[3].starts_with(&actual), "{} and then two temperatures", seen[3]);
@@ -217,13 +201,8 @@ fn pymodbus(name: &str, protocol: Protocol, format: &str) -> (SimulatedBus, Vec<
     let drive = DriveOptions::new(1, ModelOptions::by_name(name).unwrap());
     let rules = LineRules::of(protocol, LineFormat::new(19_200, format).unwrap());
     let line = SimulatedBus::start(SimulatedBusOptions::new(name, rules, vec![drive])).unwrap();
-    let root = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let mut command = Command::new(root.join(".tools/venv/bin/python"));
-    command
-        .arg(root.join("tests/peers/simulated_drives.py"))
-        .args([name, &line.address()]);
-    let (done, text) = run(&mut command, "make the Python environment .tools/venv with pymodbus");
-    assert!(done, "{text}");
+    let script = root().join("tests/peers/simulated_drives.py").display().to_string();
+    let text = run_well(&python(), &[&script, name, &line.address()]);
     (line, text.lines().map(str::to_string).collect())
 }
 
@@ -281,16 +260,16 @@ fn mbpoll_reads_a_vacon_cx() {
     let drive = DriveOptions::new(1, ModelOptions::by_name("cx").unwrap());
     let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
     let line = SimulatedBus::start(SimulatedBusOptions::new("cx", rules, vec![drive])).unwrap();
-    let (_, text) = mbpoll(&line, "-a 1 -t 1 -r 0 -c 5");
+    let text = mbpoll(&line, "-a 1 -t 1 -r 0 -c 5");
     assert_eq!(values(&text), [1, 1, 0, 0, 0], "{text}");
     line.with_drive(1, |drive, _| drive.trip(1));
-    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
+    let text = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
     assert_eq!(values(&text), [1], "{text}");
     mbpoll(&line, "-a 1 -t 0 -r 2 -- 1");
-    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
+    let text = mbpoll(&line, "-a 1 -t 3 -r 100 -c 1");
     assert_eq!(values(&text), [0], "{text}");
-    let (_, text) = mbpoll(&line, "-a 1 -t 3 -r 0 -c 20");
+    let text = mbpoll(&line, "-a 1 -t 3 -r 0 -c 20");
     assert_eq!(values(&text).len(), 20, "{text}");
-    let (_, text) = mbpoll(&line, "-a 1 -t 4 -r 9900 -c 2");
+    let text = mbpoll(&line, "-a 1 -t 4 -r 9900 -c 2");
     assert_eq!(values(&text), [0, 0], "{text}");
 }

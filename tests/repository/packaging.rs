@@ -2,11 +2,10 @@
 
 use std::collections::BTreeSet;
 use std::fs;
-use std::net::{TcpListener, TcpStream};
-use std::path::PathBuf;
-use std::process::{Command, Stdio};
-use std::time::{Duration, Instant};
+use std::net::TcpStream;
 
+use crate::support::process::{Running, until};
+use crate::support::site::Site;
 use crate::support::tools::{python, root, run_well, tool};
 use serde_json::Value;
 use tempfile::TempDir;
@@ -265,28 +264,14 @@ fn the_image_is_small_and_not_root() {
 
 #[test]
 fn mosquitto_takes_its_configuration() {
-    let dir = TempDir::new().unwrap();
-    let port = TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port();
+    let site = Site::new();
     let config = read("deploy/compose/mosquitto/mosquitto.conf")
-        .replace("listener 1883", &format!("listener {port} 127.0.0.1"))
-        .replace("/mosquitto/data", &dir.path().display().to_string());
-    let file = dir.path().join("mosquitto.conf");
-    fs::write(&file, config).unwrap();
-    let log: PathBuf = dir.path().join("log");
-    let mut broker = Command::new(tool("mosquitto"))
-        .arg("-c")
-        .arg(&file)
-        .stdout(fs::File::create(&log).unwrap())
-        .stderr(Stdio::inherit())
-        .spawn()
-        .unwrap();
-    let deadline = Instant::now() + Duration::from_secs(60);
-    let mut up = false;
-    while !up && Instant::now() < deadline && broker.try_wait().unwrap().is_none() {
-        up = TcpStream::connect(("127.0.0.1", port)).is_ok();
-        std::thread::sleep(Duration::from_millis(20));
-    }
-    broker.kill().ok();
-    broker.wait().unwrap();
-    assert!(up, "{}", fs::read_to_string(&log).unwrap_or_default());
+        .replace("listener 1883", &format!("listener {} 127.0.0.1", site.mqtt))
+        .replace("/mosquitto/data", &site.folder.path().display().to_string());
+    site.write("mosquitto.conf", &config);
+    let mut broker = Running::start(&tool("mosquitto"), &["-c", &site.path("mosquitto.conf")]);
+    until("the broker", || {
+        assert!(broker.runs(), "{}", broker.output());
+        TcpStream::connect(("127.0.0.1", site.mqtt)).ok()
+    });
 }

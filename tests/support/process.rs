@@ -186,6 +186,16 @@ pub(crate) fn mbpoll_write(port: u16, unit: u8, start: u16, values: &[u16]) -> R
     if text.contains("Written") { Ok(()) } else { Err(text) }
 }
 
+/// Reads registers, again until they are read: on a busy machine the time of a request may run out.
+pub(crate) fn read_registers(port: u16, unit: u8, start: u16, count: u16) -> Vec<u16> {
+    until("registers", || mbpoll_read(port, unit, start, count).ok())
+}
+
+/// Writes registers, again until that is acknowledged.
+pub(crate) fn write_registers(port: u16, unit: u8, start: u16, values: &[u16]) {
+    until("a write", || mbpoll_write(port, unit, start, values).ok());
+}
+
 fn mbpoll(port: u16, unit: u8, start: u16, options: &[&str], values: &[&str]) -> Result<String, String> {
     let (port, unit, start) = (port.to_string(), unit.to_string(), start.to_string());
     let mut arguments = vec![

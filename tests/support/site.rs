@@ -170,6 +170,13 @@ impl Site {
         let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
         serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{topic} {payload}: {error}: {output:?}"))
     }
+
+    /// Asks again until the command is carried out: on a busy machine its time may run out.
+    pub(crate) fn order(&self, topic: &str, payload: &str) -> serde_json::Value {
+        until(payload, || {
+            Some(self.ask(topic, payload)).filter(|result| result["ok"] == true)
+        })
+    }
 }
 
 /// Simulated drives behind a link, at 38400; what is on their line is written down.
