@@ -15,7 +15,7 @@
 //!
 //! # The parts
 //!
-//! In the order in which they may use each other, a later one the earlier ones; `tests/layering.rs` holds them to it.
+//! In the order in which they may use each other, a later one the earlier ones; `tests/repository/layering.rs` holds them to it.
 //!
 //! - [`document`]: TOML that knows the line of every key and collects all faults.
 //! - [`codec`]: requests and replies to and from bytes: Modbus RTU ([`codec::rtu`]) and ASCII ([`codec::ascii`]), Metasys N2

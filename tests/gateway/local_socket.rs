@@ -10,9 +10,9 @@ use std::time::Duration;
 use serde_json::{Value, json};
 use tempfile::TempDir;
 
-use crate::drive_access::{Line, Ran, ran};
-use crate::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until};
-use crate::tools::tool;
+use super::drive_access::{Line, Ran, ran};
+use crate::support::process::{self, Running, free_port, mbpoll_read, mbpoll_write, until};
+use crate::support::tools::tool;
 
 /// A client that speaks the protocol itself.
 struct Client(BufReader<UnixStream>);
@@ -80,7 +80,7 @@ fn its_file_is_for_owner_and_group_is_replaced_after_a_kill_and_removed_at_the_e
     gateway.signal("HUP");
     until("the socket", || exists(&line.socket()).then_some(()));
     gateway.signal("TERM");
-    assert!(gateway.ended().0.success());
+    assert!(gateway.ended().success());
     assert!(!line.socket().exists(), "removed");
 }
 

@@ -208,6 +208,7 @@ impl WorldBus {
         Some(raw.decode(&words, drivegate::drive::model::Kind::Number)?.as_f64())
     }
 
+    /// The time of the line.
     pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
@@ -341,7 +342,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
         slow_cycle: line.slow_cycle,
     };
     let drive = |address: u8| {
-        let spec = DriveSpec {
+        let mut spec = DriveSpec {
             access: Access::Control,
             unit: index as u8 * 40 + address,
             supervision: line.supervision.clone(),
@@ -350,6 +351,7 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
             ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
         };
+        (line.spec)(&mut spec);
         Arc::new(DriveImage::new(spec, line.slow_cycle))
     };
     BusHandle {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{LeaseAction, OnShutdown, Supervision};
+use drivegate::cache::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::codec::Protocol;
 use drivegate::sim::random::Random;
 
@@ -45,6 +45,8 @@ pub struct Line {
     pub dead: Vec<u8>,
     /// A register that the first drive refuses to tell.
     pub refuses: Option<&'static str>,
+    /// What else is different about its drives.
+    pub spec: fn(&mut DriveSpec),
 }
 
 /// What a client is like.
@@ -204,6 +206,7 @@ impl Line {
                 Vec::new()
             },
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
+            spec: |_| {},
         }
     }
 
