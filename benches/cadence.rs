@@ -4,22 +4,17 @@
 //! classes, north sides being read; everything is taken from the transcript of the simulated line. A round starts with
 //! the read of the process data (2100, 11 registers) of the first drive.
 
-#[path = "common/mod.rs"]
 mod common;
 
 use std::error::Error;
 use std::process::ExitCode;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use drivegate::codec::LineFormat;
-use drivegate::config::Settings;
-use drivegate::daemon::Daemon;
-use drivegate::sim::drive::DriveOptions;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::statistics::{Direction, Recorded};
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use drivegate::sim::statistics::{Direction, Recorded, Statistics};
 
-use common::{Readers, TENTH, median, option, quantile, silences};
+use common::gateway::{Bus, Gateway, NORTH, line, settings};
+use common::{median, option, quantile, silences};
 
 /// Cadence aimed at.
 const CYCLE: f64 = 0.010;
@@ -27,13 +22,7 @@ const CYCLE: f64 = 0.010;
 const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
 
 fn main() -> ExitCode {
-    match measure() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    common::exit(measure())
 }
 
 fn measure() -> Result<(), Box<dyn Error>> {
@@ -51,39 +40,27 @@ fn measure() -> Result<(), Box<dyn Error>> {
 
 /// Runs the whole gateway on simulated drives for `time`; the frames, and the requests that came too early.
 fn record(baud: u32, drives: u8, time: Duration) -> Result<(Vec<Recorded>, u64), Box<dyn Error>> {
-    let format = LineFormat::new(baud, "8N1")?;
-    let made = (1..=drives).map(DriveOptions::nx).collect();
-    let line = SimulatedBus::start(SimulatedBusOptions::new("bench", LineRules::new(format), made))?;
-    let loaded = Settings::parse(
-        "bench.toml",
-        &configuration(&line.address(), baud, drives),
-        std::iter::empty(),
-    );
-    let settings = loaded.settings.ok_or_else(|| format!("{:?}", loaded.errors))?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()?;
-    let daemon = runtime.block_on(Daemon::start(settings))?;
-    let modbus = daemon.modbus_tcp_addresses().first().copied();
-    let plant = daemon.plant().load_full();
-    let bus = plant.buses.first().ok_or("no bus")?.image.clone();
-    let patience = Instant::now() + Duration::from_secs(20);
-    while bus.online() < usize::from(drives) && Instant::now() < patience {
-        std::thread::sleep(Duration::from_millis(10));
-    }
-    let readers = Readers::start(modbus, daemon.http_address().ok_or("no HTTP")?, drives, TENTH);
+    let line = line(baud, drives)?;
+    let bus = Bus {
+        name: "line",
+        port: &line.address(),
+        baud,
+        drives,
+        profile: "vacon-nx",
+        keys: "cycle = \"10ms\"",
+        drive_keys: "",
+    };
+    let gateway = Gateway::start(settings(&(bus.toml() + NORTH))?)?;
+    let readers = gateway.read()?;
     // The class `once` is read first.
     std::thread::sleep(Duration::from_secs(1));
     line.record((time.as_secs_f64() * 2000.0) as usize);
     let before = line.statistics();
     std::thread::sleep(time);
     let (frames, after) = (line.transcript(), line.statistics());
-    runtime.block_on(daemon.stop());
-    if readers.stop() == 0 {
-        return Err("the north sides of the gateway did not answer".into());
-    }
-    let early = |s: drivegate::sim::statistics::Statistics| s.silence_violations + s.collisions;
+    gateway.stop();
+    readers.stop()?;
+    let early = |s: Statistics| s.silence_violations + s.collisions;
     Ok((frames, early(after) - early(before)))
 }
 
@@ -143,15 +120,4 @@ fn saturated(frames: &[Recorded], format: LineFormat, drives: u8) {
         quantile(&over, 1.0)
     );
     println!("line at rest beyond silence: {:.2} % of the time", 100.0 * idle);
-}
-
-fn configuration(port: &str, baud: u32, drives: u8) -> String {
-    let drives: String = (1..=drives)
-        .map(|a| format!("[[bus.drive]]\nname = \"drive-{a}\"\naddress = {a}\nprofile = \"vacon-nx\"\n"))
-        .collect();
-    format!(
-        "[gateway]\nname = \"bench\"\n\
-         [[bus]]\nname = \"line\"\nport = \"{port}\"\nbaud = {baud}\nformat = \"8N1\"\nsilence = \"chars\"\ncycle = \"10ms\"\n{drives}\
-         [modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\n[http]\nlisten = \"127.0.0.1:0\"\n"
-    )
 }

@@ -4,54 +4,41 @@
 //! far below what the line carries. A command may go as soon as the running transaction is over, so its time from
 //! queue to wire (the first byte of its request) is printed beside the time of the transactions.
 
+mod common;
+
 use std::error::Error;
 use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::cache::Direction;
-use drivegate::codec::LineFormat;
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind};
-use drivegate::config::Settings;
-use drivegate::daemon::Daemon;
 use drivegate::drive::Value;
-use drivegate::sim::drive::DriveOptions;
-use drivegate::sim::half_duplex::LineRules;
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 
-const DRIVES: std::ops::RangeInclusive<u8> = 1..=10;
+use common::gateway::{Bus, Gateway, line, settings};
+use common::{option, quantile};
+
+const DRIVES: u8 = 10;
 
 fn main() -> ExitCode {
-    match measure(&std::env::args().skip(1).collect::<Vec<_>>()) {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    common::exit(measure())
 }
 
-fn measure(arguments: &[String]) -> Result<(), Box<dyn Error>> {
-    let option = |name: &str| arguments.iter().skip_while(|argument| *argument != name).nth(1);
-    let commands: u16 = option("--commands").map_or(Ok(300), |text| text.parse())?;
-    let baud: u32 = option("--baud").map_or(Ok(38_400), |text| text.parse())?;
-    let drives = DRIVES.map(DriveOptions::nx).collect();
-    let rules = LineRules::new(LineFormat::new(baud, "8N1")?);
-    let line = SimulatedBus::start(SimulatedBusOptions::new("bench", rules, drives))?;
-    let source = configuration(&line.address(), baud);
-    let loaded = Settings::parse("bench.toml", &source, std::iter::empty());
-    let settings = loaded.settings.ok_or_else(|| format!("{:?}", loaded.errors))?;
-    let runtime = tokio::runtime::Builder::new_multi_thread()
-        .worker_threads(1)
-        .enable_all()
-        .build()?;
-    runtime.block_on(async {
-        let daemon = Daemon::start(settings).await?;
-        let plant = daemon.plant().load_full();
-        let image = plant.buses.first().ok_or("no bus")?.image.clone();
-        let patience = Instant::now() + Duration::from_secs(20);
-        while image.online() < DRIVES.count() && Instant::now() < patience {
-            tokio::time::sleep(Duration::from_millis(10)).await;
-        }
+fn measure() -> Result<(), Box<dyn Error>> {
+    let commands: u16 = option("--commands", 300)?;
+    let baud: u32 = option("--baud", 38_400)?;
+    let line = line(baud, DRIVES)?;
+    let bus = Bus {
+        name: "line",
+        port: &line.address(),
+        baud,
+        drives: DRIVES,
+        profile: "vacon-nx",
+        keys: "cycle = \"10ms\"",
+        drive_keys: "access = \"control\"",
+    };
+    let gateway = Gateway::start(settings(&bus.toml())?)?;
+    let (plant, image) = (&gateway.plant, gateway.bus()?);
+    gateway.runtime.block_on(async {
         tokio::time::sleep(Duration::from_secs(2)).await;
         let before = image.transactions.snapshot();
         let mut frames = image.trace.subscribe();
@@ -60,7 +47,7 @@ fn measure(arguments: &[String]) -> Result<(), Box<dyn Error>> {
         for value in 1..=commands.min(9_999) {
             // Not in step with the line.
             tokio::time::sleep(Duration::from_micros(30_000 + u64::from(value) * 7_919 % 17_000)).await;
-            let drive = plant.drive(&format!("drive-{}", value % 10 + 1)).ok_or("no drive")?;
+            let drive = plant.drive(&format!("line-{}", value % 10 + 1)).ok_or("no drive")?;
             let point = drive
                 .image
                 .spec
@@ -89,14 +76,11 @@ fn measure(arguments: &[String]) -> Result<(), Box<dyn Error>> {
         let after = image.transactions.snapshot();
         let mean = (after.sum - before.sum) / (after.count - before.count).max(1) as f64;
         let load = image.health().load;
-        waits.sort();
-        let at = |share: f64| {
-            let place = ((waits.len() as f64 * share).ceil() as usize).saturating_sub(1);
-            waits.get(place).copied().unwrap_or_default().as_secs_f64() * 1e3
-        };
+        let waits: Vec<f64> = waits.iter().map(|wait| wait.as_secs_f64() * 1e3).collect();
+        let at = |share| quantile(&waits, share);
         println!(
             "{baud} baud, {} drives, load {:.0} %, {} commands, {failed} failed",
-            DRIVES.count(),
+            DRIVES,
             load * 100.0,
             waits.len()
         );
@@ -107,21 +91,8 @@ fn measure(arguments: &[String]) -> Result<(), Box<dyn Error>> {
             at(1.0)
         );
         println!("one transaction: mean {:.2} ms", mean * 1e3);
-        daemon.stop().await;
-        Ok(())
-    })
-}
-
-fn configuration(port: &str, baud: u32) -> String {
-    let drives: String = DRIVES
-        .map(|a| {
-            format!(
-                "[[bus.drive]]\nname = \"drive-{a}\"\naddress = {a}\nprofile = \"vacon-nx\"\naccess = \"control\"\n"
-            )
-        })
-        .collect();
-    format!(
-        "[gateway]\nname = \"bench\"\n[[bus]]\nname = \"line\"\nport = \"{port}\"\nbaud = {baud}\nformat = \"8N1\"\n\
-         silence = \"chars\"\ncycle = \"10ms\"\n{drives}"
-    )
+        Ok::<(), Box<dyn Error>>(())
+    })?;
+    gateway.stop();
+    Ok(())
 }

@@ -4,18 +4,17 @@
 //! (`drivegate run`) and the simulator (`drivegate simulate`) are processes of their own, so that the processor time of
 //! each is known; the system counts it in hundredths of a second.
 
-#[path = "common/mod.rs"]
 mod common;
 
 use std::error::Error;
-use std::fmt::Write as _;
 use std::fs;
 use std::net::{SocketAddr, TcpListener};
 use std::path::Path;
 use std::process::{Child, Command, ExitCode, Stdio};
 use std::time::{Duration, Instant};
 
-use common::{Readers, median, option, scrape};
+use common::gateway::Bus;
+use common::{Readers, median, option, processor_time, scrape};
 
 /// Drives of each bus.
 const DRIVES: u8 = 31;
@@ -24,13 +23,7 @@ const SCRAPE: Duration = Duration::from_secs(1);
 const PROGRAM: &str = env!("CARGO_BIN_EXE_drivegate");
 
 fn main() -> ExitCode {
-    match measure() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            eprintln!("error: {error}");
-            ExitCode::FAILURE
-        }
-    }
+    common::exit(measure())
 }
 
 /// What one run gave.
@@ -99,20 +92,6 @@ impl Process {
         command.spawn().map(Process)
     }
 
-    /// Processor time so far, s.
-    fn processor(&self) -> Result<f64, Box<dyn Error>> {
-        let stat = fs::read_to_string(format!("/proc/{}/stat", self.0.id()))?;
-        // Behind the name, which may contain anything: utime and stime are the fields 14 and 15.
-        let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
-        let ticks = |index: usize| {
-            fields
-                .get(index)
-                .and_then(|f| f.parse::<f64>().ok())
-                .ok_or("no time in stat")
-        };
-        Ok((ticks(11)? + ticks(12)?) / rustix::param::clock_ticks_per_second() as f64)
-    }
-
     fn memory(&self) -> Result<f64, Box<dyn Error>> {
         let status = fs::read_to_string(format!("/proc/{}/status", self.0.id()))?;
         let line = status
@@ -147,22 +126,20 @@ fn run(buses: usize, baud: u32, time: Duration) -> Result<Run, Box<dyn Error>> {
     std::thread::sleep(Duration::from_secs(4));
     let before = (
         exchanges(http, buses)?,
-        daemon.processor()?,
-        simulator.processor()?,
+        processor_time(daemon.0.id())?,
+        processor_time(simulator.0.id())?,
         Instant::now(),
     );
     std::thread::sleep(time);
     let after = (
         exchanges(http, buses)?,
-        daemon.processor()?,
-        simulator.processor()?,
+        processor_time(daemon.0.id())?,
+        processor_time(simulator.0.id())?,
         Instant::now(),
     );
     let seconds = after.3.duration_since(before.3).as_secs_f64();
     let memory = daemon.memory()?;
-    if readers.stop() == 0 {
-        return Err("the north sides of the daemon did not answer".into());
-    }
+    readers.stop()?;
     let rates: Vec<f64> = after
         .0
         .counts
@@ -237,19 +214,16 @@ fn exchanges(http: SocketAddr, buses: usize) -> Result<Exchanges, Box<dyn Error>
 fn configuration(directory: &Path, buses: usize, baud: u32, http: SocketAddr) -> String {
     let mut text = format!("[gateway]\nname = \"bench\"\n[http]\nlisten = \"{http}\"\n");
     for bus in 1..=buses {
-        let port = directory.join(format!("line{bus}"));
-        let _ = write!(
-            text,
-            "[[bus]]\nname = \"bus{bus}\"\nport = \"{}\"\nbaud = {baud}\nformat = \"8N1\"\nsilence = \"chars\"\n",
-            port.display()
-        );
-        for address in 1..=DRIVES {
-            let name = format!("drive-{bus}-{address}");
-            let _ = write!(
-                text,
-                "[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n"
-            );
-        }
+        let bus = Bus {
+            name: &format!("bus{bus}"),
+            port: &directory.join(format!("line{bus}")).display().to_string(),
+            baud,
+            drives: DRIVES,
+            profile: "vacon-nx",
+            keys: "",
+            drive_keys: "",
+        };
+        text += &bus.toml();
     }
     text
 }

@@ -1,12 +1,14 @@
-//! The gateway as a whole: wiring, reload and the order of stopping.
+//! The gateway as a whole: start, reload and the order of shutdown.
+
+mod server;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use tokio_util::sync::CancellationToken;
 
+use self::server::{ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
@@ -14,18 +16,27 @@ use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::north::{NorthStats, http, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 
-/// Time beyond that of its stops after which a bus is not waited for any more.
+/// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
-/// Time that a server may take to end.
-const STOP_SERVER: Duration = Duration::from_secs(2);
+/// Time limit for the bus threads to end.
+const STOP_BUSES: Duration = Duration::from_secs(2);
 
-/// The gateway cannot start, or cannot take a new configuration: what, where, what to do.
+/// Why the gateway cannot start or apply a new configuration.
 #[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct StartError(pub String);
+pub enum StartError {
+    /// A server cannot start.
+    #[error(transparent)]
+    Server(#[from] ServerError),
+    /// The system does not provide a thread or a file descriptor for the bus of that name.
+    #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
+    Bus(String, std::io::Error),
+    /// A server cannot start, and the previous servers cannot be started again.
+    #[error("{0}; the previous servers cannot be restarted: {1}")]
+    NotRestored(Box<ServerError>, Box<ServerError>),
+}
 
 /// A running gateway.
 #[derive(Debug)]
@@ -36,17 +47,19 @@ pub struct Daemon {
     events: Events,
     writes: Arc<WriteStats>,
     stats: Arc<NorthStats>,
-    modbus_tcp: Option<(CancellationToken, modbus_tcp::Server)>,
-    mqtt: Option<(CancellationToken, mqtt::Mqtt)>,
-    http: Option<(CancellationToken, http::Http)>,
+    modbus_tcp: ServerSlot<modbus_tcp::Server>,
+    mqtt: ServerSlot<mqtt::Mqtt>,
+    http: ServerSlot<http::Http>,
+    local: ServerSlot<local::Local>,
+    /// Beats of the bus threads at the last check, by bus.
     beats: BTreeMap<String, u64>,
 }
 
 impl Daemon {
-    /// Starts all buses and servers. A port that cannot be opened is no error: its bus keeps trying.
+    /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
     ///
     /// # Errors
-    /// When a server cannot listen or the system gives no thread.
+    /// A server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let plant = Plant {
@@ -58,110 +71,109 @@ impl Daemon {
         };
         let mut daemon = Daemon {
             plant: Arc::new(ArcSwap::from_pointee(plant)),
-            settings: Settings {
-                modbus_tcp: None,
-                mqtt: None,
-                http: None,
-                ..settings.clone()
-            },
+            settings: settings.clone(),
             buses: Vec::new(),
             events,
             writes,
             stats: Arc::default(),
-            modbus_tcp: None,
-            mqtt: None,
-            http: None,
+            modbus_tcp: ServerSlot::default(),
+            mqtt: ServerSlot::default(),
+            http: ServerSlot::default(),
+            local: ServerSlot::default(),
             beats: BTreeMap::new(),
         };
-        // First whoever keeps events, so that none is missed; last the servers that tell whether all is ready.
-        daemon.take_mqtt(&settings).await;
-        let begins = daemon.prepare_buses(&settings)?;
-        daemon.take_buses(&settings, begins);
-        daemon.take_servers(&settings).await?;
-        daemon.settings = settings;
+        // MQTT first, so that it misses no event; the servers that report readiness last.
+        daemon.apply_mqtt(&settings).await?;
+        let prepared = daemon.prepare_buses(&settings)?;
+        daemon.replace_buses(&settings, prepared);
+        daemon.apply_servers(&settings).await?;
+        daemon.apply_local(&settings).await;
         Ok(daemon)
     }
 
-    /// The plant, for whoever wants to look.
+    /// All buses with their images and queues.
     pub fn plant(&self) -> SharedPlant {
         self.plant.clone()
     }
 
-    /// Where the HTTP server listens.
+    /// The address that the HTTP server listens on.
     pub fn http_address(&self) -> Option<std::net::SocketAddr> {
-        self.http.as_ref().map(|(_, server)| server.address())
+        self.http.server().map(http::Http::address)
     }
 
-    /// Where the Modbus TCP server listens.
+    /// The addresses that the Modbus TCP server listens on without TLS.
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
-        self.modbus_tcp
-            .as_ref()
-            .map(|(_, server)| server.addresses().to_vec())
-            .unwrap_or_default()
+        let server = self.modbus_tcp.server();
+        server.map(|server| server.addresses().to_vec()).unwrap_or_default()
     }
 
-    /// Whether every bus has moved since the last call; a bus that hangs must not be hidden by a watchdog that is fed.
+    /// Path of the local socket, if it is open.
+    pub fn socket(&self) -> Option<&std::path::Path> {
+        self.local.server().map(local::Local::path)
+    }
+
+    /// Whether every bus thread has run since the last call. If not, the watchdog keep-alive must be withheld.
     pub fn is_moving(&mut self) -> bool {
         let mut moving = self.buses.len() >= self.settings.buses.len();
         if !moving {
-            tracing::error!("not every bus of the configuration runs; the watchdog is not fed");
+            tracing::error!("not every configured bus is running; withholding the watchdog keep-alive");
         }
         for (settings, task) in &self.buses {
             let beats = task.beats();
             if self.beats.insert(settings.spec.name.clone(), beats) == Some(beats) {
-                tracing::error!(bus = %settings.spec.name, "the bus hangs; the watchdog is not fed");
+                tracing::error!(bus = %settings.spec.name, "bus thread stalled; withholding the watchdog keep-alive");
                 moving = false;
             }
         }
         moving
     }
 
-    /// Takes a new configuration: what is unchanged keeps running without a lost cycle.
+    /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// When the system gives no thread or no file descriptor for a bus, or a server cannot listen on its new address:
-    /// everything is as it was before, the old servers are open again.
+    /// A bus or a server cannot start. Everything runs as before, unless the error says that the previous servers
+    /// cannot be restarted.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
         let before = self.settings.clone();
-        // All that can fail comes before anything that runs is ended.
-        let begins = self.prepare_buses(&settings)?;
-        if let Err(error) = self.take_servers(&settings).await {
-            return Err(match self.take_servers(&before).await {
-                Ok(()) => error,
-                Err(back) => StartError(format!("{error}; the old servers cannot be opened again: {back}")),
+        // Everything that can fail comes before anything that runs is stopped for good.
+        let prepared = self.prepare_buses(&settings)?;
+        if let Err(error) = self.apply_servers(&settings).await {
+            return Err(match self.apply_servers(&before).await {
+                Ok(()) => error.into(),
+                Err(restart) => StartError::NotRestored(error.into(), restart.into()),
             });
         }
-        self.take_buses(&settings, begins);
-        self.take_mqtt(&settings).await;
+        self.replace_buses(&settings, prepared);
+        self.apply_mqtt(&settings).await?;
+        self.apply_local(&settings).await;
         self.settings = settings;
         Ok(())
     }
 
-    /// The buses that do not run as they are wanted, ready to begin.
+    /// Prepares the buses that are new or changed.
     fn prepare_buses(&self, settings: &Settings) -> Result<Vec<(BusSettings, BusTask)>, StartError> {
         let runs = |bus: &BusSettings| self.buses.iter().any(|(before, _)| before == bus);
         let wanted = settings.buses.iter().filter(|bus| !runs(bus));
         wanted.map(|bus| Ok((bus.clone(), self.prepare_bus(bus)?))).collect()
     }
 
-    /// Ends the buses that are wanted no more, and lets those begin that are new.
-    fn take_buses(&mut self, settings: &Settings, begins: Vec<(BusSettings, BusTask)>) {
-        let (mut kept, ends): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
+    /// Stops the buses that are removed or changed, and starts the `prepared` ones.
+    fn replace_buses(&mut self, settings: &Settings, prepared: Vec<(BusSettings, BusTask)>) {
+        let (mut kept, removed): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
-        // Ports are free again before a changed bus opens one of them. A bus that starts anew does not set a running drive
-        // free of its supervision.
+        // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
-        for (before, task) in ends {
-            tracing::info!(bus = %before.spec.name, "the bus ends");
+        for (before, task) in removed {
+            tracing::info!(bus = %before.spec.name, "stopping the bus");
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             let left = task.stop();
             leases.extend(drives.zip(left.leases));
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
-        for (bus, mut task) in begins {
-            tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "the bus starts");
+        for (bus, mut task) in prepared {
+            tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
             let lease = |d: &DriveSpec| {
                 let before = leases.get(&(d.name.clone(), d.address)).copied().unwrap_or_default();
                 if d.access == Access::Control {
@@ -177,7 +189,7 @@ impl Daemon {
             kept.push((bus, task));
         }
         for (bus, task) in &kept {
-            // Where nobody wrote when process data is stale, three rounds of a slow line are not.
+            // Without a configured `stale_after`, data as old as three rounds of a slow bus is not stale.
             let floor = match settings.stale_after_written {
                 true => Duration::ZERO,
                 false => 3 * bus.achievable().0,
@@ -199,12 +211,7 @@ impl Daemon {
     }
 
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
-        let failed = |error: std::io::Error| {
-            StartError(format!(
-                "cannot start bus `{}`: {error}; free memory or file descriptors",
-                bus.spec.name
-            ))
-        };
+        let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
         let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle));
         let drives = bus.drives.iter().map(image).collect();
@@ -219,104 +226,71 @@ impl Daemon {
         .map_err(failed)
     }
 
-    async fn take_servers(&mut self, settings: &Settings) -> Result<(), StartError> {
-        if let (Some(old), Some(new), Some((_, server))) =
-            (&self.settings.modbus_tcp, &settings.modbus_tcp, &self.modbus_tcp)
-            && new.differs_in_certificates_only(old)
-        {
-            server.renew_certificates(new).map_err(StartError)?;
-            tracing::info!("Modbus TCP: new certificates for clients that connect from now on");
-            self.settings.modbus_tcp = settings.modbus_tcp.clone();
-        }
-        if settings.modbus_tcp != self.settings.modbus_tcp {
-            self.settings.modbus_tcp = None;
-            if let Some((cancel, server)) = self.modbus_tcp.take() {
-                cancel.cancel();
-                within(STOP_SERVER, "Modbus TCP", server.stopped()).await;
-            }
-            if let Some(options) = settings.modbus_tcp.clone() {
-                let cancel = CancellationToken::new();
-                let server = modbus_tcp::start(options, self.plant.clone(), self.stats.clone(), cancel.clone()).await;
-                self.modbus_tcp = Some((cancel, server.map_err(|e| StartError(e.to_string()))?));
-            }
-            self.settings.modbus_tcp = settings.modbus_tcp.clone();
-        }
-        if settings.http != self.settings.http {
-            self.settings.http = None;
-            if let Some((cancel, server)) = self.http.take() {
-                cancel.cancel();
-                within(STOP_SERVER, "HTTP", server.stopped()).await;
-            }
-            if let Some(options) = settings.http.clone() {
-                let cancel = CancellationToken::new();
-                let server = http::start(options, self.plant.clone(), self.stats.clone(), cancel.clone()).await;
-                self.http = Some((cancel, server.map_err(|e| StartError(e.to_string()))?));
-            }
-            self.settings.http = settings.http.clone();
-        }
-        Ok(())
+    async fn apply_servers(&mut self, settings: &Settings) -> Result<(), ServerError> {
+        let (plant, stats) = (&self.plant, &self.stats);
+        self.modbus_tcp
+            .apply(settings.modbus_tcp.as_ref(), plant, stats)
+            .await?;
+        self.http.apply(settings.http.as_ref(), plant, stats).await
     }
 
-    async fn take_mqtt(&mut self, settings: &Settings) {
-        if settings.mqtt == self.settings.mqtt && settings.gateway == self.settings.gateway {
-            return;
+    async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
+        // The name of the gateway is part of all topics.
+        if settings.gateway != self.settings.gateway {
+            self.mqtt.stop().await;
         }
-        // Client id and buffer are free again before the new client takes them.
-        self.stop_mqtt().await;
-        if let Some(options) = settings.mqtt.clone() {
-            let cancel = CancellationToken::new();
-            let client = mqtt::start(options, self.plant.clone(), self.stats.clone(), cancel.clone());
-            self.mqtt = Some((cancel, client));
-        }
-        self.settings.mqtt = settings.mqtt.clone();
-        self.settings.gateway = settings.gateway.clone();
+        self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await
     }
 
-    async fn stop_mqtt(&mut self) {
-        if let Some((cancel, client)) = self.mqtt.take() {
-            cancel.cancel();
-            within(STOP_SERVER, "MQTT", client.stopped()).await;
+    /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
+    /// again.
+    async fn apply_local(&mut self, settings: &Settings) {
+        let socket = Some(&settings.socket).filter(|socket| **socket != local::SocketPath::Off);
+        if let Err(error) = self.local.apply(socket, &self.plant, &self.stats).await {
+            tracing::warn!(
+                target: "drivegate::local",
+                "{error}; `drivegate read` and `drivegate write` cannot use this gateway; set `socket` of [gateway], or \
+                 socket = \"\" to do without"
+            );
         }
     }
 
-    /// Stops in order: no new commands, the stops that are configured, the buses, the last messages.
+    /// Shuts down in order: no new commands of local and Modbus TCP clients, the configured stop commands, the buses,
+    /// the last MQTT messages.
     pub async fn stop(mut self) {
-        if let Some((cancel, server)) = self.modbus_tcp.take() {
-            cancel.cancel();
-            within(STOP_SERVER, "Modbus TCP", server.stopped()).await;
-        }
+        self.local.stop().await;
+        self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
-        let ended = tokio::task::spawn_blocking(move || {
+        let stopped = tokio::task::spawn_blocking(move || {
             for (_, task) in buses {
                 task.stop();
             }
         });
-        within(STOP_SERVER, "buses", async {
-            // A panic of a bus was told by the bus itself.
-            let _ = ended.await;
+        within(STOP_BUSES, "buses", async {
+            // A bus thread that panicked has logged it.
+            let _ = stopped.await;
         })
         .await;
-        self.stop_mqtt().await;
-        if let Some((cancel, server)) = self.http.take() {
-            cancel.cancel();
-            within(STOP_SERVER, "HTTP", server.stopped()).await;
-        }
+        self.mqtt.stop().await;
+        self.http.stop().await;
     }
 
-    /// Lets each bus stop the drives that are configured so, as long as that takes on its line.
+    /// Stops the drives with `on_shutdown = "stop"`; each bus has the time that this takes on its line.
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
             let time = settings.shutdown_time().unanswered;
             let missing = task.handle().queue.begin_shutdown(now + time, now);
             async move {
-                // A bus whose port is closed cannot say what became of its drives.
+                // A bus whose port is closed does not report.
                 let missing = tokio::time::timeout(time + STOP_SLACK, missing).await;
                 missing.ok().and_then(Result::ok).unwrap_or_else(|| {
                     let stop = |d: &&DriveSpec| d.on_shutdown == OnShutdown::Stop && d.access == Access::Control;
                     let wanted = settings.drives.iter().filter(stop);
-                    wanted.map(|d| format!("`{}` was not told to stop", d.name)).collect()
+                    wanted
+                        .map(|d| format!("`{}` was not sent its stop command", d.name))
+                        .collect()
                 })
             }
         });
@@ -327,15 +301,9 @@ impl Daemon {
             .collect();
         if !missing.is_empty() {
             tracing::error!(
-                "not every drive acknowledged its stop in time; the gateway stops all the same: {}",
+                "not every drive acknowledged its stop command in time; shutting down anyway: {}",
                 missing.join(", ")
             );
         }
-    }
-}
-
-async fn within(time: Duration, what: &str, end: impl Future<Output = ()>) {
-    if tokio::time::timeout(time, end).await.is_err() {
-        tracing::warn!("{what} did not end within {time:?}; going on without it");
     }
 }

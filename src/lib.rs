@@ -15,7 +15,7 @@
 //!
 //! # The parts
 //!
-//! In the order in which they may use each other, a later one the earlier ones; `tests/layering.rs` holds them to it.
+//! In the order in which they may use each other, a later one the earlier ones; `tests/repository/layering.rs` holds them to it.
 //!
 //! - [`document`]: TOML that knows the line of every key and collects all faults.
 //! - [`codec`]: requests and replies to and from bytes: Modbus RTU ([`codec::rtu`]) and ASCII ([`codec::ascii`]), Metasys N2
@@ -33,7 +33,7 @@
 //! - [`sim`]: simulated drives of every family on a simulated wire, and the broker of the demo.
 //! - [`config`]: file and environment to settings, every fault in one run.
 //! - [`daemon`]: wiring, reload, the order of stopping.
-//! - [`cli`]: one file a command; `read` and `write` are a client of a running gateway, or a bus of their own without one.
+//! - [`cli`]: one file a command; `read` and `write` are a client of a running gateway's local socket, or a bus of their own without one.
 //!
 //! # Deliberately absent
 //!

@@ -2,7 +2,7 @@
 
 use std::error::Error;
 use std::io;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::process::Command;
 use std::time::{Duration, Instant};
 
@@ -11,10 +11,11 @@ use tokio_modbus::client::{Reader, rtu};
 use tokio_modbus::slave::{Slave, SlaveContext};
 use tokio_serial::SerialStream;
 
-use super::{DRIVES, SPIN, TIMEOUT};
+use crate::common::compile;
+use crate::{DRIVES, SPIN, TIMEOUT};
 
 /// tokio-modbus for `time`, with a `pause` after each reply.
-pub(super) fn tokio_modbus(port: &str, baud: u32, pause: Duration, time: Duration) -> Result<(), Box<dyn Error>> {
+pub(crate) fn tokio_modbus(port: &str, baud: u32, pause: Duration, time: Duration) -> Result<(), Box<dyn Error>> {
     let port = port.to_string();
     let thread = std::thread::spawn(move || -> io::Result<()> {
         sharpen_timers();
@@ -42,32 +43,17 @@ pub(super) fn tokio_modbus(port: &str, baud: u32, pause: Duration, time: Duratio
 }
 
 /// The libmodbus master, built for this run.
-pub(super) struct Libmodbus {
+pub(crate) struct Libmodbus {
     directory: tempfile::TempDir,
 }
 
 impl Libmodbus {
     /// Compiles it.
-    pub(super) fn build() -> Result<Libmodbus, String> {
+    pub(crate) fn build() -> Result<Libmodbus, String> {
         let directory = tempfile::tempdir().map_err(|error| error.to_string())?;
-        let source = Path::new(env!("CARGO_MANIFEST_DIR")).join("benches/libmodbus_master.c");
-        let output = Command::new("gcc")
-            .args(["-O2", "-I/usr/include/modbus", "-o"])
-            .arg(directory.path().join("master"))
-            .arg(source)
-            .arg("-lmodbus")
-            .output();
-        match output {
-            Ok(output) if output.status.success() => Ok(Libmodbus { directory }),
-            Ok(output) => {
-                let text = String::from_utf8_lossy(&output.stderr);
-                let first = text.lines().find(|line| line.contains("error")).unwrap_or_default();
-                Err(format!("{first}; apt install libmodbus-dev"))
-            }
-            Err(error) => Err(format!(
-                "gcc does not run: {error}; apt install gcc libc6-dev libmodbus-dev"
-            )),
-        }
+        let libmodbus = Libmodbus { directory };
+        compile("bus/libmodbus_master.c", &libmodbus.program())?;
+        Ok(libmodbus)
     }
 
     fn program(&self) -> PathBuf {
@@ -75,7 +61,7 @@ impl Libmodbus {
     }
 
     /// Runs it for `time`, with a `pause` after each reply.
-    pub(super) fn run(&self, port: &str, baud: u32, pause: Duration, time: Duration) -> Result<(), Box<dyn Error>> {
+    pub(crate) fn run(&self, port: &str, baud: u32, pause: Duration, time: Duration) -> Result<(), Box<dyn Error>> {
         let numbers = [
             u64::from(baud),
             u64::from(*DRIVES.end()),

@@ -1,9 +1,15 @@
-//! What the benches share: medians, what a transcript tells, and clients of the north sides.
+//! What the benches share: the gateway under test, clients of its north sides, medians, and what a transcript shows.
 // Each bench uses its own part.
 #![allow(dead_code, unreachable_pub)]
 
+pub mod gateway;
+
+use std::error::Error;
+use std::fs;
 use std::io::{Read, Write};
 use std::net::{SocketAddr, TcpStream};
+use std::path::Path;
+use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
@@ -11,12 +17,56 @@ use std::time::Duration;
 use drivegate::sim::SimTime;
 use drivegate::sim::statistics::{Direction, Recorded};
 
+/// The exit code of a bench, whose error is printed.
+pub fn exit(outcome: Result<(), Box<dyn Error>>) -> ExitCode {
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+/// A file of this folder.
+pub fn file(name: &str) -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("benches").join(name)
+}
+
+/// Compiles a C program that uses libmodbus.
+pub fn compile(source: &str, program: &Path) -> Result<(), String> {
+    let output = Command::new("gcc")
+        .args(["-O2", "-I/usr/include/modbus", "-o"])
+        .arg(program)
+        .arg(file(source))
+        .arg("-lmodbus")
+        .output();
+    match output {
+        Ok(output) if output.status.success() => Ok(()),
+        _ => Err("it cannot be compiled; apt install gcc libc6-dev libmodbus-dev".to_string()),
+    }
+}
+
+/// Processor time of a process so far, s.
+pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
+    let stat = fs::read_to_string(format!("/proc/{process}/stat"))?;
+    // Behind the name, which may contain anything: utime and stime are the fields 14 and 15.
+    let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
+    let ticks = |index: usize| {
+        fields
+            .get(index)
+            .and_then(|f| f.parse::<f64>().ok())
+            .ok_or("no time in stat")
+    };
+    Ok((ticks(11)? + ticks(12)?) / rustix::param::clock_ticks_per_second() as f64)
+}
+
 /// The value of the option `name` on the command line of the bench, or `default`.
 pub fn option<T: std::str::FromStr>(name: &str, default: T) -> Result<T, String> {
     let given = std::env::args().skip_while(|argument| argument != name).nth(1);
     given.map_or(Ok(default), |text| {
         text.parse()
-            .map_err(|_| format!("`{text}` is no value for {name}; write a number"))
+            .map_err(|_| format!("`{text}` is not a valid value for {name}; write a number"))
     })
 }
 
@@ -63,9 +113,6 @@ pub fn silences(frames: &[Recorded]) -> Vec<f64> {
     silences
 }
 
-/// Pause of clients that read ten times a second.
-pub const TENTH: Duration = Duration::from_millis(100);
-
 /// Clients of the north sides: 100 Modbus TCP reads, where there is such a server, and one scrape of the metrics, again
 /// and again.
 pub struct Readers {
@@ -89,10 +136,16 @@ impl Readers {
         Readers { end, thread }
     }
 
-    /// Ends them and returns how often both servers answered.
-    pub fn stop(self) -> u64 {
+    /// Ends them.
+    ///
+    /// # Errors
+    /// The servers never answered.
+    pub fn stop(self) -> Result<(), String> {
         self.end.store(true, Ordering::Relaxed);
-        self.thread.join().unwrap_or_default()
+        match self.thread.join() {
+            Ok(1..) => Ok(()),
+            _ => Err("the north sides of the gateway did not answer".to_string()),
+        }
     }
 }
 

@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use rustix::event::epoll;
 
-use super::common::quantile;
+use crate::common::quantile;
 
 /// Function 3, eleven registers from 2100 of unit 1.
 const REQUEST: [u8; 12] = [0, 1, 0, 0, 0, 6, 1, 3, 0x08, 0x34, 0, 11];
@@ -15,14 +15,14 @@ const ANSWER: usize = 31;
 
 /// What came of it.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Load {
+pub(crate) struct Load {
     /// Requests answered in a second.
-    pub(super) rate: f64,
+    pub(crate) rate: f64,
     /// From sending a batch to its last answer, µs.
-    pub(super) p50: f64,
-    pub(super) p99: f64,
+    pub(crate) p50: f64,
+    pub(crate) p99: f64,
     /// Requests answered.
-    pub(super) answered: u64,
+    pub(crate) answered: u64,
 }
 
 struct Connection {
@@ -33,7 +33,7 @@ struct Connection {
 }
 
 /// Keeps a batch of `depth` requests under way on each connection for `time`.
-pub(super) fn load(
+pub(crate) fn load(
     address: SocketAddr,
     connections: usize,
     depth: usize,

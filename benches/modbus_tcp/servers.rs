@@ -10,26 +10,23 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use drivegate::cache::{BusImage, DriveImage, Link};
-use drivegate::codec::{LineFormat, Table};
+use drivegate::codec::Table;
 use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
-use drivegate::daemon::Daemon;
 use drivegate::north::modbus_tcp;
 use drivegate::plant::{BusHandle, Plant};
-use drivegate::sim::drive::DriveOptions;
-use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::statistics::Direction;
-use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tokio_modbus::prelude::*;
 use tokio_modbus::server::tcp::{Server, accept_tcp_connection};
 use tokio_util::sync::CancellationToken;
 
-use super::common::{median, quantile};
+use crate::common::gateway::{Bus, Gateway, line, settings};
+use crate::common::{compile, file, median, processor_time, quantile};
 
 /// A server under test.
-pub(super) struct Process {
-    pub(super) name: &'static str,
-    pub(super) address: SocketAddr,
+pub(crate) struct Process {
+    pub(crate) name: &'static str,
+    pub(crate) address: SocketAddr,
     child: Child,
     input: ChildStdin,
     output: BufReader<ChildStdout>,
@@ -67,43 +64,32 @@ impl Process {
     }
 
     /// One of the servers of this program.
-    pub(super) fn own(name: &'static str) -> Result<Process, Box<dyn Error>> {
+    pub(crate) fn own(name: &'static str) -> Result<Process, Box<dyn Error>> {
         let mut command = Command::new(std::env::current_exe()?);
         command.args(["--serve", name]);
         Process::start(name, command, None)
     }
 
-    pub(super) fn libmodbus() -> Result<Process, Box<dyn Error>> {
+    pub(crate) fn libmodbus() -> Result<Process, Box<dyn Error>> {
         let directory = tempfile::tempdir()?;
-        let (source, program) = (file("libmodbus_server.c"), directory.path().join("server"));
-        let output = Command::new("gcc")
-            .args(["-O2", "-I/usr/include/modbus", "-o"])
-            .arg(&program)
-            .arg(source)
-            .arg("-lmodbus")
-            .output()?;
-        if !output.status.success() {
-            return Err("it cannot be compiled; apt install gcc libc6-dev libmodbus-dev".into());
-        }
+        let program = directory.path().join("server");
+        compile("modbus_tcp/libmodbus_server.c", &program)?;
         Process::start("libmodbus", Command::new(program), Some(directory))
     }
 
-    pub(super) fn pymodbus() -> Result<Process, Box<dyn Error>> {
+    pub(crate) fn pymodbus() -> Result<Process, Box<dyn Error>> {
         let mut command = Command::new(Path::new(env!("CARGO_MANIFEST_DIR")).join(".tools/venv/bin/python"));
-        command.arg(file("pymodbus_server.py"));
+        command.arg(file("modbus_tcp/pymodbus_server.py"));
         Process::start("pymodbus", command, None).map_err(|why| format!("{why}; make tools").into())
     }
 
     /// Processor time so far, s.
-    pub(super) fn cpu(&self) -> f64 {
-        let stat = std::fs::read_to_string(format!("/proc/{}/stat", self.child.id())).unwrap_or_default();
-        let fields: Vec<&str> = stat.rsplit(')').next().unwrap_or_default().split_whitespace().collect();
-        let ticks = |at: usize| fields.get(at).and_then(|f| f.parse::<f64>().ok()).unwrap_or_default();
-        (ticks(11) + ticks(12)) / 100.0
+    pub(crate) fn cpu(&self) -> f64 {
+        processor_time(self.child.id()).unwrap_or_default()
     }
 
-    /// Tells it something and gives its answer.
-    pub(super) fn ask(&mut self, what: &str) -> Result<String, Box<dyn Error>> {
+    /// Sends it a line and returns its answer.
+    pub(crate) fn ask(&mut self, what: &str) -> Result<String, Box<dyn Error>> {
         writeln!(self.input, "{what}")?;
         let mut line = String::new();
         self.output.read_line(&mut line)?;
@@ -118,20 +104,14 @@ impl Drop for Process {
     }
 }
 
-fn file(name: &str) -> std::path::PathBuf {
-    Path::new(env!("CARGO_MANIFEST_DIR"))
-        .join("benches/modbus_tcp")
-        .join(name)
-}
-
 /// Runs the server `name` in this process until standard input ends.
-pub(super) fn serve(name: &str) -> Result<(), Box<dyn Error>> {
+pub(crate) fn serve(name: &str) -> Result<(), Box<dyn Error>> {
     // As the daemon has it.
     let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build()?;
     match name {
         "drivegate" => runtime.block_on(drivegate()),
         "tokio-modbus" => runtime.block_on(tokio_modbus()),
-        "line" => line(&runtime),
+        "line" => rounds(),
         _ => Err(format!("no server `{name}`").into()),
     }
 }
@@ -140,18 +120,24 @@ async fn until_input_ends() {
     let _ = tokio::task::spawn_blocking(|| std::io::stdin().lines().for_each(drop)).await;
 }
 
-const CONFIGURATION: &str = "[gateway]\nname = \"bench\"\n[[bus]]\nname = \"line\"\nport = \"PORT\"\nbaud = 115200\n\
-    cycle = \"10ms\"\nsilence = \"chars\"\n[[bus.drive]]\nname = \"drive\"\naddress = 1\nprofile = \"vacon-nx\"\n\
-    turnaround = \"0.5ms\"\n[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nstale_after = \"5s\"\n";
-
-fn settings(port: &str) -> Result<Settings, String> {
-    let loaded = Settings::parse("bench.toml", &CONFIGURATION.replace("PORT", port), std::iter::empty());
-    loaded.settings.ok_or_else(|| format!("{:?}", loaded.errors))
+/// One drive at 115200 baud behind a server.
+fn one_drive(port: &str) -> Result<Settings, Box<dyn Error>> {
+    let bus = Bus {
+        name: "line",
+        port,
+        baud: 115_200,
+        drives: 1,
+        profile: "vacon-nx",
+        keys: "cycle = \"10ms\"",
+        drive_keys: "turnaround = \"0.5ms\"",
+    };
+    let server = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nstale_after = \"5s\"\n";
+    settings(&(bus.toml() + server))
 }
 
 /// drivegate's server before an image that is rewritten a hundred times a second, as a bus would.
 async fn drivegate() -> Result<(), Box<dyn Error>> {
-    let settings = settings("/dev/null")?;
+    let settings = one_drive("/dev/null")?;
     let bus = settings.buses.first().ok_or("no bus")?;
     let drives: Vec<_> = bus
         .drives
@@ -235,12 +221,10 @@ const ROUND: [u8; 6] = [0x01, 0x03, 0x08, 0x34, 0x00, 0x0B];
 
 /// The whole daemon on a simulated line; a line of input begins a measurement of its rounds, the next ends it and is
 /// answered with median and 99 % of the time between two, as the daemon gave them to its port and as the drives heard them.
-fn line(runtime: &tokio::runtime::Runtime) -> Result<(), Box<dyn Error>> {
-    let rules = LineRules::new(LineFormat::new(115_200, "8N1")?);
-    let line = SimulatedBus::start(SimulatedBusOptions::new("bench", rules, vec![DriveOptions::nx(1)]))?;
-    let daemon = runtime.block_on(Daemon::start(settings(&line.address())?))?;
-    let plant = daemon.plant().load_full();
-    let mut frames = plant.buses.first().ok_or("no bus")?.image.trace.subscribe();
+fn rounds() -> Result<(), Box<dyn Error>> {
+    let line = line(115_200, 1)?;
+    let gateway = Gateway::start(one_drive(&line.address())?)?;
+    let mut frames = gateway.bus()?.trace.subscribe();
     let written: Arc<Mutex<Vec<Duration>>> = Arc::default();
     let writes = written.clone();
     std::thread::spawn(move || {
@@ -253,7 +237,15 @@ fn line(runtime: &tokio::runtime::Runtime) -> Result<(), Box<dyn Error>> {
         }
     });
     std::thread::sleep(Duration::from_secs(2));
-    println!("{}", daemon.modbus_tcp_addresses().first().ok_or("no address")?.port());
+    println!(
+        "{}",
+        gateway
+            .daemon
+            .modbus_tcp_addresses()
+            .first()
+            .ok_or("no address")?
+            .port()
+    );
     let mut begun = false;
     for input in std::io::stdin().lines() {
         input?;
@@ -274,7 +266,7 @@ fn line(runtime: &tokio::runtime::Runtime) -> Result<(), Box<dyn Error>> {
             cycles(&heard.map(|f| f.start).collect::<Vec<_>>())
         );
     }
-    runtime.block_on(daemon.stop());
+    gateway.stop();
     Ok(())
 }
 

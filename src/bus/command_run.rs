@@ -15,6 +15,9 @@ use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Interruption, Order, Outcome, Receipt, SourceKind, Ticket, Urgency};
 use crate::drive::Profile;
 
+/// Stops to a drive that go before the end of a pulse that was begun.
+const MOST_STOPS: u32 = 8;
+
 /// What a command needs next.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Next {
@@ -79,6 +82,8 @@ pub struct CommandRun {
     held_up: bool,
     /// A stop whose acknowledgement may have been a late reply.
     waits_for_late: bool,
+    /// Stops that were done since it was last written.
+    overtaken: u32,
 }
 
 impl CommandRun {
@@ -140,6 +145,7 @@ impl CommandRun {
             blind: false,
             held_up: false,
             waits_for_late: false,
+            overtaken: 0,
         }
     }
 
@@ -235,6 +241,19 @@ impl CommandRun {
     pub fn sent(&mut self, step: &Step) {
         self.reached_the_wire = true;
         self.begun |= step.pdu.is_write() || self.urgency == Urgency::Read;
+        if step.pdu.is_write() {
+            self.overtaken = 0;
+        }
+    }
+
+    /// A stop to its drive was done before it.
+    pub fn overtaken(&mut self) {
+        self.overtaken = self.overtaken.saturating_add(1);
+    }
+
+    /// Whether so many stops were that what is left of it, the end of a pulse, goes before the next one.
+    pub fn is_put_off(&self) -> bool {
+        self.only_ends && self.overtaken >= MOST_STOPS
     }
 
     /// `unbegun` where nothing of it was sent; else that it was cut short, its end being unknown.

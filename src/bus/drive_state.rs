@@ -30,7 +30,7 @@ pub(super) struct DriveState {
     pub(super) confirmations: Confirmations,
     /// Begun commands: one of each rank, so that they keep their order.
     runs: [Option<CommandRun>; 3],
-    /// When a stop was acknowledged after which no other command was sent.
+    /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
     /// It did not answer a command: the next one waits until it answers something, or until then.
     pub(super) silent_until: Option<Instant>,
@@ -103,7 +103,11 @@ impl DriveState {
         let profile = &image.spec.profile;
         let mut wake_at: Option<Instant> = None;
         let mut wait = |until: Instant| wake_at = Some(wake_at.map_or(until, |at: Instant| at.min(until)));
-        for urgency in [Urgency::Stop, Urgency::Command, Urgency::Read] {
+        let mut order = [Urgency::Stop, Urgency::Command, Urgency::Read];
+        if self.pulse_is_put_off() {
+            order.swap(0, 1);
+        }
+        for urgency in order {
             loop {
                 // What a faulted drive says of its motor may be from before the fault; it does not run by its run command.
                 let running = reading.is_set(ModelPoint::Running) && !reading.is_set(ModelPoint::Fault);
@@ -138,6 +142,13 @@ impl DriveState {
         wake_at.map_or(Wanted::Nothing, Wanted::Wait)
     }
 
+    /// Whether stop after stop went before the end of a pulse, and the next one is not on the wire yet.
+    fn pulse_is_put_off(&self) -> bool {
+        let [stop, command, _] = &self.runs;
+        let waits = command.as_ref().is_some_and(CommandRun::is_put_off);
+        waits && !stop.as_ref().is_some_and(CommandRun::reached_the_wire)
+    }
+
     /// The drive answered a step of a begun command. The outcome, when the command is over.
     pub(super) fn answered(&mut self, urgency: Urgency, step: &Step, reply: Reply) -> Option<Outcome> {
         let run = self.runs.get_mut(slot(urgency)).and_then(Option::as_mut)?;
@@ -156,8 +167,14 @@ impl DriveState {
         if run.is_of_client() && run.reached_the_wire() {
             self.supervision.renew(now);
         }
-        if urgency == Urgency::Stop && outcome.is_ok() {
-            self.stopped = Some(now);
+        if urgency == Urgency::Stop && run.has_begun() {
+            // Stops without end must not make each other news.
+            self.stopped = outcome.is_ok().then(|| self.stopped.unwrap_or(now));
+        }
+        if urgency == Urgency::Stop
+            && let Some(overtaken) = self.run(Urgency::Command)
+        {
+            overtaken.overtaken();
         }
         if outcome.is_ok() {
             let (effects, receipts) = run.acknowledge(outcome, now);
@@ -174,7 +191,7 @@ impl DriveState {
             return;
         };
         run.sent(step);
-        if step.pdu.is_write() && !run.is_reference_only() {
+        if step.pdu.is_write() && urgency != Urgency::Stop && !run.is_reference_only() {
             self.stopped = None;
         }
         if run.is_of_client() {
@@ -182,7 +199,7 @@ impl DriveState {
         }
     }
 
-    /// Whether a stop was acknowledged after which no other command was sent.
+    /// Whether a stop was acknowledged after which no command was sent that is neither stop nor reference.
     pub(super) fn was_stopped(&self) -> bool {
         self.stopped.is_some()
     }

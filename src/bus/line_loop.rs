@@ -140,6 +140,34 @@ fn or_end_the_process<T>(work: impl FnOnce() -> T) -> T {
     })
 }
 
+/// The pauses between two tries to open the port: each twice as long as the one before. A port that goes again at once
+/// is opened ever less often.
+#[derive(Debug)]
+struct ReopenPauses {
+    next: Duration,
+}
+
+impl Default for ReopenPauses {
+    fn default() -> ReopenPauses {
+        ReopenPauses { next: REOPEN.0 }
+    }
+}
+
+impl ReopenPauses {
+    /// A port that was open for so long begins anew.
+    fn was_open_for(&mut self, time: Duration) {
+        if time >= REOPEN.1 {
+            self.next = REOPEN.0;
+        }
+    }
+
+    fn next(&mut self) -> Duration {
+        let pause = self.next;
+        self.next = (pause * 2).min(REOPEN.1);
+        pause
+    }
+}
+
 struct Worker {
     handle: BusHandle,
     options: BusOptions,
@@ -152,7 +180,7 @@ impl Worker {
         let handle = self.handle.clone();
         let mut core = BusCore::new(handle, &self.options, events, writes, before, Instant::now());
         line::sharpen_timers();
-        let mut pause = REOPEN.0;
+        let mut pauses = ReopenPauses::default();
         let mut names = Names::default();
         while !self.stopping() {
             let spec = &self.handle.image.spec;
@@ -165,10 +193,7 @@ impl Worker {
                     let opened = Instant::now();
                     core.opened(opened);
                     let why = self.serve(&mut core, &line);
-                    // A port that goes again at once is opened ever less often.
-                    if opened.elapsed() >= REOPEN.1 {
-                        pause = REOPEN.0;
-                    }
+                    pauses.was_open_for(opened.elapsed());
                     if let Err(lost) = why {
                         core.lost(&lost.to_string(), Instant::now());
                     }
@@ -177,8 +202,7 @@ impl Worker {
                 Err(_) if self.stopping() => {}
                 Err(error) => core.lost(&error.to_string(), Instant::now()),
             }
-            self.rest(pause);
-            pause = (pause * 2).min(REOPEN.1);
+            self.rest(pauses.next());
         }
         core.ended(Instant::now())
     }
@@ -260,5 +284,19 @@ mod tests {
         let mut same = Command::new(std::env::current_exe().unwrap());
         let ended = same.args([test, "--exact"]).env(DIES, "1").output().unwrap();
         assert_eq!(ended.status.signal(), Some(6), "{ended:?}");
+    }
+
+    #[test]
+    fn pauses_between_tries_to_open_the_port_double_from_a_tenth_of_a_second_to_three() {
+        let first = [100, 200, 400, 800, 1600, 3000].map(Duration::from_millis);
+        let next = |pauses: &mut ReopenPauses| first.map(|_| pauses.next());
+        let mut pauses = ReopenPauses::default();
+        assert_eq!(next(&mut pauses), first);
+        assert_eq!(next(&mut pauses), [REOPEN.1; 6]);
+        // It opens and goes again at once.
+        pauses.was_open_for(Duration::from_millis(2999));
+        assert_eq!(pauses.next(), REOPEN.1);
+        pauses.was_open_for(REOPEN.1);
+        assert_eq!(next(&mut pauses), first);
     }
 }

@@ -11,7 +11,7 @@ use super::schedule::{SLOW_SHARE, slow_share};
 use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
-use crate::document::format_duration;
+use crate::document::{Finding, format_duration};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
 
@@ -378,8 +378,8 @@ fn whole_milliseconds(seconds: f64) -> Duration {
 }
 
 impl Shortage {
-    /// What is missed and what to do, separated by `; `.
-    pub fn message(&self) -> String {
+    /// What is missed and what to do about it.
+    pub fn finding(&self) -> Finding {
         let milliseconds = |time: Duration| time.as_secs_f64() * 1e3;
         let mut cadences = Vec::new();
         let mut rounds = Vec::new();
@@ -400,7 +400,7 @@ impl Shortage {
             false => remedies.join(", or "),
         };
         let (cadences, rounds) = (cadences.join(" and "), rounds.join(", "));
-        format!("the line cannot carry {cadences}: {rounds}; {remedy}")
+        Finding::new(format!("the line cannot carry {cadences}: {rounds}"), remedy)
     }
 }
 

@@ -25,7 +25,7 @@ pub const COMMANDS_IN_A_ROW: u32 = 8;
 pub const SLOW_SHARE: f64 = 0.05;
 /// Share that they get at most, however much they ask for.
 const MOST_SLOW_SHARE: f64 = 1.0 / 3.0;
-/// Share that slow polls get while something was never read: what is not known yet is worth more than what is known.
+/// Share of what commands leave that slow polls get while something was never read: what is not known yet is worth more than what is known.
 const FIRST_SHARE: f64 = 0.5;
 
 /// Share of a saturated line that slow polls get, of which their cadence asks for `demand`: with many requests (one for
@@ -135,6 +135,8 @@ pub struct Schedule {
     turn: Turn,
     /// Until when the credit is reckoned.
     earned_until: Instant,
+    /// Time on the line that commands, and what they asked for, took since then.
+    commanded: Duration,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
     /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
     most_credit: Duration,
@@ -184,6 +186,7 @@ impl Schedule {
             slow_share: slow_share(demand),
             turn: Turn::Due,
             earned_until: now,
+            commanded: Duration::ZERO,
             most_credit: longest.mul_f64(MOST_CREDIT),
             probed: false,
             share: CommandShare::default(),
@@ -217,6 +220,15 @@ impl Schedule {
         }
     }
 
+    /// What comes next where `waiting` has its turn before `highest`, which also waits: a stop yields to a command, not to
+    /// the polls that the command has to wait for.
+    pub fn next_of(&mut self, now: Instant, waiting: Option<Urgency>, highest: Option<Urgency>) -> Decision {
+        match self.next(now, waiting) {
+            Decision::Poll(_) if self.turn != Turn::Asked => self.next(now, highest),
+            decision => decision,
+        }
+    }
+
     /// A fast round that was started by the last [`Schedule::next`], told once.
     pub fn take_round(&mut self) -> Option<RoundStart> {
         self.new_round.take()
@@ -229,6 +241,7 @@ impl Schedule {
 
     /// A command (or a step of one) was on the line for `took`.
     pub fn command_done(&mut self, urgency: Urgency, took: Duration) {
+        self.commanded += took;
         self.share.commanded(urgency, took);
     }
 
@@ -241,7 +254,10 @@ impl Schedule {
         }
         let turn = std::mem::replace(&mut self.turn, Turn::Due);
         match turn {
-            Turn::Asked => self.share.read(took),
+            Turn::Asked => {
+                self.commanded += took;
+                self.share.read(took);
+            }
             // Neither the least that slow polls have nor a drive that is away is at the cost of process data alone.
             Turn::OnCredit => self.share.polled(Duration::ZERO),
             Turn::Due if poll.probe => self.share.polled(Duration::ZERO),

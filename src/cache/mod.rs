@@ -23,29 +23,30 @@ use crate::codec::{LineFormat, Protocol};
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, Value};
 
 /// Whether a drive may be commanded.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Access {
     /// Every write is refused.
+    #[default]
     Monitor,
     /// Writes are passed on.
     Control,
 }
 
-/// What is done when nobody renews a drive's lease any more.
+/// What is done when a drive's lease runs out.
 #[derive(Debug, Clone, PartialEq)]
 pub enum LeaseAction {
     /// Stop the drive.
     Stop,
-    /// Only tell.
+    /// Only raise the event.
     Hold,
     /// Set the speed reference, percent.
     SpeedReference(f64),
 }
 
-/// Lease of a drive: a commanding client must be heard of within `timeout`.
+/// Lease of a drive, renewed by commands that reach the wire and by accepted heartbeats.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Supervision {
-    /// Time without any accepted write or heartbeat.
+    /// Time without renewal after which the lease runs out.
     pub timeout: Duration,
     /// What is done then, once.
     pub action: LeaseAction,
@@ -54,9 +55,10 @@ pub struct Supervision {
 }
 
 /// What is done with a drive when the gateway stops.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum OnShutdown {
     /// Nothing is written.
+    #[default]
     Hold,
     /// The stop is written and its acknowledgement awaited.
     Stop,

@@ -1,13 +1,13 @@
 //! Lists of addresses on the command line.
 
-/// Addresses of drives, ascending, none twice.
+/// Addresses of drives, ascending, without duplicates.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Addresses(pub(super) Vec<u8>);
 
 pub(super) fn parse_addresses(text: &str) -> Result<Addresses, String> {
     let bad = || {
         format!(
-            "`{text}` is no list of addresses; write numbers from 1 to 247, with N2 from 1 to 255, such as 1-10 or 1,2,7"
+            "`{text}` is not a list of addresses; write numbers from 1 to 247, with N2 from 1 to 255, such as 1-10 or 1,2,7"
         )
     };
     let number = |word: &str| word.trim().parse::<u8>().ok().filter(|n| *n >= 1).ok_or_else(bad);

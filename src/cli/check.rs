@@ -15,7 +15,7 @@ use crate::document::Problem;
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
-/// Nothing is opened but the files the configuration names. Errors and warnings go to stderr, with --json to
+/// Opens only the files that the configuration names. Errors and warnings go to stderr, with --json to
 /// stdout with all the rest.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -86,7 +86,7 @@ fn json(loaded: &Loaded) -> String {
         warnings: &loaded.warnings,
         buses: buses.map(bus_report).collect(),
     };
-    // Only maps with keys that are no strings fail, and there is none.
+    // Only maps with keys that are not strings fail, and there are none.
     serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
 }
 
@@ -153,7 +153,7 @@ fn bus_text(bus: &BusSettings) -> String {
         "Bus {}: {}{}, {}, {}, silence {:.2} ms\n\n",
         spec.name,
         spec.port,
-        if there { "" } else { " (not there now)" },
+        if there { "" } else { " (not present)" },
         spec.protocol.name(),
         spec.format,
         milliseconds(spec.protocol.silence(bus.options.silence, &spec.format)),
@@ -189,7 +189,7 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
             milliseconds(achieved),
             milliseconds(wanted)
         ),
-        None => format!("  {name} cycle  none, there is nothing to read\n"),
+        None => format!("  {name} cycle  none, nothing to read\n"),
     };
     let wanted = match prediction.demand {
         demand if demand > 1.0 => format!(" (the cadences ask for {:.0} %)", demand * 100.0),
@@ -201,14 +201,14 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         + &shutdown(bus)
 }
 
-/// How long the stops take that the gateway writes at its end; nothing where it writes none.
+/// Duration of the stops at shutdown; empty where there are none.
 fn shutdown(bus: &BusSettings) -> String {
     let time = bus.shutdown_time();
     if time.drives == 0 {
         return String::new();
     }
     format!(
-        "  shutdown    {} in {:.2} s, {:.2} s where none answers\n",
+        "  shutdown    {} in {:.2} s, {:.2} s if none answers\n",
         counted(time.drives, "drive stopped", "drives stopped"),
         time.answered.as_secs_f64(),
         time.unanswered.as_secs_f64()

@@ -1,4 +1,4 @@
-//! A client of a running gateway's HTTP server, for commands that show what it does.
+//! A client of a running gateway's HTTP server, for commands that show its state.
 
 use std::collections::VecDeque;
 use std::fmt;
@@ -17,14 +17,14 @@ use tokio::time::timeout;
 
 /// Time for the connection and the head of the reply.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
-/// A stream that says nothing for this long is dead: the gateway sends a comment every 10 s.
+/// A stream that is silent for this long is dead: the gateway sends a comment every 10 s.
 const SILENCE: Duration = Duration::from_secs(35);
-/// Longest reply that is no stream, longest line of a stream.
+/// Longest reply that is not a stream, longest line of a stream.
 const MOST_BYTES: usize = 1 << 20;
-/// Longest document: some thousand drives with all their points.
+/// Largest document: some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;
 
-/// Where a gateway's HTTP server is: `http://host:port`, with a path where a proxy has put it below one.
+/// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Url {
     /// An IPv6 address without its brackets.
@@ -42,12 +42,14 @@ impl FromStr for Url {
         let uri: Uri = text.parse().map_err(|why| format!("{why}; {form}"))?;
         match uri.scheme_str() {
             Some("http") => {}
-            Some("https") => return Err("https:// is not spoken here; reach the gateway itself by http://".to_string()),
+            Some("https") => {
+                return Err("https:// is not supported; connect to the gateway itself with http://".to_string());
+            }
             _ => return Err(format!("http:// is missing; {form}")),
         }
         let authority = uri.authority().map(ToString::to_string).unwrap_or_default();
         if authority.contains('@') || uri.query().is_some() {
-            return Err(format!("user, password and query have no place here; {form}"));
+            return Err(format!("user, password and query are not supported; {form}"));
         }
         let host = uri.host().unwrap_or_default();
         Ok(Url {
@@ -65,38 +67,38 @@ impl fmt::Display for Url {
     }
 }
 
-/// Why nothing comes from a gateway; the texts say what, where and what to do.
+/// Why a gateway sent nothing; the messages say what, where and what to do.
 #[derive(Debug, thiserror::Error)]
 pub(super) enum ClientError {
-    /// Nobody listens there, or the way is barred.
+    /// Nothing listens there, or the connection is blocked.
     #[error(
-        "cannot reach the gateway: {1}; {0}; start it with an [http] section, or name its `listen` address by --url"
+        "cannot reach the gateway: {1}; {0}; start it with an [http] section, or pass its `listen` address with --url"
     )]
     Unreachable(Url, String),
-    /// The gateway says why not.
+    /// The gateway refused, with a reason.
     #[error("{error}; {url}; {remedy}")]
     Refused {
         /// The gateway.
         url: Url,
-        /// Its words.
+        /// Its message.
         error: String,
-        /// What to do, as far as it tells.
+        /// What to do.
         remedy: String,
     },
-    /// Somebody answers, but not so.
+    /// The reply is not that of a gateway.
     #[error("{1}; {0}; check that this is the address of drivegate's [http] section")]
     Strange(Url, String),
-    /// The stream is over, though nobody here ended it.
+    /// The stream ended early.
     #[error(
-        "the gateway has ended the stream{1}; {0}; it was stopped, or a reload took the bus away: start it and try again"
+        "the gateway ended the stream{1}; {0}; it was stopped, or a reload removed the bus: start it and try again"
     )]
     Ended(Url, String),
-    /// Neither news nor signs of life.
-    #[error("the gateway has fallen silent; {0}; check the gateway and the network, then try again")]
+    /// Nothing was received for too long.
+    #[error("the gateway stopped responding; {0}; check the gateway and the network, then try again")]
     Silent(Url),
 }
 
-/// What the gateway answers to what it cannot do.
+/// The body of an error reply.
 #[derive(Debug, Deserialize)]
 struct Problem {
     error: String,
@@ -123,12 +125,12 @@ pub(super) struct EventStream {
 }
 
 impl EventStream {
-    /// Asks for a stream; `path` begins with a slash.
+    /// Requests a stream; `path` begins with a slash.
     ///
     /// # Errors
-    /// When the gateway cannot be reached, refuses, or is none.
+    /// When the gateway cannot be reached, refuses, or is not a gateway.
     pub(super) async fn open(url: &Url, path: &str) -> Result<EventStream, ClientError> {
-        let late = || ClientError::Unreachable(url.clone(), "it does not answer within 10 s".to_string());
+        let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
         let (wire, response) = timeout(OPEN_TIMEOUT, ask(url, path)).await.map_err(|_| late())??;
         let kind = response.headers().get(header::CONTENT_TYPE);
         let is_stream = kind.is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"));
@@ -147,7 +149,7 @@ impl EventStream {
             .map_err(|_| late())?)
     }
 
-    /// The next event. May be dropped before it is ready; nothing is lost by that.
+    /// The next event. Cancel safe.
     ///
     /// # Errors
     /// When the stream is over.
@@ -185,7 +187,7 @@ impl EventStream {
         }
     }
 
-    /// What the reply that is no stream says.
+    /// The error in a reply that is not a stream.
     async fn refusal(mut self, status: StatusCode) -> ClientError {
         let mut text = Vec::new();
         while let Some(Ok(bytes)) = self.chunk().await {
@@ -198,23 +200,23 @@ impl EventStream {
         match serde_json::from_slice::<Problem>(&text) {
             Ok(Problem { error, known }) => ClientError::Refused {
                 remedy: match known.as_slice() {
-                    [] => "try again when that has changed".to_string(),
-                    known => format!("there is {}", known.join(", ")),
+                    [] => "try again later".to_string(),
+                    known => format!("known: {}", known.join(", ")),
                 },
                 url,
                 error,
             },
-            Err(_) => ClientError::Strange(url, format!("the server answers `{status}` and no stream")),
+            Err(_) => ClientError::Strange(url, format!("the server answered `{status}` without a stream")),
         }
     }
 }
 
-/// Asks for a document; `path` begins with a slash.
+/// Requests a document; `path` begins with a slash.
 ///
 /// # Errors
-/// When the gateway cannot be reached, refuses, or is none.
+/// When the gateway cannot be reached, refuses, or is not a gateway.
 pub(super) async fn get_json(url: &Url, path: &str) -> Result<serde_json::Value, ClientError> {
-    let late = || ClientError::Unreachable(url.clone(), "it does not answer within 10 s".to_string());
+    let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
     let whole = async {
         let (wire, response) = ask(url, path).await?;
         let status = response.status();
@@ -232,11 +234,11 @@ pub(super) async fn get_json(url: &Url, path: &str) -> Result<serde_json::Value,
             let chunk = chunk.map_err(|error| ClientError::Ended(url.clone(), format!(" ({error})")))?;
             text.extend_from_slice(&chunk);
             if text.len() > MOST_DOCUMENT {
-                return Err(ClientError::Strange(url.clone(), "a reply without end".to_string()));
+                return Err(ClientError::Strange(url.clone(), "the reply is too long".to_string()));
             }
         }
         serde_json::from_slice(&text)
-            .map_err(|error| ClientError::Strange(url.clone(), format!("the reply is no JSON ({error})")))
+            .map_err(|error| ClientError::Strange(url.clone(), format!("the reply is not JSON ({error})")))
     };
     timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
 }
@@ -246,7 +248,7 @@ async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), Client
     let socket = TcpStream::connect((url.host.as_str(), url.port))
         .await
         .map_err(|error| unreachable(error.to_string()))?;
-    let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("no HTTP reply ({error})"));
+    let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("not an HTTP reply ({error})"));
     let (mut sender, connection) = http1::handshake(TokioIo::new(socket)).await.map_err(strange)?;
     let mut wire = Wire(Some(Box::pin(connection)));
     let request = Request::get(format!("{}{path}", url.path))
@@ -258,7 +260,7 @@ async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), Client
     Ok((wire, response))
 }
 
-/// The connection, which moves only while somebody waits for something of it.
+/// The connection, which is polled only while a reply or event is awaited.
 struct Wire(Option<Pin<Box<Connected>>>);
 
 type Connected = Connection<TokioIo<TcpStream>, String>;
@@ -273,7 +275,7 @@ impl Wire {
     async fn with<T>(&mut self, wanted: impl Future<Output = T>) -> T {
         let mut wanted = std::pin::pin!(wanted);
         poll_fn(|cx| {
-            // How a connection ends is told by what was wanted of it.
+            // How the connection ended shows in the result of the awaited future.
             if self.0.as_mut().is_some_and(|wire| wire.as_mut().poll(cx).is_ready()) {
                 self.0 = None;
             }
@@ -283,7 +285,7 @@ impl Wire {
     }
 }
 
-/// Events out of the bytes of a stream.
+/// Parses the bytes of a stream into events.
 #[derive(Debug, Default)]
 struct Parser {
     line: Vec<u8>,
@@ -302,7 +304,7 @@ impl Parser {
                 self.line.push(byte);
             }
             if self.line.len() + self.data.len() > MOST_BYTES {
-                return Err("an event without end".to_string());
+                return Err("an event is too long".to_string());
             }
         }
         Ok(())
@@ -353,9 +355,9 @@ mod tests {
         for (bad, why) in [
             ("127.0.0.1:9488", "http:// is missing"),
             ("gateway", "http:// is missing"),
-            ("https://gateway", "https:// is not spoken"),
-            ("http://me:secret@gateway", "no place here"),
-            ("http://gateway/?a=b", "no place here"),
+            ("https://gateway", "https:// is not supported"),
+            ("http://me:secret@gateway", "not supported"),
+            ("http://gateway/?a=b", "not supported"),
             ("http://", "write it as"),
             ("", "write it as"),
         ] {

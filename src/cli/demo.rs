@@ -23,7 +23,7 @@ pub(super) struct Args {
     /// True wire times, or as fast as the programs are
     #[arg(long, value_enum, default_value_t = Speed::Real)]
     pub speed: Speed,
-    /// What to log beside the demo's own words: off, error, warn, info, debug, trace, also for each target
+    /// Log level: off, error, warn, info, debug, trace, also for each target
     #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
     pub log: String,
 }
@@ -101,7 +101,7 @@ const LINES: [DemoLine; 5] = [
     },
 ];
 
-/// The ports that the demo takes when they are free.
+/// Preferred ports.
 const MQTT: u16 = 1883;
 const MODBUS_TCP: u16 = 1502;
 const HTTP: u16 = 9488;
@@ -124,11 +124,11 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 async fn demo(args: &Args) -> Result<(), String> {
-    let lines = start_lines(args.speed).map_err(|e| format!("cannot make a simulated line: {e}"))?;
+    let lines = start_lines(args.speed).map_err(|e| format!("cannot create a simulated line: {e}"))?;
     let ports: Vec<String> = lines.iter().map(|line| line.address()).collect();
     let cancel = CancellationToken::new();
     let mut started = start(&ports, &cancel).await;
-    // Another program may take a port between the look at it and its use.
+    // Another program may take a port between the check and its use.
     for _ in 0..4 {
         if started.is_err() {
             started = start(&ports, &cancel).await;
@@ -137,13 +137,13 @@ async fn demo(args: &Args) -> Result<(), String> {
     let (daemon, broker, sides) = started?;
     for (what, address, wanted) in sides.each() {
         if address.port() != wanted {
-            println!("Port {wanted} is taken; {what} listens on {} instead.", address.port());
+            println!("Port {wanted} is in use; {what} listens on {} instead.", address.port());
         }
     }
     println!("{}", welcome(&ports, &sides));
-    // Without a handler for Ctrl-C the process ends all the same.
+    // Without a handler Ctrl-C ends the process anyway.
     let _ = tokio::signal::ctrl_c().await;
-    println!("\nThe demo ends.");
+    println!("\nStopping the demo.");
     daemon.stop().await;
     cancel.cancel();
     broker.stop().await;
@@ -151,7 +151,7 @@ async fn demo(args: &Args) -> Result<(), String> {
     Ok(())
 }
 
-/// Where the three north sides are reached.
+/// Addresses of the three north sides.
 struct Sides {
     mqtt: SocketAddr,
     modbus: SocketAddr,
@@ -159,7 +159,7 @@ struct Sides {
 }
 
 impl Sides {
-    /// Name, address and the port that was wanted.
+    /// Name, address and preferred port.
     fn each(&self) -> [(&'static str, SocketAddr, u16); 3] {
         [
             ("MQTT broker", self.mqtt, MQTT),
@@ -181,7 +181,7 @@ async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, 
         http: free_port("HTTP", HTTP)?,
     };
     let loaded = Settings::parse("demo.toml", &configuration(ports, &sides), std::iter::empty());
-    // Its warnings are known: a baud beyond the family's list and a cadence beyond the line are part of the show.
+    // Its warnings are expected: a baud beyond the family's list and a cadence beyond the line are part of the demo.
     report::errors(&loaded.errors);
     let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
     let daemon = Daemon::start(settings).await.map_err(|e| e.to_string())?;
@@ -221,7 +221,7 @@ fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
     LINES.iter().map(start).collect()
 }
 
-/// The wanted port on loopback, or the next free one.
+/// The preferred port on loopback, or the next free one.
 fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     for port in wanted..wanted.saturating_add(100) {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
@@ -237,7 +237,8 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
 
 fn configuration(ports: &[String], sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
-    let mut text = "[gateway]\nname = \"demo\"\n".to_string();
+    // The demo has no configuration file, which `read` and `write` would need to find its drives.
+    let mut text = "[gateway]\nname = \"demo\"\nsocket = \"\"\n".to_string();
     let mut unit = 0;
     for (line, port) in LINES.iter().zip(ports) {
         let DemoLine { name, baud, format, .. } = line;
@@ -288,8 +289,8 @@ fn welcome(ports: &[String], sides: &Sides) -> String {
         "\
 drivegate {version} demo: simulated drives of every family and protocol, true wire timing, no hardware.
 {lines}
-The drives start, stop, ramp and now and then fault by themselves until you command them.
-mbpoll and the mosquitto clients below are programs of others: apt install mbpoll mosquitto-clients
+The drives start, stop, ramp and occasionally fault on their own until you command them.
+mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosquitto-clients
 
 Look
   http://{http}/                       status page in a browser

@@ -21,38 +21,38 @@ use crate::config::{LogFormat, LogSettings};
 const AUDIT: &str = "audit";
 const AUDIT_LINES: Level = Level::INFO;
 
-/// Lines that wait for a slow reader of the log; what comes beyond is lost, and counted.
+/// Lines buffered for a slow reader of the log; further ones are dropped and counted.
 const WAITING: usize = 8192;
 
-/// The log of a running program; what still waits is written when it is dropped.
+/// The log of a running program; buffered lines are written when it is dropped.
 #[derive(Debug)]
 pub(super) struct LogHandle {
     filter: reload::Handle<EnvFilter, Registry>,
     lost: ErrorCounter,
-    told: AtomicUsize,
+    reported: AtomicUsize,
     _writer: WorkerGuard,
 }
 
 impl LogHandle {
-    /// Takes a new level; a format change needs a restart.
+    /// Sets the level; a format change needs a restart.
     pub(super) fn set_level(&self, level: &str) {
         if let Err(error) = self.filter.reload(filter(level)) {
-            tracing::error!("the log level stays as it is: {error}");
+            tracing::error!("cannot set the log level, keeping the current one: {error}");
         }
     }
 
-    /// Tells how many lines were lost since it was told last, if any.
-    pub(super) fn tell_lost(&self) {
+    /// Reports how many lines were dropped since the last report, if any.
+    pub(super) fn report_lost(&self) {
         let lost = self.lost.dropped_lines();
-        let more = lost.saturating_sub(self.told.swap(lost, Ordering::Relaxed));
+        let more = lost.saturating_sub(self.reported.swap(lost, Ordering::Relaxed));
         if more > 0 {
-            tracing::warn!("{more} lines of the log were lost: who reads it is too slow, or has stopped");
+            tracing::warn!("dropped {more} log lines: the reader of the log is too slow or has stopped");
         }
     }
 }
 
-/// Starts logging to standard error, by a thread of its own: a reader that stalls (a full pipe, a hanging collector) must
-/// not hold up a stop.
+/// Starts logging to standard error, on a thread of its own: a reader that stalls (a full pipe, a hanging collector) must
+/// not delay a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
     let (writer, guard) = NonBlockingBuilder::default()
         .buffered_lines_limit(WAITING)
@@ -63,12 +63,12 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
     LogHandle {
         filter: subscribe(settings, BoxMakeWriter::new(writer)),
         lost,
-        told: AtomicUsize::new(0),
+        reported: AtomicUsize::new(0),
         _writer: guard,
     }
 }
 
-/// Starts logging for a command that does one thing: in the order of what it prints itself.
+/// Starts logging for a one-shot command: synchronously, so that log lines and output keep their order.
 pub(super) fn start_in_order(settings: &LogSettings) {
     subscribe(settings, BoxMakeWriter::new(std::io::stderr));
 }
@@ -100,10 +100,9 @@ fn subscribe(settings: &LogSettings, writer: BoxMakeWriter) -> reload::Handle<En
     handle
 }
 
-/// What a checked `level` lets through. Whoever wants less to read still has a record of every command: only `off`, of
-/// everything or of the audit itself, ends that.
+/// The filter of a valid `level`. Audit lines pass at any level but `off`, of everything or of the audit itself.
 fn filter(level: &str) -> EnvFilter {
-    // The last of its kind counts, as in the filter itself.
+    // The last one of a target wins, as in the filter itself.
     let last = |wanted: Option<&str>| {
         let mut parts = level.split(',').map(|part| match part.split_once('=') {
             Some((target, level)) => (Some(target), level),

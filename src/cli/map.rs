@@ -33,7 +33,7 @@ pub(super) struct Args {
     /// JSON: listeners, units and registers
     #[arg(long, conflicts_with = "csv")]
     json: bool,
-    /// Only what the listener at this address shows
+    /// Only the units of the listener at this address
     #[arg(long, value_name = "ADDRESS")]
     listener: Option<SocketAddr>,
 }
@@ -69,7 +69,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
     match plant(&settings) {
         Ok(plant) => report::print(&render(&plant, &listeners, shown.as_deref(), format)),
         Err(why) => {
-            report::error(&format!("cannot lay out the map: {why}; map; free file descriptors"));
+            report::error(&format!("cannot build the map: {why}; map; free file descriptors"));
             ExitCode::from(EXIT_FAILED)
         }
     }
@@ -82,7 +82,7 @@ fn unknown_listener(address: SocketAddr, listeners: &[Listener]) -> ExitCode {
         .map(ToString::to_string)
         .collect();
     let remedy = match known.as_slice() {
-        [] => "write [modbus_tcp] into the configuration".to_string(),
+        [] => "add [modbus_tcp] to the configuration".to_string(),
         known => format!("write one of {}", known.join(", ")),
     };
     report::error(&format!("nothing listens on {address}; --listener; {remedy}"));

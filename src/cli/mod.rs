@@ -7,9 +7,9 @@ mod addresses;
 mod check;
 mod client;
 mod demo;
+mod drive_access;
 mod log;
 mod map;
-mod oneshot;
 mod profiles;
 mod read;
 mod report;
@@ -26,13 +26,13 @@ use std::process::ExitCode;
 
 use clap::Parser;
 
-/// Exit code of what failed while working.
+/// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
 /// Exit code of a wrong command line, the same as clap's.
 pub const EXIT_USAGE: u8 = 2;
 /// Exit code of a bad configuration (sysexits EX_CONFIG).
 pub const EXIT_CONFIG: u8 = 78;
-/// The configuration when none is named.
+/// Default path of the configuration.
 pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
 
 /// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
@@ -40,7 +40,7 @@ pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
 #[command(name = "drivegate", version, max_term_width = 100)]
 #[command(
     after_help = "Example:\n  drivegate check --config /etc/drivegate/drivegate.toml\n\n\
-    Exit codes: 0 done, 1 failed while working, 2 wrong command line, 78 bad configuration."
+    Exit codes: 0 success, 1 failure, 2 wrong command line, 78 invalid configuration."
 )]
 struct Cli {
     #[command(subcommand)]
@@ -83,14 +83,23 @@ commands! {
 /// The option that names the configuration.
 #[derive(Debug, clap::Args)]
 struct ConfigFile {
-    /// The configuration.
+    /// Configuration file.
     #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG)]
     path: PathBuf,
 }
 
-/// Reads the command line, does what it says and returns the exit code.
+/// Runs the command of the command line and returns its exit code.
 pub fn main() -> ExitCode {
     Cli::parse().command.run()
+}
+
+/// The runtime of a command that has one thing to do.
+fn runtime() -> Result<tokio::runtime::Runtime, String> {
+    let built = tokio::runtime::Builder::new_multi_thread()
+        .worker_threads(1)
+        .enable_all()
+        .build();
+    built.map_err(|why| format!("cannot start: {why}; the runtime; free memory, threads or file descriptors"))
 }
 
 /// Runs `command` on a runtime of its own.

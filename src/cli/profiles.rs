@@ -12,7 +12,7 @@ use crate::document::{Problem, format_duration};
 use crate::drive::profile::{AddressRange, Form, Profiles};
 use crate::drive::{Bound, Derived, Point, Profile, Source};
 
-/// What a point, a fault text or a place without a manual behind it is marked with.
+/// Mark of a point, fault text or address that no manual confirms.
 const NOT_VERIFIED: &str = "not verified";
 
 /// Lists the profiles, or shows the points of one.
@@ -24,23 +24,23 @@ const NOT_VERIFIED: &str = "not verified";
 pub(super) struct Args {
     #[command(subcommand)]
     what: Option<What>,
-    /// Take the profile_dirs of this configuration too.
+    /// Include the profile_dirs of this configuration.
     #[arg(long, value_name = "FILE", global = true)]
     config: Option<PathBuf>,
-    /// Take the profiles (*.toml) of this directory too; may be repeated.
+    /// Include the profiles (*.toml) of this directory; may be repeated.
     #[arg(long, value_name = "DIR", global = true)]
     profile_dir: Vec<PathBuf>,
 }
 
 #[derive(Debug, clap::Subcommand)]
 enum What {
-    /// Shows where the points of a profile lie, how they are scaled and what is known of them.
+    /// Shows the addresses, scales and notes of a profile's points.
     #[command(after_help = "Examples:\n  drivegate profiles show vacon-nx\n  \
             drivegate profiles show vacon-nx --toml > /etc/drivegate/profiles/our-nx.toml")]
     Show {
         /// Name of the profile.
         name: String,
-        /// Print the file of the profile, to make one's own of it.
+        /// Print the file of the profile, as a template for your own.
         #[arg(long)]
         toml: bool,
     },
@@ -70,12 +70,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Some(profile) if *toml => report::print(&profile.text),
         Some(profile) => report::print(&show(profile)),
         None => {
-            report::errors(&[Problem {
-                file: "command line".to_string(),
-                line: None,
-                key: "NAME".to_string(),
-                message: unknown_profile(name, &profiles, false),
-            }]);
+            let unknown = unknown_profile(name, &profiles, false);
+            report::errors(&[Problem::of_file("command line", "NAME", unknown)]);
             ExitCode::from(EXIT_USAGE)
         }
     }
@@ -136,7 +132,7 @@ fn show(profile: &Profile) -> String {
         (
             "confirmation",
             format!(
-                "within {} of the acknowledgement, or an event tells",
+                "within {} of the acknowledgement, or an event `not_confirmed`",
                 format_duration(profile.confirm_within)
             ),
         ),
@@ -213,7 +209,7 @@ fn points(profile: &Profile) -> String {
     report::lines(&table)
 }
 
-/// What else is to be said of a point: where its commands go, how they are written, its texts, its note.
+/// Notes on a point: where its commands go, how they are written, its texts, its note.
 fn remarks(profile: &Profile, point: &Point) -> String {
     let mut parts = Vec::new();
     if let Some(target) = point.write_to {
@@ -248,7 +244,7 @@ fn access(point: &Point) -> &'static str {
     }
 }
 
-/// Where a point lies, the form of its raw value, and the engineering value of one count.
+/// Address of a point, form of its raw value, and engineering value of one count.
 fn place(profile: &Profile, point: &Point) -> (String, String, String) {
     match &point.source {
         Source::Raw(raw) => {
@@ -288,7 +284,7 @@ fn place(profile: &Profile, point: &Point) -> (String, String, String) {
     }
 }
 
-/// How a derived point is made, for people.
+/// How a derived point is computed, for people.
 fn derivation(profile: &Profile, derived: &Derived) -> String {
     let bound = |bound: &Bound| match bound {
         Bound::Point(point) => name_of(profile, *point).to_string(),

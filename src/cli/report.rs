@@ -1,13 +1,14 @@
-//! What commands print. A reader that closes the pipe early ends the output, not the program.
+//! What commands print. A pipe that is closed early ends the output without an error.
 
 use std::io::{self, Write};
 use std::process::ExitCode;
+use std::time::Duration;
 
 use comfy_table::{ContentArrangement, Table, TableComponent, presets};
 
 use super::EXIT_FAILED;
 use crate::config::Loaded;
-use crate::document::Problem;
+use crate::document::{Finding, Problem, parse_duration};
 
 /// Prints `text` to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
@@ -17,16 +18,26 @@ pub(super) fn print(text: &str) -> ExitCode {
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(why) => {
             error(&format!(
-                "cannot write the output: {why}; stdout; give it a place that can take it"
+                "cannot write the output: {why}; stdout; free space, or redirect it"
             ));
             ExitCode::from(EXIT_FAILED)
         }
     }
 }
 
+/// A duration of the command line.
+pub(super) fn duration(text: &str) -> Result<Duration, Finding> {
+    Ok(parse_duration(text)?)
+}
+
 /// Prints `error: what; where; what to do` to stderr.
 pub(super) fn error(message: &str) {
     line("error", message);
+}
+
+/// Prints a note to stderr.
+pub(super) fn note(message: &str) {
+    line("note", message);
 }
 
 /// Prints errors to stderr.
@@ -45,7 +56,7 @@ pub(super) fn problems(loaded: &Loaded) {
 }
 
 fn line(kind: &str, message: &str) {
-    // There is nowhere left to tell that stderr is gone.
+    // With stderr gone there is nowhere left to report that.
     let _ = writeln!(io::stderr().lock(), "{kind}: {message}");
 }
 

@@ -74,7 +74,7 @@ async fn until_stopped(mut daemon: Daemon, path: &Path, log: &LogHandle) -> std:
             _ = interrupt.recv() => break,
             _ = hang_up.recv() => reload(&mut daemon, path, log).await,
             _ = feed.tick() => {
-                log.tell_lost();
+                log.report_lost();
                 if daemon.is_moving() && watchdog.is_some() {
                     notify(&[NotifyState::Watchdog]);
                 }
@@ -84,7 +84,7 @@ async fn until_stopped(mut daemon: Daemon, path: &Path, log: &LogHandle) -> std:
     Ok(daemon)
 }
 
-/// A bad new file changes nothing and says why.
+/// Reloads the configuration; an invalid one is rejected and changes nothing.
 async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
     let mut states = vec![NotifyState::Reloading];
     states.extend(NotifyState::monotonic_usec_now());
@@ -97,12 +97,12 @@ async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
         tracing::warn!("{problem}");
     }
     match loaded.settings {
-        None => tracing::error!("the new configuration is not taken; everything runs on as before"),
+        None => tracing::error!("reload rejected; keeping the current configuration"),
         Some(settings) => {
             log.set_level(&settings.log.level);
             match daemon.reload(settings).await {
-                Ok(()) => tracing::info!(config = %path.display(), "the new configuration is taken"),
-                Err(error) => tracing::error!("the new configuration is not taken: {error}"),
+                Ok(()) => tracing::info!(config = %path.display(), "configuration reloaded"),
+                Err(error) => tracing::error!("reload rejected: {error}; keeping the current configuration"),
             }
         }
     }
@@ -111,6 +111,6 @@ async fn reload(daemon: &mut Daemon, path: &Path, log: &LogHandle) {
 
 fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
-        tracing::debug!("systemd was not told: {error}");
+        tracing::debug!("cannot notify systemd: {error}");
     }
 }

@@ -1,4 +1,4 @@
-//! `drivegate scan`: finds the drives of a line and prints a configuration for them. Reads only.
+//! `drivegate scan`: finds the drives of a line and prints a configuration for them. Only reads.
 
 mod progress;
 mod snippet;
@@ -18,23 +18,23 @@ use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 use crate::config;
-use crate::document::parse_duration;
-use crate::drive::identify::{self, Probe};
+use crate::document::Finding;
 use crate::drive::profile::Profiles;
+use crate::drive::{Probe, identify};
 use crate::line::{Line, Rs485};
 
-/// Bauds that are tried when none is named; the drives of the built-in profiles leave the works with one of them.
+/// Bauds tried by default: the factory settings of the drives of the built-in profiles.
 const USUAL_BAUDS: [u32; 3] = [9600, 19_200, 38_400];
 /// All bauds of the built-in profiles and those of faster devices.
 const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400, 1200, 600, 300];
 
-/// Finds the drives of a line and prints a configuration for them; reads only.
+/// Finds the drives of a line and prints a configuration for them; only reads.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate scan --port /dev/ttyUSB0
   drivegate scan --port /dev/ttyUSB0 --protocol modbus-rtu --baud all --format 8N1,8E1 --addresses 1-31
 
-The settings with which a drive answered are the line's: others are not tried any more, unless --exhaustive.
+Once a drive has answered, no other settings are tried, unless --exhaustive.
 The configuration goes to standard output, everything else to standard error.")]
 pub(super) struct Args {
     /// Serial device, or tcp://host:port of a device server.
@@ -43,37 +43,37 @@ pub(super) struct Args {
     /// Protocols: modbus-rtu, modbus-ascii, n2, or all.
     #[arg(long, value_name = "LIST", default_value = "all", value_delimiter = ',')]
     protocol: Vec<String>,
-    /// Bits a second, or all; without it the usual ones.
+    /// Bits a second, or all [default: the usual ones].
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     baud: Vec<String>,
-    /// Data bits, parity and stop bits, or all; without it the usual ones of the protocol.
+    /// Data bits, parity and stop bits, or all [default: the usual ones of the protocol].
     #[arg(long, value_name = "LIST", value_delimiter = ',')]
     format: Vec<String>,
-    /// Addresses that are tried; N2 has them to 255.
+    /// Addresses to try; N2 has addresses up to 255.
     #[arg(long, value_name = "LIST", default_value = "1-247", value_parser = super::addresses::parse_addresses)]
     addresses: super::addresses::Addresses,
-    /// Time for the first byte of a reply; without it that of the protocol.
-    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    /// Time for the first byte of a reply [default: that of the protocol].
+    #[arg(long, value_name = "TIME", value_parser = report::duration)]
     timeout: Option<Duration>,
     /// Tries for each address.
     #[arg(long, value_name = "COUNT", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=10))]
     tries: u32,
-    /// Try all settings, also behind those with which a drive answered.
+    /// Go on with other settings after a drive has answered.
     #[arg(long)]
     exhaustive: bool,
-    /// Take the profiles (*.toml) of this directory too; may be repeated.
+    /// Include the profiles (*.toml) of this directory; may be repeated.
     #[arg(long, value_name = "DIR")]
     profile_dir: Vec<PathBuf>,
 }
 
-/// One way to speak on the line.
+/// Protocol and format of the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 struct Setting {
     protocol: Protocol,
     format: LineFormat,
 }
 
-/// Settings that are tried, in their order.
+/// The settings to try, in order.
 fn settings(args: &Args) -> Result<Vec<Setting>, String> {
     let protocols = protocols(&args.protocol)?;
     let mut settings: Vec<Setting> = Vec::new();
@@ -91,7 +91,7 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
     check_addresses(args, &settings)?;
     if settings.is_empty() {
         return Err(
-            "no protocol goes with these bauds and formats; --baud, --format; N2 is 9600 8N1 always, Modbus \
+            "no protocol supports these bauds and formats; --baud, --format; N2 is always 9600 8N1, Modbus \
                     RTU has 8 data bits"
                 .to_string(),
         );
@@ -99,12 +99,12 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
     Ok(settings)
 }
 
-/// The port as a configuration takes it, seen from here.
-fn parse_port(text: &str) -> Result<String, String> {
+/// The port as in a configuration, relative to the working directory.
+fn parse_port(text: &str) -> Result<String, Finding> {
     config::check_port(text, Path::new(""))
 }
 
-/// An address that no protocol of the search has cannot be meant.
+/// Refuses addresses that no protocol of the scan has.
 fn check_addresses(args: &Args, settings: &[Setting]) -> Result<(), String> {
     let has = |setting: &Setting, address: &u8| config::addresses(setting.protocol).contains(address);
     let nowhere = |address: &&u8| !settings.iter().any(|setting| has(setting, address));
@@ -120,7 +120,7 @@ fn check_addresses(args: &Args, settings: &[Setting]) -> Result<(), String> {
         .map(|(name, most)| format!("{name} has 1 to {most}"))
         .collect();
     Err(format!(
-        "no drive has address {address}; --addresses; {}",
+        "no drive can have address {address}; --addresses; {}",
         known.join(", ")
     ))
 }
@@ -153,12 +153,12 @@ fn bauds(protocol: Protocol, wanted: &[String]) -> Result<Vec<u32>, String> {
     }
     let one = |text: &String| {
         let baud = text.parse::<u32>().ok().filter(|baud| (300..=4_000_000).contains(baud));
-        baud.ok_or_else(|| format!("`{text}` is no baud; --baud; write 300 to 4000000, or all"))
+        baud.ok_or_else(|| format!("`{text}` is not a baud rate; --baud; write 300 to 4000000, or all"))
     };
     wanted.iter().map(one).collect()
 }
 
-/// The usual formats: what the drives of the reference have by their works, then with parity.
+/// The usual formats: the factory settings of the drives, then those with parity.
 fn formats(protocol: Protocol, wanted: &[String]) -> Vec<String> {
     let named = |texts: &[&str]| texts.iter().map(ToString::to_string).collect();
     match protocol {
@@ -198,10 +198,10 @@ pub(super) fn run(args: &Args) -> ExitCode {
     };
     let outcome = scan.all(&settings);
     scan.progress.end();
-    scan.tell(outcome)
+    scan.finish(outcome)
 }
 
-/// The addresses that are tried with that setting.
+/// The addresses to try with that setting.
 fn addresses(args: &Args, setting: Setting) -> impl Iterator<Item = u8> {
     let allowed = config::addresses(setting.protocol);
     args.addresses
@@ -211,10 +211,10 @@ fn addresses(args: &Args, setting: Setting) -> impl Iterator<Item = u8> {
         .filter(move |address| allowed.contains(address))
 }
 
-/// Ctrl-C ends the search; what was found is printed all the same.
+/// Ctrl-C ends the scan; what was found is still printed.
 fn stop_on_signal(stop: Arc<AtomicBool>) {
     std::thread::spawn(move || {
-        let Ok(runtime) = super::read::runtime() else { return };
+        let Ok(runtime) = super::runtime() else { return };
         // Without a handler Ctrl-C ends the process, which is harmless: nothing was written.
         if runtime.block_on(tokio::signal::ctrl_c()).is_ok() {
             stop.store(true, Ordering::Relaxed);
@@ -226,7 +226,7 @@ struct Scan<'a> {
     args: &'a Args,
     profiles: Profiles,
     found: Vec<Found>,
-    /// Settings and addresses at which something came that is no frame.
+    /// Settings and addresses that were answered with invalid frames.
     garbage: Vec<(Setting, u8)>,
     progress: Progress,
     stop: Arc<AtomicBool>,
@@ -263,21 +263,21 @@ impl Scan<'_> {
             self.progress.step();
             if answered {
                 let found = self.look_closer(&mut prober, setting, address)?;
-                self.progress.say(&format!("found {at}: {}", found.title()));
+                self.progress.print_line(&format!("found {at}: {}", found.title()));
                 self.found.push(found);
             }
         }
         Ok(())
     }
 
-    /// Whether a drive answers, with whatever.
+    /// Whether a drive answers.
     fn tries(&mut self, prober: &mut Prober<'_>, hello: &Request, setting: Setting) -> Result<bool, String> {
         for _ in 0..self.args.tries {
             match self.ask(prober, hello)? {
                 Ended::Reply(_) => return Ok(true),
                 Ended::Silent => {}
                 Ended::Corrupt(_) => {
-                    // Once more: noise does not come twice.
+                    // Once more: it may have been noise.
                     if matches!(self.ask(prober, hello)?, Ended::Reply(_)) {
                         return Ok(true);
                     }
@@ -324,7 +324,7 @@ impl Scan<'_> {
         })
     }
 
-    fn tell(&self, outcome: Result<(), String>) -> ExitCode {
+    fn finish(&self, outcome: Result<(), String>) -> ExitCode {
         let printed = if self.found.is_empty() {
             ExitCode::from(EXIT_FAILED)
         } else {
@@ -336,8 +336,8 @@ impl Scan<'_> {
         }
         if let Some((setting, address)) = self.garbage.first() {
             eprintln!(
-                "note: something that is no frame came {} times, first at {} {}, address {address}: another baud, \
-                 format or protocol, or two drives with one address",
+                "note: received invalid frames {} times, first at {} {}, address {address}: the line may have another baud, \
+                 format or protocol, or two drives the same address",
                 self.garbage.len(),
                 setting.protocol.name(),
                 setting.format
@@ -345,7 +345,7 @@ impl Scan<'_> {
         }
         if self.found.is_empty() {
             report::error(&format!(
-                "no drive has answered; {}; check power, wiring (swap - and +) and termination, and try --baud all \
+                "no drive answered; {}; check power, wiring (swap - and +) and termination, and try --baud all \
                  --format all",
                 self.args.port
             ));
@@ -387,7 +387,7 @@ mod tests {
         Ok(parsed.map_err(|e| e.to_string())?.args)
     }
 
-    fn told(words: &str) -> Result<Vec<String>, String> {
+    fn settings_of(words: &str) -> Result<Vec<String>, String> {
         let args = args(words)?;
         let one = |s: &Setting| format!("{} {}", s.protocol.name(), s.format);
         Ok(settings(&args)?.iter().map(one).collect())
@@ -395,23 +395,23 @@ mod tests {
 
     #[test]
     fn what_is_tried() {
-        let usual = told("").unwrap();
+        let usual = settings_of("").unwrap();
         assert_eq!(usual.first().unwrap(), "modbus-rtu 9600 8N1");
         assert_eq!(usual.last().unwrap(), "n2 9600 8N1");
         assert_eq!(usual.len(), 3 * 2 + 3 * 2 + 1);
-        assert_eq!(told("--protocol n2").unwrap(), ["n2 9600 8N1"]);
+        assert_eq!(settings_of("--protocol n2").unwrap(), ["n2 9600 8N1"]);
         assert_eq!(
-            told("--protocol modbus-ascii --baud 19200 --format 7O1,8N1").unwrap(),
+            settings_of("--protocol modbus-ascii --baud 19200 --format 7O1,8N1").unwrap(),
             ["modbus-ascii 19200 7O1", "modbus-ascii 19200 8N1"]
         );
         assert!(
-            told("--protocol modbus-rtu --format all")
+            settings_of("--protocol modbus-rtu --format all")
                 .unwrap()
                 .iter()
                 .all(|s| s.contains(" 8"))
         );
         assert_eq!(
-            told("--baud all --format 8N1 --protocol all").unwrap().len(),
+            settings_of("--baud all --format 8N1 --protocol all").unwrap().len(),
             10 + 10 + 1
         );
     }
@@ -429,7 +429,7 @@ mod tests {
             let wanted: Vec<u8> = (246..=most).collect();
             assert_eq!(addresses(&args, *setting).collect::<Vec<_>>(), wanted, "{protocol:?}");
         }
-        assert!(told("--protocol n2 --addresses 1-255").is_ok());
+        assert!(settings_of("--protocol n2 --addresses 1-255").is_ok());
     }
 
     #[test]
@@ -445,7 +445,7 @@ mod tests {
             ("--protocol modbus-rtu --addresses 250", "modbus-rtu has 1 to 247"),
             (
                 "--protocol modbus-rtu,modbus-ascii --addresses 1-255",
-                "no drive has address 248; --addresses; modbus-ascii has 1 to 247, modbus-rtu has 1 to 247",
+                "no drive can have address 248; --addresses; modbus-ascii has 1 to 247, modbus-rtu has 1 to 247",
             ),
             ("--port tcp://foo", "write \"tcp://host:port\""),
             (
@@ -458,7 +458,7 @@ mod tests {
             ),
             ("--tries 0", "tries"),
         ] {
-            let error = told(words).unwrap_err();
+            let error = settings_of(words).unwrap_err();
             assert!(error.contains(wanted), "{words}: {error}");
         }
     }

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use super::report;
-use crate::config::schema::schema;
+use crate::config::schema;
 
 /// Prints the JSON Schema (draft 2020-12) of the configuration, for editors and tools.
 #[derive(Debug, clap::Args)]

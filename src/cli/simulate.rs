@@ -7,7 +7,7 @@ use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::cache::DriveSpec;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
-use crate::document::{nearest, parse_duration};
+use crate::document::nearest;
 use crate::drive::profile::{Profile, Profiles};
 use crate::sim::cx::AddressOffset;
 use crate::sim::drive::{DriveOptions, ModelOptions};
@@ -36,7 +36,7 @@ pub(super) struct Args {
     /// Simulate every bus of a gateway configuration, each under its own `port`
     #[arg(long, value_name = "FILE", conflicts_with_all = ["profile", "addresses", "link", "port", "listen", "protocol", "baud", "format"])]
     pub config: Option<PathBuf>,
-    /// What the drives are
+    /// Profile of the drives
     #[arg(long, value_name = "PROFILE", default_value = "vacon-nx")]
     pub profile: String,
     /// Their addresses, such as 1-10 or 1,2,7
@@ -45,46 +45,46 @@ pub(super) struct Args {
     /// Symbolic link to the pseudo-terminal; removed at the end
     #[arg(long, value_name = "PATH", conflicts_with_all = ["port", "listen"])]
     pub link: Option<PathBuf>,
-    /// A real serial port on whose line the drives are to sit
+    /// Real serial port to simulate the drives on
     #[arg(long, value_name = "DEVICE", conflicts_with = "listen")]
     pub port: Option<PathBuf>,
     /// Serve the line raw over TCP, as a serial device server does
     #[arg(long, value_name = "HOST:PORT", value_parser = parse_listen)]
     pub listen: Option<SocketAddr>,
-    /// modbus-rtu, modbus-ascii or n2 [default: what the profile names first]
+    /// modbus-rtu, modbus-ascii or n2 [default: the first of the profile]
     #[arg(long, value_name = "PROTOCOL", value_parser = parse_protocol)]
     pub protocol: Option<Protocol>,
-    /// Bits a second [default: 38400, or the next lower that the drives have]
+    /// Bits a second [default: 38400, or the next lower rate that the drives support]
     #[arg(long, value_name = "BAUD", value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
     pub baud: Option<u32>,
     /// Data bits, parity and stop bits [default: 8N1, with modbus-ascii 7N2]
     #[arg(long, value_name = "FORMAT")]
     pub format: Option<String>,
-    /// Time between the end of a request and the reply [default: what the drive's manual tells, else 0.5ms]
-    #[arg(long, value_name = "TIME", value_parser = parse_duration)]
+    /// Time between the end of a request and the reply [default: that of the drive's manual, else 0.5ms]
+    #[arg(long, value_name = "TIME", value_parser = report::duration)]
     pub turnaround: Option<Duration>,
     /// Faults and their probabilities, such as drop=0.01,corrupt=0.02
     #[arg(long, value_name = "LIST", default_value = "")]
     pub fault: Rates,
-    /// Fixes which request meets which fault, and what the drives do by themselves
+    /// Seed of the faults and of what the drives do on their own
     #[arg(long, value_name = "NUMBER", default_value_t = 1)]
     pub seed: u64,
-    /// Let the drives start, stop and fault by themselves until a master writes to them
+    /// Let the drives start, stop and fault on their own until a master writes to them
     #[arg(long)]
     pub autopilot: bool,
-    /// Answer Modbus RTU requests that come without 3.5 characters of silence too
+    /// Also answer Modbus RTU requests that are not preceded by 3.5 characters of silence
     #[arg(long)]
     pub lenient: bool,
-    /// Put a byte, the object's status, before the values that are read over N2, as some devices do
+    /// Send a status byte before the values read over N2, as some devices do
     #[arg(long)]
     pub n2_leading_byte: bool,
-    /// Add 1 to the addresses of tables of each Vacon CX, as boards may that count from 1: holding=1,discrete-input=1
+    /// Add an offset to the addresses of each Vacon CX, as boards that count from 1 do: holding=1,discrete-input=1
     #[arg(long, value_name = "LIST")]
     pub cx_address_offset: Option<AddressOffset>,
-    /// Let each TECO 7300PA answer a request with a wrong check code by error 00H, as its error table says, not by silence
+    /// Let each TECO 7300PA answer a request with a wrong check code with error 00H, as in its error table, instead of not at all
     #[arg(long)]
     pub teco_answer_check_error: bool,
-    /// Characters that reach the master at once: 0 the whole reply, 14 as a UART's FIFO, 1 one by one
+    /// Characters delivered to the master at once: 0 the whole reply, 14 like a UART's FIFO, 1 one by one
     #[arg(long, value_name = "CHARACTERS", default_value_t = 0)]
     pub chunk: u8,
     /// True wire times, or as fast as the programs are
@@ -92,7 +92,7 @@ pub(super) struct Args {
     pub speed: Speed,
 }
 
-/// Baud rate of a line where nobody asks for another, if the drives have it.
+/// Default baud rate, if the drives support it.
 const USUAL_BAUD: u32 = 38_400;
 
 /// `nx, svx, hvx 1998; cx 9999; ...`
@@ -113,7 +113,7 @@ fn trip_registers() -> String {
 
 fn parse_protocol(text: &str) -> Result<Protocol, String> {
     let known: Vec<&str> = Protocol::ALL.iter().map(|protocol| protocol.name()).collect();
-    Protocol::from_name(text).ok_or_else(|| format!("`{text}` is no protocol; write {}", known.join(", ")))
+    Protocol::from_name(text).ok_or_else(|| format!("unknown protocol `{text}`; write {}", known.join(", ")))
 }
 
 /// The simulated drive that a profile names.
@@ -133,7 +133,7 @@ pub(super) enum Speed {
 /// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
 ///
 /// # Errors
-/// A `tcp://` address that cannot be listened on by its text.
+/// A `tcp://` address that is not an address to listen on.
 fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
     let Some(address) = port.strip_prefix("tcp://") else {
         return Ok(EndpointOptions::Pty {
@@ -142,7 +142,7 @@ fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
     };
     socket_address(address)
         .map(|listen| EndpointOptions::Tcp { listen })
-        .ok_or_else(|| format!("`{port}` is no address to listen on; write it as tcp://127.0.0.1:4001"))
+        .ok_or_else(|| format!("`{port}` is not an address to listen on; write it as tcp://127.0.0.1:4001"))
 }
 
 fn socket_address(text: &str) -> Option<SocketAddr> {
@@ -151,7 +151,7 @@ fn socket_address(text: &str) -> Option<SocketAddr> {
 
 fn parse_listen(text: &str) -> Result<SocketAddr, String> {
     socket_address(text)
-        .ok_or_else(|| format!("`{text}` is no address to listen on; write host:port, such as 127.0.0.1:4001"))
+        .ok_or_else(|| format!("`{text}` is not an address to listen on; write host:port, such as 127.0.0.1:4001"))
 }
 
 /// The simulated lines of a configuration file, each in the place of its bus's port.
@@ -223,9 +223,9 @@ impl Args {
         let profile = profiles.get(&self.profile).ok_or_else(|| {
             let near = nearest(&self.profile, profiles.names()).map(|name| format!("; did you mean `{name}`?"));
             let known: Vec<&str> = profiles.names().collect();
-            let known = format!("; there are {}", known.join(", "));
+            let known = format!("; known profiles: {}", known.join(", "));
             format!(
-                "`{}` is no profile; in --profile{}",
+                "unknown profile `{}`; in --profile{}",
                 self.profile,
                 near.unwrap_or(known)
             )
@@ -238,7 +238,7 @@ impl Args {
         })?;
         if self.cx_address_offset.is_some() && !matches!(model, ModelOptions::Cx(_)) {
             return Err(format!(
-                "drives of the profile `{}` have no address offset; in --cx-address-offset; leave it away, or choose \
+                "drives of the profile `{}` have no address offset; in --cx-address-offset; omit it, or choose \
                  vacon-cx in --profile",
                 self.profile
             ));
@@ -273,7 +273,7 @@ impl Args {
         Ok(line)
     }
 
-    /// What the drives speak: as asked, or the first that the profile names.
+    /// Protocol of the drives: as requested, or the first of the profile.
     fn protocol_of(&self, profile: &Profile, profiles: &Profiles) -> Result<Protocol, String> {
         let spoken: Vec<&str> = profile.protocols.iter().map(|protocol| protocol.name()).collect();
         match (self.protocol, profile.protocols.first()) {
@@ -294,10 +294,10 @@ impl Args {
         }
     }
 
-    /// What the other options say about any line.
+    /// Applies the options that concern every line.
     fn applied_to(&self, mut line: SimulatedBusOptions) -> SimulatedBusOptions {
         line.faults = FaultPlan::new(self.fault.clone(), self.seed);
-        // What is asked for holds for all drives, their own time or not.
+        // An explicit time applies to all drives.
         let turnaround = match self.speed {
             Speed::Max => Some(Duration::ZERO),
             Speed::Real => self.turnaround,

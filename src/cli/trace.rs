@@ -17,7 +17,7 @@ use super::client::{EventStream, Url};
 use super::{EXIT_FAILED, report};
 use crate::cache::Direction;
 
-/// The capture is on disk after this time.
+/// Interval at which the capture is flushed.
 const FLUSH: Duration = Duration::from_secs(1);
 
 /// Shows the frames on the lines of a running gateway, with times, gaps and meaning.
@@ -29,18 +29,18 @@ const FLUSH: Duration = Duration::from_secs(1);
     drivegate trace --bus line1 --count 1000 --pcap line1.pcap\n\n\
     The capture has the link type RTAC Serial (250). Wireshark shows Modbus after Analyze, Decode As,\n\
     field \"RTAC Serial Data Subdissector\", current \"Modbus RTU\"; tshark by -d rtacser.data,mbrtu\n\n\
-    Exit codes: 0 after Ctrl-C, --count or a closed pipe, 1 when no frames can be had (any more).")]
+    Exit codes: 0 after Ctrl-C, --count or a closed pipe, 1 when the gateway sends no frames (any more).")]
 pub(super) struct Args {
     /// The gateway's HTTP server.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
     url: Url,
-    /// Only this bus; else all of them.
+    /// Only this bus [default: all].
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
-    /// Write the frames to this file too, for Wireshark; it is made anew.
+    /// Write the frames to this file too, for Wireshark; an existing one is overwritten.
     #[arg(long, value_name = "FILE")]
     pcap: Option<PathBuf>,
-    /// End after so many frames.
+    /// Stop after this many frames.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
 }
@@ -57,9 +57,9 @@ pub(super) fn run(args: &Args) -> ExitCode {
     })
 }
 
-/// Shows frames until Ctrl-C, until there were enough, or until nobody reads them.
+/// Shows frames until Ctrl-C, until `--count` is reached, or until the output is closed.
 async fn trace(args: &Args) -> Result<(), String> {
-    let signals = |error: io::Error| format!("cannot hear Ctrl-C: {error}; the system; free file descriptors");
+    let signals = |error: io::Error| format!("cannot handle signals: {error}; the system; free file descriptors");
     let mut interrupt = signal(SignalKind::interrupt()).map_err(signals)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(signals)?;
     let path = match &args.bus {
@@ -100,14 +100,14 @@ async fn trace(args: &Args) -> Result<(), String> {
     ended.and(closed)
 }
 
-/// Whether there is to be more.
+/// Whether to go on.
 #[derive(Debug, PartialEq, Eq)]
 enum More {
     Yes,
     No,
 }
 
-/// A frame as the gateway tells it.
+/// A frame as the gateway sends it.
 #[derive(Debug, Deserialize)]
 struct Frame {
     bus: String,
@@ -172,9 +172,7 @@ impl View {
 
     fn frame(&mut self, data: &str) -> Result<More, String> {
         let frame: Frame = serde_json::from_str(data).map_err(|error| {
-            format!(
-                "the gateway tells a frame that is not understood ({error}); {data}; use the same version on both sides"
-            )
+            format!("cannot parse a frame of the gateway ({error}); {data}; use the same version on both sides")
         })?;
         self.keep(&frame)?;
         if self.print(&line(&frame, self.with_bus, self.colours))? == More::No {
@@ -196,7 +194,7 @@ impl View {
                 .lost(SystemTime::now())
                 .map_err(|error| unwritable(path, &error))?;
         }
-        let text = format!("--- {lost} frames are missing here: they came faster than they were read");
+        let text = format!("--- {lost} frames dropped: they arrived faster than they were read");
         self.print(&paint(&text, YELLOW, self.colours))
     }
 
@@ -208,20 +206,20 @@ impl View {
         let bus = self.captured_bus.get_or_insert_with(|| frame.bus.clone());
         if *bus != frame.bus {
             return Err(format!(
-                "a capture holds one line, and frames of {bus} and {} come; {}; name one by --bus",
+                "a capture holds one bus, but frames of {bus} and {} arrived; {}; choose one with --bus",
                 frame.bus,
                 path.display()
             ));
         }
         let strange = || {
             format!(
-                "a frame is not understood; {}; use the same version on both sides",
+                "cannot parse a frame; {}; use the same version on both sides",
                 frame.time
             )
         };
         let time = humantime::parse_rfc3339_weak(&frame.time).map_err(|_| strange())?;
         let bytes = bytes(&frame.hex).ok_or_else(strange)?;
-        // Silence is no packet.
+        // A timeout has no bytes.
         if bytes.is_empty() {
             return Ok(());
         }
@@ -230,14 +228,14 @@ impl View {
             .map_err(|error| unwritable(path, &error))
     }
 
-    /// Prints a line; a reader that went away wants no more.
+    /// Prints a line; a closed output ends the command.
     fn print(&mut self, line: &str) -> Result<More, String> {
         let mut stdout = io::stdout().lock();
         match writeln!(stdout, "{line}").and_then(|()| stdout.flush()) {
             Ok(()) => Ok(More::Yes),
             Err(error) if error.kind() == io::ErrorKind::BrokenPipe => Ok(More::No),
             Err(error) => Err(format!(
-                "cannot write the output: {error}; stdout; give it a place that can take it"
+                "cannot write the output: {error}; stdout; free space, or redirect it"
             )),
         }
     }
@@ -249,12 +247,12 @@ impl View {
         }
     }
 
-    /// Closes the capture and says what is in it.
+    /// Closes the capture and reports its size.
     fn close(mut self) -> Result<(), String> {
         self.flush()?;
         if let Some((path, capture)) = &self.capture {
-            let text = format!("{} frames are in {}", capture.packets(), path.display());
-            // Nothing depends on it.
+            let text = format!("{} frames written to {}", capture.packets(), path.display());
+            // Failing to print this is harmless.
             let _ = writeln!(io::stderr().lock(), "{text}");
         }
         Ok(())
@@ -317,7 +315,7 @@ fn line(frame: &Frame, with_bus: bool, colours: bool) -> String {
     text.join(" ").trim_end().to_string()
 }
 
-/// Without what could command a terminal.
+/// Replaces control characters, which could command a terminal.
 fn plain(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }

@@ -10,19 +10,19 @@ use tokio::signal::unix::{SignalKind, signal};
 use super::client::{Url, get_json};
 use super::{EXIT_FAILED, report};
 
-/// Pause between two looks.
+/// Refresh interval.
 const PAUSE: Duration = Duration::from_millis(500);
 
 /// Shows the drives and lines of a running gateway, live.
 ///
-/// On a terminal the table is renewed twice a second until Ctrl-C; else it is printed once.
+/// On a terminal the table refreshes twice a second until Ctrl-C; otherwise it is printed once.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  drivegate watch\n  drivegate watch --url http://10.0.0.5:9488 --once")]
 pub(super) struct Args {
     /// The gateway's HTTP server.
     #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
     url: Url,
-    /// Print the table once and end.
+    /// Print the table once and exit.
     #[arg(long)]
     once: bool,
 }
@@ -44,7 +44,7 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
     if !live {
         return Ok(report::print(&page(&args.url).await?));
     }
-    let signals = |error: io::Error| format!("cannot hear Ctrl-C: {error}; the system; free file descriptors");
+    let signals = |error: io::Error| format!("cannot handle signals: {error}; the system; free file descriptors");
     let mut interrupt = signal(SignalKind::interrupt()).map_err(signals)?;
     let mut terminate = signal(SignalKind::terminate()).map_err(signals)?;
     let mut tick = tokio::time::interval(PAUSE);
@@ -54,13 +54,13 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
             _ = terminate.recv() => return Ok(ExitCode::SUCCESS),
             _ = tick.tick() => {}
         }
-        // A gateway that restarts is waited for.
+        // Survive a restart of the gateway.
         let text = match page(&args.url).await {
             Ok(text) => text,
             Err(why) => format!("{why}\n\ntrying again\n"),
         };
         let mut stdout = io::stdout().lock();
-        // From the top, each line cleared behind its end, the rest of the screen below.
+        // Redraws from the top, clearing the rest of each line and of the screen.
         let text = text.replace('\n', "\x1b[K\r\n");
         if write!(stdout, "\x1b[H{text}\x1b[J")
             .and_then(|()| stdout.flush())
@@ -134,7 +134,7 @@ fn table(drives: &Value) -> String {
     for drive in drives.as_array().into_iter().flatten() {
         let good = |name: &str, digits: usize| {
             let point = at(drive, &format!("/points/{name}"));
-            // What is not good is not shown as a figure.
+            // Only good values are shown.
             if at(point, "/quality") == "good" {
                 fixed(at(point, "/value"), digits)
             } else {
@@ -158,7 +158,7 @@ fn table(drives: &Value) -> String {
     report::lines(&table)
 }
 
-/// What stands there, or nothing.
+/// The value there, or null.
 fn at<'v>(value: &'v Value, pointer: &str) -> &'v Value {
     value.pointer(pointer).unwrap_or(&Value::Null)
 }

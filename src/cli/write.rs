@@ -2,31 +2,28 @@
 
 use std::process::ExitCode;
 
-use super::oneshot::alone::Alone;
-use super::oneshot::remote::{Failure, Remote, refusal};
-use super::oneshot::{Target, reason, shown, target};
-use super::read::{quiet, runtime};
+use super::drive_access::{Target, Way, target};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
-use crate::codec::Exception;
-use crate::command::{Refusal, sets_twice};
+use crate::cache::value_or_null;
 use crate::drive::model::Kind;
-use crate::drive::{Point, Profile, Source, Value};
+use crate::drive::{Point, Value};
+use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
 
-/// Commands a drive once, through the running gateway or alone.
+/// Commands a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate write --config drivegate.toml pump-1 speed_reference=50 run=true
   drivegate write --config drivegate.toml pump-1 run=false
   drivegate write --config drivegate.toml pump-1 fault_reset=true
 
-Several points are one command, in the order that is safe. The drive must have access = \"control\"; limits hold.
-Nobody supervises what a command without a gateway has started.")]
+Several points are sent as one command, in a safe order. The drive must have access = \"control\"; limits hold.
+Without a gateway nothing supervises a motor that the command has started.")]
 pub(super) struct Args {
     #[command(flatten)]
     config: super::ConfigFile,
-    /// The drive.
+    /// Name of the drive.
     drive: String,
-    /// What is set.
+    /// What to set.
     #[arg(required = true, value_name = "POINT=VALUE")]
     values: Vec<String>,
 }
@@ -36,15 +33,16 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(target) => target,
         Err(code) => return code,
     };
-    let values: Result<Vec<(usize, Value)>, String> = args.values.iter().map(|text| parse(&target, text)).collect();
-    let values = match values {
-        Ok(values) => values,
+    let settings: Result<Vec<(Setting, String)>, String> =
+        args.values.iter().map(|text| parse(&target, text)).collect();
+    let settings = match settings {
+        Ok(settings) => settings,
         Err(message) => {
             report::error(&message);
             return ExitCode::from(EXIT_USAGE);
         }
     };
-    match command(&target, values) {
+    match command(&target, settings) {
         Ok(text) => report::print(&text),
         Err(message) => {
             report::error(&message);
@@ -53,23 +51,37 @@ pub(super) fn run(args: &Args) -> ExitCode {
     }
 }
 
-/// `speed_reference=50`, `run=true`, `mode=auto`.
-fn parse(target: &Target, text: &str) -> Result<(usize, Value), String> {
-    let (name, value) = text
-        .split_once('=')
-        .ok_or_else(|| format!("`{text}` sets nothing; command line; write POINT=VALUE, such as speed_reference=50"))?;
+/// `speed_reference=50`, `run=true`, `mode=auto`: what is set, and how it is shown.
+fn parse(target: &Target, text: &str) -> Result<(Setting, String), String> {
+    let (name, text) = text.split_once('=').ok_or_else(|| {
+        format!("expected POINT=VALUE, got `{text}`; command line; write for example speed_reference=50")
+    })?;
     let index = target.point(name.trim())?;
     let point = target.spec.profile.points.get(index);
     let point = point.ok_or_else(|| format!("there is no point `{name}`; command line; name another"))?;
-    Ok((index, value_of(point, value.trim())?))
+    let value = value_of(point, text.trim())?;
+    let meaning = point
+        .text_of(value)
+        .map(|meaning| format!(" ({meaning})"))
+        .unwrap_or_default();
+    let shown = format!("{}={value}{meaning} {}", point.name, point.unit);
+    // The text of an enumeration is left to the gateway: its profile says which code that is.
+    let is_meaning = point.kind() != Kind::Bool && point.texts.values().any(|meaning| meaning == text.trim());
+    let setting = Setting {
+        point: point.name.clone(),
+        value: if is_meaning {
+            text.trim().into()
+        } else {
+            value_or_null(Some(value))
+        },
+    };
+    Ok((setting, shown.trim_end().to_string()))
 }
 
 fn value_of(point: &Point, text: &str) -> Result<Value, String> {
     let bad = |wanted: &str| {
-        format!(
-            "`{text}` is no value for `{}`; command line; write {wanted}",
-            point.name
-        )
+        let name = &point.name;
+        format!("`{text}` is not a value of `{name}`; command line; write {wanted}")
     };
     let meaning = point.texts.iter().find(|(_, meaning)| meaning.as_str() == text);
     match (point.kind(), text.to_ascii_lowercase().as_str()) {
@@ -85,87 +97,32 @@ fn value_of(point: &Point, text: &str) -> Result<Value, String> {
     }
 }
 
-fn command(target: &Target, values: Vec<(usize, Value)>) -> Result<String, String> {
-    let what = described(target, &values);
-    if let Some(refusal) = contradiction(&target.spec.profile, &values) {
-        return Err(format!("{what}: {refusal} ({})", refusal.code()));
+fn command(target: &Target, settings: Vec<(Setting, String)>) -> Result<String, String> {
+    let (points, shown): (Vec<Setting>, Vec<String>) = settings.into_iter().unzip();
+    let what = format!("{} {}", target.spec.name, shown.join(" "));
+    let request = Request::Write(WriteRequest {
+        drive: target.spec.name.clone(),
+        expect: Some(target.expected()),
+        points,
+    });
+    match target.ask(&request)? {
+        (Outcome::Write(write), way) if write.ok => Ok(acknowledged(&what, &write, way)),
+        (Outcome::Write(write), _) => Err(format!("{what}: {} ({})", write.message, write.result)),
+        (other, _) => Err(other.not_asked_for()),
     }
-    if let Some(mut remote) = Remote::find(target)? {
-        return match remote.write(&target.spec, &values) {
-            Ok(()) => Ok(format!(
-                "{what}: acknowledged, through the gateway at {}\n",
-                remote.address()
-            )),
-            Err(Failure::Told(why)) => Err(why),
-            Err(Failure::Refused { code, partly }) => Err(refused(target, &remote, &what, code, partly)),
-        };
-    }
-    quiet();
-    runtime()?.block_on(async {
-        let alone = Alone::start(target).await?;
-        let (answer, confirmed) = alone.write(values).await;
-        alone.stop().await;
-        if !answer.outcome.is_ok() {
-            return Err(format!("{what}: {} ({})", answer.outcome, answer.outcome.code()));
-        }
-        let seen = match confirmed {
-            Some(after) => format!("seen {:.0} ms after it was given", after.as_secs_f64() * 1000.0),
-            None => "no read has shown it yet".to_string(),
-        };
-        let latency = answer.latency.as_secs_f64() * 1000.0;
-        Ok(format!("{what}: acknowledged within {latency:.0} ms, {seen}\n"))
-    })
 }
 
-/// Why the command cannot be meant, whichever way it would go: two values for one point of the drive.
-fn contradiction(profile: &Profile, values: &[(usize, Value)]) -> Option<Refusal> {
-    let mut set = Vec::with_capacity(values.len());
-    for (index, _) in values {
-        let index = written_to(profile, *index);
-        if set.contains(&index) {
-            return profile.points.get(index).map(|point| sets_twice(&point.name));
-        }
-        set.push(index);
-    }
-    None
-}
-
-/// The point that takes what is written to this one.
-fn written_to(profile: &Profile, index: usize) -> usize {
-    let next = |index: usize| {
-        let point = profile.points.get(index)?;
-        let base = match &point.source {
-            Source::Derived(derived) => derived.band().map(|(of, ..)| of),
-            Source::Raw(_) => None,
-        };
-        point.write_to.or(base).filter(|next| *next != index)
+fn acknowledged(what: &str, write: &WriteOutcome, way: Way) -> String {
+    let confirmed = match write.confirmed_ms {
+        Some(after) => format!("confirmed after {after:.0} ms"),
+        None => "not confirmed by a read".to_string(),
     };
-    // A profile has no circles, and no way is longer than its points.
-    let ways = std::iter::successors(Some(index), |index| next(*index));
-    ways.take(profile.points.len()).last().unwrap_or(index)
-}
-
-/// What to tell of a command that the gateway has refused: its own words where they can be had, else what the exception
-/// mostly means.
-fn refused(target: &Target, remote: &Remote, what: &str, code: Exception, partly: bool) -> String {
-    let why = reason::exact(target, remote).unwrap_or_else(|| format!("the gateway refused it with {}", refusal(code)));
-    let rest = if partly {
-        "; other values of this command were written before"
-    } else {
-        ""
+    let way = match way {
+        Way::Gateway => ", through the gateway",
+        Way::Direct => "",
     };
-    format!("{what}: {why}; through the gateway at {}{rest}", remote.address())
-}
-
-fn described(target: &Target, values: &[(usize, Value)]) -> String {
-    let one = |(index, value): &(usize, Value)| {
-        let point = target.spec.profile.points.get(*index)?;
-        Some(
-            format!("{}={} {}", point.name, shown(point, *value), point.unit)
-                .trim_end()
-                .to_string(),
-        )
-    };
-    let all: Vec<String> = values.iter().filter_map(one).collect();
-    format!("{} {}", target.spec.name, all.join(" "))
+    format!(
+        "{what}: acknowledged after {:.0} ms, {confirmed}{way}\n",
+        write.latency_ms
+    )
 }

@@ -82,7 +82,7 @@ impl Protocol {
     pub const ALL: [Protocol; 3] = [Protocol::ModbusRtu, Protocol::ModbusAscii, Protocol::N2];
 
     /// The name in configuration and output.
-    pub fn name(self) -> &'static str {
+    pub const fn name(self) -> &'static str {
         match self {
             Protocol::ModbusRtu => "modbus-rtu",
             Protocol::ModbusAscii => "modbus-ascii",

@@ -108,9 +108,10 @@ impl fmt::Display for LineFormat {
 }
 
 /// Silence that the master keeps before each request.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Silence {
     /// 3.5 characters, 1.75 ms above 19200 baud.
+    #[default]
     Spec,
     /// 3.5 characters at any baud.
     Chars,

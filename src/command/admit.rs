@@ -85,7 +85,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         let value = checked(drive, index, point, value)?;
         let asked = index;
         let (index, value) = resolve(drive, index, point, value)?;
-        kin(drive, asked, index, value)?;
+        related_limits(drive, asked, index, value)?;
         if resolved.iter().any(|(other, _)| *other == index) {
             return Err(sets_twice(profile.points.get(index).map_or("", |p| p.name.as_str())));
         }
@@ -148,7 +148,7 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
 
 /// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other
 /// way round. `asked` was checked itself.
-fn kin(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
+fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
     let points = &drive.spec.profile.points;
     let taken_by = |point: usize| points.get(point).and_then(|p| p.write_to).unwrap_or(point);
     for (other, point) in points.iter().enumerate() {
@@ -328,7 +328,7 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
         match raw.decode(&words, Kind::Number) {
             Some(value) => {
                 let value = checked(drive, index, point, value)?;
-                kin(drive, index, index, value)?;
+                related_limits(drive, index, index, value)?;
             }
             None => {
                 return Err(Refusal::BadValue(format!(

@@ -38,17 +38,20 @@ pub enum SourceKind {
     Supervision,
     /// The gateway stops.
     Shutdown,
+    /// `drivegate write` through the socket of the gateway.
+    LocalSocket,
     /// `drivegate write`, without a gateway.
     CommandLine,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 5] = [
+    pub const ALL: [SourceKind; 6] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Supervision,
         SourceKind::Shutdown,
+        SourceKind::LocalSocket,
         SourceKind::CommandLine,
     ];
 
@@ -59,6 +62,7 @@ impl SourceKind {
             SourceKind::Mqtt => "mqtt",
             SourceKind::Supervision => "supervision",
             SourceKind::Shutdown => "shutdown",
+            SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
         }
     }

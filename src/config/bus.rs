@@ -1,44 +1,21 @@
 //! `[[bus]]`: the line and its drives.
 
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::drive::{self, Surroundings};
+use super::keys::BUS;
 use super::{BusSettings, values};
 use crate::bus::BusOptions;
 use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
-use crate::document::{Place, Reader, format_duration};
+use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
 use crate::line::Rs485;
 
-/// Words of `rs485`.
-pub(super) const RS485: [(&str, Rs485); 3] = [
-    ("off", Rs485::Off),
-    ("kernel", Rs485::Kernel),
-    ("kernel-inverted", Rs485::KernelInverted),
-];
-/// Bits a second that a line can have.
-pub(super) const BAUDS: RangeInclusive<u32> = 300..=4_000_000;
-/// Tries after the first.
-pub(super) const RETRIES: RangeInclusive<u32> = 0..=10;
-/// Times that a cadence or a timeout can be.
-pub(super) const TIMES: RangeInclusive<Duration> = Duration::from_millis(1)..=Duration::from_secs(3600);
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);
-
-pub(super) const DEFAULT_PROTOCOL: Protocol = Protocol::ModbusRtu;
-pub(super) const DEFAULT_BAUD: u32 = 9600;
-/// Of Modbus RTU and N2.
-pub(super) const DEFAULT_FORMAT: &str = "8N1";
-/// Of Modbus ASCII: what TECO's card has with all switches off (drives.md 2).
-pub(super) const DEFAULT_ASCII_FORMAT: &str = "7N2";
-pub(super) const DEFAULT_CYCLE: Duration = Duration::from_millis(10);
-pub(super) const DEFAULT_SLOW_CYCLE: Duration = Duration::from_secs(1);
-pub(super) const DEFAULT_RESPONSE_TIMEOUT: Duration = Duration::from_millis(100);
-pub(super) const DEFAULT_RETRIES: u32 = 1;
 
 /// What is known of a bus even when a part of it is wrong.
 pub(super) struct Found {
@@ -51,32 +28,29 @@ pub(super) struct Found {
 }
 
 pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profiles_broken: bool) -> Found {
-    let name = values::name(reader, "-_");
-    let port = read_port(reader, base);
-    let protocol = read_protocol(reader);
-    let format = read_format(reader, protocol.unwrap_or(DEFAULT_PROTOCOL));
+    let name = BUS.name.placed(reader);
+    let port = BUS.port.read(reader);
+    let port = port.and_then(|text| reader.accept(BUS.port.name, check_port(&text, base)));
+    // A wrong protocol is an error already; the rest is checked as for the default.
+    let protocol = BUS.protocol.read(reader).unwrap_or(Protocol::ModbusRtu);
+    let format = read_format(reader, protocol);
     let (cycle, slow_cycle) = read_cadence(reader);
-    let options = read_options(
-        reader,
-        protocol.unwrap_or(DEFAULT_PROTOCOL),
-        format.as_ref(),
-        port.as_deref(),
-    );
+    let options = read_options(reader, protocol, format.as_ref(), port.as_deref());
     let around = Surroundings {
         bus: name.as_ref().map_or("", |(name, _)| name),
-        protocol: protocol.unwrap_or(DEFAULT_PROTOCOL),
+        protocol,
         profiles,
         profiles_broken,
     };
-    let tables = reader.tables("drive");
-    if !reader.has("drive") {
-        reader.warning("drive", "the bus has no drive; write [[bus.drive]] for each");
+    let tables = BUS.drive.tables(reader);
+    if !reader.has(BUS.drive.name) {
+        reader.warning(BUS.drive.name, "the bus has no drive", "write [[bus.drive]] for each");
     }
     let drives: Vec<drive::Found> = tables.iter().map(|table| drive::read(table, &around)).collect();
     reader.finish();
     let specs: Option<Vec<DriveSpec>> = drives.iter().map(|d| d.spec.clone()).collect();
-    let settings = match (&name, &port, protocol, format, specs) {
-        (Some((name, _)), Some(port), Some(protocol), Some(format), Some(drives)) => {
+    let settings = match (&name, &port, format, specs) {
+        (Some((name, _)), Some(port), Some(format), Some(drives)) => {
             check_fit(reader, &format, &options, &drives);
             let spec = BusSpec {
                 name: name.clone(),
@@ -91,36 +65,22 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
         _ => None,
     };
     Found {
-        port: port.map(|port| (port, reader.place_of("port"))),
-        cadence: (reader.place_of("cycle"), reader.place_of("slow_cycle")),
+        port: port.map(|port| (port, BUS.port.place(reader))),
+        cadence: (BUS.cycle.place(reader), BUS.slow_cycle.place(reader)),
         name,
         drives,
         settings,
     }
 }
 
-fn read_port(reader: &Reader<'_>, base: &Path) -> Option<String> {
-    let text: String = reader.required("port")?;
-    match check_port(&text, base) {
-        Ok(port) => Some(port),
-        Err(message) => {
-            reader.problem("port", message);
-            None
-        }
-    }
-}
-
 fn read_cadence(reader: &Reader<'_>) -> (Duration, Duration) {
-    let cycle = values::duration(reader, "cycle", DEFAULT_CYCLE, &TIMES);
-    let slow_cycle = values::duration(reader, "slow_cycle", DEFAULT_SLOW_CYCLE, &TIMES);
+    let (cycle, slow_cycle) = (BUS.cycle.get(reader), BUS.slow_cycle.get(reader));
     if slow_cycle < cycle {
+        let [slow, fast] = [slow_cycle, cycle].map(format_duration);
         reader.warning(
-            "slow_cycle",
-            format!(
-                "slow_cycle = {} is shorter than cycle = {}; swap them or raise slow_cycle",
-                format_duration(slow_cycle),
-                format_duration(cycle)
-            ),
+            BUS.slow_cycle.name,
+            format!("slow_cycle = {slow} is shorter than cycle = {fast}"),
+            "swap them or raise slow_cycle",
         );
     }
     (cycle, slow_cycle)
@@ -133,167 +93,157 @@ fn read_options(
     port: Option<&str>,
 ) -> BusOptions {
     let options = BusOptions {
-        response_timeout: values::duration(reader, "response_timeout", protocol.usual_timeout(), &TIMES),
-        retries: values::number(reader, "retries", default_retries(protocol), &RETRIES),
+        response_timeout: BUS.response_timeout.written(reader).unwrap_or(protocol.usual_timeout()),
+        retries: BUS.retries.written(reader).unwrap_or(default_retries(protocol)),
         silence: read_silence(reader, protocol, format),
-        rs485: values::choice(reader, "rs485", Rs485::Off, &RS485),
+        rs485: BUS.rs485.get(reader),
     };
     let device_server = port.is_some_and(|p| p.starts_with("tcp://"));
     if device_server && options.rs485 != Rs485::Off {
         reader.warning(
-            "rs485",
-            "a tcp:// line switches its own direction; write \"off\" or leave the key out",
+            BUS.rs485.name,
+            "a device server (tcp://) switches the direction itself",
+            "write \"off\" or leave the key out",
         );
     }
     options
 }
 
-/// Path of a device, seen from the directory of the file, or `tcp://host:port`.
+/// Path of a device, relative to the directory of the file, or `tcp://host:port`.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, String> {
+/// The text is neither.
+pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
     match text.split_once("://") {
         Some(("tcp", server)) => match values::host_port(server, None) {
             Some(_) => Ok(text.to_string()),
-            None => Err(format!("`{text}` is no device server; write \"tcp://host:port\"")),
+            None => Err(Finding::new(
+                format!("`{text}` is not the address of a device server"),
+                "write \"tcp://host:port\"",
+            )),
         },
-        Some((scheme, _)) => Err(format!(
-            "`{scheme}://` is no kind of port; write the path of a serial device or \"tcp://host:port\""
+        Some((scheme, _)) => Err(Finding::new(
+            format!("`{scheme}://` is not a kind of port"),
+            "write the path of a serial device or \"tcp://host:port\"",
         )),
-        None if text.is_empty() || text.contains('\0') => {
-            Err("the port has no path; write for example \"/dev/serial/by-id/usb-…\"".to_string())
-        }
+        None if text.is_empty() || text.contains('\0') => Err(Finding::new(
+            "the port has no path",
+            "write for example \"/dev/serial/by-id/usb-…\"",
+        )),
         None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
     }
 }
 
-fn read_protocol(reader: &Reader<'_>) -> Option<Protocol> {
-    if !reader.has("protocol") {
-        return Some(DEFAULT_PROTOCOL);
-    }
-    reader.parsed("protocol", |text| match Protocol::from_name(text) {
-        Some(protocol) => Ok(protocol),
-        None => Err(values::unknown_word(text, Protocol::ALL.iter().map(|p| p.name()))),
-    })
-}
-
 fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
-    let baud = match reader.has("baud") {
-        true => values::optional_number(reader, "baud", &BAUDS),
-        false => Some(DEFAULT_BAUD),
+    let key = BUS.format.name;
+    let baud = BUS.baud.get(reader);
+    let text = match reader.has(key) {
+        true => BUS.format.read(reader)?,
+        false => default_format(protocol).to_string(),
     };
-    let text = match reader.has("format") {
-        true => reader.optional::<String>("format"),
-        false => Some(default_format(protocol).to_string()),
-    };
-    let format = match LineFormat::new(baud.unwrap_or(DEFAULT_BAUD), &text?) {
-        Ok(format) => format,
-        Err(error) => {
-            reader.problem("format", error.to_string());
-            return None;
-        }
-    };
+    let format = LineFormat::new(baud, &text).map_err(|_| {
+        Finding::new(
+            format!("`{text}` is not a character format"),
+            "write data bits 7 or 8, parity N, E or O, stop bits 1 or 2, such as 8N1",
+        )
+    });
+    let format = reader.accept(key, format)?;
     if protocol == Protocol::N2 && !protocol.allows(&format) {
-        let key = if format.baud == n2::BAUD { "format" } else { "baud" };
+        let key = if format.baud == n2::BAUD { key } else { BUS.baud.name };
         reader.problem(
             key,
-            format!(
-                "N2 is {} {} always, not {format}; leave `baud` and `format` out",
-                n2::BAUD,
-                n2::FORMAT
-            ),
+            format!("N2 is always {} {}, not {format}", n2::BAUD, n2::FORMAT),
+            "leave `baud` and `format` out",
         );
     }
     if protocol == Protocol::ModbusRtu && format.data_bits != 8 {
         reader.problem(
-            "format",
-            "Modbus RTU sends bytes of 8 bits; write for example \"8N1\" or \"8E1\"",
+            key,
+            "Modbus RTU needs 8 data bits",
+            "write for example \"8N1\" or \"8E1\"",
         );
     }
     if protocol == Protocol::ModbusAscii && format.bits_per_char() < 10 {
         reader.warning(
-            "format",
-            "characters of 9 bits: Modbus ASCII drives have 10, two stop bits where there is no parity; write \"7N2\"",
+            key,
+            "characters of 9 bits: Modbus ASCII drives use 10, with two stop bits if there is no parity",
+            "write \"7N2\"",
         );
     }
-    baud.map(|_| format)
+    Some(format)
 }
 
 /// N2 tries three times (n2.md 4).
 fn default_retries(protocol: Protocol) -> u32 {
     match protocol {
-        Protocol::ModbusRtu | Protocol::ModbusAscii => DEFAULT_RETRIES,
+        Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
         Protocol::N2 => n2::RETRIES,
     }
 }
 
-/// Character format of a bus or a line where none is named.
+/// Character format of a bus without `format`. That of Modbus ASCII is that of TECO's card with all switches off
+/// (drives.md 2).
 pub(crate) fn default_format(protocol: Protocol) -> &'static str {
     match protocol {
-        Protocol::ModbusAscii => DEFAULT_ASCII_FORMAT,
-        Protocol::ModbusRtu | Protocol::N2 => DEFAULT_FORMAT,
+        Protocol::ModbusAscii => "7N2",
+        Protocol::ModbusRtu | Protocol::N2 => "8N1",
+    }
+}
+
+/// `spec`, `chars` or a duration.
+pub(super) fn parse_silence(text: &str) -> Result<Silence, Finding> {
+    match text.parse::<Silence>() {
+        Ok(Silence::Fixed(time)) if time > MOST_SILENCE => Err(Finding::new(
+            format!("{} of silence is out of range", format_duration(time)),
+            format!("write at most \"{}\"", format_duration(MOST_SILENCE)),
+        )),
+        Ok(silence) => Ok(silence),
+        Err(_) => Err(Finding::new(
+            format!("`{text}` is not a silence"),
+            "write \"spec\", \"chars\" or a duration such as \"2ms\"",
+        )),
     }
 }
 
 fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFormat>) -> Silence {
-    let silence = reader.parsed("silence", |text| {
-        match text
-            .parse::<Silence>()
-            .map_err(|_| format!("`{text}` is no silence; write \"spec\", \"chars\" or a duration such as \"2ms\""))?
-        {
-            Silence::Fixed(time) if time > MOST_SILENCE => Err(format!(
-                "{} of silence is out of range; write \"{}\" at most",
-                format_duration(time),
-                format_duration(MOST_SILENCE)
-            )),
-            silence => Ok(silence),
-        }
-    });
-    if let (Protocol::ModbusRtu, Some(Silence::Fixed(time)), Some(format)) = (protocol, silence, format)
+    let silence = BUS.silence.get(reader);
+    if let (Protocol::ModbusRtu, Silence::Fixed(time), Some(format)) = (protocol, silence, format)
         && time < format.silence_chars()
     {
+        let [time, least] = [time, format.silence_chars()].map(format_duration);
         reader.warning(
-            "silence",
-            format!(
-                "{} is less than 3.5 characters at {format}, so drives may take two frames for one; write \
-                 \"chars\" or {} and more",
-                format_duration(time),
-                format_duration(format.silence_chars())
-            ),
+            BUS.silence.name,
+            format!("{time} is less than 3.5 characters at {format}, so drives may take two frames for one"),
+            format!("write \"chars\", or {least} or more"),
         );
     }
-    silence.unwrap_or(Silence::Spec)
+    silence
 }
 
-/// What can be configured but fits the drives badly.
+/// What is valid but fits the drives badly.
 fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
-    let mut told: Vec<&str> = Vec::new();
+    let mut reported: Vec<&str> = Vec::new();
     for drive in drives {
         let profile = &drive.profile;
         let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud);
-        if !listed && !told.contains(&profile.name.as_str()) {
-            told.push(&profile.name);
+        if !listed && !reported.contains(&profile.name.as_str()) {
+            reported.push(&profile.name);
             let bauds: Vec<String> = profile.bauds.iter().map(u32::to_string).collect();
             reader.warning(
-                "baud",
-                format!(
-                    "profile `{}` knows no {} baud; check the drives, known are {}",
-                    profile.name,
-                    format.baud,
-                    bauds.join(", ")
-                ),
+                BUS.baud.name,
+                format!("profile `{}` does not list {} baud", profile.name, format.baud),
+                format!("check the drives; the profile lists {}", bauds.join(", ")),
             );
         }
         if drive.turnaround >= options.response_timeout {
+            let [turnaround, timeout] = [drive.turnaround, options.response_timeout].map(format_duration);
             reader.warning(
-                "response_timeout",
+                BUS.response_timeout.name,
                 format!(
-                    "drive `{}` takes {} to begin its answer, response_timeout is {}; raise response_timeout",
-                    drive.name,
-                    format_duration(drive.turnaround),
-                    format_duration(options.response_timeout)
+                    "drive `{}` takes {turnaround} to begin its reply, and response_timeout is {timeout}",
+                    drive.name
                 ),
+                "raise response_timeout",
             );
         }
     }

@@ -1,64 +1,55 @@
 //! `[log]`.
 
+use super::keys::LOG;
 use super::values;
-use crate::document::Reader;
+use crate::document::{Finding, Reader};
 
-/// How log lines look.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+/// Format of log lines.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum LogFormat {
     /// The journal's under systemd, coloured on a terminal, else JSON lines.
+    #[default]
     Auto,
     /// Lines with a priority for the journal, without time.
     Journal,
     /// Lines for people, coloured on a terminal.
     Text,
-    /// One JSON object a line.
+    /// One JSON object per line.
     Json,
 }
 
 /// What is logged, and how.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct LogSettings {
-    /// Level, also for each target: `info,drivegate::bus=debug`. Checked: every part is a level or
+    /// Level, also per target: `info,drivegate::bus=debug`. Checked: every part is a level or
     /// `target=level`. Commands (target `audit`) are logged at any level but `off`.
     pub level: String,
-    /// How lines look.
+    /// Format of the lines.
     pub format: LogFormat,
 }
 
-/// Words of `format`.
-pub(super) const FORMATS: [(&str, LogFormat); 4] = [
-    ("auto", LogFormat::Auto),
-    ("journal", LogFormat::Journal),
-    ("text", LogFormat::Text),
-    ("json", LogFormat::Json),
-];
 /// Words of a level.
-pub(super) const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
-pub(super) const DEFAULT_LEVEL: &str = "info";
-
-impl Default for LogSettings {
-    fn default() -> Self {
-        LogSettings {
-            level: DEFAULT_LEVEL.to_string(),
-            format: LogFormat::Auto,
-        }
-    }
-}
+const LEVELS: [&str; 6] = ["off", "error", "warn", "info", "debug", "trace"];
+/// What [`parse_level`] accepts, as a regular expression.
+pub(super) const PATTERN: &str = concat!(
+    r"^\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*",
+    r"(,\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*)*$"
+);
 
 pub(super) fn read(reader: &Reader<'_>) -> LogSettings {
-    let default = LogSettings::default();
-    let level = reader.parsed("level", parse_level).unwrap_or(default.level);
-    let format = values::choice(reader, "format", default.format, &FORMATS);
+    let settings = LogSettings {
+        level: LOG.level.get(reader),
+        format: LOG.format.get(reader),
+    };
     reader.finish();
-    LogSettings { level, format }
+    settings
 }
 
-/// `level` or `target=level`, joined by commas, as `tracing` understands them.
+/// `level` or `target=level`, joined by commas, as `tracing` reads them.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub(crate) fn parse_level(text: &str) -> Result<String, String> {
+/// A part is neither.
+pub(crate) fn parse_level(text: &str) -> Result<String, Finding> {
     for part in text.split(',') {
         let part = part.trim();
         let (target, level) = match part.split_once('=') {
@@ -74,8 +65,9 @@ pub(crate) fn parse_level(text: &str) -> Result<String, String> {
                     .all(|c| c.is_ascii_alphanumeric() || matches!(c, '_' | ':' | '-'))
         };
         if target.is_some_and(|target| !sound(target)) {
-            return Err(format!(
-                "`{part}` names no target; write for example \"info,drivegate::bus=debug\""
+            return Err(Finding::new(
+                format!("`{part}` has no valid target"),
+                "write for example \"info,drivegate::bus=debug\"",
             ));
         }
     }
@@ -105,8 +97,8 @@ mod tests {
             assert!(parse_level(bad).is_err(), "{bad}");
         }
         assert_eq!(
-            parse_level("debgu"),
-            Err("unknown word `debgu`; did you mean \"debug\"?".into())
+            parse_level("debgu").unwrap_err().to_string(),
+            "unknown word `debgu`; did you mean \"debug\"?"
         );
     }
 }

@@ -1,24 +1,25 @@
 //! The configuration: a TOML file and environment variables become [`Settings`].
 //!
-//! Every fault is found in one run and told with file, line and key. Nothing is opened but the file itself,
-//! the profiles and the secrets it names. Relative paths are seen from the directory of the file.
+//! One run reports every error with file, line and key. Nothing is opened but the file itself, the profiles and the
+//! secrets it names. Relative paths are relative to the directory of the file.
 
 mod bus;
 mod drive;
+mod key;
+mod keys;
 mod log;
 mod modbus_tcp;
 mod mqtt;
 mod north;
-pub mod schema;
 mod shutdown;
 mod unique;
 mod values;
 
-pub use log::{LogFormat, LogSettings};
-pub use shutdown::{OTHER_STOP_TIME, ShutdownTime, UNIT_STOP_TIME};
+pub(crate) use log::{LogFormat, LogSettings};
 
 pub(crate) use bus::{check_port, default_format};
 pub(crate) use drive::{addresses, unknown_profile};
+pub(crate) use keys::schema;
 pub(crate) use log::parse_level;
 
 use std::path::{Path, PathBuf};
@@ -27,25 +28,29 @@ use std::time::Duration;
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
 use crate::cache::{Access, BusSpec, DriveSpec};
-use crate::document::{self, Document, Place, Problem, Reader};
+use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
+use crate::north::local::SocketPath;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
+use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
-/// What variables of the environment begin with: `DRIVEGATE__MQTT__PASSWORD`.
-pub const ENVIRONMENT: &str = "DRIVEGATE";
+/// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
+pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
 
 /// A valid configuration. Parts compare equal when a reload changes nothing in them.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Settings {
     /// Name of the gateway.
     pub gateway: String,
+    /// Where `drivegate read` and `drivegate write` reach the gateway.
+    pub socket: SocketPath,
     /// Directories of the user's profiles.
     pub profile_dirs: Vec<PathBuf>,
     /// Built-in profiles and the user's.
     pub profiles: Profiles,
     /// Age from which a sample of process data is stale.
     pub stale_after: Duration,
-    /// `stale_after` was written: it holds for slow lines too.
+    /// `stale_after` is written, so it applies to slow lines too.
     pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
@@ -62,17 +67,18 @@ pub struct Settings {
 /// One bus with its drives.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusSettings {
-    /// What everybody may know.
+    /// What other rooms see of it.
     pub spec: BusSpec,
-    /// What only the bus itself needs.
+    /// What only the bus itself uses.
     pub options: BusOptions,
     /// In the order of the file.
     pub drives: Vec<DriveSpec>,
 }
 
 impl BusSettings {
-    /// The cadences that drives are measured by: those of the configuration, or what the line can carry at best.
-    pub fn achievable(&self) -> (Duration, Duration) {
+    /// The fast and slow cadence that staleness is measured by: those of the configuration, or the best the line can
+    /// carry.
+    pub(crate) fn achievable(&self) -> (Duration, Duration) {
         let prediction = self.predict();
         let spec = &self.spec;
         (
@@ -81,26 +87,25 @@ impl BusSettings {
         )
     }
 
-    /// Wire times, cycles and load to be expected.
-    pub fn predict(&self) -> Prediction {
+    /// Expected wire times, cycles and load.
+    pub(crate) fn predict(&self) -> Prediction {
         predict::predict(&self.spec, self.options.silence, &self.drives)
     }
 }
 
-/// What became of a configuration file.
+/// The outcome of loading a configuration file.
 #[derive(Debug)]
 pub struct Loaded {
     /// The settings; absent when there is any error.
     pub settings: Option<Settings>,
-    /// What must be mended.
+    /// What must be fixed.
     pub errors: Vec<Problem>,
-    /// What can run but will probably not do what was meant.
+    /// What works but probably not as intended.
     pub warnings: Vec<Problem>,
 }
 
 impl Settings {
-    /// Reads the file `path`, lets the variables `DRIVEGATE__SECTION__KEY` of `env` override it, and checks
-    /// everything.
+    /// Reads the file `path`, applies the variables `DRIVEGATE__SECTION__KEY` of `env`, and checks everything.
     pub fn load(path: impl AsRef<Path>, env: impl Iterator<Item = (String, String)>) -> Loaded {
         let path = path.as_ref();
         match document::read_file(path) {
@@ -113,15 +118,15 @@ impl Settings {
         }
     }
 
-    /// As [`Settings::load`], with `source` as the text of the file.
+    /// Like [`Settings::load`], with `source` as the text of the file.
     pub fn parse(path: impl AsRef<Path>, source: &str, env: impl Iterator<Item = (String, String)>) -> Loaded {
         parse(path.as_ref(), source, env).0
     }
 }
 
-/// The variables of this process that override the configuration. What is no UTF-8 in them becomes U+FFFD, which
+/// The variables of this process that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
 /// [`Settings::load`] refuses.
-pub fn environment() -> impl Iterator<Item = (String, String)> {
+pub(crate) fn environment() -> impl Iterator<Item = (String, String)> {
     std::env::vars_os().filter_map(|(name, value)| {
         let name = name.into_string().ok().filter(|name| name.starts_with(ENVIRONMENT))?;
         Some((name, value.to_string_lossy().into_owned()))
@@ -129,18 +134,13 @@ pub fn environment() -> impl Iterator<Item = (String, String)> {
 }
 
 fn not_text(name: &str) -> Problem {
-    Problem {
-        file: name.to_string(),
-        line: None,
-        key: String::new(),
-        message: "the variable is no UTF-8 text; set it again".to_string(),
-    }
+    Problem::of_file(name, "", Finding::new("the variable is not UTF-8 text", "set it again"))
 }
 
 /// The outcome, and every key the loader knows.
 fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> (Loaded, Vec<String>) {
     let mut document = Document::parse(path.display().to_string(), source);
-    for section in ["gateway", "log"] {
+    for section in [ROOT.gateway.name, ROOT.log.name] {
         document.ensure_section(section);
     }
     let (variables, broken): (Vec<_>, Vec<_>) = env
@@ -163,16 +163,16 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
 }
 
 fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
-    let gateway = reader.table("gateway").map(|table| read_gateway(&table, base));
-    let (name, profile_dirs, profiles) = match gateway {
+    let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
+    let (name, socket, profile_dirs, profiles) = match gateway {
         Some(gateway) => {
             profile_errors.extend(gateway.errors);
-            (gateway.name, gateway.profile_dirs, gateway.profiles)
+            (gateway.name, gateway.socket, gateway.profile_dirs, gateway.profiles)
         }
-        None => (None, Vec::new(), Profiles::built_in()),
+        None => (None, SocketPath::Default, Vec::new(), Profiles::built_in()),
     };
     let broken = !profile_errors.is_empty();
-    let tables = reader.tables("bus");
+    let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
         .iter()
         .map(|table| bus::read(table, base, &profiles, broken))
@@ -182,17 +182,15 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .filter_map(|bus| bus.name.as_ref())
         .map(|(name, _)| name.as_str())
         .collect();
-    let modbus_tcp = reader
-        .table("modbus_tcp")
-        .map(|table| modbus_tcp::read(&table, base, &names));
-    let mqtt = reader
-        .table("mqtt")
+    let modbus_tcp = ROOT.modbus_tcp.table(reader);
+    let modbus_tcp = modbus_tcp.map(|table| modbus_tcp::read(&table, base, &names));
+    let mqtt = ROOT
+        .mqtt
+        .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref()));
-    let (http, http_listener) = match reader.table("http").map(|table| north::read_http(&table)) {
-        Some((options, listener)) => (Some(options), listener),
-        None => (None, None),
-    };
-    let log = reader.table("log").map(|table| log::read(&table)).unwrap_or_default();
+    let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
+    let http_listener = http_listener.flatten();
+    let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
     judge(
@@ -205,21 +203,23 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
 
     Some(Settings {
         gateway: name?,
+        socket,
         profile_dirs,
         profiles,
-        stale_after: modbus_tcp
-            .as_ref()
-            .map_or(modbus_tcp::DEFAULT_STALE_AFTER, |m| m.stale_after),
+        stale_after: match &modbus_tcp {
+            Some(modbus_tcp) => modbus_tcp.stale_after,
+            None => MODBUS_TCP.stale_after.read_default()?,
+        },
         stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http)?,
-        log,
+        log: log?,
     })
 }
 
-/// What only the sections together show to be wrong or doubtful.
+/// Reports what is wrong or doubtful about the sections together.
 fn judge(
     reader: &Reader<'_>,
     buses: &[bus::Found],
@@ -228,7 +228,7 @@ fn judge(
     http: Option<&north::Listener>,
 ) {
     unique::check(reader.document(), buses);
-    // Without Modbus TCP nobody is reached by a unit, and a gateway may have more drives than there are units.
+    // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
     }
@@ -243,7 +243,7 @@ fn judge(
         warn_of_idle_control(reader, buses);
     }
     if reader.document().is_sound() {
-        // Beside errors a default may stand for a wrong value, and nobody wrote what would be told of it.
+        // Besides errors, a default may stand in for a wrong value; a warning about it would mislead.
         warn_of_idle_stops(reader, buses);
         warn_of_long_shutdowns(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);
@@ -251,7 +251,7 @@ fn judge(
     }
 }
 
-/// A section that is there but wrong makes the whole wrong; one that is absent does not.
+/// An invalid section invalidates the whole; an absent one does not.
 fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
     match section {
         None => Some(None),
@@ -261,32 +261,37 @@ fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
 
 struct Gateway {
     name: Option<String>,
+    socket: SocketPath,
     profile_dirs: Vec<PathBuf>,
     profiles: Profiles,
     errors: Vec<Problem>,
 }
 
 fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
-    let name = values::name(reader, "-").map(|(name, _)| name);
+    let name = GATEWAY.name.read(reader);
+    let socket = match GATEWAY.socket.written(reader) {
+        None => SocketPath::Default,
+        Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
+        Some(path) => SocketPath::At(values::resolved(base, path)),
+    };
     let mut profiles = Profiles::built_in();
     let mut errors = Vec::new();
-    let dirs: Vec<PathBuf> = reader.or("profile_dirs", Vec::new());
+    let dirs = GATEWAY.profile_dirs.get(reader);
     let profile_dirs: Vec<PathBuf> = dirs.into_iter().map(|dir| values::resolved(base, dir)).collect();
     for dir in &profile_dirs {
         match std::fs::read_dir(dir) {
             Ok(_) => errors.extend(profiles.load(dir)),
             Err(error) => reader.problem(
-                "profile_dirs",
-                format!(
-                    "cannot read {}: {error}; make the directory or remove it from profile_dirs",
-                    dir.display()
-                ),
+                GATEWAY.profile_dirs.name,
+                format!("cannot read {}: {error}", dir.display()),
+                "create the directory or remove it from profile_dirs",
             ),
         }
     }
     reader.finish();
     Gateway {
         name,
+        socket,
         profile_dirs,
         profiles,
         errors,
@@ -294,26 +299,28 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
 }
 
 fn warn_of_emptiness(reader: &Reader<'_>) {
-    let nowhere = |key: &str| Place {
+    let of_file = |key: &str| Place {
         key: key.to_string(),
         ..Place::default()
     };
-    if !reader.has("bus") {
+    if !reader.has(ROOT.bus.name) {
         reader.document().warning(
-            &nowhere("bus"),
-            "the configuration has no bus, so nothing is read; write [[bus]] with its drives",
+            &of_file(ROOT.bus.name),
+            "the configuration has no bus, so nothing is read",
+            "write [[bus]] with its drives",
         );
     }
-    if !["modbus_tcp", "mqtt", "http"].iter().any(|server| reader.has(server)) {
+    let servers = [ROOT.modbus_tcp.name, ROOT.mqtt.name, ROOT.http.name];
+    if !servers.iter().any(|server| reader.has(server)) {
         reader.document().warning(
-            &nowhere(""),
-            "no server is configured, so nobody can see the drives; write [modbus_tcp], [mqtt] or [http]",
+            &of_file(""),
+            "no server is configured, so nobody can see the drives",
+            "write [modbus_tcp], [mqtt] or [http]",
         );
     }
 }
 
-/// Cadences that the line cannot carry, and process data that ages faster than it is renewed where somebody wrote when it
-/// is stale.
+/// Cadences that the line cannot carry, and a written `stale_after` that is shorter than a cycle.
 fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Option<(Duration, &Place)>) {
     for found in buses {
         let Some(settings) = &found.settings else { continue };
@@ -321,60 +328,66 @@ fn warn_of_cadence(reader: &Reader<'_>, buses: &[bus::Found], stale_after: Optio
         if let Some(shortage) = &prediction.shortage {
             let (fast, slow) = &found.cadence;
             let place = if shortage.fast.is_some() { fast } else { slow };
-            reader.document().warning(place, shortage.message());
+            let Finding { what, remedy } = shortage.finding();
+            reader.document().warning(place, what, remedy);
         }
         if let (Some(cycle), Some((limit, place))) = (prediction.fast_cycle, stale_after)
             && cycle > limit
         {
-            let (cycle, limit) = (cycle.as_secs_f64() * 1e3, limit.as_secs_f64() * 1e3);
-            let text = format!(
-                "process data of bus `{}` is renewed every {cycle:.0} ms and stale after {limit:.0} ms; raise \
-                 stale_after, leave it out, or lighten the bus",
-                settings.spec.name
+            let [cycle, limit] = [cycle, limit].map(|time| time.as_secs_f64() * 1e3);
+            let bus = &settings.spec.name;
+            reader.document().warning(
+                place,
+                format!("process data of bus `{bus}` is read every {cycle:.0} ms and stale after {limit:.0} ms"),
+                "raise stale_after, leave it out, or reduce the load of the bus",
             );
-            reader.document().warning(place, text);
         }
     }
 }
 
-/// Stops at shutdown that the service manager may not wait for.
+/// Stops at shutdown that take longer than the service manager waits.
 fn warn_of_long_shutdowns(reader: &Reader<'_>, buses: &[bus::Found]) {
     for found in buses {
         let stops = found.drives.iter().find_map(|drive| drive.shutdown_stop.as_ref());
         let (Some(settings), Some(place)) = (&found.settings, stops) else {
             continue;
         };
-        if let Some(text) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
-            reader.document().warning(place, text);
+        if let Some(Finding { what, remedy }) = settings.shutdown_time().beyond_unit(&settings.spec.name) {
+            reader.document().warning(place, what, remedy);
         }
     }
 }
 
-/// What is to be written to drives to which nothing is written.
+/// Writes configured for drives that are only monitored.
 fn warn_of_idle_stops(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some((name, _)), Access::Monitor) = (&drive.name, drive.access.0) else {
             continue;
         };
-        let idle = "is only monitored, so nothing is ever written to it";
-        if let Some(place) = &drive.lease {
-            let text = format!(
-                "drive `{name}` {idle}, and it has no lease that could run out; set access = \"control\", or leave \
-                 supervision out"
+        let effects = [
+            (
+                &drive.lease,
+                "it has no lease that could run out",
+                DRIVE.supervision.name,
+            ),
+            (
+                &drive.shutdown_stop,
+                "it is not stopped with the gateway",
+                DRIVE.on_shutdown.name,
+            ),
+        ];
+        for (place, effect, key) in effects {
+            let Some(place) = place else { continue };
+            reader.document().warning(
+                place,
+                format!("drive `{name}` is only monitored, so nothing is ever written to it, and {effect}"),
+                format!("set access = \"control\", or leave {key} out"),
             );
-            reader.document().warning(place, text);
-        }
-        if let Some(place) = &drive.shutdown_stop {
-            let text = format!(
-                "drive `{name}` {idle}, and it is not stopped with the gateway; set access = \"control\", or leave \
-                 on_shutdown out"
-            );
-            reader.document().warning(place, text);
         }
     }
 }
 
-/// Drives that could be commanded, but by nobody.
+/// Drives that accept commands while no client may send any.
 fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some((name, _)), (Access::Control, place)) = (&drive.name, &drive.access) else {
@@ -382,15 +395,13 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
         };
         reader.document().warning(
             place,
-            format!(
-                "drive `{name}` takes commands but no client may give any; set `write` of [modbus_tcp] or \
-                 `commands = true` of [mqtt]"
-            ),
+            format!("drive `{name}` accepts commands but no client may send any"),
+            "set `write` of [modbus_tcp] or `commands = true` of [mqtt]",
         );
     }
 }
 
-/// Drives that are commanded and that nothing stops when whoever commands them falls silent.
+/// Commanded drives that nothing stops when the commanding client falls silent.
 fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
     for drive in buses.iter().flat_map(|bus| &bus.drives) {
         let (Some(spec), (Access::Control, place)) = (&drive.spec, &drive.access) else {
@@ -407,19 +418,20 @@ fn warn_of_missing_leases(reader: &Reader<'_>, buses: &[bus::Found]) {
             .into_iter()
             .filter(|p| spec.profile.point_index(p).is_some())
             .collect();
-        let own = if known.is_empty() {
-            "no parameter for its own response to a silent master is known".to_string()
-        } else {
-            let points = known.join(" and ");
-            format!("its own response to a silent master ({points}) may be off, and sees the gateway poll")
+        let own = match known.is_empty() {
+            true => "the profile has no parameter for the drive's own response to a silent master".to_string(),
+            false => format!(
+                "the drive's own response to a silent master ({}) may be off, and the gateway keeps polling",
+                known.join(" and ")
+            ),
         };
         reader.document().warning(
             place,
             format!(
-                "drive `{}` has no lease, so it runs on when its client falls silent; {own}; set \
-                 supervision = {{ timeout = \"5s\", action = \"stop\" }}",
+                "drive `{}` has no lease, so it runs on when its client falls silent",
                 spec.name
             ),
+            format!("{own}; set supervision = {{ timeout = \"5s\", action = \"stop\" }}"),
         );
     }
 }

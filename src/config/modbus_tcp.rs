@@ -1,46 +1,31 @@
 //! `[modbus_tcp]`, `[[modbus_tcp.listener]]` and `[modbus_tcp.tls]`.
 
 use std::collections::BTreeMap;
-use std::net::SocketAddr;
-use std::ops::RangeInclusive;
-use std::path::{Path, PathBuf};
+use std::net::{IpAddr, Ipv4Addr, SocketAddr};
+use std::path::Path;
 use std::time::{Duration, SystemTime};
 
 use ipnet::IpNet;
 
+use super::key::Key;
+use super::keys::{IDLE, LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::north::Listener as Address;
-use super::{bus, values};
-use crate::document::{Place, Raw, Reader, nearest};
-use crate::north::modbus_tcp::{self, Identity, Role, Tls, TlsFile, Uncached};
+use super::values;
+use crate::document::{Finding, Place, Reader, nearest, parse_duration};
+use crate::north::modbus_tcp::{self, Identity, Role, Tls, TlsFile};
 
-/// Words of `uncached`.
-pub(super) const UNCACHED: [(&str, Uncached); 2] = [("forward", Uncached::Forward), ("refuse", Uncached::Refuse)];
-/// Words of `roles`.
-pub(super) const ROLES: [(&str, Role); 2] = [("monitor", Role::Monitor), ("control", Role::Control)];
-/// Connections at one time.
-pub(super) const CONNECTIONS: RangeInclusive<usize> = 1..=10_000;
-/// Time without a request.
-pub(super) const IDLE: RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(7 * 86_400);
-/// The word for no limit.
-pub(super) const OFF: &str = "off";
-
-pub(super) const DEFAULT_LISTEN: &str = "127.0.0.1:1502";
-/// The port that the specification of Modbus/TCP Security has registered.
-pub(super) const DEFAULT_TLS_LISTEN: &str = "127.0.0.1:802";
-pub(super) const DEFAULT_CONNECTIONS: usize = 64;
-pub(super) const DEFAULT_IDLE: Duration = Duration::from_secs(3600);
-pub(super) const DEFAULT_STALE_AFTER: Duration = Duration::from_secs(1);
-pub(super) const DEFAULT_ALLOW: [&str; 2] = ["127.0.0.0/8", "::1/128"];
+/// Where the short form listens if `listen` is not written.
+const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
 
 /// `[modbus_tcp]` as read.
 pub(super) struct ModbusTcp {
-    /// Absent when a certificate or key cannot be used, which is a problem already told.
+    /// Absent when a certificate or key cannot be used, which is reported.
     pub(super) options: Option<modbus_tcp::Options>,
     pub(super) stale_after: Duration,
     pub(super) stale_written: bool,
     pub(super) stale_place: Place,
     pub(super) addresses: Vec<Address>,
-    /// What each listener shows: `None` all buses.
+    /// The buses that each listener shows, `None` for all.
     pub(super) selections: Vec<Option<Vec<String>>>,
     /// Whether any client could write.
     pub(super) commands: bool,
@@ -48,18 +33,18 @@ pub(super) struct ModbusTcp {
 
 /// Reads the section; `buses` are the names that a listener can select.
 pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTcp {
-    let allow = values::list(reader, "allow", loopback(), values::network);
-    let write = values::list(reader, "write", Vec::new(), values::network);
+    let allow = MODBUS_TCP.allow.get(reader);
+    let write = MODBUS_TCP.write.get(reader);
     let inherited = Inherited {
         allow: &allow,
         write: &write,
         buses,
     };
-    let tables = reader.tables("listener");
-    let tls_table = reader.table("tls");
+    let tables = MODBUS_TCP.listener.tables(reader);
+    let tls_table = MODBUS_TCP.tls.table(reader);
     let mut found = Found::default();
-    // Who writes listeners of his own or TLS wants those; the short form is there when it is written, or alone.
-    if reader.has("listen") || (tables.is_empty() && tls_table.is_none()) {
+    // Besides listeners of its own or TLS, the short form counts only if it is written.
+    if reader.has(MODBUS_TCP.listen.name) || (tables.is_empty() && tls_table.is_none()) {
         found.add(short_form(reader, &inherited), reader);
     }
     for table in &tables {
@@ -73,7 +58,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         table.finish();
         found
             .addresses
-            .extend(tls.listen.iter().map(|a| (*a, table.place_of("listen"))));
+            .extend(tls.listen.iter().map(|a| (*a, TLS.listen.place(table))));
         found.selections.push(tls.buses.clone());
         tls
     });
@@ -81,12 +66,12 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         || tls
             .as_ref()
             .is_some_and(|tls| tls.roles.values().any(|role| *role == Role::Control));
-    let max_connections = values::number(reader, "max_connections", DEFAULT_CONNECTIONS, &CONNECTIONS);
-    let per_address = values::optional_number(reader, "max_connections_per_address", &CONNECTIONS);
-    let idle_timeout = read_idle(reader);
-    let uncached = values::choice(reader, "uncached", Uncached::Forward, &UNCACHED);
-    let stale_after = values::duration(reader, "stale_after", DEFAULT_STALE_AFTER, &bus::TIMES);
-    let stale_written = reader.has("stale_after");
+    let max_connections = MODBUS_TCP.max_connections.get(reader);
+    let max_connections_per_address = MODBUS_TCP.max_connections_per_address.read(reader);
+    let idle_timeout = MODBUS_TCP.idle_timeout.get(reader);
+    let uncached = MODBUS_TCP.uncached.get(reader);
+    let stale_after = MODBUS_TCP.stale_after.get(reader);
+    let stale_written = reader.has(MODBUS_TCP.stale_after.name);
     reader.finish();
     let Found {
         listeners,
@@ -101,7 +86,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         listeners,
         tls,
         max_connections,
-        max_connections_per_address: per_address,
+        max_connections_per_address,
         idle_timeout,
         uncached,
     });
@@ -109,14 +94,14 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
         options,
         stale_after,
         stale_written,
-        stale_place: reader.place_of("stale_after"),
+        stale_place: MODBUS_TCP.stale_after.place(reader),
         addresses,
         selections,
         commands,
     }
 }
 
-/// What a listener has from `[modbus_tcp]` when it does not say otherwise, and the buses there are.
+/// What a listener takes from `[modbus_tcp]` unless it has its own, and the names of the buses.
 struct Inherited<'a> {
     allow: &'a [IpNet],
     write: &'a [IpNet],
@@ -133,7 +118,7 @@ struct Found {
 impl Found {
     fn add(&mut self, listener: modbus_tcp::Listener, reader: &Reader<'_>) {
         warn_of_reach(reader, &listener);
-        let place = reader.place_of("listen");
+        let place = MODBUS_TCP.listen.place(reader);
         self.addresses
             .extend(listener.listen.iter().map(|a| (*a, place.clone())));
         self.selections.push(listener.buses.clone());
@@ -142,9 +127,10 @@ impl Found {
 }
 
 fn short_form(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::Listener {
+    let listen = MODBUS_TCP.listen.written(reader);
     modbus_tcp::Listener {
         section: "[modbus_tcp]".to_string(),
-        listen: read_listen(reader, DEFAULT_LISTEN),
+        listen: listen.unwrap_or_else(|| vec![DEFAULT_LISTEN]),
         allow: inherited.allow.to_vec(),
         write: inherited.write.to_vec(),
         buses: None,
@@ -152,69 +138,40 @@ fn short_form(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::Lis
 }
 
 fn read_listener(reader: &Reader<'_>, inherited: &Inherited<'_>) -> modbus_tcp::Listener {
-    if !reader.has("listen") {
-        reader.problem(
-            "listen",
-            format!("`listen` is missing; write for example [\"{DEFAULT_LISTEN}\"]"),
-        );
-    }
+    let own = |key: &Key<Vec<IpNet>>, inherited: &[IpNet]| key.read(reader).unwrap_or_else(|| inherited.to_vec());
     modbus_tcp::Listener {
         section: "[[modbus_tcp.listener]]".to_string(),
-        listen: if reader.has("listen") {
-            read_listen(reader, DEFAULT_LISTEN)
-        } else {
-            Vec::new()
-        },
-        allow: values::list(reader, "allow", inherited.allow.to_vec(), values::network),
-        write: values::list(reader, "write", inherited.write.to_vec(), values::network),
-        buses: read_buses(reader, inherited.buses),
+        listen: LISTENER.listen.get(reader),
+        allow: own(&LISTENER.allow, inherited.allow),
+        write: own(&LISTENER.write, inherited.write),
+        buses: read_buses(reader, &LISTENER.buses, inherited.buses),
     }
 }
 
-fn read_listen(reader: &Reader<'_>, default: &str) -> Vec<SocketAddr> {
-    let preset = values::socket(default).into_iter().collect();
-    let listen = values::list(reader, "listen", preset, values::socket);
-    if is_empty(reader, "listen") {
-        reader.problem(
-            "listen",
-            format!("the list is empty; write for example [\"{default}\"]"),
-        );
-    }
-    listen
-}
-
-fn is_empty(reader: &Reader<'_>, key: &str) -> bool {
-    matches!(reader.raw(key).map(|node| &node.value), Some(Raw::Array(items)) if items.is_empty())
-}
-
-/// Names of buses that the file has.
-fn read_buses(reader: &Reader<'_>, known: &[&str]) -> Option<Vec<String>> {
-    if !reader.has("buses") {
-        return None;
-    }
-    if is_empty(reader, "buses") {
-        reader.problem("buses", "the list is empty; name a bus, or leave the key out for all");
-    }
-    let one = |name: &str| {
-        if known.contains(&name) {
-            return Ok(name.to_string());
+/// Names of buses, which the file must have.
+fn read_buses(reader: &Reader<'_>, key: &Key<Vec<String>>, known: &[&str]) -> Option<Vec<String>> {
+    let mut names = key.read(reader)?;
+    names.retain(|name| {
+        if known.contains(&name.as_str()) {
+            return true;
         }
-        Err(match nearest(name, known.iter().copied()) {
-            Some(near) => format!("there is no bus `{name}`; did you mean `{near}`?"),
-            None if known.is_empty() => format!("there is no bus `{name}`; the file has none that could be shown"),
-            None => format!("there is no bus `{name}`; write one of {}", known.join(", ")),
-        })
-    };
-    Some(values::list(reader, "buses", Vec::new(), one))
+        let remedy = match nearest(name, known.iter().copied()) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None if known.is_empty() => "the file has no bus to show".to_string(),
+            None => format!("write one of {}", known.join(", ")),
+        };
+        reader.problem(key.name, format!("there is no bus `{name}`"), remedy);
+        false
+    });
+    Some(names)
 }
 
-/// `idle_timeout`: a duration, or the word for none.
-fn read_idle(reader: &Reader<'_>) -> Option<Duration> {
-    let off = reader.raw("idle_timeout").is_some_and(|node| match &node.value {
-        Raw::Text(text) | Raw::Env(text) => text == OFF,
-        _ => false,
-    });
-    (!off).then(|| values::duration(reader, "idle_timeout", DEFAULT_IDLE, &IDLE))
+/// A duration, or `None` for the word `off`.
+pub(super) fn parse_idle(text: &str) -> Result<Option<Duration>, Finding> {
+    match text {
+        "off" => Ok(None),
+        text => IDLE.check(parse_duration(text)?).map(Some),
+    }
 }
 
 /// `[modbus_tcp.tls]`, whose certificates may not be usable.
@@ -247,70 +204,78 @@ impl ReadTls {
 
 fn read_tls(reader: &Reader<'_>, base: &Path, inherited: &Inherited<'_>) -> ReadTls {
     ReadTls {
-        listen: read_listen(reader, DEFAULT_TLS_LISTEN),
-        allow: values::list(reader, "allow", inherited.allow.to_vec(), values::network),
-        buses: read_buses(reader, inherited.buses),
+        listen: TLS.listen.get(reader),
+        allow: TLS.allow.read(reader).unwrap_or_else(|| inherited.allow.to_vec()),
+        buses: read_buses(reader, &TLS.buses, inherited.buses),
         identity: read_identity(reader, base),
         roles: read_roles(reader),
     }
 }
 
-/// Everything about the files is tried here, so that `check` tells what clients would run into.
+/// Loads the files, so that `check` reports what clients would run into.
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<Identity> {
-    let path = |key: &str| reader.required::<PathBuf>(key).map(|path| values::resolved(base, path));
-    let (certificate, key, client_ca) = (path("certificate"), path("key"), path("client_ca"));
+    let path = |key: &Key<_>| Some(values::resolved(base, key.read(reader)?));
+    let (certificate, key, client_ca) = (path(&TLS.certificate), path(&TLS.key), path(&TLS.client_ca));
     let name = |file: TlsFile| match file {
-        TlsFile::Certificate => "certificate",
-        TlsFile::Key => "key",
-        TlsFile::ClientCa => "client_ca",
+        TlsFile::Certificate => TLS.certificate.name,
+        TlsFile::Key => TLS.key.name,
+        TlsFile::ClientCa => TLS.client_ca.name,
     };
     match Identity::load(&certificate?, &key?, &client_ca?, SystemTime::now()) {
         Ok((identity, warnings)) => {
-            warnings
-                .iter()
-                .for_each(|(file, text)| reader.warning(name(*file), text));
+            for fault in &warnings {
+                let text = fault.to_string();
+                let (what, remedy) = parts(&text);
+                reader.warning(name(fault.file), what, remedy);
+            }
             Some(identity)
         }
         Err(errors) => {
-            errors.iter().for_each(|(file, text)| reader.problem(name(*file), text));
+            for fault in &errors {
+                let text = fault.to_string();
+                let (what, remedy) = parts(&text);
+                reader.problem(name(fault.file), what, remedy);
+            }
             None
         }
     }
 }
 
+/// What [`Identity::load`] reports is `what; what to do`.
+fn parts(text: &str) -> (&str, &str) {
+    text.split_once("; ").unwrap_or((text, ""))
+}
+
 fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
     let mut roles = BTreeMap::new();
-    if let Some(table) = reader.table("roles") {
+    if let Some(table) = TLS.roles.table(reader) {
         for name in table.keys() {
             if name.is_empty() {
-                table.problem(name, "a role without a name is none; remove it");
+                table.problem(name, "a role needs a name", "remove it");
             }
-            roles.insert(name.to_string(), values::choice(&table, name, Role::Monitor, &ROLES));
+            let role = table.parsed(name, |text| ROLES.find(text));
+            roles.insert(name.to_string(), role.unwrap_or(Role::Monitor));
         }
     }
     if !roles.values().any(|role| *role == Role::Control) && reader.document().is_sound() {
         reader.warning(
-            "roles",
-            "no role may write, so every TLS client only reads; write for example roles = { operator = \"control\" }",
+            TLS.roles.name,
+            "no role may write, so TLS clients can only read",
+            "write for example roles = { operator = \"control\" }",
         );
     }
     roles
 }
 
-fn loopback() -> Vec<IpNet> {
-    DEFAULT_ALLOW
-        .iter()
-        .filter_map(|net| values::network(net).ok())
-        .collect()
-}
-
-/// Who can reach a listener and who cannot, where that is probably not meant.
+/// Warns of who can reach a listener and who cannot, where that is probably a mistake.
 fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
+    let (listen, write) = (MODBUS_TCP.listen.name, MODBUS_TCP.write.name);
     for network in &listener.write {
         if !listener.allow.iter().any(|allowed| allowed.contains(network)) {
             reader.warning(
-                "write",
-                format!("{network} may write but not all of it may connect; add it to `allow`"),
+                write,
+                format!("{network} may write but not all of it may connect"),
+                "add it to `allow`",
             );
         }
     }
@@ -318,18 +283,19 @@ fn warn_of_reach(reader: &Reader<'_>, listener: &modbus_tcp::Listener) {
     let Some(open) = open else { return };
     if !listener.write.is_empty() {
         reader.warning(
-            "listen",
+            listen,
             format!(
-                "{open} is reached from the network, and Modbus TCP knows no passwords: addresses in `write` \
-                 command drives; keep `write` as narrow as it can be, or use [modbus_tcp.tls]"
+                "{open} can be reached from the network, and Modbus TCP has no passwords: addresses in `write` command drives"
             ),
+            "keep `write` as narrow as possible, or use [modbus_tcp.tls]",
         );
     }
     let only_here = listener.allow.iter().all(|net| net.network().is_loopback());
-    if only_here && reader.has("listen") {
+    if only_here && reader.has(listen) {
         reader.warning(
-            "listen",
-            format!("{open} listens to the network but `allow` lets nobody in from there; add the network to `allow`"),
+            listen,
+            format!("{open} listens to the network, but `allow` admits nobody from there"),
+            "add the network to `allow`",
         );
     }
 }

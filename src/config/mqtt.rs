@@ -2,66 +2,57 @@
 
 use std::fs::File;
 use std::io::Read;
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
+use super::key::Key;
+use super::keys::{BUFFER, MQTT, PUBLISH};
 use super::values;
-use crate::document::{Reader, format_duration, parse_size};
+use crate::document::{Finding, Reader, format_duration, parse_size};
 use crate::north::mqtt::{Buffer, Options, Secret};
 
-pub(super) const DEFAULT_URL: &str = "mqtt://127.0.0.1:1883";
-pub(super) const DEFAULT_BASE: &str = "drivegate";
-pub(super) const DEFAULT_MIN_INTERVAL: Duration = Duration::from_millis(100);
-pub(super) const DEFAULT_MAX_INTERVAL: Duration = Duration::from_secs(60);
-pub(super) const DEFAULT_BUFFER_DIR: &str = "/var/lib/drivegate";
-pub(super) const DEFAULT_BUFFER: &str = "64MiB";
-
-const MIN_INTERVAL: RangeInclusive<Duration> = Duration::ZERO..=Duration::from_secs(3600);
-const MAX_INTERVAL: RangeInclusive<Duration> = Duration::from_millis(10)..=Duration::from_secs(86_400);
-const BUFFER: RangeInclusive<u64> = (64 << 10)..=(1 << 40);
-/// Most bytes of a secret: a file that is longer is no password.
+/// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
 
-struct Broker {
+/// Where the broker is.
+pub(super) struct Broker {
     host: String,
     port: u16,
     tls: bool,
 }
 
 pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> Option<Options> {
-    let broker = match reader.has("url") {
-        true => reader.parsed("url", parse_url),
-        false => parse_url(DEFAULT_URL).ok(),
-    };
+    let broker = MQTT.url.read(reader);
     let tls = broker.as_ref().is_some_and(|b| b.tls);
-    let client_id = reader
-        .parsed("client_id", |text| match text {
-            "" => Err("the client id is empty; write a name or leave the key out".to_string()),
-            text => Ok(text.to_string()),
-        })
-        .unwrap_or_else(|| format!("drivegate-{}", gateway.unwrap_or_default()));
-    let username: Option<String> = reader.optional("username");
+    let client_id = MQTT.client_id.read(reader);
+    let username = MQTT.username.read(reader);
     let password = read_password(reader, base);
-    if (reader.has("password") || reader.has("password_file")) && username.is_none() && !reader.has("username") {
-        reader.problem("username", "there is a password without a user; write username = \"…\"");
-    }
-    let ca = read_pem(reader, "ca", base);
-    let identity = read_identity(reader, base);
-    if !tls && broker.is_some() && (reader.has("ca") || reader.has("certificate")) {
-        reader.warning(
-            "url",
-            "certificates are not used on an mqtt:// connection; write mqtts:// for TLS",
+    let has = |key: &str| reader.has(key);
+    if (has(MQTT.password.name) || has(MQTT.password_file.name)) && !has(MQTT.username.name) {
+        reader.problem(
+            MQTT.username.name,
+            "there is a password without a user name",
+            "write username = \"…\"",
         );
     }
-    let topics = reader.parsed("base", parse_base);
-    let (min_interval, max_interval) = read_publish(reader);
-    let commands = reader.or("commands", false);
+    let ca = read_pem(reader, &MQTT.ca, base);
+    let identity = read_identity(reader, base);
+    if !tls && broker.is_some() && (has(MQTT.ca.name) || has(MQTT.certificate.name)) {
+        reader.warning(
+            MQTT.url.name,
+            "certificates are not used on an mqtt:// connection",
+            "write mqtts:// for TLS",
+        );
+    }
+    let topics = MQTT.base.read(reader);
+    let (min_interval, max_interval) = read_publish(reader)?;
+    let commands = MQTT.commands.get(reader);
     let buffer = read_buffer(reader, base);
-    if reader.or("home_assistant", false) {
+    if reader.or(MQTT.home_assistant.name, false) {
         reader.problem(
-            "home_assistant",
-            "home_assistant = true is not served by this version; remove it",
+            MQTT.home_assistant.name,
+            "home_assistant = true is not supported by this version",
+            "remove it",
         );
     }
     reader.finish();
@@ -70,12 +61,12 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         host,
         port,
         tls,
-        client_id,
+        client_id: client_id.unwrap_or_else(|| format!("drivegate-{}", gateway.unwrap_or_default())),
         username,
         password,
         ca,
         identity,
-        base: topics.unwrap_or_else(|| DEFAULT_BASE.to_string()),
+        base: topics?,
         min_interval,
         max_interval,
         commands,
@@ -83,24 +74,37 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
     })
 }
 
-fn parse_url(text: &str) -> Result<Broker, String> {
+pub(super) fn parse_client_id(text: &str) -> Result<String, Finding> {
+    match text {
+        "" => Err(Finding::new(
+            "the client id is empty",
+            "write a name or leave the key out",
+        )),
+        text => Ok(text.to_string()),
+    }
+}
+
+pub(super) fn parse_url(text: &str) -> Result<Broker, Finding> {
     let bad = |why: &str| {
-        format!(
-            "`{}` {why}; write \"mqtt://host:port\" or \"mqtts://host:port\"",
-            hidden(text)
+        Finding::new(
+            format!("`{}` {why}", hidden(text)),
+            "write \"mqtt://host:port\" or \"mqtts://host:port\"",
         )
     };
     let (scheme, rest) = text.split_once("://").ok_or_else(|| bad("has no scheme"))?;
     let (tls, port) = match scheme {
         "mqtt" => (false, 1883),
         "mqtts" => (true, 8883),
-        _ => return Err(bad("is no MQTT address")),
+        _ => return Err(bad("is not an MQTT address")),
     };
     if rest.contains('@') {
-        return Err("the address holds a user; write username and password_file as keys of their own".to_string());
+        return Err(Finding::new(
+            "the address contains a user",
+            "write username and password_file as separate keys",
+        ));
     }
     let server = rest.strip_suffix('/').unwrap_or(rest);
-    let (host, port) = values::host_port(server, Some(port)).ok_or_else(|| bad("names no host and port"))?;
+    let (host, port) = values::host_port(server, Some(port)).ok_or_else(|| bad("has no valid host and port"))?;
     Ok(Broker { host, port, tls })
 }
 
@@ -112,132 +116,128 @@ fn hidden(url: &str) -> String {
     }
 }
 
-/// `password` or the text of `password_file`; what the environment sets wins over what the file sets.
+/// `password` or the text of `password_file`; a value from the environment overrides one from the file.
 fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
-    let plain: Option<String> = reader.optional("password");
-    let file: Option<PathBuf> = reader.optional("password_file");
-    let from_env = |key: &str| reader.place_of(key).env.is_some();
-    let (plain, file) = match (plain, file, from_env("password"), from_env("password_file")) {
-        (Some(plain), Some(_), true, false) => (Some(plain), None),
-        (Some(_), Some(file), false, true) => (None, Some(file)),
-        (Some(_), Some(_), ..) => {
-            reader.problem(
-                "password",
-                "both password and password_file are set; remove one of them",
-            );
+    let (plain, file) = (MQTT.password.read(reader), MQTT.password_file.read(reader));
+    let [plain_from_env, file_from_env] =
+        [MQTT.password.place(reader), MQTT.password_file.place(reader)].map(|p| p.env.is_some());
+    let file = match (plain, file) {
+        (Some(plain), None) => return Some(Secret(plain)),
+        (Some(plain), Some(_)) if plain_from_env && !file_from_env => return Some(Secret(plain)),
+        (Some(_), Some(_)) if plain_from_env == file_from_env => {
+            let what = "both password and password_file are set";
+            reader.problem(MQTT.password.name, what, "remove one of them");
             return None;
         }
-        (plain, file, ..) => (plain, file),
+        (_, file) => file?,
     };
-    match file.map(|file| secret(&values::resolved(base, file))) {
-        None => plain.map(Secret),
-        Some(Ok(text)) => Some(Secret(text)),
-        Some(Err(message)) => {
-            reader.problem("password_file", message);
-            None
-        }
-    }
+    let text = secret(&values::resolved(base, file));
+    reader.accept(MQTT.password_file.name, text).map(Secret)
 }
 
-/// The first line of a secret file.
-fn secret(path: &Path) -> Result<String, String> {
+/// The only line of a secret file.
+fn secret(path: &Path) -> Result<String, Finding> {
     let mut text = String::new();
     File::open(path)
         .and_then(|file| file.take(SECRET).read_to_string(&mut text))
         .map_err(|error| cannot_read(path, &error))?;
+    let shown = path.display();
     let line = text.lines().next().unwrap_or_default();
     if line.is_empty() {
-        return Err(format!("{} is empty; write the password into it", path.display()));
+        return Err(Finding::new(format!("{shown} is empty"), "write the password into it"));
     }
     if text.trim_end_matches(['\r', '\n']).contains('\n') || text.len() as u64 == SECRET {
-        return Err(format!(
-            "{} is no password: it has several lines; write one line",
-            path.display()
-        ));
+        let what = format!("{shown} is not a password: it has several lines");
+        return Err(Finding::new(what, "write one line"));
     }
     Ok(line.to_string())
 }
 
-fn cannot_read(path: &Path, error: &std::io::Error) -> String {
-    format!(
-        "cannot read {}: {error}; check the path and its permissions",
-        path.display()
+fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
+    Finding::new(
+        format!("cannot read {}: {error}", path.display()),
+        "check the path and its permissions",
     )
 }
 
 /// Path of a PEM file that can be read now.
-fn read_pem(reader: &Reader<'_>, key: &str, base: &Path) -> Option<PathBuf> {
-    let path = values::resolved(base, reader.optional(key)?);
+fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<PathBuf> {
+    let path = values::resolved(base, key.read(reader)?);
     let readable = File::open(&path).and_then(|file| match file.metadata()?.is_file() {
         true => Ok(()),
-        false => Err(std::io::Error::other("it is no file")),
+        false => Err(std::io::Error::other("not a file")),
     });
-    if let Err(error) = readable {
-        reader.problem(key, cannot_read(&path, &error));
-    }
+    reader.accept(key.name, readable.map_err(|error| cannot_read(&path, &error)));
     Some(path)
 }
 
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)> {
-    let certificate = read_pem(reader, "certificate", base);
-    let key = read_pem(reader, "key", base);
-    for (there, missing) in [("certificate", "key"), ("key", "certificate")] {
-        if reader.has(there) && !reader.has(missing) {
+    let certificate = read_pem(reader, &MQTT.certificate, base);
+    let key = read_pem(reader, &MQTT.key, base);
+    let names = [MQTT.certificate.name, MQTT.key.name];
+    for [present, missing] in [names, [names[1], names[0]]] {
+        if reader.has(present) && !reader.has(missing) {
             reader.problem(
-                there,
-                format!("`{there}` stands without `{missing}`; write both or none"),
+                present,
+                format!("`{present}` without `{missing}`"),
+                "write both or none",
             );
         }
     }
     Some((certificate?, key?))
 }
 
-fn parse_base(text: &str) -> Result<String, String> {
+pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
     let levels = || text.split('/');
     let bad = text.contains(['+', '#', '\0']) || text.starts_with('$') || levels().any(str::is_empty);
     if bad {
-        return Err(format!(
-            "`{text}` cannot begin a topic; write levels joined by /, none empty, without + and #, no $ first"
+        return Err(Finding::new(
+            format!("`{text}` cannot be the beginning of a topic"),
+            "write levels joined by /, none of them empty, without + and #, not starting with $",
         ));
     }
     Ok(text.to_string())
 }
 
-fn read_publish(reader: &Reader<'_>) -> (Duration, Duration) {
-    let Some(table) = reader.table("publish") else {
-        return (DEFAULT_MIN_INTERVAL, DEFAULT_MAX_INTERVAL);
+fn read_publish(reader: &Reader<'_>) -> Option<(Duration, Duration)> {
+    let Some(table) = MQTT.publish.table(reader) else {
+        return Some((
+            PUBLISH.min_interval.read_default()?,
+            PUBLISH.max_interval.read_default()?,
+        ));
     };
-    let least = values::duration(&table, "min_interval", DEFAULT_MIN_INTERVAL, &MIN_INTERVAL);
-    let most = values::duration(&table, "max_interval", DEFAULT_MAX_INTERVAL, &MAX_INTERVAL);
+    let (least, most) = (PUBLISH.min_interval.get(&table), PUBLISH.max_interval.get(&table));
     if least > most {
+        let [min, max] = [least, most].map(format_duration);
         table.problem(
-            "min_interval",
-            format!(
-                "min_interval = {} is longer than max_interval = {}; swap them or raise max_interval",
-                format_duration(least),
-                format_duration(most)
-            ),
+            PUBLISH.min_interval.name,
+            format!("min_interval = {min} is longer than max_interval = {max}"),
+            "swap them or raise max_interval",
         );
     }
     table.finish();
-    (least, most)
+    Some((least, most))
 }
 
 fn read_buffer(reader: &Reader<'_>, base: &Path) -> Option<Buffer> {
-    let table = reader.table("buffer")?;
-    let dir = table.or("dir", PathBuf::from(DEFAULT_BUFFER_DIR));
-    let size = match table.has("max_bytes") {
-        true => table.parsed("max_bytes", |text| match parse_size(text)? {
-            bytes if BUFFER.contains(&bytes) => Ok(bytes),
-            _ => Err(format!("{text} is out of range; write \"64KiB\" to \"1024GiB\"")),
-        }),
-        false => parse_size(DEFAULT_BUFFER).ok(),
-    };
+    let table = MQTT.buffer.table(reader)?;
+    let dir = BUFFER.dir.get(&table);
+    let max_bytes = BUFFER.max_bytes.get(&table);
     table.finish();
     Some(Buffer {
         dir: values::resolved(base, dir),
-        max_bytes: size?,
+        max_bytes,
     })
+}
+
+pub(super) fn parse_buffer_size(text: &str) -> Result<u64, Finding> {
+    match parse_size(text)? {
+        bytes if ((64 << 10)..=(1 << 40)).contains(&bytes) => Ok(bytes),
+        _ => Err(Finding::new(
+            format!("{text} is out of range"),
+            format!("write {}", BUFFER.max_bytes.form.range()),
+        )),
+    }
 }
 
 #[cfg(test)]
@@ -261,8 +261,10 @@ mod tests {
         ] {
             assert!(of(bad).is_err(), "{bad}");
         }
-        let told = of("mqtt://me:geheim@b").unwrap_err() + &of("x://me:geheim@b").unwrap_err();
-        assert!(!told.contains("geheim"), "{told}");
+        for url in ["mqtt://me:secret@b", "x://me:secret@b"] {
+            let message = of(url).unwrap_err().to_string();
+            assert!(!message.contains("secret"), "{message}");
+        }
     }
 
     #[test]

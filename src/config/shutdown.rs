@@ -1,53 +1,59 @@
-//! How long the stops of a bus take when the gateway stops. Pure.
+//! How long stopping the drives of a bus takes when the gateway shuts down. Pure.
 
 use std::time::Duration;
 
 use super::BusSettings;
 use crate::cache::{Access, DriveSpec, OnShutdown};
 use crate::codec::{RequestPdu, Table};
+use crate::document::Finding;
 use crate::drive::plan::WireTime;
 
-/// What the service manager gives the gateway to stop: `TimeoutStopSec` of `systemd/drivegate.service`.
-pub const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
-/// What of it the servers, the broker and the ports may take beside the stops of drives.
-pub const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
+/// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
+pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);
+/// The part of it that servers, broker and ports may take.
+pub(crate) const OTHER_STOP_TIME: Duration = Duration::from_secs(10);
 
-/// How long the stops of one bus take, one after the other, counted from the end of the exchange that is on the line.
+/// How long the stops of one bus take, one after another, from the end of the current exchange.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct ShutdownTime {
-    /// Drives that are to be stopped.
+pub(crate) struct ShutdownTime {
+    /// Drives to stop.
     pub drives: usize,
     /// Every one of them answers, after its turnaround.
     pub answered: Duration,
-    /// None of them answers any more: each costs `response_timeout` and wire time for every try.
+    /// None of them answers: each takes `response_timeout` and wire time for every try.
     pub unanswered: Duration,
 }
 
 impl ShutdownTime {
-    /// What to tell of that bus where the service manager may end the gateway before every drive had its stop.
-    pub fn beyond_unit(&self, bus: &str) -> Option<String> {
+    /// The warning about that bus if the service manager may kill the gateway before every drive got its stop.
+    pub(crate) fn beyond_unit(&self, bus: &str) -> Option<Finding> {
         let wanted = self.unanswered + OTHER_STOP_TIME;
         let seconds = |time: Duration| time.as_secs_f64().ceil();
-        (self.drives > 0 && wanted > UNIT_STOP_TIME).then(|| {
-            format!(
-                "stopping {} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s where they do not answer, longer \
-                 than TimeoutStopSec={}s of drivegate.service leaves for it; raise it to {:.0}s or more in the unit \
-                 (stop_grace_period in compose.yaml), lower response_timeout or retries, or split the bus",
-                if self.drives == 1 { "1 drive".to_string() } else { format!("{} drives", self.drives) },
-                self.answered.as_secs_f64(),
-                seconds(self.unanswered),
-                UNIT_STOP_TIME.as_secs(),
-                seconds(wanted),
-            )
-        })
+        let drives = match self.drives {
+            0 => return None,
+            1 => "1 drive".to_string(),
+            drives => format!("{drives} drives"),
+        };
+        let what = format!(
+            "stopping {drives} of bus `{bus}` with the gateway takes {:.1} s, and {:.0} s if they do not answer, longer \
+             than TimeoutStopSec={}s of drivegate.service allows",
+            self.answered.as_secs_f64(),
+            seconds(self.unanswered),
+            UNIT_STOP_TIME.as_secs(),
+        );
+        let remedy = format!(
+            "raise it to {:.0}s or more in the unit (stop_grace_period in compose.yaml), lower response_timeout or \
+             retries, or split the bus",
+            seconds(wanted)
+        );
+        (wanted > UNIT_STOP_TIME).then(|| Finding::new(what, remedy))
     }
 }
 
 impl BusSettings {
-    /// How long the stops take that `on_shutdown = "stop"` asks for. A stop is one write; where the run command is a bit of
-    /// a word, the word may have to be read first. Of a drive that does not answer the read is not repeated, the
-    /// write is.
-    pub fn shutdown_time(&self) -> ShutdownTime {
+    /// How long the stops of `on_shutdown = "stop"` take. A stop is one write; if the run command is a bit of a word, the
+    /// word may have to be read first. If a drive does not answer, the write is repeated, the read is not.
+    pub(crate) fn shutdown_time(&self) -> ShutdownTime {
         let mut time = ShutdownTime::default();
         for drive in self.drives.iter().filter(|drive| is_stopped(drive)) {
             let Some((read, write)) = stop_of(drive) else { continue };
@@ -70,12 +76,12 @@ impl BusSettings {
     }
 }
 
-/// Whether the drive gets a stop at the end of the gateway.
+/// Whether the drive is stopped when the gateway shuts down.
 fn is_stopped(drive: &DriveSpec) -> bool {
     drive.access == Access::Control && drive.on_shutdown == OnShutdown::Stop
 }
 
-/// The requests of a stop: the read of the control word, where there is one, and the write.
+/// The requests of a stop: the read of the control word, if there is one, and the write.
 fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
     let (raw, _, invert) = drive.profile.run_bit()?;
     let (table, address) = (raw.table, raw.address);

@@ -1,11 +1,10 @@
-//! What must not occur twice: names, ports, addresses, units, listeners.
+//! What must be unique: names, ports, addresses, units, listeners.
 
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 use super::bus::Found;
-use super::drive::UNITS;
 use super::north::Listener;
 use crate::document::{Document, Place};
 
@@ -35,10 +34,11 @@ fn check_names<'a>(document: &Document, what: &str, many: &str, names: impl Iter
             Some(first) => document.problem(
                 place,
                 format!(
-                    "there are two {many} `{name}`, the other one is {}{}; rename this {what}",
+                    "there are two {many} `{name}`, the other one is {}{}",
                     first.key.trim_end_matches(".name"),
                     line(first)
                 ),
+                format!("rename this {what}"),
             ),
             None => {
                 seen.insert(name, place);
@@ -67,12 +67,13 @@ fn check_ports(document: &Document, buses: &[Found]) {
         };
         document.problem(
             place,
-            format!("the port {port} belongs to bus{owner} already{how}; give each bus a port of its own"),
+            format!("the port {port} already belongs to bus{owner}{how}"),
+            "give each bus its own port",
         );
     }
 }
 
-/// The device behind a port: symbolic links resolved as far as they lead anywhere now.
+/// The device behind a port: symbolic links resolved as far as they exist now.
 fn device(port: &str) -> PathBuf {
     if port.contains("://") {
         return PathBuf::from(port.to_ascii_lowercase());
@@ -90,7 +91,8 @@ fn check_addresses(document: &Document, buses: &[Found]) {
             match seen.get(address) {
                 Some(owner) => document.problem(
                     place,
-                    format!("address {address} belongs to {owner} on this bus already; give each drive of a bus its own address"),
+                    format!("address {address} already belongs to {owner} on this bus"),
+                    "give each drive of a bus its own address",
                 ),
                 None => {
                     seen.insert(*address, owner(drive));
@@ -108,9 +110,9 @@ fn owner(drive: &super::drive::Found) -> String {
     }
 }
 
-/// A unit id reaches one drive on each listener. `selections` are the buses that each shows, `None` all.
+/// A unit id identifies one drive on each listener. `selections` are the buses that each shows, `None` for all.
 pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Option<Vec<String>>]) {
-    let mut told: Vec<(Option<usize>, u8)> = Vec::new();
+    let mut reported: Vec<(Option<usize>, u8)> = Vec::new();
     for selection in selections {
         let is_shown = |bus: &&Found| match (selection, &bus.name) {
             (Some(names), Some((name, _))) => names.contains(name),
@@ -129,25 +131,24 @@ pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Op
                 seen.insert(*unit, owner(drive));
                 continue;
             };
-            // What two listeners show alike is told once.
-            if place.line.is_some() && told.contains(&(place.line, *unit)) {
+            // What two listeners show alike is reported once.
+            if place.line.is_some() && reported.contains(&(place.line, *unit)) {
                 continue;
             }
-            told.push((place.line, *unit));
-            let remedy = match UNITS.into_iter().find(|unit| !used.contains(unit)) {
+            reported.push((place.line, *unit));
+            let remedy = match (1..=254).find(|unit| !used.contains(unit)) {
                 Some(free) => {
                     used.push(free);
                     format!(
-                        "write unit = {free}, or another free one, or give each bus a [[modbus_tcp.listener]] of its own"
+                        "write unit = {free}, or another free one, or give each bus its own [[modbus_tcp.listener]]"
                     )
                 }
                 None => {
-                    "all 254 units are taken; give each bus a [[modbus_tcp.listener]] of its own, or take a second \
-                         gateway"
+                    "all 254 units are taken: give each bus its own [[modbus_tcp.listener]], or use a second gateway"
                         .to_string()
                 }
             };
-            document.problem(place, format!("unit {unit} belongs to {first} already; {remedy}"));
+            document.problem(place, format!("unit {unit} already belongs to {first}"), remedy);
         }
     }
 }
@@ -160,11 +161,8 @@ pub(super) fn check_listeners<'a>(document: &Document, listeners: impl Iterator<
         if let Some((other, first)) = seen.iter().find(|(other, _)| collide(*other, *address)) {
             document.problem(
                 place,
-                format!(
-                    "{address} collides with {other} of {}{}; give each server a port of its own",
-                    first.key,
-                    line(first)
-                ),
+                format!("{address} collides with {other} of {}{}", first.key, line(first)),
+                "give each server its own port",
             );
         }
         seen.push(listener);

@@ -1,150 +1,85 @@
-//! Values of the configuration that TOML has no type for.
+//! Texts of the configuration that TOML has no type for.
 
-use std::fmt::Display;
 use std::net::{IpAddr, SocketAddr};
-use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
 use ipnet::IpNet;
 
-use crate::document::{Place, Reader, format_duration, nearest};
+use crate::document::{Finding, nearest};
 
 /// Most characters of a name.
 pub(super) const NAME_LENGTH: usize = 64;
 
-/// A duration between two bounds; `default` when it is absent or wrong.
-pub(super) fn duration(
-    reader: &Reader<'_>,
-    key: &str,
-    default: Duration,
-    bounds: &RangeInclusive<Duration>,
-) -> Duration {
-    optional_duration(reader, key, bounds).unwrap_or(default)
-}
-
-/// A duration between two bounds, if it is there and right.
-pub(super) fn optional_duration(reader: &Reader<'_>, key: &str, bounds: &RangeInclusive<Duration>) -> Option<Duration> {
-    let value: Duration = reader.optional(key)?;
-    if bounds.contains(&value) {
-        return Some(value);
+/// `"a"`, `"a" or "b"`, `"a", "b" or "c"`.
+pub(super) fn any_of<'a>(words: impl Iterator<Item = &'a str>) -> String {
+    let words: Vec<String> = words.map(|word| format!("\"{word}\"")).collect();
+    match words.split_last() {
+        Some((last, rest)) if !rest.is_empty() => format!("{} or {last}", rest.join(", ")),
+        _ => words.concat(),
     }
-    let [value, least, most] = [value, *bounds.start(), *bounds.end()].map(format_duration);
-    reader.problem(key, format!("{value} is out of range; write \"{least}\" to \"{most}\""));
-    None
 }
 
-/// A whole number between two bounds; `default` when it is absent or wrong.
-pub(super) fn number<T: Copy + TryFrom<i64> + PartialOrd + Display>(
-    reader: &Reader<'_>,
-    key: &str,
-    default: T,
-    bounds: &RangeInclusive<T>,
-) -> T {
-    optional_number(reader, key, bounds).unwrap_or(default)
-}
-
-/// A whole number between two bounds, if it is there and right.
-pub(super) fn optional_number<T: Copy + TryFrom<i64> + PartialOrd + Display>(
-    reader: &Reader<'_>,
-    key: &str,
-    bounds: &RangeInclusive<T>,
-) -> Option<T> {
-    let value: i64 = reader.optional(key)?;
-    let fitting = T::try_from(value).ok().filter(|fitting| bounds.contains(fitting));
-    if fitting.is_none() {
-        let (least, most) = (bounds.start(), bounds.end());
-        reader.problem(key, format!("{value} is out of range; write {least} to {most}"));
-    }
-    fitting
-}
-
-/// One of several words; `default` when it is absent or wrong.
-pub(super) fn choice<T: Copy>(reader: &Reader<'_>, key: &str, default: T, choices: &[(&str, T)]) -> T {
-    let parse = |text: &str| match choices.iter().find(|(word, _)| *word == text) {
-        Some((_, value)) => Ok(*value),
-        None => Err(unknown_word(text, choices.iter().map(|(word, _)| *word))),
+/// ``unknown word `x` ``, and the nearest word, or all of them.
+pub(super) fn unknown_word<'a>(text: &str, words: impl Iterator<Item = &'a str> + Clone) -> Finding {
+    let remedy = match nearest(text, words.clone()) {
+        Some(near) => format!("did you mean \"{near}\"?"),
+        None => format!("write {}", any_of(words)),
     };
-    reader.parsed(key, parse).unwrap_or(default)
+    Finding::new(format!("unknown word `{text}`"), remedy)
 }
 
-/// ``unknown word `x`; write "a" or "b"``, with the nearest word if one is near.
-pub(super) fn unknown_word<'a>(text: &str, words: impl Iterator<Item = &'a str> + Clone) -> String {
-    match nearest(text, words.clone()) {
-        Some(near) => format!("unknown word `{text}`; did you mean \"{near}\"?"),
-        None => {
-            let words: Vec<String> = words.map(|word| format!("\"{word}\"")).collect();
-            format!("unknown word `{text}`; write {}", words.join(" or "))
-        }
-    }
-}
-
-/// A name that can stand in topics, labels and addresses, with its place.
-pub(super) fn name(reader: &Reader<'_>, joints: &str) -> Option<(String, Place)> {
-    let text: String = reader.required("name")?;
-    if let Err(message) = check_name(&text, joints) {
-        reader.problem("name", message);
-        return None;
-    }
-    Some((text, reader.place_of("name")))
-}
-
-fn check_name(text: &str, joints: &str) -> Result<(), String> {
+/// Checks a name that can be part of topics, labels and addresses; `joints` are allowed besides letters and digits.
+pub(super) fn check_name(text: &str, joints: &str) -> Result<(), Finding> {
     let letter = |c: char| c.is_ascii_lowercase() || c.is_ascii_digit();
     let shape = text.starts_with(letter) && text.chars().all(|c| letter(c) || joints.contains(c));
     if shape && text.len() <= NAME_LENGTH {
         return Ok(());
     }
     let joints: Vec<String> = joints.chars().map(String::from).collect();
-    Err(format!(
-        "`{text}` cannot be a name; write a-z, 0-9 and {}, {NAME_LENGTH} characters at most, a letter or digit first",
-        joints.join(", ")
+    Err(Finding::new(
+        format!("`{text}` is not a valid name"),
+        format!(
+            "write a-z, 0-9 and {}, at most {NAME_LENGTH} characters, starting with a letter or digit",
+            joints.join(", ")
+        ),
     ))
 }
 
 /// An address to listen on.
-pub(super) fn socket(text: &str) -> Result<SocketAddr, String> {
+pub(super) fn socket(text: &str) -> Result<SocketAddr, Finding> {
     text.parse().map_err(|_| {
         let port = text.rsplit(':').next().and_then(|port| port.parse::<u16>().ok());
         let port = port.unwrap_or(1502);
-        format!(
-            "`{text}` is no IP address with a port; write for example \"127.0.0.1:{port}\" or \"[::1]:{port}\"; host names \
-             are not taken"
+        Finding::new(
+            format!("`{text}` is not an IP address with a port"),
+            format!("write for example \"127.0.0.1:{port}\" or \"[::1]:{port}\"; host names are not accepted"),
         )
     })
 }
 
-/// A network in CIDR form, or a single address.
-pub(super) fn network(text: &str) -> Result<IpNet, String> {
+/// A network in CIDR notation, or a single address.
+pub(super) fn network(text: &str) -> Result<IpNet, Finding> {
     let host = || text.parse::<IpAddr>().map(IpNet::from).ok();
-    text.parse::<IpNet>()
-        .ok()
-        .or_else(host)
-        .map(|net| net.trunc())
-        .ok_or_else(|| format!("`{text}` is no network; write for example \"192.168.1.0/24\" or \"192.168.1.7/32\""))
+    let network = text.parse::<IpNet>().ok().or_else(host);
+    network.map(|network| network.trunc()).ok_or_else(|| {
+        Finding::new(
+            format!("`{text}` is not a network"),
+            "write for example \"192.168.1.0/24\" or \"192.168.1.7/32\"",
+        )
+    })
 }
 
-/// A list of strings, each parsed; every bad item is a problem.
-pub(super) fn list<T>(
-    reader: &Reader<'_>,
-    key: &str,
-    default: Vec<T>,
-    parse: impl Fn(&str) -> Result<T, String>,
-) -> Vec<T> {
-    let Some(items) = reader.optional::<Vec<String>>(key) else {
-        return default;
-    };
-    let mut values = Vec::new();
-    for item in items {
-        match parse(&item) {
-            Ok(value) => values.push(value),
-            Err(message) => reader.problem(key, message),
-        }
-    }
-    values
+/// Any text.
+pub(super) fn any_text(text: &str) -> Result<String, Finding> {
+    Ok(text.to_string())
 }
 
-/// `host:port` or `[v6]:port`; the port may be left out where there is a default.
+/// Any path.
+pub(super) fn path(text: &str) -> Result<PathBuf, Finding> {
+    Ok(PathBuf::from(text))
+}
+
+/// `host:port` or `[v6]:port`; the port may be omitted where there is a default.
 pub(super) fn host_port(text: &str, default: Option<u16>) -> Option<(String, u16)> {
     let (host, port) = match text.strip_prefix('[') {
         Some(rest) => {
@@ -172,7 +107,7 @@ pub(super) fn host_port(text: &str, default: Option<u16>) -> Option<(String, u16
     Some((host.to_string(), port))
 }
 
-/// `path` as seen from the directory of the configuration file.
+/// `path` relative to the directory of the configuration file.
 pub(super) fn resolved(base: &Path, path: PathBuf) -> PathBuf {
     if path.is_absolute() { path } else { base.join(path) }
 }

@@ -1,54 +1,63 @@
-//! Reading a document's file, and what to say of one that is no text.
+//! Reads the text of a document, and reports where a file stops being text.
 
 use std::path::Path;
 
-use super::Problem;
+use super::{Finding, Problem};
 
-/// Reads a file for a document; the problem says why it cannot.
-///
-/// # Errors
-/// One problem that names the file, and where it stops being text.
-pub fn read_file(path: &Path) -> Result<String, Problem> {
-    let problem = |line, message| Problem {
-        file: path.display().to_string(),
-        line,
-        key: String::new(),
-        message,
-    };
-    let bytes = std::fs::read(path).map_err(|error| {
-        let message = format!("cannot read the file: {error}; check the path and its permissions");
-        problem(None, message)
-    })?;
-    text(bytes).map_err(|(line, message)| problem(line, message))
+/// Why bytes are not the text of a document.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+enum NotText {
+    #[error("the file is UTF-16 text")]
+    Utf16,
+    #[error("the file is not text: byte 0x{byte:02X} at line {line}, column {column}")]
+    Byte { byte: u8, line: usize, column: usize },
 }
 
-/// The text in `bytes`, or where it is none, with its line, and what to do.
-fn text(bytes: Vec<u8>) -> Result<String, (Option<usize>, String)> {
-    // Some shells and editors of Windows write it unasked; what follows may look like text with holes.
+/// Reads a file for a document.
+///
+/// # Errors
+/// One problem with the file and, where it stops being text, the line.
+pub(crate) fn read_file(path: &Path) -> Result<String, Problem> {
+    let of_file =
+        |what: String, remedy: &str| Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy));
+    let bytes = std::fs::read(path).map_err(|error| {
+        of_file(
+            format!("cannot read the file: {error}"),
+            "check the path and its permissions",
+        )
+    })?;
+    text(bytes).map_err(|error| match error {
+        NotText::Utf16 => of_file(error.to_string(), "save it as UTF-8"),
+        NotText::Byte { line, .. } => Problem {
+            line: Some(line),
+            ..of_file(error.to_string(), "save it as UTF-8 text, or name the intended file")
+        },
+    })
+}
+
+fn text(bytes: Vec<u8>) -> Result<String, NotText> {
+    // Some shells and editors on Windows write UTF-16 by default.
     if bytes.starts_with(&[0xFF, 0xFE]) || bytes.starts_with(&[0xFE, 0xFF]) {
-        let message = "the file is UTF-16 text; save it as UTF-8".to_string();
-        return Err((None, message));
+        return Err(NotText::Utf16);
     }
     let sound = match std::str::from_utf8(&bytes) {
         Ok(_) => bytes.len(),
         Err(error) => error.valid_up_to(),
     };
-    // A zero byte is UTF-8 and stands in no text: it tells of a program, an archive, or a file that was cut by a crash.
+    // A zero byte is valid UTF-8 but never part of a text: the file is a program, an archive, or was cut by a crash.
     let zero = bytes.iter().position(|byte| *byte == 0).unwrap_or(sound);
     let end = sound.min(zero);
     let (before, rest) = bytes.split_at_checked(end).unwrap_or((&bytes, &[]));
-    let Some(byte) = rest.first() else {
-        // Nothing is lossy here: all of it is sound.
+    let Some(&byte) = rest.first() else {
+        // All of it was checked above.
         return Ok(String::from_utf8(bytes).unwrap_or_default());
     };
     let before = String::from_utf8_lossy(before);
-    let line = before.matches('\n').count() + 1;
-    let column = before.rsplit('\n').next().unwrap_or_default().chars().count() + 1;
-    let message = format!(
-        "the file is no text: byte 0x{byte:02X} at line {line}, column {column}; save it as UTF-8 text, or name the file \
-         that was meant"
-    );
-    Err((Some(line), message))
+    Err(NotText::Byte {
+        byte,
+        line: before.matches('\n').count() + 1,
+        column: before.rsplit('\n').next().unwrap_or_default().chars().count() + 1,
+    })
 }
 
 #[cfg(test)]
@@ -57,31 +66,42 @@ mod tests {
 
     #[test]
     fn where_a_file_stops_being_text() {
-        let told = |bytes: &[u8]| text(bytes.to_vec());
+        let text = |bytes: &[u8]| text(bytes.to_vec());
         for good in ["", "a = 1\n", "# Übergabe ℃\r\n", "\u{FEFF}a = 1", "\u{FFFD}"] {
-            assert_eq!(told(good.as_bytes()).as_deref(), Ok(good));
+            assert_eq!(text(good.as_bytes()).as_deref(), Ok(good));
         }
-        let place = |bytes: &[u8]| {
-            let (line, message) = told(bytes).unwrap_err();
-            let (what, remedy) = message.split_once("; ").unwrap();
-            assert_eq!(remedy, "save it as UTF-8 text, or name the file that was meant");
-            (line, what.strip_prefix("the file is no text: ").unwrap().to_string())
-        };
-        let at = |byte: &str, line: usize, column: usize| {
-            (Some(line), format!("byte 0x{byte} at line {line}, column {column}"))
-        };
-        assert_eq!(place(b"\x7FELF\x02\x01\x01\x00\xFF"), at("00", 1, 8));
+        let at = |byte, line, column| Err(NotText::Byte { byte, line, column });
+        assert_eq!(text(b"\x7FELF\x02\x01\x01\x00\xFF"), at(0, 1, 8));
         // Latin-1, behind a letter of two bytes and one column.
-        assert_eq!(place(b"a = 1\n# \xC3\x9Cbergabe 20 \xB0C\n"), at("B0", 2, 15));
-        assert_eq!(place(b"\xB0\x00"), at("B0", 1, 1));
-        assert_eq!(place(b"a = 1\n\x00\xB0"), at("00", 2, 1));
+        assert_eq!(text(b"a = 1\n# \xC3\x9Cbergabe 20 \xB0C\n"), at(0xB0, 2, 15));
+        assert_eq!(text(b"\xB0\x00"), at(0xB0, 1, 1));
+        assert_eq!(text(b"a = 1\n\x00\xB0"), at(0, 2, 1));
         // The last letter is cut off.
-        assert_eq!(place(b"a\r\n\r\nb\xC3"), at("C3", 3, 2));
+        assert_eq!(text(b"a\r\n\r\nb\xC3"), at(0xC3, 3, 2));
         for utf16 in [b"\xFF\xFEa\0".as_slice(), b"\xFE\xFF\0a"] {
-            assert_eq!(
-                told(utf16),
-                Err((None, "the file is UTF-16 text; save it as UTF-8".to_string()))
-            );
+            assert_eq!(text(utf16), Err(NotText::Utf16));
         }
+    }
+
+    #[test]
+    fn the_problem_names_the_file_and_the_line() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("x.toml");
+        let problem = || {
+            read_file(&path)
+                .unwrap_err()
+                .to_string()
+                .replace(dir.path().to_str().unwrap(), "")
+        };
+        assert!(
+            problem().ends_with("/x.toml; check the path and its permissions"),
+            "{}",
+            problem()
+        );
+        std::fs::write(&path, b"a\n\xB0").unwrap();
+        assert_eq!(
+            problem(),
+            "the file is not text: byte 0xB0 at line 2, column 1; /x.toml:2; save it as UTF-8 text, or name the intended file"
+        );
     }
 }

@@ -1,11 +1,10 @@
-//! TOML documents that know the place of every value, for the configuration and the profiles.
+//! TOML documents that keep the place of every value, for the configuration and the profiles.
 //!
-//! A [`Reader`] hands out the keys of one table. What is missing, of the wrong type or unknown is
-//! collected as a [`Problem`] with file, line and key, so that one run reports every fault of a
-//! file. A key is known when somebody asked for it: [`Reader::finish`] reports the others, with
-//! the nearest known one.
+//! A [`Reader`] returns the keys of one table. Keys that are missing, unknown or have the wrong type are collected as
+//! [`Problem`]s with file, line and key, so that one run reports every error of a file. A key is known once it was
+//! asked for: [`Reader::finish`] reports the others, each with the nearest known key.
 //!
-//! The values themselves are in `tree`, the types that they can be read as in `value`.
+//! `tree` holds the values, `value` the types they can be read as.
 
 mod file;
 mod reader;
@@ -16,16 +15,48 @@ use std::cell::RefCell;
 use std::collections::BTreeSet;
 use std::fmt;
 
-use serde::Serialize;
+use serde::{Serialize, Serializer};
 
-use tree::entries;
+use tree::{OverrideError, entries};
 
-pub use file::read_file;
-pub use reader::{Reader, nearest};
-pub use tree::{Entry, Node, Raw};
-pub use value::{FromNode, format_duration, parse_duration, parse_size};
+pub(crate) use file::read_file;
+pub(crate) use reader::{Reader, nearest};
+pub(crate) use tree::{Entry, Node, Raw};
+pub(crate) use value::{FromNode, format_duration, parse_duration, parse_size};
 
-/// One fault of a document: what, where, and what to do.
+/// What is wrong and what to do about it.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Finding {
+    /// What is wrong.
+    pub what: String,
+    /// What to do; empty where there is nothing to add.
+    pub remedy: String,
+}
+
+impl Finding {
+    /// Both parts.
+    pub(crate) fn new(what: impl Into<String>, remedy: impl Into<String>) -> Finding {
+        Finding {
+            what: what.into(),
+            remedy: remedy.into(),
+        }
+    }
+}
+
+impl fmt::Display for Finding {
+    /// `what; what to do`.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.what)?;
+        match self.remedy.as_str() {
+            "" => Ok(()),
+            remedy => write!(f, "; {remedy}"),
+        }
+    }
+}
+
+impl std::error::Error for Finding {}
+
+/// A finding and its place.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Problem {
     /// File, or the environment variable that overrides it.
@@ -34,34 +65,45 @@ pub struct Problem {
     pub line: Option<usize>,
     /// Dotted path of the key, such as `bus[0].drive[1].address`.
     pub key: String,
-    /// What is wrong and what to do, separated by `; `.
-    pub message: String,
+    /// What is wrong and what to do.
+    #[serde(rename = "message", serialize_with = "as_text")]
+    pub finding: Finding,
+}
+
+impl Problem {
+    /// A problem of a whole file, or of `key` in it, without a line.
+    pub(crate) fn of_file(file: impl Into<String>, key: &str, finding: Finding) -> Problem {
+        Problem {
+            file: file.into(),
+            line: None,
+            key: key.to_string(),
+            finding,
+        }
+    }
 }
 
 impl fmt::Display for Problem {
     /// `what; file:line, key; what to do`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let (what, remedy) = match self.message.split_once("; ") {
-            Some((what, remedy)) => (what, Some(remedy)),
-            None => (self.message.as_str(), None),
-        };
-        write!(f, "{what}; {}", self.file)?;
+        let mut place = self.file.clone();
         if let Some(line) = self.line {
-            write!(f, ":{line}")?;
+            place += &format!(":{line}");
         }
         if !self.key.is_empty() {
-            write!(f, ", {}", self.key)?;
+            place += &format!(", {}", self.key);
         }
-        match remedy {
-            Some(remedy) => write!(f, "; {remedy}"),
-            None => Ok(()),
-        }
+        let what = format!("{}; {place}", self.finding.what);
+        Finding::new(what, self.finding.remedy.as_str()).fmt(f)
     }
 }
 
-/// Where a value stands.
+fn as_text<S: Serializer>(finding: &Finding, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.collect_str(finding)
+}
+
+/// Where a value comes from.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
-pub struct Place {
+pub(crate) struct Place {
     /// Line of the file, from 1.
     pub line: Option<usize>,
     /// Environment variable that set the value instead of the file.
@@ -72,7 +114,7 @@ pub struct Place {
 
 /// A parsed file and the problems found in it so far.
 #[derive(Debug)]
-pub struct Document {
+pub(crate) struct Document {
     file: String,
     root: Node,
     problems: RefCell<Vec<Problem>>,
@@ -81,8 +123,8 @@ pub struct Document {
 }
 
 impl Document {
-    /// Parses `source`, the text of `file`. Syntax errors become problems; what could be read is kept.
-    pub fn parse(file: impl Into<String>, source: &str) -> Document {
+    /// Parses `source`, the text of `file`. Syntax errors become problems; whatever can be read is kept.
+    pub(crate) fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let document = Document {
             file: file.into(),
@@ -96,13 +138,13 @@ impl Document {
                 line,
                 ..Place::default()
             };
-            document.problem(&place, format!("not valid TOML: {message}"));
+            document.problem(&place, format!("not valid TOML: {message}"), "");
         }
         document
     }
 
     /// Adds the section `name` of the top level if it is absent, so that variables can set its keys.
-    pub fn ensure_section(&mut self, name: &str) {
+    pub(crate) fn ensure_section(&mut self, name: &str) {
         let Raw::Table(entries) = &mut self.root.value else {
             return;
         };
@@ -112,8 +154,8 @@ impl Document {
     }
 
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
-    /// The section must be there, tables inside it need not.
-    pub fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
+    /// The section must exist, tables inside it need not.
+    pub(crate) fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
             .into_iter()
@@ -126,54 +168,50 @@ impl Document {
                 .first()
                 .filter(|section| path.len() > 1 && !self.has_section(section));
             let outcome = match absent {
-                Some(section) => Err(format!(
-                    "there is no `{section}` in the file to override; add the section to the file first"
-                )),
+                Some(section) => Err(OverrideError::NoSection(section.clone())),
                 None => tree::set(&mut self.root, &path, &name, value),
             };
-            if let Err(message) = outcome {
-                let problem = Problem {
-                    file: name,
-                    line: None,
-                    key: path.join("."),
-                    message,
-                };
+            if let Err(error) = outcome {
+                let finding = Finding::new(error.to_string(), error.remedy());
+                let problem = Problem::of_file(name, &path.join("."), finding);
                 self.problems.get_mut().push(problem);
             }
         }
     }
 
     /// The whole tree.
-    pub fn root(&self) -> &Node {
+    pub(crate) fn root(&self) -> &Node {
         &self.root
     }
 
-    /// Puts another tree in the place of the one that was parsed.
-    pub fn set_root(&mut self, root: Node) {
+    /// Replaces the parsed tree.
+    pub(crate) fn set_root(&mut self, root: Node) {
         self.root = root;
     }
 
     /// The reader of the whole document.
-    pub fn reader(&self) -> Reader<'_> {
+    pub(crate) fn reader(&self) -> Reader<'_> {
         Reader::of(self, &self.root, Place::default())
     }
 
     /// Adds a problem.
-    pub fn problem(&self, place: &Place, message: impl Into<String>) {
-        self.problems.borrow_mut().push(self.finding(place, message.into()));
+    pub(crate) fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+        let problem = self.at(place, Finding::new(what, remedy));
+        self.problems.borrow_mut().push(problem);
     }
 
-    /// Adds a warning: the document can be used, but something in it will not do what it seems to.
-    pub fn warning(&self, place: &Place, message: impl Into<String>) {
-        self.warnings.borrow_mut().push(self.finding(place, message.into()));
+    /// Adds a warning: the document can be used, but part of it will not do what it seems to.
+    pub(crate) fn warning(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
+        let warning = self.at(place, Finding::new(what, remedy));
+        self.warnings.borrow_mut().push(warning);
     }
 
-    fn finding(&self, place: &Place, message: String) -> Problem {
+    fn at(&self, place: &Place, finding: Finding) -> Problem {
         Problem {
             file: place.env.clone().unwrap_or_else(|| self.file.clone()),
             line: place.line,
             key: place.key.clone(),
-            message,
+            finding,
         }
     }
 
@@ -181,29 +219,24 @@ impl Document {
         entries(&self.root).iter().any(|(key, _, _)| key == name)
     }
 
-    /// Every key that any reader of this document asked for, as a path without the numbers of array
-    /// elements: `bus[].drive[].address`.
-    pub fn known_keys(&self) -> BTreeSet<String> {
+    /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
+    /// `bus[].drive[].address`.
+    pub(crate) fn known_keys(&self) -> BTreeSet<String> {
         self.known.borrow().clone()
     }
 
     /// Whether no problem was found so far.
-    pub fn is_sound(&self) -> bool {
+    pub(crate) fn is_sound(&self) -> bool {
         self.problems.borrow().is_empty()
     }
 
-    /// The file's name as it was given.
-    pub fn file(&self) -> &str {
-        &self.file
-    }
-
-    /// Takes the problems, in the order of the lines.
-    pub fn into_problems(self) -> Vec<Problem> {
+    /// The problems, in the order of the lines.
+    pub(crate) fn into_problems(self) -> Vec<Problem> {
         self.into_findings().0
     }
 
-    /// Takes problems and warnings, each in the order of the lines.
-    pub fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
+    /// Problems and warnings, each in the order of the lines.
+    pub(crate) fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
         let sorted = |mut found: Vec<Problem>| {
             found.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
             found
@@ -226,7 +259,7 @@ mod tests {
     }
 
     #[test]
-    fn every_fault_is_told_with_its_place() {
+    fn every_error_has_its_place() {
         let text = "nmae = \"x\"\nport = 5\n\n[[bus]]\nbaud = \"fast\"\n[[bus]]\nbaud = -1\n";
         let found = problems(text, |r| {
             let _: Option<String> = r.required("name");
@@ -240,7 +273,7 @@ mod tests {
             found,
             [
                 "unknown key `nmae`; f.toml:1, nmae; did you mean `name`?",
-                "an integer stands here; f.toml:2, port; write a string in quotes",
+                "wrong type: an integer; f.toml:2, port; write a string in quotes",
                 "`fast` is not a whole number from 0 to 4294967295; f.toml:5, bus[0].baud; write a whole number from 0 to 4294967295",
                 "-1 is out of range; f.toml:7, bus[1].baud; write a whole number from 0 to 4294967295",
                 "`name` is missing; f.toml, name; write a string in quotes",

@@ -1,13 +1,13 @@
-//! The reader of one table: typed values by key, and what is missing, wrong or unknown as problems.
+//! The reader of one table: typed values by key; missing, wrong and unknown keys become problems.
 
 use std::cell::{Cell, RefCell};
 
 use super::tree::entries;
-use super::{Document, Entry, FromNode, Node, Place, Raw};
+use super::{Document, Entry, Finding, FromNode, Node, Place, Raw};
 
-/// Hands out the keys of one table.
+/// Returns the keys of one table.
 #[derive(Debug)]
-pub struct Reader<'d> {
+pub(crate) struct Reader<'d> {
     document: &'d Document,
     entries: &'d [Entry],
     place: Place,
@@ -27,18 +27,13 @@ impl<'d> Reader<'d> {
         }
     }
 
-    /// Where the table stands.
-    pub fn place(&self) -> &Place {
-        &self.place
-    }
-
     /// The document it belongs to.
-    pub fn document(&self) -> &'d Document {
+    pub(crate) fn document(&self) -> &'d Document {
         self.document
     }
 
-    /// Where `key` stands, or the table when it is absent.
-    pub fn place_of(&self, key: &str) -> Place {
+    /// The place of `key`, or of the table if the key is absent.
+    pub(crate) fn place_of(&self, key: &str) -> Place {
         let node = self.find(key);
         let env = node.and_then(|n| n.env.clone()).or_else(|| self.place.env.clone());
         let line = node.and_then(|n| n.line).or(self.place.line);
@@ -50,72 +45,71 @@ impl<'d> Reader<'d> {
     }
 
     /// Adds a problem at `key`.
-    pub fn problem(&self, key: &str, message: impl Into<String>) {
-        self.document.problem(&self.place_of(key), message);
+    pub(crate) fn problem(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
+        self.document.problem(&self.place_of(key), what, remedy);
+    }
+
+    /// Adds what is wrong with the value of `key`.
+    pub(crate) fn finding(&self, key: &str, finding: impl Into<Finding>) {
+        let Finding { what, remedy } = finding.into();
+        self.problem(key, what, remedy);
+    }
+
+    /// The value, or `None` with its error as a problem at `key`.
+    pub(crate) fn accept<T, E: Into<Finding>>(&self, key: &str, outcome: Result<T, E>) -> Option<T> {
+        outcome.map_err(|error| self.finding(key, error)).ok()
     }
 
     /// Adds a warning at `key`.
-    pub fn warning(&self, key: &str, message: impl Into<String>) {
-        self.document.warning(&self.place_of(key), message);
+    pub(crate) fn warning(&self, key: &str, what: impl Into<String>, remedy: impl Into<String>) {
+        self.document.warning(&self.place_of(key), what, remedy);
     }
 
-    /// All keys that stand in the table, known or not.
-    pub fn keys(&self) -> Vec<&'d str> {
+    /// All keys in the table, known or not.
+    pub(crate) fn keys(&self) -> Vec<&'d str> {
         self.entries.iter().map(|(key, _, _)| key.as_str()).collect()
     }
 
-    /// Whether `key` stands in the table; makes it known.
-    pub fn has(&self, key: &str) -> bool {
+    /// Whether the table has `key`; makes it known.
+    pub(crate) fn has(&self, key: &str) -> bool {
         self.know(key);
         self.find(key).is_some()
     }
 
     /// The untyped value of `key`.
-    pub fn raw(&self, key: &str) -> Option<&'d Node> {
+    pub(crate) fn raw(&self, key: &str) -> Option<&'d Node> {
         self.know(key);
         self.find(key)
     }
 
-    /// The value of `key`, if it is there and right.
-    pub fn optional<T: FromNode>(&self, key: &str) -> Option<T> {
+    /// The value of `key`, if it is present and valid.
+    pub(crate) fn optional<T: FromNode>(&self, key: &str) -> Option<T> {
         self.know(key);
         let node = self.find(key)?;
-        match T::from_node(node) {
-            Ok(value) => Some(value),
-            Err(message) => {
-                self.problem(key, message);
-                None
-            }
-        }
+        self.accept(key, T::from_node(node))
     }
 
     /// The value of `key`; its absence is a problem.
-    pub fn required<T: FromNode>(&self, key: &str) -> Option<T> {
+    pub(crate) fn required<T: FromNode>(&self, key: &str) -> Option<T> {
         if !self.has(key) {
-            self.problem(key, format!("`{key}` is missing; write {}", T::WANTED));
+            self.problem(key, format!("`{key}` is missing"), format!("write {}", T::WANTED));
         }
         self.optional(key)
     }
 
-    /// The value of `key` or, when it is absent or wrong, `default`.
-    pub fn or<T: FromNode>(&self, key: &str, default: T) -> T {
+    /// The value of `key`, or `default` if it is absent or wrong.
+    pub(crate) fn or<T: FromNode>(&self, key: &str, default: T) -> T {
         self.optional(key).unwrap_or(default)
     }
 
     /// The value of `key` parsed from a string.
-    pub fn parsed<T>(&self, key: &str, parse: impl FnOnce(&str) -> Result<T, String>) -> Option<T> {
+    pub(crate) fn parsed<T, E: Into<Finding>>(&self, key: &str, parse: impl FnOnce(&str) -> Result<T, E>) -> Option<T> {
         let text: String = self.optional(key)?;
-        match parse(&text) {
-            Ok(value) => Some(value),
-            Err(message) => {
-                self.problem(key, message);
-                None
-            }
-        }
+        self.accept(key, parse(&text))
     }
 
     /// The reader of the table `key`.
-    pub fn table(&self, key: &str) -> Option<Reader<'d>> {
+    pub(crate) fn table(&self, key: &str) -> Option<Reader<'d>> {
         self.know(key);
         let node = self.find(key)?;
         match node.value {
@@ -123,11 +117,8 @@ impl<'d> Reader<'d> {
             _ => {
                 self.problem(
                     key,
-                    format!(
-                        "`{key}` is {}, not a table; write [{}]",
-                        node.value.kind(),
-                        self.header(key)
-                    ),
+                    format!("`{key}` is {}, not a table", node.value.kind()),
+                    format!("write [{}]", self.header(key)),
                 );
                 None
             }
@@ -135,19 +126,16 @@ impl<'d> Reader<'d> {
     }
 
     /// The readers of the array of tables `key`; none when it is absent.
-    pub fn tables(&self, key: &str) -> Vec<Reader<'d>> {
+    pub(crate) fn tables(&self, key: &str) -> Vec<Reader<'d>> {
         self.know(key);
         let Some(node) = self.find(key) else { return Vec::new() };
         let items = match &node.value {
             Raw::Array(items) if items.iter().all(|i| matches!(i.value, Raw::Table(_))) => items,
             other => {
-                let kind = other.kind();
                 self.problem(
                     key,
-                    format!(
-                        "`{key}` is {kind}, not a list of tables; write [[{}]]",
-                        self.header(key)
-                    ),
+                    format!("`{key}` is {}, not a list of tables", other.kind()),
+                    format!("write [[{}]]", self.header(key)),
                 );
                 return Vec::new();
             }
@@ -159,18 +147,13 @@ impl<'d> Reader<'d> {
             .collect()
     }
 
-    /// The keys asked for so far: what the table may hold.
-    pub fn known(&self) -> Vec<String> {
-        self.known.borrow().clone()
-    }
-
-    /// Lets unknown keys pass, for a table that is broken in a way that is already told.
-    pub fn tolerate(&self) {
+    /// Accepts unknown keys, for a table with an error that is already reported and may explain them.
+    pub(crate) fn tolerate(&self) {
         self.lenient.set(true);
     }
 
-    /// Reports the keys nobody asked for, with the nearest known one.
-    pub fn finish(&self) {
+    /// Reports the keys that were never asked for, each with the nearest known key.
+    pub(crate) fn finish(&self) {
         if self.lenient.get() {
             return;
         }
@@ -188,7 +171,7 @@ impl<'d> Reader<'d> {
                 Some(near) => format!("did you mean `{near}`?"),
                 None => format!("known here: {}", known.join(", ")),
             };
-            self.document.problem(&place, format!("unknown key `{key}`; {remedy}"));
+            self.document.problem(&place, format!("unknown key `{key}`"), remedy);
         }
     }
 
@@ -216,7 +199,7 @@ impl<'d> Reader<'d> {
         }
     }
 
-    /// The path as it stands in the header of a table.
+    /// The path as it is written in the header of a table.
     fn header(&self, key: &str) -> String {
         without_numbers(&self.path(key)).replace("[]", "")
     }
@@ -241,8 +224,8 @@ fn without_numbers(path: &str) -> String {
     path.chars().filter(keep).collect()
 }
 
-/// The known word nearest to `word`, if one is near enough to be meant.
-pub fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+/// The known word nearest to `word`, if one is close enough to be a misspelling.
+pub(crate) fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
     let mut best: Option<(usize, &str)> = None;
     for candidate in known {
         let distance = strsim::damerau_levenshtein(word, candidate);

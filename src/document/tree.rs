@@ -1,13 +1,13 @@
-//! The tree of a document: values, each with its place, and how they come out of TOML or a variable.
+//! The tree of a document: values with their places, from TOML or from an environment variable.
 
 use toml::de::{DeTable, DeValue};
 
 /// One key of a table: the key, its line, the value.
-pub type Entry = (String, Option<usize>, Node);
+pub(crate) type Entry = (String, Option<usize>, Node);
 
 /// A value and its place.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Node {
+pub(crate) struct Node {
     /// The value.
     pub value: Raw,
     pub(super) line: Option<usize>,
@@ -16,79 +16,42 @@ pub struct Node {
 
 impl Node {
     /// The value of `key`, if this is a table that has it.
-    pub fn entry(&self, key: &str) -> Option<&Node> {
+    pub(crate) fn entry(&self, key: &str) -> Option<&Node> {
         entries(self).iter().find(|(k, ..)| k == key).map(|(_, _, node)| node)
     }
 
     /// Line of the file, from 1.
-    pub fn line(&self) -> Option<usize> {
+    pub(crate) fn line(&self) -> Option<usize> {
         self.line
     }
 
-    /// Takes the place of another value, so that what is told of this one is told there.
-    pub fn stand_where(&mut self, other: &Node) {
+    /// Takes over the place of another value: problems of this one are reported there.
+    pub(crate) fn move_to(&mut self, other: &Node) {
         self.line = other.line;
         self.env = other.env.clone();
     }
 
-    /// The same for a document of another file: what is told of it names `what` instead of a line.
-    pub fn told_as(&self, what: &str) -> Node {
+    /// A copy for a document of another file: its problems name `source` instead of a line.
+    pub(crate) fn with_source(&self, source: &str) -> Node {
         let value = match &self.value {
             Raw::Table(entries) => {
-                let told = entries
+                let copies = entries
                     .iter()
-                    .map(|(key, _, node)| (key.clone(), None, node.told_as(what)));
-                Raw::Table(told.collect())
+                    .map(|(key, _, node)| (key.clone(), None, node.with_source(source)));
+                Raw::Table(copies.collect())
             }
-            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.told_as(what)).collect()),
+            Raw::Array(items) => Raw::Array(items.iter().map(|item| item.with_source(source)).collect()),
             other => other.clone(),
         };
         Node {
             value,
             line: None,
-            env: Some(what.to_string()),
-        }
-    }
-
-    /// The content in one form: without comments, lines, the way a value is written, and the order of keys.
-    pub fn canonical(&self) -> String {
-        let mut text = String::new();
-        self.write_canonical(&mut text);
-        text
-    }
-
-    fn write_canonical(&self, out: &mut String) {
-        match &self.value {
-            Raw::Text(text) => out.push_str(&format!("{text:?}")),
-            Raw::Env(text) => out.push_str(&format!("env {text:?}")),
-            Raw::Integer(number) => out.push_str(&number.to_string()),
-            Raw::Float(number) => out.push_str(&format!("{number:?}")),
-            Raw::Bool(state) => out.push_str(&state.to_string()),
-            Raw::Other => out.push('?'),
-            Raw::Array(items) => {
-                out.push('[');
-                for item in items {
-                    item.write_canonical(out);
-                    out.push(',');
-                }
-                out.push(']');
-            }
-            Raw::Table(entries) => {
-                let mut entries: Vec<&Entry> = entries.iter().collect();
-                entries.sort_by(|(a, ..), (b, ..)| a.cmp(b));
-                out.push('{');
-                for (key, _, value) in entries {
-                    out.push_str(&format!("{key:?}="));
-                    value.write_canonical(out);
-                    out.push(',');
-                }
-                out.push('}');
-            }
+            env: Some(source.to_string()),
         }
     }
 
     /// A table without keys.
-    pub fn empty_table(env: Option<String>) -> Node {
+    pub(crate) fn empty_table(env: Option<String>) -> Node {
         Node {
             value: Raw::Table(Vec::new()),
             line: None,
@@ -99,7 +62,7 @@ impl Node {
 
 /// A TOML value.
 #[derive(Debug, Clone, PartialEq)]
-pub enum Raw {
+pub(crate) enum Raw {
     /// A string.
     Text(String),
     /// A 64-bit integer.
@@ -112,14 +75,14 @@ pub enum Raw {
     Array(Vec<Node>),
     /// A table: key, line of the key, value.
     Table(Vec<Entry>),
-    /// Text of an environment variable, read as whatever type is wanted.
+    /// Text of an environment variable, read as any type.
     Env(String),
-    /// A date or an integer beyond 64 bits: no key takes one.
+    /// A date or an integer beyond 64 bits, which no key accepts.
     Other,
 }
 
 impl Raw {
-    /// What it is, for messages: `an integer`.
+    /// The type, for messages: `an integer`.
     pub(super) fn kind(&self) -> &'static str {
         match self {
             Raw::Text(_) | Raw::Env(_) => "a string",
@@ -187,7 +150,7 @@ fn table_of(table: DeTable<'_>, lines: &Lines) -> Raw {
             lines.line(span.start)
         };
         let value = value_of(value.into_inner(), lines);
-        // A table's own place is its header or key, not the first of its values.
+        // A table is placed at its header or key, not at its first value.
         let node_line = if matches!(value, Raw::Table(_)) {
             line
         } else {
@@ -232,11 +195,33 @@ fn value_of(value: DeValue<'_>, lines: &Lines) -> Raw {
     }
 }
 
+/// Why an environment variable cannot override a value.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum OverrideError {
+    #[error("there is no `{0}` in the file to override")]
+    NoSection(String),
+    #[error("`{key}` is not an element of an array of {count}")]
+    NoElement { key: String, count: usize },
+    #[error("`{0}` is below a plain value")]
+    BelowValue(String),
+}
+
+impl OverrideError {
+    /// What to do about it.
+    pub(super) fn remedy(&self) -> &'static str {
+        match self {
+            OverrideError::NoSection(_) => "add the section to the file first",
+            OverrideError::NoElement { .. } => "count from 0",
+            OverrideError::BelowValue(_) => "override the value itself",
+        }
+    }
+}
+
 /// Puts the `text` of the variable `name` at `path` below `node`.
 ///
 /// # Errors
-/// What is wrong with the path and what to do.
-pub(super) fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(), String> {
+/// The path leads nowhere.
+pub(super) fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(), OverrideError> {
     let Some((key, rest)) = path.split_first() else {
         *node = Node {
             value: Raw::Env(text),
@@ -259,9 +244,12 @@ pub(super) fn set(node: &mut Node, path: &[String], name: &str, text: String) ->
             let count = items.len();
             match key.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
                 Some(item) => set(item, rest, name, text),
-                None => Err(format!("`{key}` is no element of an array of {count}; count from 0")),
+                None => Err(OverrideError::NoElement {
+                    key: key.clone(),
+                    count,
+                }),
             }
         }
-        _ => Err(format!("`{key}` lies below a plain value; override the value itself")),
+        _ => Err(OverrideError::BelowValue(key.clone())),
     }
 }

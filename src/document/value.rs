@@ -1,37 +1,72 @@
-//! The types that a value can be read as, and the texts of durations and sizes.
+//! The types a value can be read as, and the notation of durations and sizes.
 
 use std::path::PathBuf;
 use std::time::Duration;
 
-use super::{Node, Raw};
+use super::{Finding, Node, Raw};
+
+/// Why a value cannot be read: the value or its type, then what to write.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(crate) enum ValueError {
+    #[error("`\"{0}\"` is a string")]
+    Quoted(String, &'static str),
+    #[error("`{0}` is not {1}")]
+    Text(String, &'static str),
+    #[error("`{0}` is not a list")]
+    NotAList(String, String),
+    #[error("wrong type: {0}")]
+    Type(&'static str, String),
+    #[error("{0} is out of range")]
+    OutOfRange(i64, &'static str),
+    #[error("{0} is not a finite number")]
+    NotFinite(f64, &'static str),
+    #[error("`{0}` is not a duration")]
+    Duration(String),
+    #[error("`{0}` is not a size")]
+    Size(String),
+}
+
+impl From<ValueError> for Finding {
+    fn from(error: ValueError) -> Finding {
+        use ValueError::{Duration, NotAList, NotFinite, OutOfRange, Quoted, Size, Text, Type};
+        let remedy = match &error {
+            Quoted(_, wanted) => format!("write {wanted}, without quotes"),
+            Text(_, wanted) | OutOfRange(_, wanted) | NotFinite(_, wanted) => format!("write {wanted}"),
+            NotAList(_, wanted) | Type(_, wanted) => format!("write {wanted}"),
+            Duration(_) => "write a number with its unit, such as 10ms, 1.5s or 2min".to_string(),
+            Size(_) => "write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"".to_string(),
+        };
+        Finding::new(error.to_string(), remedy)
+    }
+}
 
 /// A type that a value can be read as.
-pub trait FromNode: Sized {
+pub(crate) trait FromNode: Sized {
     /// What to write, for messages: `a string`.
     const WANTED: &'static str;
 
     /// Reads the value.
     ///
     /// # Errors
-    /// What is wrong and what to write instead.
-    fn from_node(node: &Node) -> Result<Self, String>;
+    /// The value has another type, another form, or is out of range.
+    fn from_node(node: &Node) -> Result<Self, ValueError>;
 }
 
-fn wrong<T: FromNode>(node: &Node) -> String {
+fn wrong<T: FromNode>(node: &Node) -> ValueError {
     let is_quoted = |text: &str| text.parse::<f64>().is_ok() || text.parse::<bool>().is_ok();
     match &node.value {
         Raw::Text(text) if is_quoted(text) && !T::WANTED.contains("quotes") => {
-            format!("`\"{text}\"` is text; write {}, without quotes", T::WANTED)
+            ValueError::Quoted(text.clone(), T::WANTED)
         }
-        Raw::Env(text) | Raw::Text(text) => format!("`{text}` is not {}; write {}", T::WANTED, T::WANTED),
-        other => format!("{} stands here; write {}", other.kind(), T::WANTED),
+        Raw::Env(text) | Raw::Text(text) => ValueError::Text(text.clone(), T::WANTED),
+        other => ValueError::Type(other.kind(), T::WANTED.to_string()),
     }
 }
 
 impl FromNode for String {
     const WANTED: &'static str = "a string in quotes";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Text(text) | Raw::Env(text) => Ok(text.clone()),
             _ => Err(wrong::<Self>(node)),
@@ -42,7 +77,7 @@ impl FromNode for String {
 impl FromNode for PathBuf {
     const WANTED: &'static str = "a path in quotes";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         String::from_node(node)
             .map(PathBuf::from)
             .map_err(|_| wrong::<Self>(node))
@@ -52,7 +87,7 @@ impl FromNode for PathBuf {
 impl FromNode for bool {
     const WANTED: &'static str = "true or false";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Bool(value) => Ok(*value),
             Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
@@ -64,7 +99,7 @@ impl FromNode for bool {
 impl FromNode for i64 {
     const WANTED: &'static str = "a whole number";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Integer(value) => Ok(*value),
             Raw::Env(text) => text.parse().map_err(|_| wrong::<Self>(node)),
@@ -78,10 +113,10 @@ macro_rules! from_integer {
         impl FromNode for $type {
             const WANTED: &'static str = $wanted;
 
-            fn from_node(node: &Node) -> Result<Self, String> {
+            fn from_node(node: &Node) -> Result<Self, ValueError> {
                 let value = i64::from_node(node).map_err(|_| wrong::<Self>(node))?;
                 <$type>::try_from(value)
-                    .map_err(|_| format!("{value} is out of range; write {}", Self::WANTED))
+                    .map_err(|_| ValueError::OutOfRange(value, Self::WANTED))
             }
         }
     )*};
@@ -93,7 +128,7 @@ from_integer!(u8: "a whole number from 0 to 255", u16: "a whole number from 0 to
 impl FromNode for f64 {
     const WANTED: &'static str = "a number";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         let value = match &node.value {
             Raw::Float(value) => *value,
             Raw::Integer(value) => *value as f64,
@@ -103,7 +138,7 @@ impl FromNode for f64 {
         if value.is_finite() {
             Ok(value)
         } else {
-            Err(format!("{value} is no finite number; write {}", Self::WANTED))
+            Err(ValueError::NotFinite(value, Self::WANTED))
         }
     }
 }
@@ -111,7 +146,7 @@ impl FromNode for f64 {
 impl FromNode for Duration {
     const WANTED: &'static str = "a duration in quotes, such as \"10ms\", \"1.5s\" or \"2min\"";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Text(text) | Raw::Env(text) => parse_duration(text),
             _ => Err(wrong::<Self>(node)),
@@ -122,7 +157,7 @@ impl FromNode for Duration {
 impl<T: FromNode> FromNode for Vec<T> {
     const WANTED: &'static str = "a list in brackets";
 
-    fn from_node(node: &Node) -> Result<Self, String> {
+    fn from_node(node: &Node) -> Result<Self, ValueError> {
         match &node.value {
             Raw::Array(items) => items.iter().map(T::from_node).collect(),
             Raw::Env(text) => text
@@ -136,17 +171,23 @@ impl<T: FromNode> FromNode for Vec<T> {
                     })
                 })
                 .collect(),
-            _ => Err(format!("{}, each {}", wrong::<Self>(node), T::WANTED)),
+            Raw::Text(text) => Err(ValueError::NotAList(text.clone(), each::<T>())),
+            other => Err(ValueError::Type(other.kind(), each::<T>())),
         }
     }
+}
+
+/// What to write for a list.
+fn each<T: FromNode>() -> String {
+    format!("{}, each {}", Vec::<T>::WANTED, T::WANTED)
 }
 
 /// A duration: a number, not negative, and one of `us`, `ms`, `s`, `min`, `h`.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub fn parse_duration(text: &str) -> Result<Duration, String> {
-    let bad = || format!("`{text}` is no duration; write a number with its unit, such as 10ms, 1.5s or 2min");
+/// The text is not a duration.
+pub(crate) fn parse_duration(text: &str) -> Result<Duration, ValueError> {
+    let bad = || ValueError::Duration(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed
         .find(|c: char| !c.is_ascii_digit() && c != '.')
@@ -164,8 +205,8 @@ pub fn parse_duration(text: &str) -> Result<Duration, String> {
     Duration::try_from_secs_f64(number * seconds).map_err(|_| bad())
 }
 
-/// The text that [`parse_duration`] reads as `time`, in the unit that makes it short.
-pub fn format_duration(time: Duration) -> String {
+/// The shortest text that [`parse_duration`] reads as `time`.
+pub(crate) fn format_duration(time: Duration) -> String {
     match (time.as_secs(), time.subsec_nanos()) {
         (0, 0) => "0s".to_string(),
         (seconds, 0) if seconds % 3600 == 0 => format!("{}h", seconds / 3600),
@@ -178,9 +219,9 @@ pub fn format_duration(time: Duration) -> String {
 /// A size in bytes: a number and one of `B`, `KiB`, `MiB`, `GiB`.
 ///
 /// # Errors
-/// What is wrong and what to write.
-pub fn parse_size(text: &str) -> Result<u64, String> {
-    let bad = || format!("`{text}` is no size; write a whole number with B, KiB, MiB or GiB, such as \"64MiB\"");
+/// The text is not a size.
+pub(crate) fn parse_size(text: &str) -> Result<u64, ValueError> {
+    let bad = || ValueError::Size(text.to_string());
     let trimmed = text.trim();
     let digits = trimmed.find(|c: char| !c.is_ascii_digit()).ok_or_else(bad)?;
     let (number, unit) = trimmed.split_at(digits);

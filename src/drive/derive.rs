@@ -1,9 +1,8 @@
-//! Points that the drive does not tell, made of points that it does. Pure.
+//! Points derived from the points of the drive. Pure.
 
-use super::model::{Quality, Sample, Value};
-use super::profile::tidy;
+use super::model::{Quality, Sample, Value, tidy};
 
-/// One end of a band: another point, or a figure of the manual.
+/// One end of a band: another point, or a number from the manual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
     /// Index of a point of the profile.
@@ -12,10 +11,10 @@ pub enum Bound {
     Fixed(f64),
 }
 
-/// How a value is made of other points, by their indices in the profile. All of them are raw points.
+/// How a value is derived from other points, given by their indices in the profile. All of them are raw points.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Derived {
-    /// A percentage as a place in a band: `minimum + of / 100 * (maximum - minimum)`.
+    /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`.
     Band {
         /// Point in percent.
         of: usize,
@@ -24,7 +23,7 @@ pub enum Derived {
         /// Value at 100 %.
         maximum: Bound,
     },
-    /// A place in a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`.
+    /// A value within a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`.
     Percent {
         /// Point in the unit of the band.
         of: usize,
@@ -33,14 +32,14 @@ pub enum Derived {
         /// Value at 100 %.
         maximum: Bound,
     },
-    /// True while the amount of the point is not above `within`.
+    /// True while the absolute value of the point is at most `within`.
     Zero {
         /// Point.
         of: usize,
         /// In the unit of the point.
         within: f64,
     },
-    /// True while the two points differ by not more than `within`.
+    /// True while the two points differ by at most `within`.
     Equal {
         /// Point.
         of: usize,
@@ -49,12 +48,12 @@ pub enum Derived {
         /// In the unit of the points.
         within: f64,
     },
-    /// True while all of the points are.
+    /// True while all of the points are true.
     All {
         /// Points.
         of: Vec<usize>,
     },
-    /// Number of the lowest bit that is set, counted from 1; 0 when none is.
+    /// Number of the lowest set bit, counted from 1; 0 if none is set.
     LowestBit {
         /// Point with a mask.
         of: usize,
@@ -62,7 +61,8 @@ pub enum Derived {
 }
 
 impl Derived {
-    /// The name in profiles and output.
+    /// The name in profiles.
+    #[cfg(test)]
     pub fn name(&self) -> &'static str {
         match self {
             Derived::Band { .. } => "band",
@@ -74,7 +74,7 @@ impl Derived {
         }
     }
 
-    /// The point that a command to this one is turned into, with the ends of its band.
+    /// The point that a command to this one is converted to, with the ends of the band.
     pub fn band(&self) -> Option<(usize, Bound, Bound)> {
         match *self {
             Derived::Band { of, minimum, maximum } | Derived::Percent { of, minimum, maximum } => {
@@ -84,7 +84,7 @@ impl Derived {
         }
     }
 
-    /// The points that the value itself is made of; the ends of a band are not among them.
+    /// The points that the value itself is derived from, without the ends of a band.
     pub fn sources(&self) -> Vec<usize> {
         match self {
             Derived::Band { of, .. }
@@ -96,15 +96,15 @@ impl Derived {
         }
     }
 
-    /// All points that it rests on, the ends of a band among them.
-    pub fn rests_on(&self) -> Vec<usize> {
+    /// All points that it depends on, including the ends of a band.
+    pub(crate) fn rests_on(&self) -> Vec<usize> {
         let mut points = self.sources();
         points.extend(self.ends());
         points
     }
 
-    /// The points that are ends of its band.
-    pub fn ends(&self) -> impl Iterator<Item = usize> {
+    /// The points that are the ends of its band.
+    pub(crate) fn ends(&self) -> impl Iterator<Item = usize> {
         let ends = self.band().map(|(_, low, high)| [low, high]);
         ends.into_iter().flatten().filter_map(|bound| match bound {
             Bound::Point(point) => Some(point),
@@ -112,8 +112,8 @@ impl Derived {
         })
     }
 
-    /// The value in the unit of this point that `value` of its source means; `None` where there is none.
-    pub fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
+    /// The value for these values of the sources; `None` if it cannot be computed.
+    pub(crate) fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
         let first = sources.first()?;
         match self {
             Derived::Band { .. } => {
@@ -142,8 +142,8 @@ impl Derived {
         }
     }
 
-    /// What the source has to be so that this point is `value`; `None` where it cannot be commanded.
-    pub fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
+    /// The value of the source for which this point is `value`; `None` if it cannot be commanded.
+    pub(crate) fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
         let (low, high) = band;
         match self {
             _ if high <= low => None,
@@ -153,8 +153,8 @@ impl Derived {
         }
     }
 
-    /// The sample made of those of the sources: the worst quality, the oldest time.
-    pub fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
+    /// The sample derived from those of the sources: the worst quality, the oldest time.
+    pub(crate) fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
         let values: Option<Vec<Value>> = sources.iter().map(|s| s.value).collect();
         let value = values.and_then(|values| self.value(&values, band));
         let Some(value) = value else { return Sample::NONE };

@@ -1,23 +1,24 @@
 //! What a drive is: points, profiles and the requests that read them. Pure.
 
-pub mod derive;
+pub(crate) mod derive;
 #[cfg(test)]
 mod families_tests;
-pub mod identify;
+pub(crate) mod identify;
 pub mod model;
-pub mod plan;
+pub(crate) mod plan;
 pub mod profile;
 mod profile_file;
 
 pub use derive::{Bound, Derived};
+pub(crate) use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
-pub use plan::{Plan, PlannedRead};
-pub use profile::{Point, PollClass, Profile, Raw, Source};
+pub(crate) use plan::{Plan, PlannedRead};
+pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
 
-/// Name of the point that tells how a drive itself responds to a silent master; 0 is no response. For Vacon NX
-/// parameter P2.7.22.
-pub const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
+/// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
+/// P2.7.22.
+pub(crate) const FIELDBUS_FAULT_RESPONSE: &str = "fieldbus_fault_response";
 
-/// Name of the point that tells after how many seconds without a request a drive responds to a silent master; 0 is
-/// never. For drives that have a register for it.
-pub const COMMUNICATION_TIMEOUT: &str = "communication_timeout";
+/// Name of the point with the time without a request, in seconds, after which a drive responds to a silent master; 0 is
+/// never. For drives with a register for it.
+pub(crate) const COMMUNICATION_TIMEOUT: &str = "communication_timeout";

@@ -13,12 +13,12 @@ pub enum Value {
     Bool(bool),
     /// A code or a bit mask.
     Integer(i64),
-    /// A figure in the point's unit; always finite.
+    /// A number in the point's unit; always finite.
     Number(f64),
 }
 
 impl Value {
-    /// The figure; true is 1.
+    /// The value as a number; true is 1.
     pub fn as_f64(self) -> f64 {
         match self {
             Value::Bool(b) => f64::from(u8::from(b)),
@@ -43,11 +43,11 @@ impl fmt::Display for Value {
     }
 }
 
-/// What a value is worth.
+/// Whether a value can be relied on.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum Quality {
-    /// Read from the drive within its time.
+    /// Read from the drive recently enough.
     Good,
     /// Older than allowed, or the drive is offline.
     Stale,
@@ -57,7 +57,7 @@ pub enum Quality {
 
 impl Quality {
     /// The worse of two.
-    pub fn worse(self, other: Quality) -> Quality {
+    pub(crate) fn worse(self, other: Quality) -> Quality {
         let rank = |quality| match quality {
             Quality::Good => 0,
             Quality::Stale => 1,
@@ -81,21 +81,21 @@ impl Quality {
 pub struct Sample {
     /// The last value read; absent when there never was one.
     pub value: Option<Value>,
-    /// What it is worth.
+    /// Its quality.
     pub quality: Quality,
-    /// When the reply that carried it ended.
+    /// End of the reply that contained it.
     pub at: Option<Instant>,
 }
 
 impl Sample {
     /// Nothing is known.
-    pub const NONE: Sample = Sample {
+    pub(crate) const NONE: Sample = Sample {
         value: None,
         quality: Quality::Bad,
         at: None,
     };
 
-    /// The value, only if it is good.
+    /// The value, if it is good.
     pub fn good(&self) -> Option<Value> {
         if self.quality == Quality::Good {
             self.value
@@ -105,11 +105,11 @@ impl Sample {
     }
 }
 
-/// The state of a drive in one word.
+/// The state of a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum State {
-    /// Does not answer, was never reached, or its values are too old.
+    /// Does not answer, never answered, or its values are too old.
     Offline,
     /// Answers, is not ready to run.
     NotReady,
@@ -132,7 +132,7 @@ impl State {
     ];
 
     /// Code in the common block of Modbus TCP.
-    pub fn code(self) -> u16 {
+    pub(crate) fn code(self) -> u16 {
         match self {
             State::Offline => 0,
             State::NotReady => 1,
@@ -159,10 +159,16 @@ impl State {
 pub enum Kind {
     /// True or false.
     Bool,
-    /// A figure.
+    /// A number with a unit.
     Number,
     /// A code.
     Integer,
+}
+
+/// Rounds away the error of binary fractions in a scaled count: 2500 * 0.01 is 25, not 25.000000000000004.
+pub(crate) fn tidy(value: f64) -> f64 {
+    let rounded = (value * 1e6).round() / 1e6;
+    if rounded.is_finite() { rounded } else { value }
 }
 
 macro_rules! model_points {
@@ -198,11 +204,11 @@ macro_rules! model_points {
 model_points! {
     Ready "ready" "" Bool "Ready to run.",
     Running "running" "" Bool "Runs.",
-    Reversed "reversed" "" Bool "Turns in reverse.",
+    Reversed "reversed" "" Bool "Runs in reverse.",
     Fault "fault" "" Bool "Has a fault.",
     Warning "warning" "" Bool "Has a warning.",
     AtReference "at_reference" "" Bool "Output has reached the reference.",
-    ZeroSpeed "zero_speed" "" Bool "Motor stands.",
+    ZeroSpeed "zero_speed" "" Bool "Motor at standstill.",
     Remote "remote" "" Bool "The fieldbus is the control place.",
     ActualSpeed "actual_speed" "%" Number "Speed in percent of the speed range.",
     OutputFrequency "output_frequency" "Hz" Number "Output frequency.",
@@ -225,12 +231,12 @@ model_points! {
 
 impl ModelPoint {
     /// The point of that name.
-    pub fn from_name(name: &str) -> Option<ModelPoint> {
+    pub(crate) fn from_name(name: &str) -> Option<ModelPoint> {
         ModelPoint::ALL.iter().copied().find(|p| p.name() == name)
     }
 
     /// Place in [`ModelPoint::ALL`].
-    pub fn index(self) -> usize {
+    pub(crate) fn index(self) -> usize {
         self as usize
     }
 }

@@ -1,4 +1,4 @@
-//! The requests that read a drive: points that lie together become one request.
+//! The requests that read a drive: neighbouring points are read in one request.
 
 use std::collections::BTreeSet;
 use std::time::Duration;
@@ -9,7 +9,7 @@ use crate::codec::{LineFormat, Protocol, RequestPdu, Table};
 /// One request of the plan.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
 pub struct PlannedRead {
-    /// How often it is sent.
+    /// Poll class.
     pub class: PollClass,
     /// Table.
     pub table: Table,
@@ -17,7 +17,7 @@ pub struct PlannedRead {
     pub start: u16,
     /// Items.
     pub count: u16,
-    /// Bit i is set where item i is the second register of a value: no request begins there.
+    /// Bit i is set if item i is the second register of a value: no request begins there.
     pub wide: u128,
 }
 
@@ -31,8 +31,8 @@ impl PlannedRead {
         }
     }
 
-    /// Whether it reads that address.
-    pub fn covers(&self, table: Table, address: u16) -> bool {
+    /// Whether it includes that address.
+    pub(crate) fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address >= self.start
             && u32::from(address) < u32::from(self.start) + u32::from(self.count)
@@ -47,11 +47,10 @@ pub struct Plan {
 }
 
 impl Plan {
-    /// Merges the points of a profile into few requests: addresses of one class that lie together
-    /// in one range of the drive, up to the limit of the range. A gap is covered only where the
-    /// range allows holes. An address needed by two classes, or read with the faster one as such a gap, is read in
-    /// the faster one only.
-    pub fn of(profile: &Profile) -> Plan {
+    /// Merges the points of a profile into few requests: neighbouring addresses of one class in one range of the drive,
+    /// up to the limit of the range. A gap is read only where the range allows holes. An address that two classes need,
+    /// or that the faster one reads as such a gap, is read in the faster one only.
+    pub(crate) fn of(profile: &Profile) -> Plan {
         let mut taken: BTreeSet<(Table, u16)> = BTreeSet::new();
         let mut reads = Vec::new();
         for class in [PollClass::Fast, PollClass::Slow, PollClass::Once] {
@@ -70,8 +69,8 @@ impl Plan {
         Plan { reads }
     }
 
-    /// Whether these requests tell a point of that profile: all that it lies in or rests on.
-    pub fn tells(&self, profile: &Profile, point: usize) -> bool {
+    /// Whether these requests read a point of that profile: everything it is in or derived from.
+    pub(crate) fn tells(&self, profile: &Profile, point: usize) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
@@ -82,8 +81,8 @@ impl Plan {
         }
     }
 
-    /// Splits a refused request in two halves, never within a value; a single value cannot be split.
-    pub fn halves(read: PlannedRead) -> Option<(PlannedRead, PlannedRead)> {
+    /// Splits a refused request into halves, never within a value; a single value cannot be split.
+    pub(crate) fn halves(read: PlannedRead) -> Option<(PlannedRead, PlannedRead)> {
         let middle = read.count / 2;
         let joint = |at: &u16| *at >= 1 && *at < read.count && !is_wide(read.wide, *at);
         let first = (middle..read.count).chain((0..middle).rev()).find(joint)?;
@@ -104,7 +103,7 @@ impl Plan {
 
 impl PlannedRead {
     /// Appends the read of the addresses that follow.
-    pub fn append(&mut self, next: &PlannedRead) {
+    pub(crate) fn append(&mut self, next: &PlannedRead) {
         self.wide |= next.wide.checked_shl(u32::from(self.count)).unwrap_or(0);
         self.count = self.count.saturating_add(next.count);
     }
@@ -118,7 +117,7 @@ fn low_bits(count: u16) -> u128 {
     1u128.checked_shl(u32::from(count)).map_or(u128::MAX, |bit| bit - 1)
 }
 
-/// Registers that make one value and are read together: table, first address, how many.
+/// Registers of one value, which are read together: table, first address, count.
 type Piece = (Table, u16, u16);
 
 fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<PlannedRead> {
@@ -154,13 +153,13 @@ fn merge(profile: &Profile, class: PollClass, wanted: &BTreeSet<Piece>) -> Vec<P
     reads
 }
 
-/// What an exchange costs on the line.
+/// Time an exchange takes on the line.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub struct WireTime {
+pub(crate) struct WireTime {
     /// Characters of the request.
     pub request: Duration,
-    /// Silence by which the drive knows that the request is over (Modbus RTU: 3.5 characters); its turnaround
-    /// begins behind it.
+    /// Silence by which the drive detects the end of the request (Modbus RTU: 3.5 characters); its turnaround begins
+    /// after it.
     pub recognition: Duration,
     /// Characters of the regular reply.
     pub reply: Duration,
@@ -168,7 +167,7 @@ pub struct WireTime {
 
 impl WireTime {
     /// Wire time of an exchange.
-    pub fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
+    pub(crate) fn of(protocol: Protocol, format: &LineFormat, pdu: &RequestPdu) -> WireTime {
         WireTime {
             request: format.chars(protocol.request_chars(pdu)),
             recognition: protocol.recognition(format),
@@ -177,7 +176,7 @@ impl WireTime {
     }
 
     /// The whole transaction: request, recognition, turnaround, reply, silence.
-    pub fn total(&self, turnaround: Duration, silence: Duration) -> Duration {
+    pub(crate) fn total(&self, turnaround: Duration, silence: Duration) -> Duration {
         self.request + self.recognition + turnaround + self.reply + silence
     }
 }

@@ -1,53 +1,51 @@
-//! A drive family as data: its points, where they lie, their scales, and what the drive allows.
+//! A drive family as data: its points, their addresses and scales, and what the drive allows.
 
 mod raw;
 
 use std::collections::BTreeMap;
-use std::fmt;
 use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::Duration;
 
 use super::derive::Derived;
-use super::identify::Expected;
 use super::model::{Kind, ModelPoint, Value};
-use crate::codec::{N2Options, Protocol, Table};
+use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::Node;
 
-pub use raw::{Form, Raw, Unwritable, WordOrder, tidy};
+pub use raw::{Form, Raw, WordOrder};
 
 /// A validated profile.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Profile {
     /// Name in configurations.
     pub name: String,
-    /// One line for people.
+    /// One line of description.
     pub title: String,
-    /// Manual and tables the profile rests on.
+    /// Manual and tables the profile is based on.
     pub source: String,
     /// Whether the profile is part of the program; else it came from a file.
     pub built_in: bool,
-    /// The profile that its file rests on.
+    /// The profile that its file is based on.
     pub base: Option<String>,
-    /// Protocols the family speaks.
+    /// Protocols of the family.
     pub protocols: Vec<Protocol>,
-    /// Baud rates of the family; empty when any will do.
+    /// Baud rates of the family; empty if any is possible.
     pub bauds: Vec<u32>,
     /// Addresses a drive can have.
     pub addresses: RangeInclusive<u8>,
-    /// Time a drive takes to begin its answer, for the prediction only.
+    /// Time a drive takes to begin its reply, for the prediction only.
     pub turnaround: Duration,
-    /// Period at which the drive takes over its process data; a reset pulse is held for two of them.
+    /// Update period of the drive's process data; a reset pulse is held for two of them.
     pub update_period: Duration,
     /// Time after an acknowledged command within which a read must show its effect.
     pub confirm_within: Duration,
     /// Function 04 reads the same registers as function 03.
     pub input_is_holding: bool,
-    /// Reads that show the family, for whoever looks for drives.
+    /// Reads that identify the family, for `scan`.
     pub identify: Vec<Expected>,
-    /// What is known of the family's N2.
+    /// N2 options of the family.
     pub n2: N2Options,
-    /// Name of the behaviour that a simulated drive of this profile has.
+    /// Name of the simulated drive that behaves like the family.
     pub simulator: Option<String>,
     /// Address ranges with their limits per request, ascending.
     pub ranges: Vec<AddressRange>,
@@ -57,30 +55,10 @@ pub struct Profile {
     pub faults: BTreeMap<u16, FaultText>,
     /// Index of each model point in `points`.
     pub(super) model: Vec<Option<usize>>,
-    /// The file as it is, without its base.
+    /// The text of the file, without its base.
     pub text: String,
-    /// The file with its base, for profiles that rest on this one.
+    /// The file merged with its base, for profiles based on this one.
     pub(super) tree: Node,
-    /// Digest of `tree`.
-    pub(super) digest: Digest,
-}
-
-/// What tells a profile from another of the same name: FNV-1a, 64 bits, of its content with that of its base.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct Digest(u64);
-
-impl Digest {
-    /// The digest of a profile's tree. Comments, blanks and the order of keys change nothing.
-    pub(super) fn of(tree: &Node) -> Digest {
-        let one = |hash: u64, byte: u8| (hash ^ u64::from(byte)).wrapping_mul(0x0100_0000_01B3);
-        Digest(tree.canonical().bytes().fold(0xCBF2_9CE4_8422_2325, one))
-    }
-}
-
-impl fmt::Display for Digest {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "{:016x}", self.0)
-    }
 }
 
 /// Text of a fault code.
@@ -88,7 +66,7 @@ impl fmt::Display for Digest {
 pub struct FaultText {
     /// What the fault is.
     pub text: String,
-    /// Whether a manual at hand says so.
+    /// Whether an available manual confirms it.
     pub verified: bool,
 }
 
@@ -105,10 +83,41 @@ pub struct AddressRange {
     pub write: u16,
     /// A read may cover addresses between two points that no point names.
     pub holes: bool,
-    /// When the drive takes a write, for people; empty where the manual says nothing.
+    /// When the drive accepts a write, as a note; empty if the manual does not say.
     pub write_when: String,
-    /// For people.
+    /// Note for the user.
     pub note: String,
+}
+
+/// A read whose outcome differs between families; identification never writes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct Probe {
+    /// Table.
+    pub table: Table,
+    /// First PDU address.
+    pub start: u16,
+    /// Items.
+    pub count: u16,
+}
+
+/// How a family responds to a probe.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Expected {
+    /// The read.
+    pub probe: Probe,
+    /// Answered with values; else refused.
+    pub values: bool,
+}
+
+impl Probe {
+    /// The request.
+    pub(crate) fn pdu(&self) -> RequestPdu {
+        RequestPdu::Read {
+            table: self.table,
+            start: self.start,
+            count: self.count,
+        }
+    }
 }
 
 /// How often a point is read.
@@ -151,19 +160,19 @@ pub struct Point {
     pub class: PollClass,
     /// Whether it can be commanded.
     pub write: bool,
-    /// The point of the profile that takes the commands, in the same unit, where the drive is read elsewhere.
+    /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.
     pub write_to: Option<usize>,
     /// Written as a pulse 0, 1, 0.
     pub pulse: bool,
-    /// Written only when the drive is not known to have the value already: it keeps it in a memory that wears.
+    /// Written only if the drive is not known to have the value already: it is stored in EEPROM with limited write cycles.
     pub on_change: bool,
     /// Range of commands in engineering units.
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
-    /// Whether a manual at hand confirms the address.
+    /// Whether an available manual confirms the address.
     pub verified: bool,
-    /// For people.
+    /// Note for the user.
     pub note: String,
 }
 
@@ -172,16 +181,8 @@ pub struct Point {
 pub enum Source {
     /// From registers or bits of the drive.
     Raw(Raw),
-    /// Made of other points.
+    /// Derived from other points.
     Derived(Derived),
-}
-
-/// A PDU address, decimal or as the hexadecimal number of a manual (0x0023).
-pub(super) fn parse_address(text: &str) -> Option<u16> {
-    match text.strip_prefix("0x") {
-        Some(hex) => u16::from_str_radix(hex, 16).ok(),
-        None => text.parse().ok(),
-    }
 }
 
 impl Point {
@@ -200,7 +201,7 @@ impl Point {
     }
 
     /// What a value of an enumeration, or a bit with texts, means.
-    pub fn text_of(&self, value: Value) -> Option<&str> {
+    pub(crate) fn text_of(&self, value: Value) -> Option<&str> {
         let code = match value {
             Value::Integer(code) => code,
             Value::Bool(state) => i64::from(state),
@@ -219,11 +220,6 @@ impl Point {
 }
 
 impl Profile {
-    /// Digest of the content, by which two programs find out whether they mean the same profile.
-    pub fn digest(&self) -> Digest {
-        self.digest
-    }
-
     /// Index of a model point.
     pub fn model_index(&self, point: ModelPoint) -> Option<usize> {
         self.model.get(point.index()).copied().flatten()
@@ -240,14 +236,14 @@ impl Profile {
     }
 
     /// The range that holds `address`.
-    pub fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
+    pub(crate) fn range(&self, table: Table, address: u16) -> Option<&AddressRange> {
         self.ranges
             .iter()
             .find(|r| r.table == table && r.addresses.contains(&address))
     }
 
-    /// The table that a read of `table` really means in this family.
-    pub fn canonical(&self, table: Table) -> Table {
+    /// The table that a read of `table` addresses in this family.
+    pub(crate) fn canonical(&self, table: Table) -> Table {
         if table == Table::Input && self.input_is_holding {
             Table::Holding
         } else {
@@ -256,7 +252,7 @@ impl Profile {
     }
 
     /// Text of a fault code; a code without text is shown as a plain number.
-    pub fn fault_text(&self, code: i64) -> String {
+    pub(crate) fn fault_text(&self, code: i64) -> String {
         let known = u16::try_from(code).ok().and_then(|c| self.faults.get(&c));
         match known {
             Some(fault) => fault.text.clone(),
@@ -265,7 +261,7 @@ impl Profile {
         }
     }
 
-    /// Where the run bit lies.
+    /// The run bit: its register or coil, its number, and whether it is inverted.
     pub fn run_bit(&self) -> Option<(&Raw, u8, bool)> {
         let raw = self.model_point(ModelPoint::Run)?.raw()?;
         match raw.form {
@@ -274,9 +270,9 @@ impl Profile {
         }
     }
 
-    /// Whether a write of these items is left out when the drive has them already: it keeps them in a memory that wears.
-    /// On N2 that holds for what no point names too. A stop is none of these, nor is a pulse.
-    pub fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
+    /// Whether a write of these items is skipped if the drive has them already, because it stores them in EEPROM with
+    /// limited write cycles. On N2 that includes addresses without a point, but never a stop or a pulse.
+    pub(crate) fn writes_on_change(&self, table: Table, items: &[(u16, u16)]) -> bool {
         let spared = |address: u16| {
             let covers = |p: &&Point| p.write && p.raw().is_some_and(|raw| raw.covers(table, address));
             let mut points = self.points.iter().filter(covers).peekable();
@@ -289,12 +285,12 @@ impl Profile {
         items.iter().all(|(address, _)| spared(*address)) && !items.iter().any(stops)
     }
 
-    /// Whether what is written to that table is released afterwards: an analog output of N2.
-    pub fn releases(&self, table: Table) -> bool {
+    /// Whether a write to that table is released afterwards: an analog output of N2.
+    pub(crate) fn releases(&self, table: Table) -> bool {
         table == Table::Holding && self.n2.release && self.protocols.contains(&Protocol::N2)
     }
 
-    /// Whether writing `value` to that register (or coil) takes the run command away: a stop.
+    /// Whether writing `value` to that register (or coil) clears the run command: a stop.
     pub fn is_stop(&self, table: Table, address: u16, value: u16) -> bool {
         self.run_bit().is_some_and(|(raw, bit, invert)| {
             raw.table == table && raw.address == address && ((value >> bit) & 1 == 1) == invert
@@ -308,7 +304,7 @@ pub struct Profiles(BTreeMap<String, Arc<Profile>>);
 
 impl Profiles {
     /// Adds a profile; one of the same name is replaced.
-    pub fn insert(&mut self, profile: Profile) {
+    pub(crate) fn insert(&mut self, profile: Profile) {
         self.0.insert(profile.name.clone(), Arc::new(profile));
     }
 

@@ -31,9 +31,10 @@ const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
 const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
 
 /// Who switches the direction of an RS-485 line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub enum Rs485 {
     /// The adapter itself.
+    #[default]
     Off,
     /// The kernel, RTS high while sending.
     Kernel,

@@ -1,11 +1,56 @@
-//! The north sides: Modbus TCP, MQTT and HTTP. They read the process image and queue commands; they never
+//! The north sides: Modbus TCP, MQTT, HTTP and the local socket. They read the process image and queue commands; they never
 //! name the bus.
 
+mod connection_limit;
 pub mod http;
+mod listener;
+pub mod local;
+mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
-pub mod register_map;
+mod pem;
+pub(crate) mod register_map;
 mod stats;
 
-pub use stats::{ModbusTcpStats, MqttStats, NorthStats, Turned};
+use std::io;
+use std::net::SocketAddr;
+
+pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
+
+/// Why a server cannot start.
+#[derive(Debug, thiserror::Error)]
+pub enum ServerError {
+    /// An address cannot be listened on.
+    #[error("cannot listen for {protocol} on {address}: {cause}; {} in `listen` of {section}", remedy(.cause))]
+    Listen {
+        /// `Modbus TCP` or `HTTP`.
+        protocol: &'static str,
+        /// The address.
+        address: SocketAddr,
+        /// Section of the configuration, in brackets.
+        section: String,
+        /// What the system reports.
+        cause: io::Error,
+    },
+    /// The system does not provide a thread.
+    #[error("cannot start the Modbus TCP thread: {0}; free memory, threads or file descriptors")]
+    Thread(io::Error),
+    /// The local socket cannot be opened.
+    #[error("{0}")]
+    Local(io::Error),
+    /// The certificates of the server cannot be used.
+    #[error("TLS of Modbus TCP: {0}")]
+    Tls(#[from] modbus_tcp::IdentityFault),
+}
+
+fn remedy(cause: &io::Error) -> &'static str {
+    match cause.kind() {
+        io::ErrorKind::AddrInUse => "another program uses it; stop that program or choose another port",
+        io::ErrorKind::PermissionDenied => {
+            "ports below 1024 require CAP_NET_BIND_SERVICE; grant it or choose another port"
+        }
+        io::ErrorKind::AddrNotAvailable => "this machine does not have that address; choose one that it has",
+        _ => "choose another address",
+    }
+}

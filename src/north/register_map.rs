@@ -1,25 +1,24 @@
 //! The public register map of Modbus TCP: common model, command block, float block and the gateway itself
-//! (`docs/modbus-tcp.md`). Pure.
+//! (`docs/modbus-tcp.md`).
 //!
-//! Addresses below [`FIRST`] are the drive's own; everything from there on is answered from here, for holding
-//! and input registers alike. A figure that does not fit its register is served as "not available", never
-//! clamped.
+//! Addresses below [`FIRST`] are those of the drive. Holding and input registers from there on are the same. A value
+//! that does not fit its register is "not available", never clamped.
 
 mod command;
 mod gateway;
 
-pub use command::{Before, CommandWrite, command, without_reset};
-pub use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, BusRegister, gateway};
+pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
+pub(crate) use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
 use crate::cache::Reading;
 use crate::codec::Exception;
-use crate::drive::profile::tidy;
+use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
 
-/// First address that is not the drive's own.
-pub const FIRST: u16 = 0x8000;
-/// Unit id under which the gateway itself is reached.
-pub const GATEWAY_UNIT: u8 = 255;
+/// First address that does not belong to the drive.
+pub(crate) const FIRST: u16 = 0x8000;
+/// Unit id of the gateway itself.
+pub(crate) const GATEWAY_UNIT: u8 = 255;
 
 const COMMAND_WORD: u16 = 0x8100;
 const SPEED_REFERENCE: u16 = 0x8101;
@@ -30,7 +29,7 @@ const HEARTBEAT: u16 = 0x8103;
 const NO_I16: u16 = 0x8000;
 /// "Not available" of an unsigned register.
 const NO_U16: u16 = 0xFFFF;
-/// Oldest age that is told apart, ms.
+/// Maximum age in its register, ms.
 const MAX_AGE_MS: u128 = 65_534;
 
 const RUN: u16 = 1 << 0;
@@ -50,9 +49,9 @@ const STATUS_BITS: [ModelPoint; 8] = [
     ModelPoint::Remote,
 ];
 
-/// How a figure lies in registers.
+/// How a value is encoded in registers.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Form {
+pub(crate) enum Form {
     /// One register, 0 to 65534; 0xFFFF is not available.
     U16,
     /// One register, -32767 to 32767; 0x8000 is not available.
@@ -64,16 +63,16 @@ pub enum Form {
 }
 
 impl Form {
-    /// Registers that it takes.
-    pub fn registers(self) -> u16 {
+    /// Number of registers.
+    pub(crate) fn registers(self) -> u16 {
         match self {
             Form::U16 | Form::I16 => 1,
             Form::U32 | Form::F32 => 2,
         }
     }
 
-    /// The name in the printed map.
-    pub fn name(self) -> &'static str {
+    /// Name in the printed map.
+    pub(crate) fn name(self) -> &'static str {
         match self {
             Form::U16 => "u16",
             Form::I16 => "i16",
@@ -82,8 +81,8 @@ impl Form {
         }
     }
 
-    /// What stands there when there is no value, for the printed map.
-    pub fn not_available(self) -> &'static str {
+    /// What the registers contain when there is no value, for the printed map.
+    pub(crate) fn not_available(self) -> &'static str {
         match self {
             Form::U16 => "0xFFFF",
             Form::I16 => "0x8000",
@@ -92,7 +91,7 @@ impl Form {
         }
     }
 
-    /// The registers of `value` counted in `1 / per_unit`; the second one of a 16-bit form means nothing.
+    /// The registers of `value` in steps of `1 / per_unit`; the second one is unused by 16-bit forms.
     fn registers_of(self, value: Option<f64>, per_unit: f64) -> [u16; 2] {
         let count = |least: f64, most: f64| {
             value
@@ -115,34 +114,34 @@ fn high_low(word: u32) -> [u16; 2] {
     [(word >> 16) as u16, word as u16]
 }
 
-/// What a place of the map tells.
+/// What an entry of the map contains.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Content {
+pub(crate) enum Content {
     /// The status bits.
     Status,
-    /// The state in one number.
+    /// The state as a number.
     State,
     /// Age of the process data.
     Age,
     /// A point of the common model.
     Point(ModelPoint),
-    /// The command bits; read: as the drive has them.
+    /// The command bits; they read as the drive has them.
     Command,
     /// Any write renews the supervision; reads 0.
     Heartbeat,
 }
 
-/// One figure of the map.
+/// One value of the map.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Entry {
+pub(crate) struct Entry {
     /// First PDU address.
-    pub address: u16,
-    /// What it tells.
-    pub content: Content,
-    /// How it lies there.
-    pub form: Form,
+    pub(crate) address: u16,
+    /// What it contains.
+    pub(crate) content: Content,
+    /// How it is encoded.
+    pub(crate) form: Form,
     /// Counts for one unit of the point.
-    pub per_unit: f64,
+    pub(crate) per_unit: f64,
 }
 
 const fn entry(address: u16, content: Content, form: Form, per_unit: f64) -> Entry {
@@ -204,9 +203,8 @@ const FLOAT: [Entry; 13] = [
     point(0x8218, ModelPoint::FrequencyReference, Form::F32, 1.0),
 ];
 
-/// The blocks of a drive, each without a gap, in the order of their addresses: common model, command block,
-/// float block.
-pub const BLOCKS: [&[Entry]; 3] = [&COMMON, &COMMAND, &FLOAT];
+/// The blocks of a drive, each without gaps, in the order of their addresses.
+pub(crate) const BLOCKS: [&[Entry]; 3] = [&COMMON, &COMMAND, &FLOAT];
 
 impl Entry {
     /// First address after it.
@@ -214,44 +212,53 @@ impl Entry {
         u32::from(self.address) + u32::from(self.form.registers())
     }
 
-    /// Whether writes are taken there.
-    pub fn is_command(&self) -> bool {
+    /// Whether the entry can be written.
+    pub(crate) fn is_command(&self) -> bool {
         (COMMAND_WORD..=HEARTBEAT).contains(&self.address)
     }
 
-    fn registers(&self, look: &Look<'_>) -> [u16; 2] {
+    fn registers(&self, view: &DriveView<'_>) -> [u16; 2] {
         match self.content {
-            Content::Status => [look.status(), 0],
-            Content::State => [look.state().map_or(NO_U16, State::code), 0],
-            Content::Age => [look.age_ms(), 0],
-            Content::Point(point) => self.form.registers_of(look.good(point), self.per_unit),
-            Content::Command => [look.command(), 0],
+            Content::Status => [view.status(), 0],
+            Content::State => [view.state().map_or(NO_U16, State::code), 0],
+            Content::Age => [view.age_ms(), 0],
+            Content::Point(point) => self.form.registers_of(view.good(point), self.per_unit),
+            Content::Command => [view.command(), 0],
             Content::Heartbeat => [0, 0],
         }
     }
 }
 
-/// A drive as a Modbus TCP client sees it at one time.
+/// Whether the port of a bus is open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum BusState {
+    /// It is open.
+    Up,
+    /// It is closed, so no value is current.
+    Down,
+}
+
+/// A drive as Modbus TCP clients see it at one time.
 #[derive(Debug)]
-pub struct Look<'r> {
+pub(crate) struct DriveView<'r> {
     reading: &'r Reading<'r>,
-    bus_up: bool,
+    bus: BusState,
     stale: bool,
 }
 
-impl<'r> Look<'r> {
-    /// The drive as `reading` shows it; while the bus is down nothing of it is good.
-    pub fn new(reading: &'r Reading<'r>, bus_up: bool) -> Look<'r> {
-        let stale = !bus_up || reading.is_stale();
-        Look { reading, bus_up, stale }
+impl<'r> DriveView<'r> {
+    /// The drive as in `reading`; while its bus is down no value is good.
+    pub(crate) fn new(reading: &'r Reading<'r>, bus: BusState) -> DriveView<'r> {
+        let stale = bus == BusState::Down || reading.is_stale();
+        DriveView { reading, bus, stale }
     }
 
-    /// Registers of the blocks from 0x8000 on, all of the same reading. A drive that is offline or stale is
-    /// served too, with no value in it but its state and age.
+    /// Registers of the blocks from 0x8000 on, all from the same reading. A drive that is offline or stale has a state
+    /// and an age but no values.
     ///
     /// # Errors
-    /// 02 when the span does not lie within one block.
-    pub fn registers(&self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
+    /// 02 if the span is not within one block.
+    pub(crate) fn registers(&self, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
         let (start, end) = (u32::from(start), u32::from(start) + u32::from(count));
         let inside = |block: &&&[Entry]| {
             block.first().is_some_and(|e| u32::from(e.address) <= start) && block.last().is_some_and(|e| end <= e.end())
@@ -265,7 +272,7 @@ impl<'r> Look<'r> {
         Ok(registers)
     }
 
-    /// The figure of a point, when it is good; nothing of a stale drive is.
+    /// The value of a point if it is good, which it never is for a stale drive.
     fn good(&self, point: ModelPoint) -> Option<f64> {
         if self.stale {
             return None;
@@ -273,18 +280,18 @@ impl<'r> Look<'r> {
         self.reading.model(point).good().map(Value::as_f64)
     }
 
-    /// A bit of the model; `None` where the family has it and it is not good.
+    /// A bit of the model; `None` if the family has it but it is not good.
     fn bit(&self, point: ModelPoint) -> Option<bool> {
         self.reading.bit(point).filter(|_| !self.stale)
     }
 
-    /// A bit that is not good is 0, and the word says so: it is stale as soon as one of its bits is not known.
+    /// A bit that is not good is 0 and marks the word as stale.
     fn status(&self) -> u16 {
         let mut word = if self.stale { STALE } else { 0 };
         for (bit, point) in (0u16..).zip(STATUS_BITS) {
             word |= self.bit(point).map_or(STALE, |set| u16::from(set) << bit);
         }
-        let online = self.bus_up && self.reading.snapshot.link.is_online();
+        let online = self.bus == BusState::Up && self.reading.snapshot.link.is_online();
         word | if online { ONLINE } else { 0 }
     }
 
@@ -302,7 +309,7 @@ impl<'r> Look<'r> {
             .map_or(NO_U16, |age| age.as_millis().min(MAX_AGE_MS) as u16)
     }
 
-    /// "Not available" has bits set that a command may not have, so that it cannot be written back unnoticed.
+    /// "Not available" has bits set that are invalid in a command, so that writing it back is refused.
     fn command(&self) -> u16 {
         let (Some(run), Some(reverse)) = (self.good(ModelPoint::Run), self.bit(ModelPoint::Reverse)) else {
             return NO_U16;

@@ -24,30 +24,35 @@ const OUTCOMES: [(u8, &str); 8] = [
 ];
 const OTHER: &str = "other";
 
-/// Why a Modbus TCP client was not let in.
+/// Why a Modbus TCP client was refused.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Turned {
+pub enum ConnectionRefusal {
     /// Its address is not in `allow`.
     NotAllowed,
-    /// All places are taken.
+    /// `max_connections` is reached.
     Full,
-    /// All places for its address are taken.
+    /// `max_connections_per_address` is reached.
     AddressFull,
-    /// The handshake failed: no certificate, one that is not trusted or has expired, no TLS at all.
+    /// The handshake failed: no certificate, an untrusted or expired one, a malformed role, or no TLS at all.
     Tls,
 }
 
-impl Turned {
+impl ConnectionRefusal {
     /// All reasons.
-    pub const ALL: [Turned; 4] = [Turned::NotAllowed, Turned::Full, Turned::AddressFull, Turned::Tls];
+    pub const ALL: [ConnectionRefusal; 4] = [
+        ConnectionRefusal::NotAllowed,
+        ConnectionRefusal::Full,
+        ConnectionRefusal::AddressFull,
+        ConnectionRefusal::Tls,
+    ];
 
-    /// The name in metrics.
+    /// Name in the metrics.
     pub fn name(self) -> &'static str {
         match self {
-            Turned::NotAllowed => "not_allowed",
-            Turned::Full => "full",
-            Turned::AddressFull => "address_full",
-            Turned::Tls => "tls",
+            ConnectionRefusal::NotAllowed => "not_allowed",
+            ConnectionRefusal::Full => "full",
+            ConnectionRefusal::AddressFull => "address_full",
+            ConnectionRefusal::Tls => "tls",
         }
     }
 }
@@ -56,7 +61,7 @@ impl Turned {
 #[derive(Debug, Default)]
 pub struct ModbusTcpStats {
     connections: AtomicU64,
-    turned_away: [AtomicU64; Turned::ALL.len()],
+    refused_connections: [AtomicU64; ConnectionRefusal::ALL.len()],
     requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
 }
 
@@ -66,8 +71,8 @@ impl ModbusTcpStats {
         self.connections.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// A client left.
-    pub fn disconnected(&self) {
+    /// A client disconnected.
+    pub(crate) fn disconnected(&self) {
         self.connections.fetch_sub(1, Ordering::Relaxed);
     }
 
@@ -76,20 +81,20 @@ impl ModbusTcpStats {
         self.connections.load(Ordering::Relaxed)
     }
 
-    /// Counts a client that was not let in.
-    pub fn turned_away(&self, why: Turned) {
-        if let Some(counter) = self.turned_away.get(why as usize) {
+    /// Counts a refused client.
+    pub(crate) fn connection_refused(&self, why: ConnectionRefusal) {
+        if let Some(counter) = self.refused_connections.get(why as usize) {
             counter.fetch_add(1, Ordering::Relaxed);
         }
     }
 
-    /// Clients that were not let in so far, by reason.
-    pub fn refused(&self) -> impl Iterator<Item = (Turned, u64)> {
-        let counts = self.turned_away.iter().map(|c| c.load(Ordering::Relaxed));
-        Turned::ALL.into_iter().zip(counts)
+    /// Clients refused so far, by reason.
+    pub fn refused_connections(&self) -> impl Iterator<Item = (ConnectionRefusal, u64)> {
+        let counts = self.refused_connections.iter().map(|c| c.load(Ordering::Relaxed));
+        ConnectionRefusal::ALL.into_iter().zip(counts)
     }
 
-    /// Counts an answer: exception code, 0 for a regular one.
+    /// Counts an answer; `exception` is 0 for a regular one.
     pub fn answered(&self, function: u8, exception: u8) {
         let row = FUNCTIONS.iter().position(|f| *f == function).unwrap_or(FUNCTIONS.len());
         let column = OUTCOMES
@@ -101,7 +106,7 @@ impl ModbusTcpStats {
         }
     }
 
-    /// Answers so far by function and outcome, zeros left out.
+    /// Answers so far by function and outcome, without zeros.
     pub fn requests(&self) -> Vec<(String, &'static str, u64)> {
         let functions = FUNCTIONS.iter().map(u8::to_string).chain([OTHER.to_string()]);
         let mut all = Vec::new();
@@ -123,8 +128,8 @@ impl ModbusTcpStats {
 pub struct MqttStats {
     /// Whether the client is connected to the broker.
     pub connected: AtomicBool,
-    /// Messages that the broker took.
+    /// Messages that the broker acknowledged.
     pub published: AtomicU64,
-    /// Messages that wait for the broker.
+    /// Messages waiting for the broker.
     pub buffered: AtomicU64,
 }

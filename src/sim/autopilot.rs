@@ -1,4 +1,4 @@
-//! Somebody who runs a drive of the demo: starts, ramps, reverses, stops, and now and then the drive faults.
+//! Operates a drive of the demo: starts, ramps, reverses, stops, and now and then trips it.
 //!
 //! Pure and reproducible: the seed fixes what happens when. It acts as another master on the fieldbus would, through
 //! control word and reference, until the drive is commanded over the bus; then it lets go for good.
@@ -18,9 +18,9 @@ enum Next {
     ResetOff,
 }
 
-/// Runs one drive by itself.
+/// Operates one drive.
 #[derive(Debug, Clone)]
-pub struct Autopilot {
+pub(crate) struct Autopilot {
     random: Random,
     next: Next,
     at: SimTime,
@@ -31,7 +31,7 @@ pub struct Autopilot {
 
 impl Autopilot {
     /// An autopilot that begins within a few seconds after `now`.
-    pub fn new(seed: u64, now: SimTime) -> Autopilot {
+    pub(crate) fn new(seed: u64, now: SimTime) -> Autopilot {
         let mut random = Random::new(seed);
         let at = now + Duration::from_millis(random.within(500..=4000));
         Autopilot {
@@ -44,12 +44,12 @@ impl Autopilot {
     }
 
     /// When it acts next.
-    pub fn next_at(&self) -> SimTime {
+    pub(crate) fn next_at(&self) -> SimTime {
         self.at
     }
 
     /// Does what is due at `now`.
-    pub fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
+    pub(crate) fn act(&mut self, drive: &mut dyn Model, now: SimTime) {
         match self.next {
             Next::Start => {
                 self.changes = self.random.within(2..=5);

@@ -1,4 +1,4 @@
-//! One simulated drive on a line: its model, who runs it by itself, and whether it answers.
+//! One simulated drive on a line: its model, its autopilot, and whether it answers.
 
 use super::SimTime;
 use super::autopilot::Autopilot;
@@ -12,7 +12,7 @@ use std::time::Duration;
 /// Missed actions of an autopilot that lie longer back are passed over.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
-/// How one drive on a simulated line is made.
+/// Options of one drive on a simulated line.
 #[derive(Debug, Clone)]
 pub struct DriveOptions {
     /// Address on the line, 1..=247, with N2 to 255.
@@ -68,7 +68,7 @@ impl ModelOptions {
         }
     }
 
-    /// Time that the drive takes before it answers, where its manual tells one; otherwise it is the line's.
+    /// Response delay of the drive where its manual states one; otherwise the line's applies.
     pub fn turnaround(&self) -> Option<Duration> {
         match self {
             ModelOptions::Nx(_) | ModelOptions::Cx(_) => None,
@@ -153,7 +153,7 @@ impl SimulatedDrive {
         }
     }
 
-    /// Lives on until `now`.
+    /// Advances to `now`.
     pub fn advance(&mut self, now: SimTime) {
         let drive = self.model.get_mut();
         if let Some(autopilot) = &mut self.autopilot {
@@ -177,7 +177,7 @@ impl SimulatedDrive {
         self.alive = alive;
     }
 
-    /// Time that it takes before it answers, where its manual tells one.
+    /// Response delay where its manual states one.
     pub fn turnaround(&self) -> Option<Duration> {
         self.turnaround
     }
@@ -188,7 +188,7 @@ impl SimulatedDrive {
         self.model.get_mut().heard(now);
     }
 
-    /// A sound frame was on the line, whomever it is for; to be told before the frame is acted upon.
+    /// A valid frame was on the line, for any address. Call it before the frame is acted upon.
     pub fn bus_message(&mut self) {
         self.model.get_mut().bus_message();
     }
@@ -198,8 +198,8 @@ impl SimulatedDrive {
         self.model.get_mut().bus_error();
     }
 
-    /// The reply to a request that came whole at `now`; `None` when the drive stays silent. A write takes the drive from
-    /// its autopilot for good.
+    /// The reply to a request that was complete at `now`; `None` when the drive stays silent. A write ends the autopilot for
+    /// good.
     pub fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
         self.advance(now);
         if request.is_write() {
@@ -208,7 +208,7 @@ impl SimulatedDrive {
         self.model.get_mut().answer(request, now)
     }
 
-    /// The answer to a sound frame whose PDU is no request, for which a plain slave has `exception`; `None` when the
+    /// The reply to a valid frame whose PDU is not a valid request, for which a plain slave returns `exception`; `None` when the
     /// drive stays silent.
     pub fn malformed(&mut self, pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
         self.advance(now);
@@ -220,7 +220,7 @@ impl SimulatedDrive {
         self.model.get().check_error()
     }
 
-    /// A request to all drives. Nobody answers it; a write takes the drive from its autopilot for good.
+    /// A broadcast, which is not answered; a write ends the autopilot for good.
     pub fn heard_broadcast(&mut self, request: &RequestPdu, now: SimTime) {
         self.advance(now);
         if request.is_write() {
@@ -260,7 +260,7 @@ impl SimulatedDrive {
         self.power_cycles = self.power_cycles.wrapping_add(1);
     }
 
-    /// How often it was switched on again: what hangs on its supply has started anew as often.
+    /// Power cycles so far: whatever shares its supply has restarted as often.
     pub fn power_cycles(&self) -> u32 {
         self.power_cycles
     }
@@ -336,7 +336,7 @@ mod tests {
         );
         assert!(!drive.runs_by_itself());
         drive.advance(minute * 5);
-        assert_eq!(drive.state().output, 0.0, "nobody starts it any more");
+        assert_eq!(drive.state().output, 0.0, "the autopilot does not start it again");
     }
 
     #[test]

@@ -140,7 +140,7 @@ impl Endpoint {
         }
     }
 
-    /// Nobody used the line for a while.
+    /// The line has been idle for a while.
     pub(super) fn settle(&self) {
         if let Endpoint::Pty(pty) = self {
             pty.settle();

@@ -1,9 +1,9 @@
-//! What goes wrong on a simulated line: by chance, or by script for the request of a given number. Pure.
+//! Faults on a simulated line: at random, or scripted for the request of a given number. Pure.
 
 use super::framing;
 use super::random::Random;
 use crate::codec::{Protocol, RequestPdu, Table};
-use crate::document::parse_duration;
+use crate::document::{Finding, parse_duration};
 use std::collections::BTreeMap;
 use std::str::FromStr;
 use std::time::Duration;
@@ -64,9 +64,15 @@ impl FromStr for Fault {
             .split_once(':')
             .map_or((text, None), |(name, argument)| (name, Some(argument)));
         let fault = match (name, argument) {
-            ("late", argument) => Fault::Late(parse_duration(argument.unwrap_or("50ms"))?),
+            ("late", argument) => Fault::Late(
+                parse_duration(argument.unwrap_or("50ms")).map_err(|error| Finding::from(error).to_string())?,
+            ),
             ("exception", Some(code)) => Fault::Exception(exception_code(code)?),
-            (_, Some(_)) => return Err(format!("`{name}` is no fault that takes a value; there are {NAMES}")),
+            (_, Some(_)) => {
+                return Err(format!(
+                    "`{name}` is not a fault that takes a value; valid faults: {NAMES}"
+                ));
+            }
             ("deaf", None) => Fault::Deaf,
             ("drop", None) => Fault::Drop,
             ("truncate", None) => Fault::Truncate,
@@ -85,7 +91,7 @@ impl FromStr for Fault {
             ("split", None) => Fault::Split,
             ("exception", None) => Fault::Exception(4),
             ("busy", None) => Fault::Exception(6),
-            _ => return Err(format!("`{text}` is no fault; there are {NAMES}")),
+            _ => return Err(format!("`{text}` is not a fault; valid faults: {NAMES}")),
         };
         Ok(fault)
     }
@@ -95,7 +101,7 @@ fn exception_code(text: &str) -> Result<u8, String> {
     text.parse()
         .ok()
         .filter(|code| *code != 0)
-        .ok_or_else(|| format!("`{text}` is no exception code; write 1 to 255, such as exception:4"))
+        .ok_or_else(|| format!("`{text}` is not an exception code; write 1 to 255, such as exception:4"))
 }
 
 /// Faults with their probability: `drop=0.01,late:50ms=0.02`.
@@ -111,11 +117,10 @@ impl FromStr for Rates {
             let (fault, rate) = part
                 .split_once('=')
                 .ok_or_else(|| format!("`{part}` has no probability; write it as {part}=0.01"))?;
-            let probability = rate
-                .parse()
-                .ok()
-                .filter(|p| (0.0..=1.0).contains(p))
-                .ok_or_else(|| format!("`{rate}` is no probability; write a number from 0 to 1, such as 0.01"))?;
+            let probability =
+                rate.parse().ok().filter(|p| (0.0..=1.0).contains(p)).ok_or_else(|| {
+                    format!("`{rate}` is not a probability; write a number from 0 to 1, such as 0.01")
+                })?;
             rates.push((fault.parse()?, probability));
         }
         let sum: f64 = rates.iter().map(|(_, p)| p).sum();
@@ -133,7 +138,7 @@ pub struct FaultPlan {
     rates: Rates,
     script: BTreeMap<u64, Fault>,
     only: Vec<u8>,
-    /// A register that one drive refuses to tell: address, table, register.
+    /// A register that one drive refuses to read: address, table, register.
     refused: Option<(u8, Table, u16)>,
     random: Random,
     asked: u64,
@@ -146,7 +151,7 @@ impl Default for FaultPlan {
 }
 
 impl FaultPlan {
-    /// Faults by chance; the seed fixes which request meets which.
+    /// Random faults; the seed determines which request meets which.
     pub fn new(rates: Rates, seed: u64) -> FaultPlan {
         FaultPlan {
             rates,
@@ -159,7 +164,7 @@ impl FaultPlan {
     }
 
     /// The fault for the request of that number. The first sound request to a drive that answers, counted from when
-    /// the plan is put to work, is number 1.
+    /// the plan takes effect, is number 1.
     #[must_use]
     pub fn at(mut self, number: u64, fault: Fault) -> FaultPlan {
         self.script.insert(number, fault);
@@ -304,7 +309,7 @@ fn cut(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     reply
 }
 
-/// A reply that is no sound frame any more, and no other one either.
+/// Corrupts a reply so that it is not a valid frame, not even another one.
 fn corrupt(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     match protocol {
         Protocol::ModbusRtu | Protocol::N2 => flip(reply, random),
@@ -312,7 +317,7 @@ fn corrupt(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     }
 }
 
-/// Not any bit of any character: bit 5 of a letter is its case, which is no error.
+/// Not just any bit of any character: bit 5 of a letter is its case, which is not an error.
 fn garble(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
     let digits = reply.len().saturating_sub(3) as u64;
     let at = random.within(1..=digits.max(1)) as usize;

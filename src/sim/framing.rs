@@ -12,10 +12,10 @@ use crate::codec::{Protocol, ascii, rtu};
 
 /// Longest pause between two characters of one Modbus ASCII frame (Modbus over serial line, 2.5.2.1); N2 is given the
 /// same.
-pub const LONGEST_PAUSE: Duration = Duration::from_secs(1);
+pub(crate) const LONGEST_PAUSE: Duration = Duration::from_secs(1);
 
 /// Whether the character begins a frame, whatever was before it.
-pub fn begins(protocol: Protocol, character: u8) -> bool {
+pub(crate) fn begins(protocol: Protocol, character: u8) -> bool {
     match protocol {
         Protocol::ModbusRtu => false,
         Protocol::ModbusAscii => character == b':',
@@ -24,7 +24,7 @@ pub fn begins(protocol: Protocol, character: u8) -> bool {
 }
 
 /// Whether a frame is over with that character.
-pub fn ends(protocol: Protocol, character: u8) -> bool {
+pub(crate) fn ends(protocol: Protocol, character: u8) -> bool {
     match protocol {
         Protocol::ModbusRtu => false,
         Protocol::ModbusAscii => character == b'\n',
@@ -33,12 +33,12 @@ pub fn ends(protocol: Protocol, character: u8) -> bool {
 }
 
 /// The characters in pieces, none of which belongs to two frames.
-pub fn pieces(protocol: Protocol, characters: &[u8]) -> impl Iterator<Item = &[u8]> {
+pub(crate) fn pieces(protocol: Protocol, characters: &[u8]) -> impl Iterator<Item = &[u8]> {
     characters.chunk_by(move |&last, &next| !ends(protocol, last) && !begins(protocol, next))
 }
 
 /// Characters of a frame that a drive keeps; what follows until its end is thrown away.
-pub fn kept(protocol: Protocol) -> usize {
+pub(crate) fn kept(protocol: Protocol) -> usize {
     match protocol {
         Protocol::ModbusRtu | Protocol::N2 => 300,
         Protocol::ModbusAscii => ascii::LONGEST,
@@ -47,7 +47,7 @@ pub fn kept(protocol: Protocol) -> usize {
 
 /// Address and request of a sound Modbus frame; the request's function with the exception that refuses it when its PDU
 /// is wrong.
-pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> {
+pub(crate) fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> {
     match protocol {
         Protocol::ModbusRtu => rtu::decode_request(frame),
         Protocol::ModbusAscii => ascii::decode_request(frame),
@@ -56,7 +56,7 @@ pub fn open(protocol: Protocol, frame: &[u8]) -> Option<(u8, rtu::ReceivedPdu)> 
 }
 
 /// The PDU in a sound Modbus frame.
-pub fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
+pub(crate) fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
     match protocol {
         Protocol::ModbusRtu => rtu::open_frame(frame).map(|(_, pdu)| pdu.to_vec()),
         Protocol::ModbusAscii => ascii::open_frame(frame).map(|(_, pdu)| pdu),
@@ -66,7 +66,7 @@ pub fn pdu(protocol: Protocol, frame: &[u8]) -> Option<Vec<u8>> {
 
 /// Address and function of a frame that is whole but for its check code. A Modbus RTU frame has nothing else by which it
 /// could be whole.
-pub fn damaged(protocol: Protocol, frame: &[u8]) -> Option<(u8, u8)> {
+pub(crate) fn damaged(protocol: Protocol, frame: &[u8]) -> Option<(u8, u8)> {
     match protocol {
         Protocol::ModbusAscii => {
             let (address, pdu) = ascii::damaged_frame(frame)?;
@@ -77,7 +77,7 @@ pub fn damaged(protocol: Protocol, frame: &[u8]) -> Option<(u8, u8)> {
 }
 
 /// Appends the frame of a Modbus PDU to `out`.
-pub fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
+pub(crate) fn close(protocol: Protocol, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     match protocol {
         Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
         Protocol::ModbusAscii => ascii::encode_frame(address, pdu, out),

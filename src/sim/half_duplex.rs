@@ -1,6 +1,6 @@
 //! The simulated two-wire line: which character is on it when, silence, collisions. Pure; the time is an argument.
 //!
-//! A master on a pseudo-terminal hands over a whole frame in no time. Here it takes the time that it would take on the
+//! A master on a pseudo-terminal writes a whole frame in no time. Here it takes the time that it would take on the
 //! wire: its first character begins when the bytes were read, or right after the characters before them. A frame is
 //! over when its protocol says so (Modbus RTU: after 3.5 characters of silence; see [`framing`]); then the drive takes
 //! its turnaround, then its reply begins. Bytes of the reply are due at the end of the character that completes a
@@ -22,7 +22,7 @@ use std::time::Duration;
 pub enum Delivery {
     /// All at the end of the last character: a master that ends a reply by its length sees no difference.
     Whole,
-    /// In chunks of so many characters, as a UART hands over its FIFO (14 of 16 is usual); 1 is one by one.
+    /// In chunks of so many characters, as a UART empties its FIFO (14 of 16 is usual); 1 is one by one.
     Chunks(u8),
 }
 
@@ -45,12 +45,10 @@ pub struct LineRules {
     /// Baud and character format.
     pub format: LineFormat,
     /// Time between the end of a request (with Modbus RTU: its last character and 3.5 characters of silence) and the
-    /// reply. A drive whose manual tells its own time takes that.
+    /// reply. A drive whose manual states a time of its own uses that.
     pub turnaround: Duration,
     /// Whether drives ignore a request that comes too early; counted it is anyway.
     pub strict: bool,
-    /// Share of the 3.5 characters that may be missing.
-    pub tolerance: f64,
     /// How the bytes of a reply reach the master.
     pub delivery: Delivery,
     /// What is between the drives and the master.
@@ -58,7 +56,7 @@ pub struct LineRules {
 }
 
 impl LineRules {
-    /// A strict Modbus RTU line with whole delivery, turnaround 0.5 ms and a tolerance of 3 %.
+    /// A strict Modbus RTU line with whole delivery and a turnaround of 0.5 ms.
     pub fn new(format: LineFormat) -> LineRules {
         LineRules::of(Protocol::ModbusRtu, format)
     }
@@ -70,7 +68,6 @@ impl LineRules {
             format,
             turnaround: Duration::from_micros(500),
             strict: true,
-            tolerance: 0.03,
             delivery: Delivery::Whole,
             wire: Wire::Simulated,
         }
@@ -79,6 +76,8 @@ impl LineRules {
 
 /// Where the time on the wire is not known, a Modbus RTU frame that stays a fragment is over after that time.
 const FRAGMENT: Duration = Duration::from_millis(20);
+/// Share of the silence before a request that may be missing.
+const TOLERANCE: f64 = 0.03;
 /// Bursts that may wait for delivery; late replies beyond that are lost.
 const MOST_OUTGOING: usize = 64;
 
@@ -111,7 +110,7 @@ struct Outgoing {
     kind: Kind,
 }
 
-/// When the line wants to be looked at again.
+/// When the line needs attention again.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Wake {
     /// When.
@@ -148,7 +147,7 @@ pub struct HalfDuplex {
     statistics: Statistics,
     lateness: Lateness,
     transcript: Transcript,
-    /// What the drives did since it was last asked, where somebody watches.
+    /// What the drives did since the last [`HalfDuplex::take_acts`]; `None` until its first call.
     acts: Option<Vec<Act>>,
 }
 
@@ -291,7 +290,7 @@ impl HalfDuplex {
 
     /// What it means that a request begins at `start`.
     fn verdict(&self, start: SimTime) -> Verdict {
-        let least = self.silence().mul_f64((1.0 - self.rules.tolerance).max(0.0));
+        let least = self.silence().mul_f64(1.0 - TOLERANCE);
         if self.rules.wire == Wire::Instant {
             Verdict::Clean
         } else if self.reply_end.is_some_and(|end| start < end) {
@@ -505,7 +504,7 @@ impl HalfDuplex {
         Some(due)
     }
 
-    /// When the line wants to be looked at next; `None` while nothing goes on.
+    /// When the line needs attention next; `None` while it is idle.
     pub fn wake(&self) -> Option<Wake> {
         let over = |frame: &Incoming| frame.end + Self::end_after(frame, &self.rules);
         let frame = self.incoming.as_ref().map(|frame| Wake {

@@ -2,17 +2,16 @@
 //!
 //! The pieces, from the drive to the port:
 //!
-//! - [`motor`], [`parameter_set`], [`model`]: what all drives have, and what a drive is to the line.
-//! - [`nx`] (Vacon NX, Eaton SVX and HVX), [`cx`] (Vacon CX), [`teco`] (TECO 7300PA): what the drives with their boards
-//!   do, asked by Modbus PDUs (pure); and [`autopilot`], which runs one in a demo.
+//! - `motor`, `parameter_set`, `model`: what all drives have, and what a drive is to the line.
+//! - [`nx`] (Vacon NX, Eaton SVX and HVX), `cx` (Vacon CX), `teco` (TECO 7300PA): what the drives with their boards
+//!   do, asked by Modbus PDUs (pure); and `autopilot`, which runs one in a demo.
 //! - [`drive`]: a drive of any model with its autopilot and its power switch; [`slave`]: all drives of a line, frames
 //!   in and replies out.
-//! - [`n2`]: the N2 board that a drive may have in the place of its Modbus board.
-//! - [`faults`]: what goes wrong on a line, by chance or by script.
-//! - [`framing`]: where a frame begins and ends, by protocol (pure).
+//! - `n2`: the N2 board that a drive may have in the place of its Modbus board.
+//! - [`faults`]: faults on a line, random or scripted.
+//! - `framing`: where a frame begins and ends, by protocol (pure).
 //! - [`half_duplex`]: the wire itself (pure): when which character is on it, silence, collisions.
 //! - [`wire`]: the thread that puts all this behind a pseudo-terminal, a serial port or a TCP listener.
-//! - [`bare_master`]: a measuring rod for benches, not a master to build on.
 //! - [`broker`]: a small MQTT broker for the demo and for tests.
 //!
 //! Everything but [`wire`], its endpoints, the measuring rod and the broker is pure and takes the time as an argument,
@@ -20,25 +19,24 @@
 
 use std::time::Duration;
 
-pub mod autopilot;
-pub mod bare_master;
+pub(crate) mod autopilot;
 pub mod broker;
-pub mod cx;
+pub(crate) mod cx;
 pub mod drive;
 pub mod endpoint;
 pub mod faults;
-pub mod framing;
+pub(crate) mod framing;
 pub mod half_duplex;
-pub mod model;
-pub mod motor;
-pub mod n2;
+pub(crate) mod model;
+pub(crate) mod motor;
+pub(crate) mod n2;
 pub mod nx;
-pub mod parameter_set;
-pub mod pty;
+pub(crate) mod parameter_set;
+pub(crate) mod pty;
 pub mod random;
 pub mod slave;
 pub mod statistics;
-pub mod teco;
+pub(crate) mod teco;
 pub mod wire;
 
 /// Time since the simulated line was switched on.

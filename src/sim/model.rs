@@ -1,6 +1,7 @@
 //! What line, board, autopilot and tests need of a simulated drive, whatever its model.
 
 use super::SimTime;
+use super::motor::{Load, Motor};
 use crate::codec::{Exception, Reply, RequestPdu};
 use std::fmt;
 use std::time::Duration;
@@ -8,11 +9,11 @@ use std::time::Duration;
 /// A drive lives in steps of that length: the update period of the Vacon boards (drives.md 3.3).
 pub const UPDATE_PERIOD: Duration = Duration::from_millis(10);
 
-/// A drive that nobody looked at for longer skips the rest of the time instead of living through it.
+/// A drive that was not advanced for longer skips the rest of the time.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
 /// Output and reference closer than this count as reached, Hz: below what a register can show.
-pub const AT_REFERENCE_BAND: f64 = 0.005;
+pub(crate) const AT_REFERENCE_BAND: f64 = 0.005;
 
 /// Run, direction and speed from whoever commands a drive.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
@@ -28,7 +29,7 @@ pub struct Command {
 /// What any drive looks like from outside.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct DriveState {
-    /// It would run if it were told to.
+    /// It would run if it were commanded to.
     pub ready: bool,
     /// The inverter feeds the motor.
     pub running: bool,
@@ -42,18 +43,86 @@ pub struct DriveState {
     pub remote: bool,
 }
 
+/// What every drive has, whatever its model.
+#[derive(Debug, Clone)]
+pub(crate) struct Body {
+    pub(super) motor: Motor,
+    pub(super) latch: Latch,
+    /// A run command is obeyed.
+    pub(super) running: bool,
+    powered: bool,
+    steps: Steps,
+}
+
+impl Body {
+    /// Switched on at `now`, with the motor at rest.
+    pub(super) fn new(load: &Load, now: SimTime) -> Body {
+        Body {
+            motor: Motor::new(load),
+            latch: Latch::new(),
+            running: false,
+            powered: true,
+            steps: Steps::new(now),
+        }
+    }
+
+    /// The inverter feeds the motor, and no fault hides it.
+    pub(super) fn shows_running(&self) -> bool {
+        self.motor.fed && self.latch.fault() == 0
+    }
+
+    /// The direction that the motor turns in; at rest, the one that a running drive is about to turn it in, by the
+    /// frequency that it aims at.
+    pub(super) fn turns_reverse(&self, target: f64) -> bool {
+        let shaft = self.motor.shaft;
+        shaft < 0.0 || (shaft == 0.0 && self.running && target < 0.0)
+    }
+
+    /// A fault, with which the motor coasts.
+    pub(super) fn trip(&mut self, fault: u16) {
+        if self.latch.trip(fault) {
+            self.running = false;
+            self.motor.release();
+        }
+    }
+}
+
 /// A simulated drive with its Modbus board.
 ///
 /// Pure: the time is an argument and never runs backwards. No method panics, whatever it is given.
-pub trait Model: fmt::Debug {
-    /// Lives on until `now`, in steps of [`UPDATE_PERIOD`].
-    fn advance(&mut self, now: SimTime);
+pub(crate) trait Model: fmt::Debug {
+    /// What it has in common with all drives.
+    fn body(&self) -> &Body;
+
+    /// The same, to change it.
+    fn body_mut(&mut self) -> &mut Body;
+
+    /// One update period, which ends at `now`.
+    fn step(&mut self, now: SimTime);
+
+    /// Whether it would run if it were commanded to.
+    fn ready(&self) -> bool;
+
+    /// Frequency that it aims at by the command that holds, Hz, negative for counterclockwise.
+    fn target(&self) -> f64;
+
+    /// Whether it obeys the bus.
+    fn remote(&self) -> bool;
+
+    /// Advances to `now`, in steps of [`UPDATE_PERIOD`].
+    fn advance(&mut self, now: SimTime) {
+        while let Some(at) = self.body_mut().steps.due(now) {
+            if self.body().powered {
+                self.step(at);
+            }
+        }
+    }
 
     /// The reply to a request to this drive that came whole at `now`; `None` for silence.
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply>;
 
-    /// A request in a sound frame to this drive whose PDU is none that the protocol knows, and the exception that a
-    /// plain slave answers; `None` for silence.
+    /// The exception for a valid frame to this drive whose PDU the protocol does not know, where a plain slave returns
+    /// `exception`; `None` for silence.
     fn malformed(&mut self, _pdu: &[u8], exception: Exception, now: SimTime) -> Option<Exception> {
         self.heard(now);
         Some(exception)
@@ -65,7 +134,7 @@ pub trait Model: fmt::Debug {
     /// A valid message to this drive or to all was on the bus.
     fn heard(&mut self, _now: SimTime) {}
 
-    /// A sound frame was on the line, whomever it is for. Called before the frame is acted upon.
+    /// A valid frame was on the line, for any address. Called before the frame is acted upon.
     fn bus_message(&mut self) {}
 
     /// A frame with a wrong check code was on the line.
@@ -77,16 +146,22 @@ pub trait Model: fmt::Debug {
     }
 
     /// Whether the drive has supply; without it, it answers nothing.
-    fn powered(&self) -> bool;
+    fn powered(&self) -> bool {
+        self.body().powered
+    }
 
     /// Switches the supply off: the drive answers nothing and the motor coasts unseen.
-    fn power_off(&mut self);
+    fn power_off(&mut self) {
+        self.body_mut().powered = false;
+    }
 
     /// Switches the supply on again: commands are 0, faults are gone, parameters are as they were kept.
     fn power_on(&mut self, now: SimTime);
 
     /// Trips the drive with a fault as its registers show it; 0 does nothing, and so does a second fault.
-    fn trip(&mut self, fault: u16);
+    fn trip(&mut self, fault: u16) {
+        self.body_mut().trip(fault);
+    }
 
     /// Faults that happen now and then, for the autopilot.
     fn usual_faults(&self) -> &'static [u16];
@@ -101,7 +176,17 @@ pub trait Model: fmt::Debug {
     fn set_remote(&mut self, on: bool);
 
     /// What it looks like from outside.
-    fn state(&self) -> DriveState;
+    fn state(&self) -> DriveState {
+        let body = self.body();
+        DriveState {
+            ready: self.ready(),
+            running: body.shows_running(),
+            reverse: body.turns_reverse(self.target()),
+            fault: body.latch.fault(),
+            output: body.motor.output,
+            remote: self.remote(),
+        }
+    }
 }
 
 /// The answer to a count beyond the limit of a drive.

@@ -62,7 +62,7 @@ const DC_SAG: f64 = 6.0;
 
 /// What the inverter does with the motor.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Feed {
+pub(crate) enum Feed {
     /// Nothing: the motor coasts or stands.
     Off,
     /// Turns it towards this frequency, Hz, negative for counterclockwise.
@@ -71,7 +71,7 @@ pub enum Feed {
 
 /// The state of the motor and the inverter.
 #[derive(Debug, Clone)]
-pub struct Motor {
+pub(crate) struct Motor {
     /// Output frequency, Hz, negative for counterclockwise; 0 while the inverter is off.
     pub output: f64,
     /// Frequency that the shaft turns with, Hz.
@@ -88,7 +88,7 @@ pub struct Motor {
 
 impl Motor {
     /// A motor at rest, cold.
-    pub fn new(load: &Load) -> Motor {
+    pub(crate) fn new(load: &Load) -> Motor {
         Motor {
             output: 0.0,
             shaft: 0.0,
@@ -100,13 +100,13 @@ impl Motor {
     }
 
     /// Switches the inverter off at once; the shaft goes on turning.
-    pub fn release(&mut self) {
+    pub(crate) fn release(&mut self) {
         self.fed = false;
         self.output = 0.0;
     }
 
     /// One step of `dt` seconds.
-    pub fn step(&mut self, dt: f64, feed: Feed, ratings: &Ratings, load: &Load) {
+    pub(crate) fn step(&mut self, dt: f64, feed: Feed, ratings: &Ratings, load: &Load) {
         let before = self.shaft;
         match feed {
             Feed::Off => {
@@ -159,7 +159,7 @@ impl Motor {
     }
 
     /// Shaft speed, rpm: the synchronous speed less the slip that the torque costs.
-    pub fn rpm(&self, ratings: &Ratings) -> f64 {
+    pub(crate) fn rpm(&self, ratings: &Ratings) -> f64 {
         let pole_pairs = (60.0 * ratings.frequency / ratings.speed.max(1.0)).floor().max(1.0);
         let synchronous = 60.0 / pole_pairs;
         let slip = (synchronous * ratings.frequency - ratings.speed).max(0.0) * self.torque / 100.0;
@@ -171,7 +171,7 @@ impl Motor {
     }
 
     /// Motor current, A: magnetising and torque component at a right angle.
-    pub fn current(&self, ratings: &Ratings) -> f64 {
+    pub(crate) fn current(&self, ratings: &Ratings) -> f64 {
         if !self.fed {
             return 0.0;
         }
@@ -181,17 +181,17 @@ impl Motor {
     }
 
     /// Shaft power, % of nominal; negative while the motor brakes.
-    pub fn power(&self, ratings: &Ratings) -> f64 {
+    pub(crate) fn power(&self, ratings: &Ratings) -> f64 {
         self.torque * self.shaft / ratings.frequency
     }
 
     /// Motor voltage, V: proportional to the frequency up to the nominal one.
-    pub fn voltage(&self, ratings: &Ratings) -> f64 {
+    pub(crate) fn voltage(&self, ratings: &Ratings) -> f64 {
         ratings.voltage * (self.output / ratings.frequency).abs().min(1.0)
     }
 
     /// DC link voltage, V.
-    pub fn dc_link(&self, ratings: &Ratings, load: &Load) -> f64 {
+    pub(crate) fn dc_link(&self, ratings: &Ratings, load: &Load) -> f64 {
         1.35 * load.mains - DC_SAG * self.power(ratings) / 100.0
     }
 }

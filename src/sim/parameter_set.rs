@@ -2,7 +2,7 @@
 
 /// One parameter.
 #[derive(Debug, Clone, Copy)]
-pub struct Parameter {
+pub(crate) struct Parameter {
     /// Its ID or address.
     pub key: u16,
     /// Least value.
@@ -24,11 +24,11 @@ pub enum Refused {
 
 /// The parameters of one drive by ascending key.
 #[derive(Debug, Clone)]
-pub struct ParameterSet(Vec<Parameter>);
+pub(crate) struct ParameterSet(Vec<Parameter>);
 
 impl ParameterSet {
     /// Of (key, minimum, maximum, default); keys may come in any order, the first of equal ones counts.
-    pub fn new(parameters: impl IntoIterator<Item = (u16, u16, u16, u16)>) -> ParameterSet {
+    pub(crate) fn new(parameters: impl IntoIterator<Item = (u16, u16, u16, u16)>) -> ParameterSet {
         let mut all: Vec<Parameter> = parameters
             .into_iter()
             .map(|(key, min, max, value)| Parameter { key, min, max, value })
@@ -45,12 +45,12 @@ impl ParameterSet {
     }
 
     /// The value of a parameter.
-    pub fn get(&self, key: u16) -> Option<u16> {
+    pub(crate) fn get(&self, key: u16) -> Option<u16> {
         self.find(key).ok().and_then(|at| self.0.get(at)).map(|p| p.value)
     }
 
     /// The value of a parameter that every drive of the model has; 0 when it has not.
-    pub fn number(&self, key: u16) -> u16 {
+    pub(crate) fn number(&self, key: u16) -> u16 {
         self.get(key).unwrap_or(0)
     }
 
@@ -58,7 +58,7 @@ impl ParameterSet {
     ///
     /// # Errors
     /// No such parameter, or a value outside its range.
-    pub fn check(&self, key: u16, value: u16) -> Result<(), Refused> {
+    pub(crate) fn check(&self, key: u16, value: u16) -> Result<(), Refused> {
         let at = self.find(key)?;
         let inside = self.0.get(at).is_some_and(|p| (p.min..=p.max).contains(&value));
         if inside { Ok(()) } else { Err(Refused::Value) }
@@ -68,7 +68,7 @@ impl ParameterSet {
     ///
     /// # Errors
     /// As [`ParameterSet::check`]; nothing is written then.
-    pub fn set(&mut self, key: u16, value: u16) -> Result<(), Refused> {
+    pub(crate) fn set(&mut self, key: u16, value: u16) -> Result<(), Refused> {
         self.check(key, value)?;
         let at = self.find(key)?;
         if let Some(parameter) = self.0.get_mut(at) {
@@ -78,7 +78,7 @@ impl ParameterSet {
     }
 
     /// All of them, by ascending key.
-    pub fn iter(&self) -> impl Iterator<Item = &Parameter> {
+    pub(crate) fn iter(&self) -> impl Iterator<Item = &Parameter> {
         self.0.iter()
     }
 }

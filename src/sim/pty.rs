@@ -11,7 +11,7 @@ use std::path::{Path, PathBuf};
 
 /// A pseudo-terminal; dropping it takes path and link away.
 #[derive(Debug)]
-pub struct Pty {
+pub(crate) struct Pty {
     /// The drives' end.
     pub(super) master: OwnedFd,
     /// The master's end, kept open: without it reads at the drives' end fail while no master is connected.
@@ -24,9 +24,9 @@ impl Pty {
     /// A new pseudo-terminal in raw mode; `link` becomes a symbolic link to it.
     ///
     /// # Errors
-    /// No pseudo-terminal is to be had; or the link cannot be made, or there is something at its path that is no
-    /// symbolic link, which is left alone.
-    pub fn open(link: Option<&Path>) -> io::Result<Pty> {
+    /// No pseudo-terminal is available, or the link cannot be made. Anything but a symbolic link at its path is left alone
+    /// and is an error.
+    pub(crate) fn open(link: Option<&Path>) -> io::Result<Pty> {
         let flags = OpenptFlags::RDWR | OpenptFlags::NOCTTY | OpenptFlags::CLOEXEC;
         let master = openpt(flags)?;
         grantpt(&master)?;
@@ -50,12 +50,12 @@ impl Pty {
     }
 
     /// What a master opens: the link when there is one.
-    pub fn path(&self) -> &Path {
+    pub(crate) fn path(&self) -> &Path {
         self.link.as_deref().unwrap_or(&self.path)
     }
 
-    /// Does what the last close of a serial port does and the open end prevents here: what nobody read is thrown away,
-    /// and a master that was killed no longer holds the port for itself alone.
+    /// Does what the last close of a serial port does, which the open slave end prevents here: discards unread bytes, and
+    /// releases the exclusive access of a master that was killed.
     pub(super) fn settle(&self) {
         let _ = tcflush(&self.slave, QueueSelector::IFlush);
         let _ = ioctl_tiocnxcl(&self.slave);
@@ -84,7 +84,7 @@ fn point(link: &Path, target: &Path) -> io::Result<()> {
     match fs::symlink_metadata(link) {
         Ok(found) if !found.is_symlink() => {
             let text = format!(
-                "{} exists and is no symbolic link; choose another path or remove it",
+                "{} exists and is not a symbolic link; choose another path or remove it",
                 link.display()
             );
             return Err(io::Error::new(io::ErrorKind::AlreadyExists, text));
@@ -116,7 +116,7 @@ mod tests {
 
         fs::write(&link, "precious").unwrap();
         let error = Pty::open(Some(&link)).unwrap_err();
-        assert!(error.to_string().contains("no symbolic link"), "{error}");
+        assert!(error.to_string().contains("not a symbolic link"), "{error}");
         assert_eq!(fs::read_to_string(&link).unwrap(), "precious");
         let nowhere = directory.path().join("no/such/line");
         assert!(

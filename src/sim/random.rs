@@ -1,4 +1,4 @@
-//! A small reproducible source of chance: the same seed gives the same demo and the same faults.
+//! A small reproducible random number generator: the same seed gives the same demo and the same faults.
 
 use std::ops::RangeInclusive;
 
@@ -7,7 +7,7 @@ use std::ops::RangeInclusive;
 pub struct Random(u64);
 
 impl Random {
-    /// A source that is fixed by `seed`.
+    /// A generator with that seed.
     pub fn new(seed: u64) -> Random {
         // Zero is the one state that xorshift never leaves; mixing also separates neighbouring seeds.
         let mixed = seed

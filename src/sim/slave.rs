@@ -1,7 +1,7 @@
 //! The drives of one line: whole frames in, replies out.
 //!
-//! A frame with a wrong check code and a frame for somebody else get silence, unless a drive answers the former; a broadcast acts on all and gets silence
-//! (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
+//! A frame with a wrong check code gets no reply, unless a drive answers such frames; nor does a frame for another address
+//! or a broadcast, which acts on all drives (drives.md 3.10). When a frame begins and ends is the wire's business, see [`half_duplex`](super::half_duplex).
 
 use super::SimTime;
 use super::drive::{DriveOptions, SimulatedDrive};
@@ -18,9 +18,9 @@ const BROADCAST: u8 = 0;
 /// What a frame meant to the drives of a line.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Heard {
-    /// The check code is wrong, or it is no frame at all.
+    /// The check code is wrong, or it is not a frame at all.
     BadFrame,
-    /// Nobody with that address is on the line, or it is dead.
+    /// No drive with that address is on the line, or it is dead.
     Nobody(u8),
     /// A broadcast, acted upon.
     Broadcast,
@@ -43,7 +43,7 @@ pub struct Asked {
     pub request: Result<RequestPdu, Exception>,
     /// The command on a line of N2, or the code of its refusal.
     pub command: Option<Result<Command, u8>>,
-    /// The PDU as it was sent, where it is no request.
+    /// The PDU as it was sent, where it is not a valid request.
     pub malformed: Vec<u8>,
 }
 
@@ -91,13 +91,13 @@ impl Slaves {
         self.drives.keys().copied()
     }
 
-    /// Lets all drives live on until `now`.
+    /// Advances all drives to `now`.
     pub fn advance(&mut self, now: SimTime) {
         self.drives.values_mut().for_each(|drive| drive.advance(now));
     }
 
-    /// Lets one drive live on until `now`, each time the next: a drive that nobody asks has little to catch up when it
-    /// is asked at last.
+    /// Advances one drive to `now`, the next one with each call: a drive that is not polled has little to catch up when a
+    /// request comes at last.
     pub fn advance_next(&mut self, now: SimTime) {
         let next = self
             .drives
@@ -374,7 +374,7 @@ mod tests {
         );
     }
 
-    /// drives.md 9.8: silence, or error 00H where a drive is made so.
+    /// drives.md 9.8: silence, or error 00H with the option.
     #[test]
     fn a_wrong_check_code_is_answered_by_none_but_a_teco_made_so() {
         let teco = |address, answer_check_error| {
@@ -410,8 +410,8 @@ mod tests {
             let heard = line.hear(protocol, &damaged(protocol, address, &read), SimTime::ZERO);
             assert_eq!(heard, Heard::BadFrame, "{protocol:?} {address}");
         }
-        // The check code is looked at first (drives.md 5.6): a message that lacks a byte fails there. What is no frame is
-        // nobody's.
+        // The check code is verified first (drives.md 5.6): a message that lacks a byte fails there. What is not a frame
+        // gets no reply.
         let whole = damaged(ascii, 1, &read);
         let [short, odd] = [4, 5].map(|less| [&whole[..whole.len() - less], b"\r\n"].concat());
         assert!(matches!(line.hear(ascii, &short, SimTime::ZERO), Heard::Damaged(..)));

@@ -14,7 +14,7 @@ pub struct Statistics {
     pub replies: u64,
     /// Sound broadcasts.
     pub broadcasts: u64,
-    /// Sound requests to addresses where nobody answers.
+    /// Valid requests to addresses without a drive that answers.
     pub unanswered: u64,
     /// Requests whose CRC is wrong or that are cut short.
     pub bad_crc: u64,
@@ -30,7 +30,7 @@ pub struct Statistics {
     pub bytes_in: u64,
     /// Bytes to the master.
     pub bytes_out: u64,
-    /// Bytes that nobody took from the port, so that they are lost.
+    /// Bytes that the port did not take.
     pub bytes_lost: u64,
 }
 
@@ -116,7 +116,7 @@ impl fmt::Display for Recorded {
     }
 }
 
-/// The last frames of a line, recorded when somebody wants them.
+/// The last frames of a line, recorded on request.
 #[derive(Debug, Clone, Default)]
 pub struct Transcript {
     frames: VecDeque<Recorded>,

@@ -15,13 +15,12 @@ use crate::codec::Protocol;
 use crate::line::{poll_until, sharpen_timers, wait_until};
 use rustix::event::{EventfdFlags, PollFd, PollFlags, eventfd};
 use std::io;
-use std::ops::Deref;
 use std::os::fd::{AsFd, OwnedFd};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
-/// How a simulated line is made.
+/// Options of a simulated line.
 #[derive(Debug, Clone)]
 pub struct SimulatedBusOptions {
     /// Name for messages and for the thread.
@@ -33,15 +32,12 @@ pub struct SimulatedBusOptions {
     pub rules: LineRules,
     /// The drives on it.
     pub drives: Vec<DriveOptions>,
-    /// How their boards are made, where they speak N2.
+    /// Options of their boards, where they speak N2.
     pub boards: BoardOptions,
     /// What goes wrong.
     pub faults: FaultPlan,
     /// Frames that the transcript keeps; 0 for none.
     pub transcript: usize,
-    /// Time before a delivery in which the thread watches the clock instead of sleeping: the kernel's wake-up is late by
-    /// some ten microseconds.
-    pub spin: Duration,
 }
 
 impl SimulatedBusOptions {
@@ -55,14 +51,14 @@ impl SimulatedBusOptions {
             boards: BoardOptions::default(),
             faults: FaultPlan::default(),
             transcript: 0,
-            spin: SPIN,
         }
     }
 }
 
-/// The wake-up from `ppoll` was measured late by 50 to 80 microseconds in most cases, on a virtual machine.
+/// Time before a delivery in which the thread watches the clock instead of sleeping: the wake-up from `ppoll` was measured
+/// late by 50 to 80 microseconds in most cases, on a virtual machine.
 const SPIN: Duration = Duration::from_micros(80);
-/// An idle line is looked at so often, to let its drives live on.
+/// Period at which the drives of an idle line are advanced.
 const IDLE: Duration = Duration::from_millis(100);
 /// A line without traffic for that time may have been left by its master; the port is settled, and again so often.
 const SETTLE_AFTER: Duration = Duration::from_secs(1);
@@ -136,14 +132,10 @@ impl Shared {
     }
 }
 
-/// What tests and commands do with a running line; cheap to clone.
-#[derive(Debug, Clone)]
-pub struct LineControl(Arc<Shared>);
-
 /// A running simulated line; dropping it ends the thread and takes the port away.
 #[derive(Debug)]
 pub struct SimulatedBus {
-    control: LineControl,
+    shared: Arc<Shared>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -161,7 +153,6 @@ impl SimulatedBus {
             boards,
             faults,
             transcript,
-            spin,
         } = options;
         if matches!(endpoint, EndpointOptions::Port { .. }) {
             rules.wire = Wire::Real;
@@ -186,21 +177,15 @@ impl SimulatedBus {
         let runner = Runner {
             shared: Arc::clone(&shared),
             open,
-            spin,
             settled: SimTime::ZERO,
         };
         let thread = std::thread::Builder::new()
             .name(format!("sim-{name}"))
             .spawn(move || runner.run(Some(port)))?;
         Ok(SimulatedBus {
-            control: LineControl(shared),
+            shared,
             thread: Some(thread),
         })
-    }
-
-    /// A handle that others may keep.
-    pub fn control(&self) -> LineControl {
-        self.control.clone()
     }
 
     /// Ends the thread and takes the port away.
@@ -209,7 +194,7 @@ impl SimulatedBus {
     }
 
     fn end(&mut self) {
-        self.control.0.want(Wanted::Stop);
+        self.shared.want(Wanted::Stop);
         if let Some(thread) = self.thread.take() {
             let _ = thread.join();
         }
@@ -222,18 +207,10 @@ impl Drop for SimulatedBus {
     }
 }
 
-impl Deref for SimulatedBus {
-    type Target = LineControl;
-
-    fn deref(&self) -> &LineControl {
-        &self.control
-    }
-}
-
-impl LineControl {
+impl SimulatedBus {
     /// What a master opens: a path or `tcp://host:port`; empty while the port is away.
     pub fn address(&self) -> String {
-        match &self.0.port().found {
+        match &self.shared.port().found {
             Found::Present(address) => address.clone(),
             _ => String::new(),
         }
@@ -243,7 +220,7 @@ impl LineControl {
     /// where it is not Modbus RTU.
     pub fn description(&self) -> String {
         let (addresses, format, protocol) = {
-            let mut line = self.0.line();
+            let mut line = self.shared.line();
             let addresses: Vec<u8> = line.slaves().addresses().collect();
             (addresses, line.rules().format, line.rules().protocol)
         };
@@ -258,7 +235,7 @@ impl LineControl {
         };
         format!(
             "{}: {drives} ({}) at {format}{protocol} on {}",
-            self.0.name,
+            self.shared.name,
             ranges(&addresses),
             self.address()
         )
@@ -266,49 +243,49 @@ impl LineControl {
 
     /// Time since the line was switched on.
     pub fn now(&self) -> SimTime {
-        self.0.now()
+        self.shared.now()
     }
 
     /// Counters so far.
     pub fn statistics(&self) -> Statistics {
-        self.0.line().statistics()
+        self.shared.line().statistics()
     }
 
     /// How late the simulator delivered, as a quantile (0.5 is the median).
     pub fn lateness(&self, quantile: f64) -> Option<Duration> {
-        let lateness = self.0.line().lateness().clone();
+        let lateness = self.shared.line().lateness().clone();
         lateness.quantile(quantile)
     }
 
     /// Frames of the transcript, oldest first.
     pub fn transcript(&self) -> Vec<Recorded> {
-        self.0.line().transcript().frames()
+        self.shared.line().transcript().frames()
     }
 
     /// Starts an empty transcript of the last `limit` frames; 0 ends recording.
     pub fn record(&self, limit: usize) {
-        self.0.line().record(limit);
+        self.shared.line().record(limit);
     }
 
     /// Replaces the faults from the next request on.
     pub fn set_faults(&self, faults: FaultPlan) {
-        self.0.line().set_faults(faults);
+        self.shared.line().set_faults(faults);
     }
 
-    /// Does something with a drive as it is now; `None` when there is none with that address.
+    /// Calls `act` with a drive as it is now; `None` when there is none with that address.
     pub fn with_drive<R>(&self, address: u8, act: impl FnOnce(&mut SimulatedDrive, SimTime) -> R) -> Option<R> {
-        let mut line = self.0.line();
-        let now = self.0.now();
+        let mut line = self.shared.line();
+        let now = self.shared.now();
         line.slaves().drive(address).map(|drive| {
             drive.advance(now);
             act(drive, now)
         })
     }
 
-    /// Does something with the N2 board of a drive; `None` when there is none with that address.
+    /// Calls `act` with the N2 board of a drive; `None` when there is none with that address.
     pub fn with_board<R>(&self, address: u8, act: impl FnOnce(&mut Board, SimTime) -> R) -> Option<R> {
-        let mut line = self.0.line();
-        let now = self.0.now();
+        let mut line = self.shared.line();
+        let now = self.shared.now();
         line.slaves().board(address).map(|board| act(board, now))
     }
 
@@ -319,8 +296,8 @@ impl LineControl {
 
     /// The adapter is unplugged: path and link are gone when this returns, and a master's open port fails.
     pub fn vanish(&self) {
-        self.0.want(Wanted::Absent);
-        drop(self.0.wait_for(|found| !matches!(found, Found::Present(_))));
+        self.shared.want(Wanted::Absent);
+        drop(self.shared.wait_for(|found| !matches!(found, Found::Present(_))));
     }
 
     /// The adapter is plugged in again: a new pseudo-terminal stands under the same link.
@@ -329,14 +306,14 @@ impl LineControl {
     /// It cannot be opened again.
     pub fn restore(&self) -> io::Result<()> {
         {
-            let mut port = self.0.port();
+            let mut port = self.shared.port();
             if matches!(port.found, Found::Present(_)) {
                 return Ok(());
             }
             port.found = Found::Absent;
         }
-        self.0.want(Wanted::Present);
-        match &self.0.wait_for(|found| !matches!(found, Found::Absent)).found {
+        self.shared.want(Wanted::Present);
+        match &self.shared.wait_for(|found| !matches!(found, Found::Absent)).found {
             Found::Failed(kind, text) => Err(io::Error::new(*kind, text.clone())),
             Found::Present(_) => Ok(()),
             Found::Absent => Err(io::ErrorKind::TimedOut.into()),
@@ -367,7 +344,6 @@ fn ranges(addresses: &[u8]) -> String {
 struct Runner<F> {
     shared: Arc<Shared>,
     open: F,
-    spin: Duration,
     /// Last traffic, or the last time that the port was settled.
     settled: SimTime,
 }
@@ -407,7 +383,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
         }
     }
 
-    /// Lets the drives live on without a line, until the bell rings or it is time to try again.
+    /// Advances the drives without a line, until the bell rings or it is time to try again.
     fn without_port(&self, found: Found) {
         self.shared.line().cut();
         self.shared.found(found);
@@ -428,7 +404,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
         let now = self.shared.now();
         let wake = self.shared.line().wake();
         let until = match wake {
-            Some(wake) if wake.delivery => wake.at.saturating_sub(self.spin),
+            Some(wake) if wake.delivery => wake.at.saturating_sub(SPIN),
             Some(wake) => wake.at,
             None => now + IDLE,
         };
@@ -443,8 +419,8 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
             return self.take(port);
         }
         match wake {
-            Some(wake) if wake.delivery && self.shared.start + wake.at <= until + self.spin => {
-                wait_until(self.shared.start + wake.at, self.spin);
+            Some(wake) if wake.delivery && self.shared.start + wake.at <= until + SPIN => {
+                wait_until(self.shared.start + wake.at, SPIN);
             }
             Some(_) => {}
             None => self.idle(port),
@@ -460,7 +436,7 @@ impl<F: Fn() -> io::Result<Endpoint>> Runner<F> {
             self.settled = now;
             let mut line = self.shared.line();
             line.on_bytes(bytes, now);
-            // Nothing is due before the request's silence is over: time for a drive that nobody asks.
+            // Nothing is due before the request's silence is over: time for a drive that is not polled.
             line.slaves().advance_next(now);
         }
         Ok(())

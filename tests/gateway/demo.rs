@@ -1,10 +1,11 @@
 //! `drivegate demo`, as the README promises it.
 
 use std::process::Command;
-use std::time::Duration;
 
-use crate::process::{Running, api, get, mbpoll_read, mbpoll_write, point, until, until_ready};
-use crate::tools::tool;
+use crate::support::process::{
+    Running, api, get, mbpoll_read, point, read_registers, until, until_ready, write_registers,
+};
+use crate::support::tools::tool;
 
 /// The number behind `mark` in what the demo printed.
 fn port(printed: &str, mark: &str) -> u16 {
@@ -55,25 +56,24 @@ fn everything_it_prints_works_and_ctrl_c_ends_it() {
 
     // The same words for a TECO on Modbus ASCII and for a Vacon NX on N2: 50 %, run, read, stop.
     for (unit, name, half) in [(7, "conveyor-1", 3000), (8, "ahu-1", 2500)] {
-        mbpoll_write(modbus, unit, 33_025, &[5000]).unwrap();
-        mbpoll_write(modbus, unit, 33_024, &[1]).unwrap();
+        write_registers(modbus, unit, 33_025, &[5000]);
+        write_registers(modbus, unit, 33_024, &[1]);
         until(&format!("{name} at half speed"), || {
             let registers = mbpoll_read(modbus, unit, 32_768, 19).ok()?;
             (registers.get(1) == Some(&3) && registers.get(5) == Some(&half)).then_some(())
         });
-        mbpoll_write(modbus, unit, 33_024, &[0]).unwrap();
+        write_registers(modbus, unit, 33_024, &[0]);
     }
 
-    assert_eq!(mbpoll_read(modbus, 1, 32_768, 19).unwrap().get(5), Some(&2500));
-    mbpoll_write(modbus, 1, 33_024, &[0]).unwrap();
+    assert_eq!(read_registers(modbus, 1, 32_768, 19).get(5), Some(&2500));
+    write_registers(modbus, 1, 33_024, &[0]);
     until("pump-1 stopped", || {
         (api(http, "pump-1")["state"] == "ready").then_some(())
     });
 
     demo.signal("INT");
-    let (status, took) = demo.ended();
+    let status = demo.ended();
     assert!(status.success(), "{status}");
-    assert!(took < Duration::from_secs(10), "it took {took:?}");
 }
 
 #[test]
@@ -89,6 +89,6 @@ fn a_second_demo_takes_other_ports() {
     ] {
         assert_ne!(port(&printed, mark), port(&taken, mark), "{what}");
     }
-    assert!(printed.contains(" is taken; "), "it says so:\n{printed}");
+    assert!(printed.contains(" is in use; "), "it says so:\n{printed}");
     until_ready(port(&printed, "http://127.0.0.1:"));
 }

@@ -3,9 +3,9 @@
 use std::io::{Read, Write};
 use std::net::TcpStream;
 use std::process::{Child, Command, Stdio};
-use std::time::{Duration, Instant};
 
-use crate::process::{free_port, get, until};
+use crate::support::process::{PATIENCE, get, until};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, controlled};
 
 struct Unread(Child);
 
@@ -29,22 +29,14 @@ fn ask(client: &mut TcpStream, unit: u8, pdu: &[u8; 5]) -> Vec<u8> {
 
 #[test]
 fn a_log_that_nobody_reads_holds_nobody_up() {
-    let folder = tempfile::tempdir().unwrap();
-    let (modbus, http) = (free_port(), free_port());
-    let config = folder.path().join("drivegate.toml");
-    let text = format!(
-        "[gateway]\nname = \"test\"\n[[bus]]\nname = \"line1\"\nport = \"{}\"\n[[bus.drive]]\nname = \"pump\"\naddress = 1\n\
-         profile = \"vacon-nx\"\naccess = \"control\"\n[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\n[http]\nlisten = \
-         \"127.0.0.1:{http}\"\n",
-        folder.path().join("no-port").display()
-    );
-    std::fs::write(&config, text).unwrap();
+    let modbus = MODBUS_TCP.replace("127.0.0.1/32", "127.0.0.9/32");
+    let site = Site::of(&[LINE1, &controlled("pump", 1, ""), &modbus, HTTP]);
     let mut gateway = Command::new(env!("CARGO_BIN_EXE_drivegate"));
-    gateway.args(["run", "--config", config.to_str().unwrap()]);
+    gateway.args(["run", "--config", &site.config()]);
     let mut gateway = Unread(gateway.stderr(Stdio::piped()).spawn().unwrap());
-    until("the metrics", || get(http, "/metrics"));
-    let mut client = TcpStream::connect(("127.0.0.1", modbus)).unwrap();
-    client.set_read_timeout(Some(Duration::from_secs(10))).unwrap();
+    until("the metrics", || get(site.http, "/metrics"));
+    let mut client = TcpStream::connect(("127.0.0.1", site.modbus)).unwrap();
+    client.set_read_timeout(Some(PATIENCE)).unwrap();
     // Each is refused, since the client is not in `write`, and is a line of more than 200 characters; a pipe holds 64 KiB.
     for _ in 0..1000 {
         assert_eq!(ask(&mut client, 1, &[6, 0x81, 0x00, 0, 0]), [0x86, 1]);
@@ -56,12 +48,8 @@ fn a_log_that_nobody_reads_holds_nobody_up() {
     );
     let pid = gateway.0.id().to_string();
     assert!(Command::new("kill").args(["-TERM", &pid]).status().unwrap().success());
-    let begun = Instant::now();
     let status = until("the end", || gateway.0.try_wait().unwrap());
-    assert!(
-        status.success() && begun.elapsed() < Duration::from_secs(10),
-        "{status}"
-    );
+    assert!(status.success(), "{status}");
     let mut log = String::new();
     gateway.0.stderr.take().unwrap().read_to_string(&mut log).unwrap();
     assert!(log.len() >= 60_000, "{} characters: the pipe was full", log.len());

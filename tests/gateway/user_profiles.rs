@@ -1,10 +1,10 @@
 //! The energy meter of docs/profiles.md, made by pymodbus, read with the profile of that page.
 
 use std::path::Path;
-use std::process::Command;
 
-use crate::process::{Running, api, free_port, get, mbpoll_read, mbpoll_write, point, until, until_ready};
-use crate::tools::{python, root};
+use crate::support::process::{Running, api, free_port, get, mbpoll_write, read_registers, until, write_registers};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::tools::{python, root, run_well};
 
 /// A profile over the example, with a float that is no number.
 const OURS: &str = r#"
@@ -19,43 +19,24 @@ unit = "A"
 class = "fast"
 "#;
 
-fn configure(folder: &Path, meter: u16, modbus: u16, http: u16) -> String {
-    let profiles = folder.join("profiles");
-    std::fs::create_dir(&profiles).unwrap();
-    std::fs::copy(
-        root().join("docs/energy-meter.toml"),
-        profiles.join("energy-meter.toml"),
-    )
-    .unwrap();
-    std::fs::write(profiles.join("a.toml"), OURS).unwrap();
-    let file = folder.join("drivegate.toml");
-    let text = format!(
-        "[gateway]\nname = \"test\"\nprofile_dirs = [\"profiles\"]\n\
-         [[bus]]\nname = \"line1\"\nport = \"tcp://127.0.0.1:{meter}\"\nbaud = 38400\ncycle = \"50ms\"\nslow_cycle = \"200ms\"\n\
-         response_timeout = \"500ms\"\n\
-         [[bus.drive]]\nname = \"meter\"\naddress = 7\nprofile = \"our-meter\"\naccess = \"control\"\n\
-         limits = {{ current_transformer_ratio = [1, 500] }}\n\
-         [modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\n\
-         [http]\nlisten = \"127.0.0.1:{http}\"\n"
-    );
-    std::fs::write(&file, text).unwrap();
-    file.display().to_string()
-}
-
 #[test]
 fn the_energy_meter_of_the_page_is_served() {
-    let folder = tempfile::tempdir().unwrap();
-    let (meter, modbus, http) = (free_port(), free_port(), free_port());
+    let port = free_port();
+    let meter = "cycle = \"50ms\"\nslow_cycle = \"200ms\"\n\
+         [[bus.drive]]\nname = \"meter\"\naddress = 7\nprofile = \"our-meter\"\naccess = \"control\"\n\
+         limits = { current_transformer_ratio = [1, 500] }\n";
+    let bus = LINE1.replace("port = \"line1\"", &format!("port = \"tcp://127.0.0.1:{port}\""));
+    let site = Site::of(&[&bus, meter, MODBUS_TCP, HTTP]);
+    let (modbus, http) = (site.modbus, site.http);
+    std::fs::copy(root().join("docs/energy-meter.toml"), site.file("energy-meter.toml")).unwrap();
+    site.write("a.toml", OURS);
     let peer = root().join("tests/peers/energy_meter.py");
-    let _peer = Running::start(&python(), &[&peer.display().to_string(), &meter.to_string()]);
-    let file = configure(folder.path(), meter, modbus, http);
-    let check = Command::new(env!("CARGO_BIN_EXE_drivegate"))
-        .args(["check", "--config", &file])
-        .output()
-        .unwrap();
-    assert!(check.status.success(), "{check:?}");
-    let _gateway = Running::drivegate(&["run", "--config", &file]);
-    until_ready(http);
+    let _peer = Running::start(&python(), &[&peer.display().to_string(), &port.to_string()]);
+    run_well(
+        Path::new(env!("CARGO_BIN_EXE_drivegate")),
+        &["check", "--config", &site.config()],
+    );
+    let _gateway = site.run_ready();
     for (name, value) in [
         ("voltage_l1", serde_json::json!(230.5)),
         ("current_l1", serde_json::json!(52.0)),
@@ -73,7 +54,7 @@ fn the_energy_meter_of_the_page_is_served() {
         ("current_transformer_ratio", serde_json::json!(40.0)),
         ("relay", serde_json::json!(true)),
     ] {
-        let read = || Some(point(http, "meter", name)).filter(|v| !v.is_null());
+        let read = || Some(site.point("meter", name)).filter(|v| !v.is_null());
         assert_eq!(until(name, read), value, "{name}");
     }
     let points = api(http, "meter")["points"].clone();
@@ -99,12 +80,10 @@ fn the_energy_meter_of_the_page_is_served() {
     }
     assert!(!metrics.contains("neutral_current"), "{metrics}");
     // The common model and the meter's own registers, through Modbus TCP; 32 bits with the high word first.
-    assert_eq!(mbpoll_read(modbus, 7, 0x800D, 2).unwrap(), [0, 1235]);
-    assert_eq!(mbpoll_read(modbus, 7, 256, 2).unwrap(), [40, 15]);
-    mbpoll_write(modbus, 7, 256, &[100]).unwrap();
-    until("the new ratio", || {
-        (point(http, "meter", "current_transformer_ratio") == 100.0).then_some(())
-    });
+    assert_eq!(read_registers(modbus, 7, 0x800D, 2), [0, 1235]);
+    assert_eq!(read_registers(modbus, 7, 256, 2), [40, 15]);
+    write_registers(modbus, 7, 256, &[100]);
+    site.until_point("meter", "current_transformer_ratio", 100.0);
     let refused = mbpoll_write(modbus, 7, 256, &[501]).unwrap_err();
     assert!(refused.contains("Illegal data value"), "{refused}");
 }

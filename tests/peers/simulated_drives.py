@@ -10,7 +10,7 @@ from pymodbus.pdu.diag_message import ForceListenOnlyModeRequest, RestartCommuni
 model, port = sys.argv[1:]
 FRAMERS = {"cx": FramerType.RTU, "teco": FramerType.ASCII}
 # A pseudo-terminal knows characters of 8 bits without parity only.
-client = ModbusSerialClient(port, framer=FRAMERS[model], baudrate=19200, parity="N", stopbits=1, timeout=5, retries=0)
+client = ModbusSerialClient(port, framer=FRAMERS[model], baudrate=19200, parity="N", stopbits=1, timeout=30, retries=0)
 if not client.connect():
     sys.exit(f"cannot open {port}")
 

@@ -9,7 +9,7 @@ from pymodbus.client import ModbusSerialClient
 
 framer = FramerType(sys.argv[2])
 client = ModbusSerialClient(
-    sys.argv[1], framer=framer, baudrate=38400, parity="N", stopbits=1, timeout=5, retries=0
+    sys.argv[1], framer=framer, baudrate=38400, parity="N", stopbits=1, timeout=30, retries=0
 )
 if not client.connect():
     sys.exit(f"cannot open {sys.argv[1]}")

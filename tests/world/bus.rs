@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use drivegate::bus::BusOptions;
 use drivegate::bus::core::{Action, BusCore};
 use drivegate::bus::master::{Handover, Purpose};
+use drivegate::bus::predict::predict;
 use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
@@ -18,6 +19,7 @@ use drivegate::plant::BusHandle;
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
+use drivegate::sim::random::Random;
 use drivegate::sim::slave::Slaves;
 use drivegate::sim::statistics::Transcript;
 
@@ -59,6 +61,11 @@ pub struct WorldBus {
     /// It was asked to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
+    /// The fast cycle of the line when it is saturated with polls, as predicted.
+    pub round: Duration,
+    /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
+    pub flips: f64,
+    dice: Random,
     began: Instant,
     until: Instant,
     commands: bool,
@@ -70,6 +77,7 @@ pub struct Parts {
     pub profile: Arc<Profile>,
     pub drives: Vec<DriveOptions>,
     pub faults: FaultPlan,
+    pub flips: f64,
     pub delivery: Delivery,
     pub silence: Silence,
 }
@@ -94,6 +102,7 @@ impl Parts {
         Parts {
             drives: drives.collect(),
             faults,
+            flips: line.flips,
             delivery: Delivery::Whole,
             silence: Silence::Spec,
             profile,
@@ -119,6 +128,10 @@ impl WorldBus {
             rs485: Rs485::Off,
         };
         let handle = handle(index, line, &profile, format);
+        let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
+        let round = predict(&handle.image.spec, parts.silence, &specs)
+            .fast_cycle
+            .unwrap_or_default();
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         rules.delivery = parts.delivery;
@@ -145,6 +158,9 @@ impl WorldBus {
             open: true,
             ending: false,
             exchanges: 0,
+            round,
+            flips: parts.flips,
+            dice: Random::new(index as u64 ^ 0xF11B),
             began: now,
             until: now,
             commands: true,
@@ -167,7 +183,33 @@ impl WorldBus {
         (self.until, self.commands) = (now, true);
     }
 
-    fn sim(&self, now: Instant) -> Duration {
+    /// The maximum frequency of a drive, in Hz, as it has it; set to `new` first, as at its panel. None where the
+    /// family has none in a register of its own, or the drive is off.
+    pub fn maximum_frequency(&mut self, address: u8, new: Option<f64>, now: Instant) -> Option<f64> {
+        if self.line.protocol == Protocol::N2 {
+            return None;
+        }
+        let index = self.profile.point_index("maximum_frequency")?;
+        let raw = self.profile.points[index]
+            .raw()
+            .filter(|raw| raw.form.items() == 1)?
+            .clone();
+        let sim = self.sim(now);
+        let drive = self.wire.slaves().drive(address)?;
+        if let Some(hertz) = new {
+            let value = *raw.encode(drivegate::drive::Value::Number(hertz), 0).ok()?.first()?;
+            let address = raw.address;
+            drive.answer(&RequestPdu::WriteRegister { address, value }, sim)?;
+        }
+        let (table, start) = (raw.table, raw.address);
+        let words = drive
+            .answer(&RequestPdu::Read { table, start, count: 1 }, sim)?
+            .words()?;
+        Some(raw.decode(&words, drivegate::drive::model::Kind::Number)?.as_f64())
+    }
+
+    /// The time of the line.
+    pub fn sim(&self, now: Instant) -> Duration {
         now - self.began
     }
 
@@ -251,6 +293,10 @@ impl WorldBus {
         self.note_acts(seen);
         let mut bytes = Vec::new();
         while self.wire.take_due(sim, &mut bytes).is_some() {}
+        if !bytes.is_empty() && self.dice.chance(self.flips) {
+            let place = self.dice.within(0..=bytes.len() as u64 - 1) as usize;
+            bytes[place] ^= 1 << self.dice.within(0..=7);
+        }
         if self.open && !bytes.is_empty() {
             seen.push(Seen::Heard(bytes.clone()));
             self.core.heard(&bytes, now);
@@ -293,10 +339,10 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
         protocol: line.protocol,
         format,
         cycle: line.cycle,
-        slow_cycle: Duration::from_secs(1),
+        slow_cycle: line.slow_cycle,
     };
     let drive = |address: u8| {
-        let spec = DriveSpec {
+        let mut spec = DriveSpec {
             access: Access::Control,
             unit: index as u8 * 40 + address,
             supervision: line.supervision.clone(),
@@ -305,7 +351,8 @@ fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat)
             frequency_range: (line.protocol == Protocol::N2).then_some(0.0..=50.0),
             ..DriveSpec::new(&format!("d{index}-{address}"), &name, address, profile.clone())
         };
-        Arc::new(DriveImage::new(spec, Duration::from_secs(1)))
+        (line.spec)(&mut spec);
+        Arc::new(DriveImage::new(spec, line.slow_cycle))
     };
     BusHandle {
         image: Arc::new(BusImage::new(spec, (1..=line.drives).map(drive).collect())),

@@ -1,12 +1,13 @@
 //! The clients of a world, as bytes and messages.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::command::Authority;
 use drivegate::north::modbus_tcp::{self, Uncached};
+use drivegate::north::mqtt::Incoming;
 use drivegate::north::{NorthStats, mqtt};
 use drivegate::plant::{Placed, SharedPlant};
 
@@ -21,15 +22,53 @@ pub struct Client {
     pub open: usize,
     /// Nothing comes from it before then.
     pub silent_until: Instant,
+    /// Bus and drive that it commands for a moment, and with how many more orders.
+    pub burst: (usize, usize, u64),
 }
 
 pub enum Way {
     /// Orders given by the function that all north sides use; the number of each and what it waits with.
     Plain(Vec<(usize, Placed)>),
     /// By the id in the result.
-    Mqtt(Box<mqtt::Offline>),
+    Mqtt(Box<mqtt::Offline>, Broker),
     /// By the id of the transaction.
     ModbusTcp(Box<modbus_tcp::Offline>, BTreeMap<u16, usize>, u16),
+}
+
+/// The broker between a client and the gateway, whose session outlives the connection.
+#[derive(Default)]
+pub struct Broker {
+    /// The gateway is not connected until then.
+    pub away_until: Option<Instant>,
+    /// What it delivered last, with the time and the number of the order: it repeats what was not acknowledged.
+    pub delivered: VecDeque<(Instant, usize, Incoming)>,
+    /// Messages that wait for the gateway to be back.
+    pub waiting: u64,
+}
+
+impl Broker {
+    /// Messages that may not be acknowledged when the connection breaks, and for how long.
+    const UNACKNOWLEDGED: (usize, Duration) = (6, Duration::from_millis(300));
+
+    pub fn deliver(&mut self, id: usize, message: &Incoming, now: Instant) {
+        self.delivered.push_back((now, id, message.clone()));
+        if self.delivered.len() > Broker::UNACKNOWLEDGED.0 {
+            self.delivered.pop_front();
+        }
+    }
+
+    /// The connection breaks.
+    pub fn lose(&mut self, now: Instant, until: Instant) {
+        self.delivered.retain(|(at, ..)| now - *at < Broker::UNACKNOWLEDGED.1);
+        self.away_until = Some(until);
+    }
+
+    /// The session is resumed: what is delivered once more, marked as that.
+    pub fn resume(&mut self) -> Vec<(usize, Incoming)> {
+        self.away_until = None;
+        let again = |(_, id, message)| (id, Incoming { dup: true, ..message });
+        self.delivered.drain(..).map(again).collect()
+    }
 }
 
 /// Everything that all clients share.
@@ -49,23 +88,34 @@ impl Servers {
             uncached: Uncached::Forward,
         };
         let stats = Arc::<NorthStats>::default();
-        let modbus_tcp = modbus_tcp::Offline::new(options, plant.clone(), stats, address(250), Authority::Write);
+        let modbus_tcp = modbus_tcp::Offline::new(options, plant.clone(), stats, address(250, 0), Authority::Write);
         Servers { plant, modbus_tcp }
+    }
+
+    /// A connection of a Modbus TCP client. Those of [`Habit::Shares`] are of two clients, one of them with a certificate.
+    pub fn connection(&self, habit: Habit, index: usize) -> modbus_tcp::Offline {
+        let (host, name) = match habit {
+            Habit::Shares if index.is_multiple_of(2) => (251, Some("press")),
+            Habit::Shares => (252, None),
+            _ => (index as u8, None),
+        };
+        self.modbus_tcp
+            .beside(address(host, index as u16), name, Authority::Write)
     }
 
     pub fn client(&self, index: usize, habit: Habit, now: Instant) -> Client {
         let way = match habit {
-            Habit::Mqtt => Way::Mqtt(Box::new(mqtt::Offline::new(
-                "b",
-                self.plant.clone(),
-                now,
-                SystemTime::UNIX_EPOCH,
-            ))),
-            Habit::ModbusTcp | Habit::StopsInALoop => {
-                let client = self.modbus_tcp.beside(address(index as u8), Authority::Write);
+            Habit::Mqtt => {
+                let gateway = mqtt::Offline::new("b", self.plant.clone(), now, SystemTime::UNIX_EPOCH);
+                Way::Mqtt(Box::new(gateway), Broker::default())
+            }
+            Habit::ModbusTcp | Habit::StopsInALoop | Habit::Shares => {
+                let client = self.connection(habit, index);
                 Way::ModbusTcp(Box::new(client), BTreeMap::new(), 0)
             }
-            Habit::Plain | Habit::Floods | Habit::Steady => Way::Plain(Vec::new()),
+            Habit::Plain | Habit::Floods | Habit::Crowds | Habit::Duels | Habit::Operates | Habit::Steady => {
+                Way::Plain(Vec::new())
+            }
         };
         Client {
             habit,
@@ -73,12 +123,13 @@ impl Servers {
             way,
             open: 0,
             silent_until: now,
+            burst: (0, 0, 0),
         }
     }
 }
 
-fn address(host: u8) -> SocketAddr {
-    SocketAddr::from(([127, 0, 0, host], 40_000))
+fn address(host: u8, connection: u16) -> SocketAddr {
+    SocketAddr::from(([127, 0, 0, host], 40_000 + connection))
 }
 
 /// The frame of a write of one register.

@@ -4,8 +4,8 @@ use std::time::Duration;
 
 use drivegate::bus::predict::predict;
 use drivegate::cache::DriveSpec;
-use drivegate::codec::Protocol;
 use drivegate::codec::wire::Silence;
+use drivegate::codec::{Protocol, RequestPdu};
 use drivegate::command::{Order, Urgency};
 use drivegate::drive::{ModelPoint, PollClass, Value};
 
@@ -136,4 +136,56 @@ fn stops_to_a_silent_drive_leave_the_others_their_data() {
     let (seldom, sent2) = oldest(&mut rig, 2 * MINUTE, Some(Duration::from_millis(700)));
     assert!(sent > 10 && sent2 > 10, "{sent} and {sent2} stops went out");
     assert!(first.max(seldom) <= most, "{first:?} and {seldom:?}, bound {most:?}");
+}
+
+/// A thousand references a second to one drive, and twenty of another client to another.
+#[test]
+fn a_flood_leaves_half_of_the_line_to_polls_and_its_turn_to_another_client() {
+    let ms = Duration::from_millis;
+    let mut rig = rig(&line("vacon-nx", Protocol::ModbusRtu, 38_400, 2));
+    rig.run(MINUTE / 4);
+    let (mut others, mut sent_to_other) = (Vec::new(), 0);
+    let (mut polls, mut commands) = (Duration::ZERO, Duration::ZERO);
+    for number in 0..4_000 {
+        // The flood is under way.
+        if number == 1_000 {
+            for percent in 1..=20 {
+                let order = Order::Write(RequestPdu::WriteRegister {
+                    address: 2002,
+                    value: percent * 100,
+                });
+                others.push(rig.place_as("other", 2, order));
+            }
+        }
+        let order = rig.points(1, &[("speed_reference", f64::from(number % 80))]);
+        rig.place_as("flood", 1, order);
+        let until = rig.now + ms(1);
+        while let Some(seen) = rig.step(until) {
+            for one in seen {
+                match one {
+                    Seen::Sent(asked) if !asked.is_poll && asked.drive == 1 => {
+                        sent_to_other += 1;
+                        let value = sent_to_other * 100;
+                        assert_eq!(
+                            asked.pdu,
+                            RequestPdu::WriteRegister { address: 2002, value },
+                            "in order"
+                        );
+                    }
+                    Seen::Over(asked) if asked.is_poll => polls += rig.now - asked.at,
+                    Seen::Over(asked) => commands += rig.now - asked.at,
+                    _ => {}
+                }
+            }
+        }
+    }
+    assert_eq!(sent_to_other, 20);
+    for order in &mut others {
+        assert!(rig.answered(order).is_ok());
+    }
+    assert!(commands > ms(1_000), "a flood: {commands:?}");
+    assert!(
+        polls.as_secs_f64() > 0.9 * commands.as_secs_f64(),
+        "{polls:?} of polls, {commands:?} of commands"
+    );
 }

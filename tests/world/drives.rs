@@ -30,14 +30,30 @@ pub struct Truth {
     pub online_since: Option<Instant>,
     /// Supervision last acted.
     pub supervised: Option<Instant>,
-    /// A drive that is dead, or befell something: until then its answers excuse much.
+    /// Something befell it: until then that excuses much.
     pub troubled_until: Option<Instant>,
+    /// Its bus was started anew: until then that excuses some of it.
+    pub found_anew_until: Option<Instant>,
     /// The word of the control register was changed by something else than the line.
     pub lost_word: Option<Instant>,
+    /// The last order of a client that stops it.
+    pub last_stop: Option<usize>,
+    /// A write that takes its run command away was last on the wire.
+    pub stop_sent: Option<Instant>,
+    /// A stop that the broker delivered once more may be under way until then.
+    pub repeated_until: Option<Instant>,
+    /// A request to it was last on the wire.
+    pub asked: Option<Instant>,
+    /// The image has had it offline since.
+    pub offline_since: Option<Instant>,
+    /// The bus was started anew while it ran, its lease being of then.
+    pub carried: Option<Instant>,
+    /// Its maximum frequency in Hz, and since when it has that.
+    pub maxima: Vec<(Instant, f64)>,
 }
 
 impl Truth {
-    pub fn new() -> Truth {
+    pub fn new(maximum: Option<(Instant, f64)>) -> Truth {
         Truth {
             run: false,
             may_run: None,
@@ -50,7 +66,15 @@ impl Truth {
             online_since: None,
             supervised: None,
             troubled_until: None,
+            found_anew_until: None,
             lost_word: None,
+            last_stop: None,
+            stop_sent: None,
+            repeated_until: None,
+            asked: None,
+            offline_since: None,
+            carried: None,
+            maxima: maximum.into_iter().collect(),
         }
     }
 
@@ -78,6 +102,11 @@ impl Truth {
     }
 
     pub fn is_troubled(&self, since: Instant) -> bool {
+        self.befell_since(since) || self.found_anew_until.is_some_and(|until| until >= since)
+    }
+
+    /// Whether something befell the drive itself or its line, the gateway apart.
+    pub fn befell_since(&self, since: Instant) -> bool {
         self.troubled_until.is_some_and(|until| until >= since)
     }
 

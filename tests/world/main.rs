@@ -3,7 +3,8 @@
 //! wires. A seed decides who sends what when, what the wire does to it, and what befalls drives and ports. Every step is
 //! checked against what must always hold (see `checks`); a seed that fails prints itself and the end of its history.
 //!
-//! `make check` runs fixed seeds. `make world SEEDS=n` runs n new ones, `WORLD_SEED=n` one again with its history.
+//! `make check` runs fixed seeds. `make world SEEDS=n` runs n new ones, `WORLD_SEED=n` one again with its history. With
+//! `WORLD_FLOOD=1` clients that flood a drive do so without pauses.
 
 #![allow(
     unreachable_pub,
@@ -18,14 +19,21 @@ mod bus;
 mod clients;
 mod cost;
 mod drives;
+mod families;
 mod history;
 mod matrix;
+mod n2;
+mod one_bus;
 mod orders;
 mod prediction;
 mod rig;
 mod scenario;
+mod situations;
 mod world;
 
+use std::ops::Range;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use self::scenario::Scenario;
@@ -33,32 +41,51 @@ use self::world::{Figures, World};
 
 /// Seeds of every test run.
 const FIXED: u64 = 400;
+/// Seeds of every test run in which clients flood without a pause.
+const FLOODED: Range<u64> = 0..16;
 
 /// One world from its beginning to the end of its gateway.
 fn run(seed: u64) -> Figures {
-    World::new(Scenario::of(seed)).run()
+    run_with(seed, std::env::var_os("WORLD_FLOOD").is_some())
 }
 
-fn run_all(seeds: impl Iterator<Item = u64>) {
+fn run_with(seed: u64, floods: bool) -> Figures {
+    World::new(Scenario {
+        floods,
+        ..Scenario::of(seed)
+    })
+    .run()
+}
+
+/// Runs the seeds, on all cores; each world is of one thread.
+fn run_all(seeds: Range<u64>) {
     let began = Instant::now();
-    let mut all = Figures::default();
     // To see how many seeds meet a fault, and which.
     let goes_on = std::env::var_os("WORLD_GO_ON").is_some();
-    let mut failed = Vec::new();
-    for seed in seeds {
-        let figures = match std::panic::catch_unwind(|| run(seed)) {
-            Ok(figures) => figures,
-            Err(cause) if !goes_on => std::panic::resume_unwind(cause),
-            Err(_) => {
-                failed.push(seed);
-                continue;
+    let (next, ended) = (
+        AtomicU64::new(seeds.start),
+        Mutex::new((Figures::default(), Vec::new())),
+    );
+    let worker = || {
+        loop {
+            let seed = next.fetch_add(1, Ordering::Relaxed);
+            if seed >= seeds.end || (!goes_on && !ended.lock().unwrap().1.is_empty()) {
+                return;
             }
-        };
-        all.add(&figures);
-        if std::env::var_os("WORLD_EACH").is_some() {
-            println!("seed {seed}: {figures}");
+            let figures = std::panic::catch_unwind(|| run(seed));
+            let mut ended = ended.lock().unwrap();
+            match figures {
+                Ok(figures) => ended.0.add(&figures),
+                Err(_) => ended.1.push(seed),
+            }
         }
-    }
+    };
+    std::thread::scope(|scope| {
+        for _ in 0..std::thread::available_parallelism().map_or(1, usize::from) {
+            scope.spawn(worker);
+        }
+    });
+    let (all, failed) = ended.into_inner().unwrap();
     let took = began.elapsed();
     let speed = all.bus_time.as_secs_f64() / 60.0 / took.as_secs_f64();
     assert!(failed.is_empty(), "seeds that failed: {failed:?}");
@@ -82,6 +109,13 @@ fn fixed_seeds() {
             run_all(first..first + count);
         }
         (None, None) => run_all(0..FIXED),
+    }
+}
+
+#[test]
+fn floods_without_a_pause() {
+    for seed in FLOODED {
+        run_with(seed, true);
     }
 }
 

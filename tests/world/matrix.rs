@@ -33,24 +33,29 @@ const PAUSE: Duration = Duration::from_millis(7);
 /// Time in which all drives are back behind a storm: the longest back-off, and a round.
 const BACK: Duration = Duration::from_secs(15);
 
-/// Two blocks of process data that look alike on the wire.
-fn twins() -> Arc<Profile> {
+/// Blocks of process data, two of them that look alike on the wire.
+const TWINS: &[(u16, u16)] = &[(2100, 3), (2104, 3)];
+/// Two such pairs.
+const PAIRS: &[(u16, u16)] = &[(2100, 2), (2103, 2), (2106, 1), (2108, 1)];
+
+/// A profile with these blocks, by first register and count.
+fn blocks(blocks: &[(u16, u16)]) -> Arc<Profile> {
     let mut text = String::from(
         "name = \"twins\"\nprotocols = [\"modbus-rtu\", \"modbus-ascii\"]\n\
          [[range]]\ntable = \"holding\"\nfirst = 2000\nlast = 2010\nread = 20\nwrite = 20\n\
          [[range]]\ntable = \"holding\"\nfirst = 2100\nlast = 2110\nread = 20\n\
          [[point]]\nname = \"reference\"\nat = \"holding 2002\"\nclass = \"slow\"\nwrite = true\n",
     );
-    for address in (2100..2103).chain(2104..2107) {
+    for address in blocks.iter().flat_map(|(first, count)| *first..first + count) {
         text += &format!("[[point]]\nname = \"p{address}\"\nat = \"holding {address}\"\nclass = \"fast\"\n");
     }
     Arc::new(Profile::parse("twins.toml", &text, false).unwrap())
 }
 
-fn rig(protocol: Protocol, delivery: Delivery) -> Rig {
+fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
     let (baud, profile) = match protocol {
         Protocol::N2 => (9600, Profiles::built_in().get("vacon-nx-n2").unwrap().clone()),
-        Protocol::ModbusRtu | Protocol::ModbusAscii => (115_200, twins()),
+        Protocol::ModbusRtu | Protocol::ModbusAscii => (115_200, blocks(data)),
     };
     let drive = |address| {
         let values = Values::Tagged(address);
@@ -64,6 +69,7 @@ fn rig(protocol: Protocol, delivery: Delivery) -> Rig {
         profile,
         drives: (1..=DRIVES).map(drive).collect(),
         faults: FaultPlan::default(),
+        flips: 0.0,
         delivery,
         silence: if protocol == Protocol::N2 {
             Silence::Spec
@@ -175,7 +181,10 @@ struct Watched {
 
 impl Watched {
     fn new(protocol: Protocol, delivery: Delivery) -> Watched {
-        let rig = rig(protocol, delivery);
+        Watched::of(protocol, rig(protocol, delivery, TWINS))
+    }
+
+    fn of(protocol: Protocol, rig: Rig) -> Watched {
         let mut watched = Watched {
             next_write: rig.now,
             rig,
@@ -554,4 +563,19 @@ fn n2() {
         by(1, named("everything, by 1", ALL, All, 0.1)),
     ];
     matrix(Protocol::N2, rows);
+}
+
+/// A late reply that is mangled on its way comes instead of the reply to a later request, which is late too: the garbage
+/// settles nothing.
+#[test]
+fn late_replies_that_are_mangled_settle_nothing() {
+    for protocol in [Protocol::ModbusRtu, Protocol::ModbusAscii] {
+        let mut watched = Watched::of(protocol, rig(protocol, Delivery::Whole, PAIRS));
+        watched
+            .rig
+            .set_faults(FaultPlan::new("late:106ms=0.3,late:130ms=0.2".parse().unwrap(), 7));
+        watched.rig.bus.flips = 0.3;
+        watched.run(10 * STORM, true);
+        assert!(watched.wrong.is_empty(), "{protocol:?}: {:?}", watched.wrong);
+    }
 }

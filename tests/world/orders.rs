@@ -22,6 +22,8 @@ pub enum Wish {
     Reset,
     Reverse,
     RawRead,
+    /// A speed in the unit that is not the drive's own: Hz of one that knows percent, percent of one that knows Hz.
+    Converted,
 }
 
 impl Wish {
@@ -108,6 +110,36 @@ pub fn unique_reference(profile: &Profile, number: usize) -> (usize, Value, Uniq
     (index, value, (raw.table, raw.address, words))
 }
 
+/// Whether the drive has its reference in percent, so that one in Hz is converted.
+pub fn converts_hertz(profile: &Profile) -> bool {
+    reference_point(profile).1.unit == "%"
+}
+
+/// What the order of that number that is converted writes to a drive with that maximum frequency.
+pub fn converted(profile: &Profile, number: usize, maximum: f64) -> Option<Unique> {
+    let (_, value, _) = unique_reference(profile, number);
+    let percent = if converts_hertz(profile) {
+        value.as_f64() * 100.0 / maximum
+    } else {
+        value.as_f64()
+    };
+    percent_reference(profile, percent, maximum)
+}
+
+/// What a speed reference in percent of a drive with that maximum frequency is in its own register; none where it is not
+/// told in a register of one word.
+pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Option<Unique> {
+    let (_, point) = reference_point(profile);
+    let raw = point.raw()?;
+    let own = if point.unit == "%" {
+        percent
+    } else {
+        percent * maximum / 100.0
+    };
+    let own = Value::Number((own * 100.0).round() / 100.0);
+    Some((raw.table, raw.address, raw.encode(own, 0).ok()?))
+}
+
 /// The order that a wish is, with the words that only it writes; none where the family has no such thing.
 pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, Option<Unique>)> {
     let run = |on: bool| (profile.model_index(ModelPoint::Run).unwrap(), Value::Bool(on));
@@ -145,6 +177,16 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
         }
         Wish::Reset => model(ModelPoint::FaultReset, Value::Bool(true)),
         Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number % 2 == 0)),
+        Wish::Converted => {
+            let point = if converts_hertz(profile) {
+                ModelPoint::FrequencyReference
+            } else {
+                ModelPoint::SpeedReference
+            };
+            let writes = |index: &usize| profile.points[*index].write && !profile.name.ends_with("n2");
+            let index = profile.model_index(point).filter(writes)?;
+            Some((Order::Points(vec![(index, value)]), None))
+        }
         Wish::RawRead => {
             let (table, start, count) = match profile.name.as_str() {
                 "vacon-nx" => (Table::Holding, 1500, 1),

@@ -3,16 +3,23 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use arc_swap::ArcSwap;
 use drivegate::cache::{OnShutdown, Outcome as Counted};
-use drivegate::codec::{Protocol, RequestPdu};
-use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind, WriteStats};
-use drivegate::drive::PollClass;
+use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
+use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::drive::{ModelPoint, PollClass, Sample, State, Value};
 use drivegate::event::Events;
-use drivegate::plant::{DriveHandle, Placed, Plant};
+use drivegate::plant::{DriveHandle, Placed, Plant, SharedPlant};
+use drivegate::sim::SimTime;
+use drivegate::sim::drive::SimulatedDrive;
 use drivegate::sim::faults::FaultPlan;
+use drivegate::sim::statistics::{Direction, Recorded};
 
 use super::bus::{Parts, Seen, WorldBus};
 use super::scenario::Line;
+
+/// Bus time in which everything that is waited for must come.
+pub const PATIENCE: Duration = Duration::from_secs(60);
 
 pub struct Rig {
     pub bus: WorldBus,
@@ -60,15 +67,29 @@ pub fn line(family: &'static str, protocol: Protocol, baud: u32, drives: u8) -> 
         response_timeout: protocol.usual_timeout(),
         retries: if protocol == Protocol::N2 { 2 } else { 1 },
         cycle: Duration::from_millis(10),
+        slow_cycle: Duration::from_secs(1),
         faults: String::new(),
+        flips: 0.0,
         supervision: None,
         on_shutdown: OnShutdown::Hold,
         dead: Vec::new(),
         refuses: None,
+        spec: |_| {},
     }
 }
 
 impl Rig {
+    /// One with the usual drives, whose frames are written down.
+    pub fn of(line: &Line) -> Rig {
+        Rig::recorded(line, Parts::of(0, line, 5))
+    }
+
+    pub fn recorded(line: &Line, parts: Parts) -> Rig {
+        let mut rig = Rig::new(line, parts);
+        rig.bus.wire.record(100_000);
+        rig
+    }
+
     pub fn new(line: &Line, parts: Parts) -> Rig {
         let now = Instant::now();
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
@@ -116,12 +137,140 @@ impl Rig {
 
     /// Gives an order at the present time.
     pub fn place(&mut self, address: u8, order: Order) -> Placed {
-        let origin = Origin::new(SourceKind::Mqtt, "test");
+        self.place_as("test", address, order)
+    }
+
+    /// The same for that client.
+    pub fn place_as(&mut self, client: &str, address: u8, order: Order) -> Placed {
+        let origin = Origin::new(SourceKind::Mqtt, client);
         let placed = self
             .drive(address)
             .place(order, origin, Authority::Write, DEFAULT_EXPIRY, self.now);
         self.bus.command_came(self.now);
         placed
+    }
+
+    /// The bus is started anew, as by a reload.
+    pub fn restart(&mut self) {
+        while self.bus.core.asked().is_some() {
+            self.step(self.now + Duration::from_secs(1));
+        }
+        self.bus.restart(0, &self.plant.events, &self.plant.writes, self.now);
+        self.plant.buses = vec![self.bus.handle.clone()];
+    }
+
+    /// The plant as servers have it.
+    pub fn shared_plant(&self) -> SharedPlant {
+        Arc::new(ArcSwap::from_pointee(Plant {
+            gateway: self.plant.gateway.clone(),
+            stale_after: self.plant.stale_after,
+            buses: self.plant.buses.clone(),
+            events: self.plant.events.clone(),
+            writes: self.plant.writes.clone(),
+        }))
+    }
+
+    /// Gives an order and waits for its answer.
+    pub fn ordered(&mut self, address: u8, order: Order) -> Outcome {
+        let mut placed = self.place(address, order);
+        self.answered(&mut placed)
+    }
+
+    pub fn answered(&mut self, placed: &mut Placed) -> Outcome {
+        let until = self.now + PATIENCE;
+        loop {
+            if let Some(answer) = placed.answer() {
+                return answer.outcome;
+            }
+            assert!(self.step(until).is_some(), "an order that nobody answers");
+        }
+    }
+
+    /// An order that sets points as one command.
+    pub fn points(&self, address: u8, points: &[(&str, f64)]) -> Order {
+        let profile = &self.drive(address).image.spec.profile;
+        let index = |name: &str| profile.point_index(name).unwrap();
+        let value = |(name, value): &(&str, f64)| (index(name), Value::Number(*value));
+        Order::Points(points.iter().map(value).collect())
+    }
+
+    pub fn set(&mut self, address: u8, points: &[(&str, f64)]) -> Outcome {
+        let order = self.points(address, points);
+        self.ordered(address, order)
+    }
+
+    /// Reads holding registers of a drive through the bus.
+    pub fn read(&mut self, address: u8, start: u16, count: u16) -> Outcome {
+        let table = Table::Holding;
+        self.ordered(address, Order::Read(RequestPdu::Read { table, start, count }))
+    }
+
+    pub fn sample(&self, address: u8, point: ModelPoint) -> Sample {
+        self.drive(address).reading(self.now).model(point)
+    }
+
+    pub fn good(&self, address: u8, point: ModelPoint) -> Option<Value> {
+        self.sample(address, point).good()
+    }
+
+    /// The good value of any point.
+    pub fn value(&self, address: u8, name: &str) -> Option<Value> {
+        let drive = self.drive(address);
+        let index = drive.image.spec.profile.point_index(name).unwrap();
+        drive.reading(self.now).sample(index).good()
+    }
+
+    /// One that is not known yet counts as offline.
+    pub fn state(&self, address: u8) -> State {
+        self.drive(address).reading(self.now).state().unwrap_or(State::Offline)
+    }
+
+    pub fn until_state(&mut self, address: u8, state: State) {
+        self.until(&format!("{state:?}"), PATIENCE, |rig| rig.state(address) == state);
+    }
+
+    pub fn until_good(&mut self, address: u8, point: ModelPoint, value: Value) {
+        let what = format!("{} = {value}", point.name());
+        self.until(&what, PATIENCE, |rig| rig.good(address, point) == Some(value));
+    }
+
+    /// Does something with a drive as it is now.
+    pub fn with_drive<R>(&mut self, address: u8, act: impl FnOnce(&mut SimulatedDrive, SimTime) -> R) -> R {
+        let now = self.bus.sim(self.now);
+        let drive = self.bus.wire.slaves().drive(address).unwrap();
+        drive.advance(now);
+        act(drive, now)
+    }
+
+    pub fn set_alive(&mut self, address: u8, alive: bool) {
+        self.with_drive(address, |drive, _| drive.set_alive(alive));
+    }
+
+    /// Somebody writes a register at the drive itself.
+    pub fn at_the_drive(&mut self, address: u8, register: u16, value: u16) {
+        let write = RequestPdu::WriteRegister {
+            address: register,
+            value,
+        };
+        self.with_drive(address, |drive, now| drive.answer(&write, now))
+            .unwrap();
+    }
+
+    /// A holding register as the drive itself has it.
+    pub fn word(&mut self, address: u8, start: u16) -> u16 {
+        let (table, count) = (Table::Holding, 1);
+        let read = RequestPdu::Read { table, start, count };
+        match self.with_drive(address, |drive, now| drive.answer(&read, now)) {
+            Some(Reply::Registers(words)) => words[0],
+            other => unreachable!("{other:?}"),
+        }
+    }
+
+    /// Frames of the master since the line is recorded.
+    pub fn requests(&self) -> Vec<Recorded> {
+        let mut frames = self.bus.wire.transcript().frames();
+        frames.retain(|frame| frame.direction == Direction::ToDrives);
+        frames
     }
 
     pub fn set_faults(&mut self, faults: FaultPlan) {

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{LeaseAction, OnShutdown, Supervision};
+use drivegate::cache::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::codec::Protocol;
 use drivegate::sim::random::Random;
 
@@ -18,6 +18,8 @@ pub struct Scenario {
     pub incidents: Option<Duration>,
     /// Whether the gateway takes a new configuration now and then.
     pub reloads: bool,
+    /// Clients that flood a drive seldom pause.
+    pub floods: bool,
 }
 
 /// One line with its drives.
@@ -32,14 +34,19 @@ pub struct Line {
     pub response_timeout: Duration,
     pub retries: u32,
     pub cycle: Duration,
+    pub slow_cycle: Duration,
     /// Of the wire, as `simulate --faults` takes them; empty for a sound one.
     pub faults: String,
+    /// Share of what comes to the gateway in which one bit is wrong besides.
+    pub flips: f64,
     pub supervision: Option<Supervision>,
     pub on_shutdown: OnShutdown,
     /// Addresses where nobody answers.
     pub dead: Vec<u8>,
     /// A register that the first drive refuses to tell.
     pub refuses: Option<&'static str>,
+    /// What else is different about its drives.
+    pub spec: fn(&mut DriveSpec),
 }
 
 /// What a client is like.
@@ -55,6 +62,14 @@ pub enum Habit {
     StopsInALoop,
     /// Commands one drive as fast as it is answered.
     Floods,
+    /// Commands all drives of a line as fast as it can, with hardly a stop: the queue is full.
+    Crowds,
+    /// Run and stop of one drive in turn, the next as soon as one is answered.
+    Duels,
+    /// Commands one drive for a moment, is silent for about as long as its lease or for much longer, and is back.
+    Operates,
+    /// One of many connections of a client, by Modbus TCP: each commands the drives of the last line, all but the last.
+    Shares,
     /// One reference every half second to its own drive; it must always be served.
     Steady,
 }
@@ -101,12 +116,25 @@ impl Scenario {
             Habit::StopsInALoop,
             Habit::StopsInALoop,
             Habit::Floods,
+            Habit::Crowds,
+            Habit::Duels,
+            Habit::Operates,
         ] {
-            if dice.chance(0.35) {
+            if dice.chance(0.3) {
                 clients.push(habit);
             }
         }
+        // A world of its own for what many clients hide.
+        match dice.within(0..=9) {
+            0 | 1 => clients = vec![Habit::Operates; dice.within(1..=2) as usize],
+            2 => clients = vec![Habit::Duels; dice.within(1..=2) as usize],
+            3 => clients = vec![Habit::Crowds],
+            _ => {}
+        }
         if calm {
+            if dice.chance(0.15) {
+                clients = vec![Habit::Shares; 48];
+            }
             clients.push(Habit::Steady);
         }
         Scenario {
@@ -116,6 +144,7 @@ impl Scenario {
             clients,
             incidents: (!calm).then(|| Duration::from_millis(dice.within(700..=8_000))),
             reloads: !calm && dice.chance(0.3),
+            floods: false,
         }
     }
 }
@@ -154,6 +183,8 @@ impl Line {
             response_timeout,
             retries: dice.within(0..=2) as u32,
             cycle: ms([10, 50, 200][dice.within(0..=2) as usize]),
+            slow_cycle: ms([1_000, 1_000, 4_000, 6_000][dice.within(0..=3) as usize]),
+            flips: if !calm && dice.chance(0.15) { 0.05 } else { 0.0 },
             faults: if calm || dice.chance(0.25) {
                 String::new()
             } else {
@@ -175,7 +206,13 @@ impl Line {
                 Vec::new()
             },
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
+            spec: |_| {},
         }
+    }
+
+    /// Whether anything goes wrong on its wire.
+    pub fn is_noisy(&self) -> bool {
+        !self.faults.is_empty() || self.flips > 0.0
     }
 
     /// Whether replies may come when they are not expected any more, or twice.

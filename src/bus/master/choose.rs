@@ -102,7 +102,8 @@ impl Master {
                 None => Some(Err(commands.wake_at.unwrap_or(now + super::LOOK_ROUND))),
             };
         }
-        match self.schedule.next(now, rank) {
+        let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));
+        match self.schedule.next_of(now, rank, highest) {
             Decision::Poll(poll) => self.poll(poll, now),
             Decision::Idle(until) => Some(Err(commands.wake_at.map_or(until, |at| at.min(until)))),
             Decision::Command(rank) => self.command(rank, &mut commands, now),

@@ -28,6 +28,8 @@ pub(super) struct Shutdown {
 struct Stop {
     drive: usize,
     state: State,
+    /// It was ordered, and not acknowledged.
+    in_vain: bool,
 }
 
 #[derive(Debug)]
@@ -57,6 +59,7 @@ impl Stop {
             }) => State::Refused(outcome.to_string()),
             Ok(_) | Err(TryRecvError::Closed) => State::Due(now + AGAIN),
         };
+        self.in_vain |= matches!(self.state, State::Due(_));
     }
 
     fn is_over(&self) -> bool {
@@ -72,6 +75,7 @@ impl Shutdown {
         let stop = |(drive, _)| Stop {
             drive,
             state: State::Due(now),
+            in_vain: false,
         };
         Shutdown {
             stopping: Some(stopping),
@@ -87,7 +91,7 @@ impl Shutdown {
             let name = name(stop.drive);
             match &stop.state {
                 State::Acknowledged => None,
-                State::Refused(why) => Some(format!("`{name}` was not told to stop ({why})")),
+                State::Refused(why) => Some(format!("`{name}` was not sent its stop command ({why})")),
                 State::Due(_) | State::Ordered(_) => Some(format!("`{name}` did not acknowledge its stop")),
             }
         });
@@ -118,14 +122,13 @@ impl Master {
             shutdown.end(bus);
             return;
         }
-        // Drives that do not answer come last: each of them costs a whole timeout.
-        let online_due = shutdown
-            .stops
-            .iter()
-            .any(|stop| !stop.is_over() && schedule.is_online(stop.drive));
+        // Drives that do not answer come last: each of them costs a whole timeout. Without polls one that was online before it
+        // fell silent counts as online for good.
+        let answers = |stop: &Stop| schedule.is_online(stop.drive) && !stop.in_vain;
+        let others_first = shutdown.stops.iter().any(|stop| !stop.is_over() && answers(stop));
         for stop in &mut shutdown.stops {
             let due = matches!(stop.state, State::Due(at) if at <= now);
-            if due && (schedule.is_online(stop.drive) || !online_due) {
+            if due && (schedule.is_online(stop.drive) || !others_first) {
                 stop.state = order(bus, stop.drive, deadline, writes, now);
             }
         }

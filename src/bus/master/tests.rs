@@ -322,6 +322,75 @@ fn cyclic_stops_of_a_drive_that_stands_starve_nobody() {
 }
 
 #[test]
+fn cyclic_stops_of_a_drive_that_stands_do_not_make_each_other_urgent() {
+    let mut rig = Rig::new(1);
+    let _first = rig.switch(0, "plc", false);
+    rig.run(Duration::from_secs(1));
+    let from = rig.wire.len();
+    for _ in 0..200 {
+        let _stop = rig.switch(0, "plc", false);
+        rig.step();
+    }
+    let ranks: Vec<Urgency> = rig.wire[from..].iter().filter_map(|(_, turn)| turn.rank()).collect();
+    assert!(
+        ranks.len() > 50 && ranks.iter().all(|rank| *rank == Urgency::Command),
+        "{ranks:?}"
+    );
+    // One that the drive did not acknowledge leaves a doubt.
+    rig.drives[0].next_write = Some(Ended::Corrupt("noise"));
+    let _doubtful = rig.switch(0, "plc", false);
+    rig.drives[0].silent = true;
+    rig.step();
+    rig.step();
+    rig.drives[0].silent = false;
+    rig.run(COST * 10);
+    let from = rig.wire.len();
+    let _stop = rig.switch(0, "plc", false);
+    rig.step();
+    assert_eq!(rig.wire[from].1.rank(), Some(Urgency::Stop));
+}
+
+#[test]
+fn stops_without_end_do_not_leave_a_reset_bit_set() {
+    let mut rig = Rig::new(1);
+    let reset = |rig: &Rig| rig.drives[0].holding.get(&2000).is_some_and(|word| word & 4 == 4);
+    let _reset = rig.order(0, "other", ModelPoint::FaultReset, Value::Bool(true));
+    while !reset(&rig) {
+        rig.step();
+    }
+    let from = rig.wire.len();
+    while reset(&rig) {
+        let _stop = rig.switch(0, "plc", false);
+        rig.step();
+        assert!(rig.wire.len() < from + 40, "the reset bit is still set");
+    }
+}
+
+#[test]
+fn a_stop_yields_to_a_command_and_not_to_what_that_has_to_wait_for() {
+    let mut rig = Rig::new(2);
+    let from = rig.wire.len();
+    for round in 0..300 {
+        // A run behind it makes each stop news.
+        let _stop = rig.switch(0, "flood", false);
+        let _run = rig.switch(0, "flood", true);
+        let _reference = rig.order(
+            1,
+            "other",
+            ModelPoint::SpeedReference,
+            Value::Number(f64::from(round % 100)),
+        );
+        rig.step();
+    }
+    let ranks: Vec<Option<Urgency>> = rig.wire[from..].iter().map(|(_, turn)| turn.rank()).collect();
+    let others = ranks.split(|rank| *rank == Some(Urgency::Stop));
+    let polls = others.map(|others| others.iter().filter(|rank| rank.is_none()).count());
+    assert!(polls.max() <= Some(2), "{ranks:?}");
+    let before = ranks.split(|rank| *rank == Some(Urgency::Command)).map(<[_]>::len);
+    assert!(before.max() <= Some(32), "{ranks:?}");
+}
+
+#[test]
 fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
     let mut rig = Rig::new(2);
     let mut sent = rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(10.0));
@@ -377,6 +446,28 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
         rig.wire[from..].iter().find(stop).map(|(at, _)| *at - begin)
     });
     assert!(last.max().unwrap() < COST * 60);
+}
+
+#[test]
+fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_back() {
+    let mut rig = Rig::new(3);
+    rig.drives[1].silent = true;
+    rig.run(Duration::from_secs(2));
+    assert!(!rig.master.schedule.is_online(1));
+    rig.drives[1].silent = false;
+    rig.drives[1].holding.insert(2000, 1);
+    rig.drives[0].silent = true;
+    let deadline = rig.now + Duration::from_secs(5);
+    let mut missing = rig.bus.queue.begin_shutdown(deadline, rig.now);
+    let missing = loop {
+        rig.step();
+        if let Ok(missing) = missing.try_recv() {
+            break missing;
+        }
+        assert!(rig.now < deadline + TIMEOUT * 2);
+    };
+    assert_eq!(missing, ["`d1` did not acknowledge its stop"]);
+    assert!(!rig.runs(1));
 }
 
 #[test]

@@ -95,7 +95,7 @@ fn a_saturated_line_gives_slow_polls_five_percent() {
     let cycle = Duration::from_millis(148);
     assert_eq!(shortage.remedies, [Remedy::Cycle { cycle, baud: None }]);
     assert_eq!(
-        shortage.message(),
+        shortage.finding().to_string(),
         "the line cannot carry cycle = \"10ms\" and slow_cycle = \"1s\": fast rounds of 10 requests take 114.4 ms \
          and come every 120.4 ms, slow rounds of 20 requests take 218.3 ms and come every 4366.7 ms; set cycle = \"148ms\""
     );
@@ -135,7 +135,7 @@ fn the_least_baud_of_the_profile_that_would_do() {
     let drives = drives(&profile("[9600, 19200, 38400, 115200]", 0), 3);
     let p = predict(&spec(9600, 40, 1000), Silence::Chars, &drives);
     assert_eq!(p.shortage.as_ref().unwrap().remedies[0], Remedy::Baud(38_400));
-    let message = p.shortage.unwrap().message();
+    let message = p.shortage.unwrap().finding().to_string();
     assert!(
         message.contains("cannot carry cycle = \"40ms\"") && message.contains("set baud = 38400"),
         "{message}"
@@ -160,7 +160,13 @@ fn else_the_bus_is_split() {
         p.shortage.as_ref().unwrap().remedies[0],
         Remedy::Split { buses: 4, baud: None }
     );
-    assert!(p.shortage.unwrap().message().contains("split the bus in 4 buses"));
+    assert!(
+        p.shortage
+            .unwrap()
+            .finding()
+            .to_string()
+            .contains("split the bus in 4 buses")
+    );
     // At 19200 one drive takes 22.4 ms: seven buses there, four at 38400.
     let p = predict(&spec(19_200, 25, 1000), Silence::Chars, &drives);
     let split = Remedy::Split {

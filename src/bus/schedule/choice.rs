@@ -8,13 +8,17 @@ use crate::drive::{PlannedRead, PollClass};
 
 impl Schedule {
     /// Slow polls earn their share of all time, idle time too: on a line that is nearly full it helps them nothing that
-    /// the line rests where none of them fits.
+    /// the line rests where none of them fits. The greater share that they have at first is one of what commands leave:
+    /// with half of the line for commands, process data would have nothing.
     pub(super) fn earn(&mut self, now: Instant) {
         let passed = now.saturating_duration_since(self.earned_until);
         self.earned_until = now;
-        let first = self.drives.iter().any(DriveSchedule::has_unread);
-        let share = if first { FIRST_SHARE } else { self.slow_share };
-        self.slow_credit = (self.slow_credit + passed.mul_f64(share)).min(self.most_credit);
+        let of_polls = passed.saturating_sub(std::mem::take(&mut self.commanded));
+        let earned = match self.drives.iter().any(DriveSchedule::has_unread) {
+            true => of_polls.mul_f64(FIRST_SHARE),
+            false => passed.mul_f64(self.slow_share),
+        };
+        self.slow_credit = (self.slow_credit + earned).min(self.most_credit);
     }
 
     pub(super) fn start_round(&mut self, now: Instant) {

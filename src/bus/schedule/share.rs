@@ -22,6 +22,13 @@ impl Lead {
         self.took = took;
     }
 
+    /// What goes whether there is room or not leaves none until something is paid, and is not reckoned beyond that: others
+    /// would wait without bound.
+    fn fill(&mut self, took: Duration) {
+        let full = (self.time + took).min(COMMANDS_IN_A_ROW * took);
+        (self.time, self.took) = (self.time.max(full), took);
+    }
+
     fn pay(&mut self, took: Duration) {
         self.time = self.time.saturating_sub(took);
     }
@@ -71,21 +78,23 @@ impl CommandShare {
         !command_waits || self.unread >= COMMANDS_IN_A_ROW
     }
 
-    /// Whether it goes before a poll that is due: two of them never do.
+    /// Whether it goes before a poll that is due: two of them never do, and none on top of stops that have all their half.
     pub(super) fn reads_before_polls(&self) -> bool {
-        !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && self.all.has_room()
+        let room = self.all.has_room() && self.stops.has_room();
+        !self.asked_last && self.in_a_row < COMMANDS_IN_A_ROW && room
     }
 
     /// A command, or a step of one, took that time.
     pub(super) fn commanded(&mut self, urgency: Urgency, took: Duration) {
         self.in_a_row += 1;
         self.unread += 1;
-        self.all.charge(took);
         if urgency == Urgency::Stop {
             self.stops_in_a_row += 1;
+            self.all.fill(took);
             self.stops.charge(took);
         } else {
             self.stops_in_a_row = 0;
+            self.all.charge(took);
         }
     }
 

@@ -163,6 +163,28 @@ fn garbage_ends_the_exchange_once_no_more_of_it_can_come() {
     assert_eq!(transaction.on_time(deadline), corrupt("check code is wrong"));
 }
 
+/// A byte count with which no frame exists does not hold the line until the deadline, and the reply is still found
+/// behind it.
+#[test]
+fn a_reply_of_impossible_length_ends_the_exchange_before_its_deadline() {
+    let (request, frame) = request();
+    let now = Instant::now();
+    let mut transaction = start(&request, &frame, now);
+    let Step::Wait(until) = transaction.on_bytes(now, &[1, 3, 0xFF]) else {
+        panic!("the rest may still be on the line")
+    };
+    assert!(
+        until <= now + Duration::from_millis(6),
+        "a reply's time: {:?}",
+        until - now
+    );
+    let why = "the reply announces more than 256 characters";
+    assert_eq!(transaction.on_time(until), Step::Done(Ended::Corrupt(why)));
+    let mut transaction = start(&request, &frame, now);
+    transaction.on_bytes(now, &[1, 3, 0xFF]);
+    assert_eq!(transaction.on_bytes(now, &reply(9)), done(9));
+}
+
 #[test]
 fn a_reply_behind_noise_is_found_but_no_exception_and_no_echo() {
     let (request, frame) = request();

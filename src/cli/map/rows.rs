@@ -1,4 +1,4 @@
-//! The rows of the map: what stands at each address.
+//! The rows of the map: the content of each address.
 
 use crate::cache::Access;
 use crate::codec::Table;
@@ -28,7 +28,7 @@ pub(super) struct Row {
     pub(super) note: String,
 }
 
-/// What the cells of a row are.
+/// Names of the cells of a row.
 pub(super) const COLUMNS: [&str; 14] = [
     "view",
     "table",
@@ -155,7 +155,7 @@ fn point_source(profile: &Profile, plan: &Plan, point: ModelPoint) -> String {
     };
     match point.raw() {
         Some(raw) => format!("{} {}, {}", raw.table.name(), raw.address, polled(plan, point, raw)),
-        None => "made of other points".to_string(),
+        None => "derived from other points".to_string(),
     }
 }
 
@@ -174,12 +174,12 @@ fn command_source(profile: &Profile) -> String {
     }
 }
 
-/// How a register comes to be known.
+/// How a register is read.
 fn polled(plan: &Plan, point: &Point, raw: &Raw) -> String {
     if plan.reads.iter().any(|r| r.covers(raw.table, raw.address)) {
         format!("polled {}", point.class.name())
     } else {
-        "asked of the drive on request".to_string()
+        "read from the drive on request".to_string()
     }
 }
 

@@ -21,7 +21,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
         out += &listeners(map.listeners);
     }
     out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
-            32-bit values lie high word first; age and state tell why a value is not available.\n";
+            32-bit values lie high word first; age and state show why a value is not available.\n";
     let mut seen: Vec<&str> = Vec::new();
     for drive in &map.drives {
         let profile = &drive.image.spec.profile;
@@ -41,7 +41,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             profile.title,
             units.join(", ")
         );
-        // What a unit of this profile can have; the table above tells which units take writes.
+        // What a unit of this profile can have; the table above tells which units can be written.
         out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
         out += &ranges(profile);
@@ -102,7 +102,7 @@ fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
     out
 }
 
-/// What the raw view reaches beside the points.
+/// Addresses of the raw view beyond the points.
 fn ranges(profile: &Profile) -> String {
     let header = ["table", "first", "last", "read at once", "written at once", "note"];
     let rows = profile.ranges.iter().map(|range| {

@@ -1,4 +1,4 @@
-//! How far the search is, and how long it will take.
+//! Progress of the scan and its estimated time.
 
 use std::collections::VecDeque;
 use std::io::{IsTerminal, Write};
@@ -8,21 +8,21 @@ use std::time::{Duration, Instant};
 
 /// Characters of the bar.
 const BAR: usize = 24;
-/// A terminal is told at most so often.
+/// Shortest interval between updates of a terminal.
 const PAUSE: Duration = Duration::from_millis(100);
-/// A file is told at most so often.
+/// Shortest interval between lines in a file.
 const LINE_PAUSE: Duration = Duration::from_secs(10);
-/// Steps that the estimate looks back on.
+/// Steps that the estimate is averaged over.
 const REMEMBERED: usize = 32;
 
-/// A bar on standard error, or a line now and then where that is no terminal.
+/// A bar on standard error, or a line now and then where that is not a terminal.
 #[derive(Debug)]
 pub(super) struct Progress {
     total: usize,
     done: usize,
     steps: VecDeque<Duration>,
     begun: Instant,
-    told: Option<Instant>,
+    shown: Option<Instant>,
     live: bool,
     stop: Arc<AtomicBool>,
 }
@@ -34,21 +34,21 @@ impl Progress {
             done: 0,
             steps: VecDeque::new(),
             begun: Instant::now(),
-            told: None,
+            shown: None,
             live: std::io::stderr().is_terminal(),
             stop,
         }
     }
 
-    /// What is tried now; `patience` is what it takes at the longest.
+    /// Shows what is tried now, which takes `patience` at most.
     pub(super) fn show(&mut self, what: &str, patience: Duration) {
         let now = Instant::now();
         self.begun = now;
         let pause = if self.live { PAUSE } else { LINE_PAUSE };
-        if self.told.is_some_and(|told| now.duration_since(told) < pause) {
+        if self.shown.is_some_and(|shown| now.duration_since(shown) < pause) {
             return;
         }
-        self.told = Some(now);
+        self.shown = Some(now);
         let text = line(
             self.done,
             self.total,
@@ -67,21 +67,21 @@ impl Progress {
         }
     }
 
-    /// A line that stays.
-    pub(super) fn say(&mut self, text: &str) {
+    /// Prints a line that stays.
+    pub(super) fn print_line(&mut self, text: &str) {
         let clear = if self.live { "\r\x1b[K" } else { "" };
-        // There is nowhere left to tell that stderr is gone.
+        // With stderr gone there is nowhere left to report that.
         let _ = writeln!(std::io::stderr().lock(), "{clear}{text}");
-        self.told = None;
+        self.shown = None;
     }
 
-    /// The bar goes.
+    /// Clears the bar.
     pub(super) fn end(&mut self) {
         if self.live {
             let _ = write!(std::io::stderr().lock(), "\r\x1b[K");
         }
         if self.stop.load(Ordering::Relaxed) {
-            self.say(&format!("stopped after {} of {} addresses", self.done, self.total));
+            self.print_line(&format!("stopped after {} of {} addresses", self.done, self.total));
         }
     }
 
@@ -95,7 +95,7 @@ impl Progress {
     }
 }
 
-/// Time for the addresses that are left: as long as the last ones took, or as the first takes at the longest.
+/// Estimated time for the remaining addresses: by the mean of the last ones, or by the longest time of the first.
 fn left(steps: &VecDeque<Duration>, remaining: usize, patience: Duration) -> Duration {
     let remaining = u32::try_from(remaining).unwrap_or(u32::MAX);
     match u32::try_from(steps.len()) {

@@ -1,4 +1,4 @@
-//! The configuration that a search prints. Pure.
+//! The configuration that a scan prints. Pure.
 
 use std::path::Path;
 
@@ -10,7 +10,7 @@ pub(super) struct Found {
     pub(super) protocol: Protocol,
     pub(super) format: LineFormat,
     pub(super) address: u8,
-    /// Profiles that fit what it answers; none, one, or some that cannot be told apart by reading.
+    /// Profiles that match its answers; none, one, or some that cannot be distinguished by reading.
     pub(super) profiles: Vec<String>,
 }
 
@@ -18,9 +18,9 @@ impl Found {
     /// For people.
     pub(super) fn title(&self) -> String {
         match self.profiles.as_slice() {
-            [] => "of no profile that is known".to_string(),
+            [] => "no known profile".to_string(),
             [one] => one.clone(),
-            some => format!("{}, which reading does not tell apart", some.join(" or ")),
+            some => format!("{} (indistinguishable by reading)", some.join(" or ")),
         }
     }
 }
@@ -39,7 +39,7 @@ pub(super) fn snippet(port: &str, found: &[Found]) -> String {
     let mut number = 0;
     for (index, (protocol, format)) in settings.iter().enumerate() {
         if index > 0 {
-            text += "\n# Drives answered to other settings too; a line has one setting, so choose.\n";
+            text += "\n# Drives also answered with other settings; a line has one, so choose.\n";
         }
         let written = format.to_string();
         let characters = written.split_once(' ').map_or("8N1", |(_, characters)| characters);
@@ -78,7 +78,7 @@ fn entry(drive: &Found, number: usize, unit: Option<u8>) -> String {
     match drive.profiles.as_slice() {
         [] => {
             commented(true, &format!("{head}profile = \"\""))
-                + "    # no profile fits; docs/profiles.md tells how to write one\n"
+                + "    # no profile matches; see docs/profiles.md to write one\n"
         }
         [one] => format!("{head}profile = \"{one}\"\n"),
         [first, others @ ..] => format!("{head}profile = \"{first}\"    # or {}\n", others.join(", or ")),

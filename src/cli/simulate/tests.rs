@@ -71,7 +71,7 @@ fn boards_that_count_from_one() {
         assert!(bad.parse::<AddressOffset>().is_err(), "{bad}");
     }
     let error = parse("--profile vacon-cx --cx-address-offset coils=1").unwrap_err();
-    assert!(error.contains("names no table; write coil, "), "{error}");
+    assert!(error.contains("does not name a table; write coil, "), "{error}");
     let error = parse("--cx-address-offset coil=1").unwrap().line().unwrap_err();
     assert!(error.contains("`vacon-nx` have no address offset"), "{error}");
 }

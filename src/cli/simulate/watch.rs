@@ -1,4 +1,4 @@
-//! What is told while lines are simulated.
+//! Output while lines are simulated.
 
 use std::io::{self, IsTerminal, Write};
 use std::time::{Duration, Instant};
@@ -8,7 +8,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use crate::sim::statistics::Statistics;
 use crate::sim::wire::SimulatedBus;
 
-/// Tells where the lines are, and once a second, on a terminal, what goes on; ends on Ctrl-C and SIGTERM.
+/// Prints the lines and, once a second on a terminal, their counters; ends on Ctrl-C and SIGTERM.
 pub(super) fn serve(lines: &[SimulatedBus]) -> io::Result<()> {
     let mut out = io::stdout();
     for line in lines {
@@ -51,7 +51,7 @@ fn total(lines: &[SimulatedBus]) -> Statistics {
     lines.iter().map(|line| line.statistics()).sum()
 }
 
-/// The counters that tell a good master from a bad one; those at rest stay unsaid.
+/// The counters that distinguish a good master from a bad one; rare ones only when they are not 0.
 fn summary(s: &Statistics) -> String {
     let mut text = format!(
         "{} requests, {} replies, {} too early",
@@ -60,10 +60,10 @@ fn summary(s: &Statistics) -> String {
     let rare = [
         (s.collisions, "collisions"),
         (s.bad_crc, "bad frames"),
-        (s.unanswered, "to nobody"),
+        (s.unanswered, "unanswered"),
         (s.broadcasts, "broadcasts"),
         (s.faults, "faults injected"),
-        (s.bytes_lost, "bytes nobody read"),
+        (s.bytes_lost, "bytes not read"),
     ];
     for (count, name) in rare.into_iter().filter(|(count, _)| *count > 0) {
         text.push_str(&format!(", {count} {name}"));

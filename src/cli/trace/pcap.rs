@@ -1,8 +1,8 @@
 //! Captures for Wireshark: the classic pcap format, link type `RTAC_SERIAL`.
 //!
-//! Each packet is a serial line's event with its direction, which the Modbus frame alone does not tell; its payload is
-//! decoded as Modbus RTU by `rtacser.data,mbrtu`. The other choice, a `USER` link type, knows no direction and shows
-//! nothing at all before it is set up.
+//! Each packet is a serial line's event with its direction, which the Modbus frame alone does not show; its payload is
+//! decoded as Modbus RTU by `rtacser.data,mbrtu`. The other choice, a `USER` link type, has no direction and shows
+//! nothing until it is set up.
 
 use std::fs::File;
 use std::io::{self, BufWriter, Write};
@@ -28,7 +28,7 @@ pub(super) struct Capture<W: Write> {
 }
 
 impl Capture<File> {
-    /// Makes the file anew.
+    /// Creates the file, or empties it.
     ///
     /// # Errors
     /// When it cannot be written.
@@ -92,7 +92,7 @@ impl<W: Write> Capture<W> {
         self.out.write_all(&packet)
     }
 
-    /// Gives the file what was added.
+    /// Writes what was added to the file.
     ///
     /// # Errors
     /// When it cannot be written.

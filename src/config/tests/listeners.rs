@@ -2,16 +2,16 @@
 
 use std::path::Path;
 use std::sync::LazyLock;
+use std::time::Duration;
 
 use super::{FORM, FULL, load, settings};
-use crate::config::modbus_tcp;
 
 /// Directory of a CA and a server certificate, made by the script of the documentation.
 pub(super) fn certificates() -> &'static Path {
     static DIR: LazyLock<tempfile::TempDir> = LazyLock::new(|| {
         let dir = tempfile::tempdir().unwrap();
         for arguments in [&["ca"][..], &["server", "gateway"], &["server", "other"]] {
-            // A day under the thirty from which on the end is told, whatever second it is looked at.
+            // A day less than the thirty from which a warning is given, at any second.
             certificate(dir.path(), arguments, "29");
         }
         certificate(dir.path(), &["server", "expired"], "-1");
@@ -48,7 +48,7 @@ fn units_are_unique_where_modbus_tcp_serves_them() {
     let (served, _) = load(&(source + "[modbus_tcp]\n"));
     assert_eq!(served.errors.len(), 961);
     assert!(
-        served.errors[0].message.contains("unit 1 belongs to"),
+        served.errors[0].finding.what.contains("unit 1 already belongs to"),
         "{:?}",
         served.errors[0]
     );
@@ -87,7 +87,7 @@ fn a_listener_for_each_line() {
         ("10.0.0.0/8".into(), "10.0.0.1/32".into())
     );
     assert_eq!((two.allow[0].to_string(), two.write.len()), ("10.2.0.0/16".into(), 0));
-    assert_eq!(options.idle_timeout, Some(modbus_tcp::DEFAULT_IDLE));
+    assert_eq!(options.idle_timeout, Some(Duration::from_secs(3600)));
     let off = settings(&split.replace("[modbus_tcp]", "[modbus_tcp]\nidle_timeout = \"off\""))
         .modbus_tcp
         .unwrap();
@@ -96,49 +96,52 @@ fn a_listener_for_each_line() {
     let (both, _) = load(&split.replace("buses = [\"line2\"]", "buses = [\"line1\", \"line2\"]"));
     assert_eq!(both.errors.len(), 2, "{:?}", both.errors);
     assert!(
-        both.errors[0].message.contains("unit 1 belongs to drive `line1-1`"),
+        both.errors[0]
+            .finding
+            .what
+            .contains("unit 1 already belongs to drive `line1-1`"),
         "{:?}",
         both.errors[0]
     );
-    // Shown twice, told once.
+    // Shown twice, reported once.
     let (all, _) = load(&(split + "[modbus_tcp.tls]\ncertificate = \"a\"\n"));
     assert_eq!(
         all.errors
             .iter()
-            .filter(|e| e.message.contains("belongs to drive"))
+            .filter(|e| e.finding.what.contains("already belongs to drive"))
             .count(),
         2
     );
 }
 
 #[test]
-fn faults_of_listeners() {
+fn errors_of_listeners() {
     let (loaded, _) = load(&two_lines(
         "[modbus_tcp]\nlisten = [\"127.0.0.1:1502\"]\nmax_connections_per_address = 0\nidle_timeout = \"0s\"\n\
          [[modbus_tcp.listener]]\nbuses = [\"lime1\", \"hall\"]\n\
          [[modbus_tcp.listener]]\nlisten = [\"127.0.0.1:1502\"]\nbuses = []\n",
     ));
-    let told: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
+    let found: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
     for wanted in [
         "there is no bus `lime1`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; did you mean `line1`?",
         "there is no bus `hall`; /etc/drivegate/t.toml:30, modbus_tcp.listener[0].buses; write one of line1, line2",
-        "`listen` is missing; /etc/drivegate/t.toml:29, modbus_tcp.listener[0].listen; write for example [\"127.0.0.1:1502\"]",
+        "`listen` is missing; /etc/drivegate/t.toml:29, modbus_tcp.listener[0].listen; write addresses with ports, such as [\"127.0.0.1:1502\"]",
         "the list is empty; /etc/drivegate/t.toml:33, modbus_tcp.listener[1].buses; name a bus, or leave the key out for all",
         "127.0.0.1:1502 collides with 127.0.0.1:1502 of modbus_tcp.listen (line 26); /etc/drivegate/t.toml:32, \
-         modbus_tcp.listener[1].listen; give each server a port of its own",
+         modbus_tcp.listener[1].listen; give each server its own port",
         "0 is out of range; /etc/drivegate/t.toml:27, modbus_tcp.max_connections_per_address; write 1 to 10000",
         "0s is out of range; /etc/drivegate/t.toml:28, modbus_tcp.idle_timeout; write \"1s\" to \"168h\"",
     ] {
         assert!(
-            told.iter().any(|t| t == wanted),
+            found.iter().any(|t| t == wanted),
             "{wanted}\nis missing in\n{}",
-            told.join("\n")
+            found.join("\n")
         );
     }
 }
 
 #[test]
-fn faults_of_certificates_are_told_with_file_and_key() {
+fn errors_of_certificates_name_file_and_key() {
     let dir = certificates();
     let shown = dir.display();
     let of = |from: &str, to: &str| {
@@ -162,21 +165,25 @@ fn faults_of_certificates_are_told_with_file_and_key() {
         (
             "gateway.crt",
             file("gateway.key"),
-            "gateway.key holds no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; give a PEM file",
+            "gateway.key contains no certificate; /etc/drivegate/t.toml:18, modbus_tcp.tls.certificate; specify a PEM file",
         ),
         (
             "gateway.crt",
             file("other.crt"),
-            "the key does not belong to the certificate; /etc/drivegate/t.toml:19, \
-          modbus_tcp.tls.key; give the key that the certificate was made for",
+            "the key does not match the certificate; /etc/drivegate/t.toml:19, \
+          modbus_tcp.tls.key; specify the key of the certificate",
         ),
-        ("gateway.key", file("gateway.crt"), "gateway.crt holds no private key: "),
+        (
+            "gateway.key",
+            file("gateway.crt"),
+            "gateway.crt contains no private key",
+        ),
         ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
-        ("gateway.crt", file("expired.crt"), "has expired on "),
+        ("gateway.crt", file("expired.crt"), "expired on "),
     ] {
-        let told = of(from, &to);
-        assert!(told.contains(wanted), "{wanted}\nis not in\n{told}");
-        assert_eq!(told.lines().count(), 1, "{told}");
+        let found = of(from, &to);
+        assert!(found.contains(wanted), "{wanted}\nis not in\n{found}");
+        assert_eq!(found.lines().count(), 1, "{found}");
     }
 }
 
@@ -203,10 +210,10 @@ fn new_certificates_in_the_same_files_are_seen() {
         debug.contains("elided") && !debug.contains(key.lines().nth(1).unwrap()),
         "{debug}"
     );
-    // Thirty days before its end a certificate is worth a word.
+    // A certificate that expires within thirty days gives a warning.
     let (loaded, _) = load(&FULL);
     assert!(
-        loaded.warnings.iter().any(|w| w.message.contains("expires on")),
+        loaded.warnings.iter().any(|w| w.finding.what.contains("expires on")),
         "{:?}",
         loaded.warnings
     );

@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use serde_json::Value;
 
 use super::{FULL, load, settings};
-use crate::config::schema::schema;
+use crate::config::schema;
 
 /// Paths of all properties below `node`, in the form of `Document::known_keys`.
 fn properties(node: &Value, path: &str, found: &mut BTreeSet<String>) {

@@ -1,9 +1,9 @@
-//! Raw values: where they lie, their form, and what they mean in engineering units.
+//! Raw values: address, format and conversion to engineering units.
 
-use super::super::model::{Kind, Value};
+use super::super::model::{Kind, Value, tidy};
 use crate::codec::Table;
 
-/// Place and form of a raw value.
+/// Address and format of a raw value.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Raw {
     /// Table.
@@ -43,7 +43,7 @@ pub enum Form {
     U32(WordOrder),
     /// Signed 32 bit, two's complement, in two registers.
     I32(WordOrder),
-    /// IEEE 754 single in two registers; what is no number is never a value.
+    /// IEEE 754 single in two registers; NaN and infinities are not values.
     F32(WordOrder),
 }
 
@@ -84,7 +84,7 @@ impl WordOrder {
 }
 
 impl Form {
-    /// Registers or bits that the value takes.
+    /// Number of registers or bits of the value.
     pub fn items(self) -> u16 {
         match self {
             Form::U32(_) | Form::I32(_) | Form::F32(_) => 2,
@@ -105,8 +105,8 @@ impl Form {
         }
     }
 
-    /// Which register of two comes first, where there are two.
-    pub fn word_order(self) -> Option<WordOrder> {
+    /// Which register of two comes first, if there are two.
+    pub(crate) fn word_order(self) -> Option<WordOrder> {
         match self {
             Form::U32(order) | Form::I32(order) | Form::F32(order) => Some(order),
             _ => None,
@@ -143,8 +143,8 @@ pub enum Unwritable {
 }
 
 impl Raw {
-    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` where they hold none: too few
-    /// of them, or a float that is no number.
+    /// The value in `words`, the registers (or bits as 0 and 1) from `address` on; `None` if there are too few of them,
+    /// or a float is not a finite number.
     pub fn decode(&self, words: &[u16], kind: Kind) -> Option<Value> {
         let &word = words.first()?;
         let count = match self.form {
@@ -162,10 +162,10 @@ impl Raw {
         Some(Value::Number(tidy(count * self.scale + self.offset)))
     }
 
-    /// The registers that mean `value`; bits are merged into `old`.
+    /// The registers for `value`; bits are merged into `old`.
     ///
     /// # Errors
-    /// When the value does not fit the register's type. Nothing is clamped.
+    /// The value does not fit the register's type. Nothing is clamped.
     pub fn encode(&self, value: Value, old: u16) -> Result<Vec<u16>, Unwritable> {
         if let Form::Bit { bit, invert } = self.form {
             let set = value.as_bool() != invert;
@@ -197,13 +197,13 @@ impl Raw {
         })
     }
 
-    /// Registers or bits that it takes, as addresses.
-    pub fn addresses(&self) -> impl Iterator<Item = u16> + use<> {
+    /// The addresses of its registers or bits.
+    pub(crate) fn addresses(&self) -> impl Iterator<Item = u16> + use<> {
         let start = self.address;
         (0..self.form.items()).filter_map(move |item| start.checked_add(item))
     }
 
-    /// Whether it takes that register or bit.
+    /// Whether it includes that register or bit.
     pub fn covers(&self, table: Table, address: u16) -> bool {
         self.table == table
             && address
@@ -216,17 +216,11 @@ fn mask(bits: u8) -> u16 {
     ((1u32 << bits.min(16)) - 1) as u16
 }
 
-/// A single as the figure that a person would write: 0.1 and not 0.10000000149; `None` for what is no number.
+/// A single as its shortest decimal: 0.1 and not 0.10000000149; `None` for NaN and infinities.
 fn short(single: f32) -> Option<f64> {
     single
         .is_finite()
         .then(|| single.to_string().parse().unwrap_or(f64::from(single)))
-}
-
-/// Takes the dust of binary fractions off a scaled count: 2500 * 0.01 is 25, not 25.000000000000004.
-pub fn tidy(value: f64) -> f64 {
-    let rounded = (value * 1e6).round() / 1e6;
-    if rounded.is_finite() { rounded } else { value }
 }
 
 #[cfg(test)]

@@ -1,18 +1,18 @@
-//! `base`: a profile that is another one but for a few keys.
+//! `base`: a profile that changes a few keys of another one.
 //!
-//! The trees of both files are merged before anything is read, so that every check sees the whole. What comes from the
-//! base is told by the base's name instead of a line.
+//! The trees of both files are merged before anything is read, so that every check sees the whole. Problems of what
+//! comes from the base name the base instead of a line.
 
-use crate::document::{Document, Entry, Node, Raw};
+use crate::document::{Document, Entry, Finding, Node, Place, Raw, nearest};
 
-/// Keys by which a derived point is made.
+/// Keys of a derived point.
 const DERIVATION: [&str; 6] = ["derive", "of", "to", "within", "minimum", "maximum"];
-/// Keys by which a point is taken from registers.
+/// Keys of a point that is read from registers.
 const PLACE: [&str; 7] = ["at", "type", "words", "invert", "scale", "offset", "class"];
-/// Of these, the ones that a bit does not have.
+/// Those of them that a bit does not have.
 const REGISTER: [&str; 4] = ["type", "words", "scale", "offset"];
 
-/// What the file says before it is read: its name and the one it rests on.
+/// Name and base of a file that is not read yet.
 pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {
     let text = |key: &str| match document.root().entry(key).map(|node| &node.value) {
         Some(Raw::Text(text)) => Some(text.clone()),
@@ -21,9 +21,9 @@ pub(super) fn peek(document: &Document) -> (Option<String>, Option<String>) {
     (text("name"), text("base"))
 }
 
-/// Lays the document over the tree of its base, which is called `name`.
+/// Merges the document into the tree of its base, the profile `name`.
 pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
-    let mut merged = base.told_as(&format!("profile {name}"));
+    let mut merged = base.with_source(&format!("profile {name}"));
     let own = document.root().clone();
     if let Raw::Table(entries) = &mut merged.value {
         // The name is the file's own.
@@ -42,7 +42,10 @@ pub(super) fn lay_over(document: &mut Document, base: &Node, name: &str) {
     document.set_root(merged);
 }
 
-/// `points.NAME.key` and `remove`, which change points of the list `point`; what names no point is told.
+/// Where a change of a point is wrong: key, line, what and what to do.
+type Mistake = (String, Option<usize>, Finding);
+
+/// Applies `points.NAME.key` and `remove` to the list `point`; names of unknown points are reported.
 pub(super) fn change_points(document: &mut Document) {
     let mut root = document.root().clone();
     let Raw::Table(entries) = &mut root.value else { return };
@@ -51,73 +54,71 @@ pub(super) fn change_points(document: &mut Document) {
     if changes.is_none() && removed.is_none() {
         return;
     }
-    let mut problems: Vec<(String, Option<usize>, String)> = Vec::new();
     let mut nothing = Vec::new();
-    let points = match entries
-        .iter_mut()
-        .find(|(key, ..)| key == "point")
-        .map(|(_, _, node)| &mut node.value)
-    {
+    let list = entries.iter_mut().find(|(key, ..)| key == "point");
+    let points = match list.map(|(_, _, node)| &mut node.value) {
         Some(Raw::Array(points)) => points,
         _ => &mut nothing,
     };
-    match changes.map(|(_, line, node)| (line, node.value)) {
-        Some((_, Raw::Table(changes))) => {
-            for (name, line, node) in changes {
-                let key = format!("points.{name}");
-                match (points.iter_mut().find(|p| name_of(p) == Some(&name)), &node.value) {
-                    (None, _) => problems.push((key, line, unknown(&name, points))),
-                    (Some(point), Raw::Table(own)) => {
-                        merge_point(point, own.clone());
-                        point.stand_where(&node);
-                    }
-                    (Some(_), _) => {
-                        problems.push((key, line, format!("that is no table; write points.{name}.KEY = VALUE")));
-                    }
-                }
-            }
-        }
-        Some((line, _)) => problems.push((
-            "points".to_string(),
-            line,
-            "that is no table; write points.NAME.KEY = VALUE".to_string(),
-        )),
-        None => {}
+    let mut mistakes = Vec::new();
+    if let Some((_, line, node)) = changes {
+        change(points, line, node.value, &mut mistakes);
     }
-    match removed.map(|(_, line, node)| (line, node.value)) {
-        Some((line, Raw::Array(names))) => {
-            for node in names {
-                let name = match &node.value {
-                    Raw::Text(name) => name.as_str(),
-                    _ => "",
-                };
-                if points.iter().any(|p| name_of(p) == Some(name)) {
-                    points.retain(|p| name_of(p) != Some(name));
-                } else {
-                    problems.push(("remove".to_string(), node.line().or(line), unknown(name, points)));
-                }
-            }
-        }
-        Some((line, _)) => problems.push((
-            "remove".to_string(),
-            line,
-            "that is no list; write remove = [\"NAME\"]".to_string(),
-        )),
-        None => {}
+    if let Some((_, line, node)) = removed {
+        remove(points, line, node.value, &mut mistakes);
     }
     document.set_root(root);
-    for (key, line, message) in problems {
-        document.problem(&crate::document::Place { line, env: None, key }, message);
+    for (key, line, Finding { what, remedy }) in mistakes {
+        document.problem(&Place { line, env: None, key }, what, remedy);
     }
 }
 
-fn unknown(name: &str, points: &[Node]) -> String {
-    let near = crate::document::nearest(name, points.iter().filter_map(name_of));
-    let remedy = near.map_or_else(
-        || "name a point of the profile".to_string(),
-        |near| format!("did you mean `{near}`?"),
-    );
-    format!("there is no point `{name}`; {remedy}")
+fn change(points: &mut [Node], line: Option<usize>, changes: Raw, mistakes: &mut Vec<Mistake>) {
+    let not_a_table = |name: &str| Finding::new("not a table", format!("write points.{name}.KEY = VALUE"));
+    let Raw::Table(changes) = changes else {
+        mistakes.push(("points".to_string(), line, not_a_table("NAME")));
+        return;
+    };
+    for (name, line, node) in changes {
+        let point = points.iter().position(|p| name_of(p) == Some(&name));
+        let mistake = match (point.and_then(|i| points.get_mut(i)), &node.value) {
+            (Some(point), Raw::Table(own)) => {
+                merge_point(point, own.clone());
+                point.move_to(&node);
+                continue;
+            }
+            (Some(_), _) => not_a_table(&name),
+            (None, _) => unknown(&name, points),
+        };
+        mistakes.push((format!("points.{name}"), line, mistake));
+    }
+}
+
+fn remove(points: &mut Vec<Node>, line: Option<usize>, names: Raw, mistakes: &mut Vec<Mistake>) {
+    let key = || "remove".to_string();
+    let Raw::Array(names) = names else {
+        mistakes.push((key(), line, Finding::new("not a list", "write remove = [\"NAME\"]")));
+        return;
+    };
+    for node in names {
+        let name = match &node.value {
+            Raw::Text(name) => name.as_str(),
+            _ => "",
+        };
+        let before = points.len();
+        points.retain(|p| name_of(p) != Some(name));
+        if points.len() == before {
+            mistakes.push((key(), node.line().or(line), unknown(name, points)));
+        }
+    }
+}
+
+fn unknown(name: &str, points: &[Node]) -> Finding {
+    let near = nearest(name, points.iter().filter_map(name_of)).map(|near| format!("did you mean `{near}`?"));
+    Finding::new(
+        format!("there is no point `{name}`"),
+        near.unwrap_or_else(|| "name a point of the profile".to_string()),
+    )
 }
 
 fn take(entries: &mut Vec<Entry>, key: &str) -> Option<Entry> {
@@ -139,7 +140,7 @@ fn replace(old: &mut Entry, new: Entry) {
             if let Raw::Table(from) = &node.value {
                 merge_keys(into, from.clone());
             }
-            old.2.stand_where(&node);
+            old.2.move_to(&node);
         }
         (_, new) => *old = new,
     }
@@ -164,14 +165,14 @@ fn merge_points(old: &mut Entry, new: Entry) {
         match (known.and_then(|i| into.get_mut(i)), &point.value) {
             (Some(mine), Raw::Table(own)) => {
                 merge_point(mine, own.clone());
-                mine.stand_where(point);
+                mine.move_to(point);
             }
             _ => into.push(point.clone()),
         }
     }
 }
 
-/// A point that is taken from elsewhere loses what said where it was taken from before.
+/// A point with a new source loses the keys of its old one.
 fn merge_point(point: &mut Node, own: Vec<Entry>) {
     let Raw::Table(into) = &mut point.value else { return };
     let text = |wanted: &str| {
@@ -194,8 +195,8 @@ fn merge_point(point: &mut Node, own: Vec<Entry>) {
     merge_keys(into, own);
 }
 
-/// A range that begins where one of the base does changes that one; another comes first, so that it counts where
-/// both hold an address.
+/// A range with the start of a base's range changes that range; others come first, so that they take precedence where
+/// both contain an address.
 fn merge_ranges(old: &mut Entry, new: Entry) {
     let (Raw::Array(into), Raw::Array(from)) = (&mut old.2.value, &new.2.value) else {
         *old = new;
@@ -216,7 +217,7 @@ fn merge_ranges(old: &mut Entry, new: Entry) {
                 if let Raw::Table(keys) = &mut mine.value {
                     merge_keys(keys, own.clone());
                 }
-                mine.stand_where(range);
+                mine.move_to(range);
             }
             _ => first.push(range.clone()),
         }

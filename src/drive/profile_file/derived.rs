@@ -1,14 +1,19 @@
-//! `derive`: points made of other points.
+//! `derive`: points derived from other points.
 
 use super::super::derive::{Bound, Derived};
 use super::super::profile::{Point, PollClass, Source};
-use crate::document::{self, Reader};
+use crate::document::{self, Finding, Reader};
 
 pub(super) fn read_derived(reader: &Reader<'_>, names: &[String]) -> Option<Source> {
     const KNOWN: [&str; 6] = ["band", "percent", "zero", "equal", "all", "lowest_bit"];
     let kind = reader.parsed("derive", |text| {
         let known = KNOWN.into_iter().find(|known| *known == text);
-        known.ok_or_else(|| format!("unknown derivation `{text}`; known: {}", KNOWN.join(", ")))
+        known.ok_or_else(|| {
+            Finding::new(
+                format!("unknown derivation `{text}`"),
+                format!("known: {}", KNOWN.join(", ")),
+            )
+        })
     })?;
     let index = |key: &str, name: &str| point_of(reader, key, name, names);
     let other = |key: &str| -> Option<usize> { index(key, &reader.required::<String>(key)?) };
@@ -57,12 +62,12 @@ pub(super) fn point_of(reader: &Reader<'_>, key: &str, name: &str, names: &[Stri
             || "name a point of this profile".to_string(),
             |n| format!("did you mean `{n}`?"),
         );
-        reader.problem(key, format!("there is no point `{name}`; {remedy}"));
+        reader.problem(key, format!("there is no point `{name}`"), remedy);
     }
     index
 }
 
-/// The end of a band: the name of a point, or a figure.
+/// The end of a band: the name of a point, or a number.
 fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<Bound>) -> Option<Bound> {
     match reader.raw(key).map(|node| &node.value) {
         None if default.is_some() => default,
@@ -74,8 +79,7 @@ fn read_bound(reader: &Reader<'_>, key: &str, names: &[String], default: Option<
     }
 }
 
-/// The ends of a band are read again and again: commands are converted and limited by them, and somebody may change them at
-/// the drive.
+/// The ends of a band are polled: commands are converted and limited by them, and they can be changed at the drive.
 pub(super) fn keep_ends_fresh(points: &mut [Point]) {
     let ends: Vec<usize> = points
         .iter()
@@ -92,7 +96,7 @@ pub(super) fn keep_ends_fresh(points: &mut [Point]) {
     }
 }
 
-/// What is told of derived points: they rest on points that the drive tells itself.
+/// Checks that a derived point is made of points that are read from the drive.
 pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(Source::Derived(derived)) = points.get(index).map(|p| &p.source) else {
         return;
@@ -101,7 +105,8 @@ pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point])
         if let Some(point) = points.get(source).filter(|p| p.raw().is_none()) {
             reader.problem(
                 "derive",
-                format!("`{}` is derived itself; name points that have `at`", point.name),
+                format!("`{}` is derived itself", point.name),
+                "name points that have `at`",
             );
         }
         if let Some(point) = points
@@ -110,7 +115,8 @@ pub(super) fn check_derived(reader: &Reader<'_>, index: usize, points: &[Point])
         {
             reader.problem(
                 "derive",
-                format!("`{}` is never read; give it another class", point.name),
+                format!("`{}` is never read", point.name),
+                "give it another class",
             );
         }
     }

@@ -1,7 +1,8 @@
-//! Profile files: TOML to a validated [`Profile`], every fault with its line.
+//! Profile files: TOML to a validated [`Profile`], every error with its line.
 
 mod base;
 mod derived;
+mod identify;
 mod n2;
 mod place;
 mod points;
@@ -15,9 +16,9 @@ use std::sync::LazyLock;
 use std::time::Duration;
 
 use super::model::ModelPoint;
-use super::profile::{AddressRange, Digest, FaultText, Point, Profile, Profiles};
+use super::profile::{AddressRange, FaultText, Point, Profile, Profiles};
 use crate::codec::Protocol;
-use crate::document::{self, Document, Node, Problem, Reader};
+use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_range};
@@ -51,15 +52,16 @@ impl Profiles {
         READ.clone()
     }
 
-    /// Adds the profiles of the files `*.toml` in `directory`; a built-in of the same name is replaced. A file may
-    /// rest on any other one of them (`base`), whatever their order.
+    /// Adds the profiles of the files `*.toml` in `directory`; they replace built-in ones of the same name. A file may
+    /// have any other of them as its `base`, in any order.
     pub fn load(&mut self, directory: &Path) -> Vec<Problem> {
         let mut problems = Vec::new();
         let files = match files_of(directory) {
             Ok(files) => files,
             Err(error) => {
-                let message = format!("cannot read the profile directory: {error}; check its path and its permissions");
-                return vec![whole(directory.display().to_string(), "", message)];
+                let what = format!("cannot read the profile directory: {error}");
+                let finding = Finding::new(what, "check its path and its permissions");
+                return vec![Problem::of_file(directory.display().to_string(), "", finding)];
             }
         };
         let mut waiting = Vec::new();
@@ -76,8 +78,8 @@ impl Profiles {
             match Profile::parse_over(&file, &source, false, self) {
                 Ok(profile) => {
                     if let Some(other) = seen.insert(profile.name.clone(), file.clone()) {
-                        let message = format!("profile `{}` is also in {other}; rename one of them", profile.name);
-                        problems.push(whole(file, "name", message));
+                        let what = format!("profile `{}` is also in {other}", profile.name);
+                        problems.push(Problem::of_file(file, "name", Finding::new(what, "rename one of them")));
                     }
                     self.insert(profile);
                 }
@@ -86,8 +88,12 @@ impl Profiles {
         }
         for file in waiting {
             let base = file.base.unwrap_or_default();
-            let message = format!("`{base}` rests on this profile in its turn; let one of them have no base");
-            problems.push(whole(file.file, "base", message));
+            let what = format!("`{base}` is itself based on this profile");
+            problems.push(Problem::of_file(
+                file.file,
+                "base",
+                Finding::new(what, "remove the base of one of them"),
+            ));
         }
         problems
     }
@@ -112,19 +118,9 @@ impl Waiting {
         }
     }
 
-    /// A file that replaces the profile it rests on waits for none.
+    /// A file that replaces its own base waits for none.
     fn waits_for_any_of(&self, files: &[Waiting]) -> bool {
         self.base.is_some() && self.base != self.name && files.iter().any(|other| other.name == self.base)
-    }
-}
-
-/// A problem of a whole file.
-fn whole(file: String, key: &str, message: String) -> Problem {
-    Problem {
-        file,
-        line: None,
-        key: key.to_string(),
-        message,
     }
 }
 
@@ -141,11 +137,10 @@ fn files_of(directory: &Path) -> std::io::Result<Vec<PathBuf>> {
 }
 
 impl Profile {
-    /// Reads and validates the profile `source`, the text of `file`, which rests on no other profile but the
-    /// built-in ones.
+    /// Reads and validates the profile `source`, the text of `file`, whose base can only be a built-in profile.
     ///
     /// # Errors
-    /// Every fault of the file, with line and key.
+    /// Every error of the file, with line and key.
     pub fn parse(file: &str, source: &str, built_in: bool) -> Result<Profile, Vec<Problem>> {
         let known = if built_in {
             Profiles::default()
@@ -168,7 +163,6 @@ impl Profile {
         match profile {
             Some(profile) if problems.is_empty() => Ok(Profile {
                 text: source.to_string(),
-                digest: Digest::of(&tree),
                 tree,
                 ..profile
             }),
@@ -180,7 +174,8 @@ impl Profile {
 fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option<Profile> {
     let name: Option<String> = reader.required("name");
     if name.as_deref().is_some_and(|n| !is_name(n, '-')) {
-        reader.problem("name", "the name may hold a-z, 0-9 and -; rename the profile");
+        let what = format!("`{}` is not a valid name", name.as_deref().unwrap_or_default());
+        reader.problem("name", what, "write a-z, 0-9 and -, starting with a letter");
     }
     let base = read_base(reader, known);
     let protocols = read_protocols(reader);
@@ -188,7 +183,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     if addresses.is_empty() || *addresses.start() == 0 {
         reader.problem(
             "addresses",
-            "the first address is 0 or above the last; write for example [1, 247]",
+            "the first address is 0 or above the last",
+            "write for example [1, 247]",
         );
     }
     let input_is_holding = reader.or("input_is_holding", false);
@@ -201,7 +197,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     check_overlaps(reader, &ranges);
     let tables = reader.tables("point");
     if tables.is_empty() {
-        reader.problem("point", "the profile has no point; write at least one [[point]]");
+        reader.problem("point", "the profile has no point", "write at least one [[point]]");
     }
     let names: Vec<String> = tables.iter().map(|t| t.optional("name").unwrap_or_default()).collect();
     let mut points: Vec<Point> = (0..)
@@ -242,7 +238,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         update_period: reader.or("update_period", Duration::from_millis(10)),
         confirm_within: reader.or("confirm_within", Duration::from_secs(2)),
         input_is_holding,
-        identify: super::identify::read(reader),
+        identify: identify::read(reader),
         simulator: reader.optional("simulator"),
         ranges,
         points,
@@ -250,21 +246,20 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         model,
         text: String::new(),
         tree: Node::empty_table(None),
-        digest: Digest::default(),
     };
     reader.finish();
     name.map(|_| profile)
 }
 
-/// The profile this one rests on; the files are one by now, so only an unknown name is left to tell.
+/// The base of this profile; the files are merged by now, so only an unknown name is left to report.
 fn read_base(reader: &Reader<'_>, known: &Profiles) -> Option<String> {
     let base: String = reader.optional("base")?;
     if known.get(&base).is_none() {
         let near = document::nearest(&base, known.names()).map(|near| format!("did you mean `{near}`?"));
         let names: Vec<&str> = known.names().collect();
-        let remedy = near.unwrap_or_else(|| format!("known are {}", names.join(", ")));
-        reader.problem("base", format!("there is no sound profile `{base}`; {remedy}"));
-        // Everything else may be there.
+        let remedy = near.unwrap_or_else(|| format!("known profiles: {}", names.join(", ")));
+        reader.problem("base", format!("there is no valid profile `{base}`"), remedy);
+        // The base may explain any key.
         reader.tolerate();
     }
     Some(base)
@@ -281,18 +276,20 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
                 let known: Vec<&str> = Protocol::ALL.iter().map(|p| p.name()).collect();
                 reader.problem(
                     "protocols",
-                    format!("unknown protocol `{name}`; known: {}", known.join(", ")),
+                    format!("unknown protocol `{name}`"),
+                    format!("known: {}", known.join(", ")),
                 );
             }
         }
     }
     if none_named {
-        reader.problem("protocols", "no protocol is named; write for example [\"modbus-rtu\"]");
+        reader.problem("protocols", "the list is empty", "write for example [\"modbus-rtu\"]");
     }
     if protocols.len() > 1 && protocols.contains(&Protocol::N2) {
         reader.problem(
             "protocols",
-            "n2 has a map of its own; write a profile for n2 and another for Modbus",
+            "n2 has its own map",
+            "write one profile for n2 and another for Modbus",
         );
     }
     protocols
@@ -303,7 +300,7 @@ fn read_pair<T: document::FromNode + Copy + PartialOrd>(reader: &Reader<'_>, key
     match pair.as_slice() {
         [low, high] if low <= high => Some(*low..=*high),
         _ => {
-            reader.problem(key, "two values are wanted, the lower one first; write [low, high]");
+            reader.problem(key, "expected two values, the lower one first", "write [low, high]");
             None
         }
     }
@@ -322,7 +319,8 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
             }
             (Err(_), _) => table.problem(
                 code,
-                format!("`{code}` is no fault code; write a number from 0 to 65535"),
+                format!("`{code}` is not a fault code"),
+                "write a number from 0 to 65535",
             ),
             (Ok(_), None) => {}
         }
@@ -331,7 +329,7 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
     faults
 }
 
-/// Lower-case letters, digits and `joint`, beginning with a letter.
+/// Lower-case letters, digits and `joint`, starting with a letter.
 fn is_name(text: &str, joint: char) -> bool {
     text.starts_with(|c: char| c.is_ascii_lowercase())
         && text

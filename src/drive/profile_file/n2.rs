@@ -1,4 +1,4 @@
-//! `[n2]` of a profile file: what the family's N2 is otherwise than assumed, see [`crate::codec::n2::ASSUMPTIONS`].
+//! `[n2]` of a profile file: where the family's N2 differs from [`crate::codec::n2::ASSUMPTIONS`].
 
 use std::ops::RangeInclusive;
 use std::time::Duration;
@@ -8,7 +8,7 @@ use crate::codec::{N2Options, Protocol};
 use crate::document::Reader;
 use crate::drive::profile::Point;
 
-/// Pauses between two polls: drives take themselves for alone after about 10 minutes.
+/// Time between two polls: drives assume that the master is gone after about 10 minutes.
 const POLLS: RangeInclusive<Duration> = Duration::from_secs(1)..=Duration::from_secs(480);
 
 pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options {
@@ -19,7 +19,8 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
     if !protocols.contains(&Protocol::N2) {
         reader.problem(
             "n2",
-            "the profile does not speak n2; take the section out or add \"n2\" to `protocols`",
+            "the profile is not for n2",
+            "remove the section or add \"n2\" to `protocols`",
         );
     }
     let region_width = match table.or("region_width", default.region_width.digits()) {
@@ -28,7 +29,8 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
         other => {
             table.problem(
                 "region_width",
-                format!("{other} is no width of the region; write 1 or 2"),
+                format!("{other} is not a width of the region"),
+                "write 1 or 2",
             );
             default.region_width
         }
@@ -37,7 +39,8 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
     if !POLLS.contains(&poll) {
         table.problem(
             "poll",
-            "the pause between two polls is 1 s to 8 min; drives take themselves for alone after 10 min",
+            "the time between two polls is out of range",
+            "write \"1s\" to \"8min\": drives assume that the master is gone after 10 min",
         );
     }
     let options = N2Options {
@@ -52,7 +55,8 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
     if options.unreliable_bit == Some(options.state_bit) {
         table.problem(
             "unreliable_bit",
-            "the bit is that of the state already; write another one or leave the key out",
+            "the bit is already that of the state",
+            "write another one or leave the key out",
         );
     }
     table.finish();
@@ -62,13 +66,13 @@ pub(super) fn read_n2(reader: &Reader<'_>, protocols: &[Protocol]) -> N2Options 
 fn read_bit(table: &Reader<'_>, key: &str) -> Option<u8> {
     let bit: u8 = table.optional(key)?;
     if bit > 7 {
-        table.problem(key, format!("a status byte has no bit {bit}; write 0 to 7"));
+        table.problem(key, format!("a status byte has no bit {bit}"), "write 0 to 7");
     }
     (bit <= 7).then_some(bit)
 }
 
-/// What is overridden is kept in a memory that wears, or is the same as before: unless a point says otherwise it is
-/// written on change only. Pulses are never left out.
+/// N2 outputs are stored in EEPROM with limited write cycles: unless a point has its own `on_change`, it is written on
+/// change only. Pulses are always written.
 pub(super) fn write_on_change(tables: &[Reader<'_>], points: &mut [Point]) {
     for (table, point) in tables.iter().zip(points) {
         if point.write && !point.pulse && point.raw().is_some() && !table.has("on_change") {

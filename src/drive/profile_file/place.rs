@@ -1,17 +1,29 @@
-//! Where a value lies and what form it has: `at`, `type`, `words`, `invert`, `scale`, `offset`.
+//! Address and format of a value: `at`, `type`, `words`, `invert`, `scale`, `offset`.
 
-use super::super::profile::{AddressRange, Form, Raw, Source, WordOrder, parse_address};
+use super::super::profile::{AddressRange, Form, Raw, Source, WordOrder};
 use super::ranges::{Offsets, read_table};
 use crate::codec::Table;
-use crate::document::Reader;
+use crate::document::{Finding, Reader};
+
+/// A PDU address, decimal or hexadecimal as in some manuals (0x0023).
+pub(super) fn parse_address(text: &str) -> Option<u16> {
+    match text.strip_prefix("0x") {
+        Some(hex) => u16::from_str_radix(hex, 16).ok(),
+        None => text.parse().ok(),
+    }
+}
 
 /// `holding 2100.3`: table, PDU address, bit.
 pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &Offsets) -> Option<Source> {
     let at: String = reader.required("at")?;
-    let bad =
-        || format!("`{at}` is no place; write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"");
+    let bad = || {
+        Finding::new(
+            format!("`{at}` is not an address"),
+            "write table and PDU address, such as \"holding 2103\" or \"holding 2100.3\"",
+        )
+    };
     let Some((table, place)) = at.split_once(' ') else {
-        reader.problem("at", bad());
+        reader.finding("at", bad());
         return None;
     };
     let table = read_table(reader, "at", table)?;
@@ -20,14 +32,14 @@ pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &O
         None => (parse_address(place), Some(None)),
     };
     let (Some(address), Some(bits)) = (address, bits) else {
-        reader.problem("at", bad());
+        reader.finding("at", bad());
         return None;
     };
     let address = offsets.applied(reader, "at", table, address)?;
     let invert = reader.or("invert", false);
     let form = read_form(reader, table, bits, invert)?;
     if reader.has("invert") && !matches!(form, Form::Bit { .. }) {
-        reader.problem("invert", "only a bit can be inverted; leave the key out");
+        reader.problem("invert", "only a bit can be inverted", "leave the key out");
     }
     let raw = Raw {
         table,
@@ -39,7 +51,8 @@ pub(super) fn read_raw(reader: &Reader<'_>, ranges: &[AddressRange], offsets: &O
     if raw.scale == 0.0 {
         reader.problem(
             "scale",
-            "a scale of 0 loses every value; write the engineering value of one count",
+            "a scale of 0 loses every value",
+            "write the engineering value of one count",
         );
     }
     check_place(reader, &raw, ranges);
@@ -63,7 +76,8 @@ fn check_place(reader: &Reader<'_>, raw: &Raw, ranges: &[AddressRange]) {
     let Some(range) = range else {
         reader.problem(
             "at",
-            format!("{table} {address} lies in no [[range]] of the profile; add the range"),
+            format!("{table} {address} is not in any [[range]] of the profile"),
+            "add the range",
         );
         return;
     };
@@ -71,15 +85,14 @@ fn check_place(reader: &Reader<'_>, raw: &Raw, ranges: &[AddressRange]) {
     if raw.addresses().count() != usize::from(items) || raw.addresses().any(|a| !range.addresses.contains(&a)) {
         reader.problem(
             "at",
-            format!("{table} {address} takes {items} registers, which its [[range]] does not hold; widen the range"),
+            format!("{table} {address} takes {items} registers and exceeds its [[range]]"),
+            "extend the range",
         );
     } else if items > range.read {
         reader.problem(
             "type",
-            format!(
-                "the value takes {items} registers, its [[range]] reads {}; raise `read` there",
-                range.read
-            ),
+            format!("the value takes {items} registers, its [[range]] reads {}", range.read),
+            "raise `read` there",
         );
     }
 }
@@ -92,7 +105,8 @@ fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: 
         Some(other) => {
             reader.problem(
                 "words",
-                format!("unknown word order `{other}`; write high-first or low-first"),
+                format!("unknown word order `{other}`"),
+                "write high-first or low-first",
             );
             WordOrder::HighFirst
         }
@@ -106,12 +120,13 @@ fn read_form(reader: &Reader<'_>, table: Table, bits: Option<(u8, u8)>, invert: 
         (true, _, _) => {
             reader.problem(
                 "at",
-                "an item of a bit table has neither bit number nor type; leave them out",
+                "an item of a bit table has neither bit number nor type",
+                "leave them out",
             );
             None
         }
         (false, Some(_), Some(_)) => {
-            reader.problem("type", "a bit has no type; leave the key out");
+            reader.problem("type", "a bit has no type", "leave the key out");
             None
         }
     }
@@ -127,7 +142,8 @@ fn form_of(reader: &Reader<'_>, kind: &str, words: WordOrder) -> Option<Form> {
         other => {
             reader.problem(
                 "type",
-                format!("unknown type `{other}`; known: u16, i16, u32, i32, f32"),
+                format!("unknown type `{other}`"),
+                "known: u16, i16, u32, i32, f32",
             );
             return None;
         }
@@ -135,7 +151,8 @@ fn form_of(reader: &Reader<'_>, kind: &str, words: WordOrder) -> Option<Form> {
     if form.items() == 1 && reader.has("words") {
         reader.problem(
             "words",
-            format!("a {kind} is one register and has no word order; leave the key out"),
+            format!("a {kind} is one register and has no word order"),
+            "leave the key out",
         );
     }
     Some(form)

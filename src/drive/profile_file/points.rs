@@ -10,7 +10,7 @@ use super::place::read_raw;
 use super::ranges::Offsets;
 use super::{is_name, read_pair};
 use crate::codec::Table;
-use crate::document::Reader;
+use crate::document::{Finding, Reader};
 
 /// Address of ADI 1 of N2 in the table of input registers.
 const FIRST_ADI: u16 = 0x4000;
@@ -24,10 +24,14 @@ pub(super) fn read_point(
 ) -> Point {
     let name: String = reader.required("name").unwrap_or_default();
     if !is_name(&name, '_') {
-        reader.problem("name", "a point's name is snake_case: a-z, 0-9 and _; rename the point");
+        reader.problem(
+            "name",
+            format!("`{name}` is not a valid name"),
+            "write a-z, 0-9 and _, starting with a letter",
+        );
     }
     if names.iter().take(index).any(|n| *n == name) {
-        reader.problem("name", format!("there are two points `{name}`; rename one of them"));
+        reader.problem("name", format!("there are two points `{name}`"), "rename one of them");
     }
     let model = ModelPoint::from_name(&name);
     let source = if reader.has("derive") {
@@ -41,7 +45,8 @@ pub(super) fn read_point(
             if reader.has("unit") && reader.optional::<String>("unit").as_deref() != Some(model.unit()) {
                 reader.problem(
                     "unit",
-                    format!("the unit of `{name}` is fixed to `{}`; leave the key out", model.unit()),
+                    format!("the unit of `{name}` is always `{}`", model.unit()),
+                    "leave the key out",
                 );
             }
             model.unit().to_string()
@@ -82,32 +87,34 @@ fn read_class(reader: &Reader<'_>) -> PollClass {
         "slow" => Ok(PollClass::Slow),
         "once" => Ok(PollClass::Once),
         "never" => Ok(PollClass::Never),
-        other => Err(format!("unknown poll class `{other}`; write fast, slow, once or never")),
+        other => Err(Finding::new(
+            format!("unknown poll class `{other}`"),
+            "write fast, slow, once or never",
+        )),
     });
     class.unwrap_or(PollClass::Slow)
 }
 
-/// Commands for another point: that one must take them, and may not pass them on again.
+/// Checks `write_to`: the other point must be writable itself.
 pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(point) = points.get(index) else { return };
     let Some(target) = point.write_to.and_then(|to| points.get(to)) else {
         return;
     };
     if !point.write {
-        reader.problem("write_to", "the point is not written at all; add `write = true`");
+        reader.problem("write_to", "the point is not writable", "add `write = true`");
     }
     if !target.write || target.write_to.is_some() {
         reader.problem(
             "write_to",
-            format!(
-                "`{}` takes no commands itself; name a point with `write = true` and without `write_to`",
-                target.name
-            ),
+            format!("`{}` does not accept commands itself", target.name),
+            "name a point with `write = true` and without `write_to`",
         );
     } else if target.kind() != point.kind() {
         reader.problem(
             "write_to",
-            format!("`{}` is of another kind; name a point with like values", target.name),
+            format!("`{}` has another type", target.name),
+            "name a point with values of the same type",
         );
     }
 }
@@ -124,7 +131,11 @@ fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
             (Ok(value), Some(text)) => {
                 texts.insert(value, text);
             }
-            (Err(_), _) => table.problem(key, format!("`{key}` is no whole number; write value = \"meaning\"")),
+            (Err(_), _) => table.problem(
+                key,
+                format!("`{key}` is not a whole number"),
+                "write value = \"meaning\"",
+            ),
             (Ok(_), None) => {}
         }
     }
@@ -132,7 +143,7 @@ fn read_texts(reader: &Reader<'_>) -> BTreeMap<i64, String> {
     texts
 }
 
-/// A point of the common model has the kind of the model; an enumeration and a bit have no scale.
+/// Checks that a point of the common model has the kind of the model, and that enumerations and bits have no scale.
 fn check_kind(reader: &Reader<'_>, point: &Point) {
     let figure = match &point.source {
         Source::Raw(raw) => !matches!(raw.form, Form::Bit { .. }),
@@ -145,14 +156,14 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
     match point.model.map(ModelPoint::kind) {
         Some(Kind::Bool) if figure => reader.problem(
             key,
-            format!(
-                "`{}` is true or false; name a bit, such as \"holding 2100.3\"",
-                point.name
-            ),
+            format!("`{}` is true or false", point.name),
+            "name a bit, such as \"holding 2100.3\"",
         ),
-        Some(Kind::Number | Kind::Integer) if !figure => {
-            reader.problem(key, format!("`{}` is a figure, not a bit; name a register", point.name))
-        }
+        Some(Kind::Number | Kind::Integer) if !figure => reader.problem(
+            key,
+            format!("`{}` is a number, not a bit", point.name),
+            "name a register",
+        ),
         _ => {}
     }
     let scaled = reader.has("scale") || reader.has("offset");
@@ -160,10 +171,8 @@ fn check_kind(reader: &Reader<'_>, point: &Point) {
         let key = if reader.has("scale") { "scale" } else { "offset" };
         reader.problem(
             key,
-            format!(
-                "`{}` is a state or a code, which has no scale; leave the key out",
-                point.name
-            ),
+            format!("`{}` is a state or a code, which has no scale", point.name),
+            "leave the key out",
         );
     }
 }
@@ -177,14 +186,15 @@ fn check_texts(reader: &Reader<'_>, point: &Point, names: &[String]) {
         reader.problem(
             "name",
             format!(
-                "the text of `{}` is shown as `{beside}`, which is a point too; rename one of them",
+                "the text of `{}` is shown as `{beside}`, which is also a point",
                 point.name
             ),
+            "rename one of them",
         );
     }
 }
 
-/// What N2 has: floats at even addresses below 0x4000, internal integers from there on.
+/// Checks the object of an N2 point: floats at even addresses below 0x4000, internal integers from there on.
 pub(super) fn check_object(reader: &Reader<'_>, index: usize, points: &[Point]) {
     let Some(raw) = points
         .get(index)
@@ -197,28 +207,27 @@ pub(super) fn check_object(reader: &Reader<'_>, index: usize, points: &[Point]) 
     match raw.form {
         Form::F32(WordOrder::HighFirst) if !integer && raw.address % 2 == 0 => {}
         Form::U16 | Form::I16 if integer => {}
-        _ if integer => reader.problem("at", "an ADI is one register; write type = \"i16\" and no bit"),
+        _ if integer => reader.problem("at", "an ADI is one register", "write type = \"i16\" and no bit"),
         _ => reader.problem(
             "at",
-            "AI and AO of N2 are floats at even addresses, number n at 2(n-1); write type = \"f32\" and such an address",
+            "AI and AO of N2 are floats at even addresses, number n at 2(n-1)",
+            "write type = \"f32\" and such an address",
         ),
     }
 }
 
 fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if point.pulse && !point.write {
-        reader.problem(
-            "pulse",
-            "only a point that can be written can be a pulse; add `write = true`",
-        );
+        reader.problem("pulse", "only a writable point can be a pulse", "add `write = true`");
     }
     if point.pulse && point.kind() != Kind::Bool {
-        reader.problem("pulse", "only a bit can be a pulse; leave the key out");
+        reader.problem("pulse", "only a bit can be a pulse", "leave the key out");
     }
     if point.on_change && !point.write {
         reader.problem(
             "on_change",
-            "only a point that can be written is written on change; add `write = true`",
+            "only a writable point is written on change",
+            "add `write = true`",
         );
     }
     let Some(raw) = point.raw().filter(|_| point.write && !reader.has("write_to")) else {
@@ -231,15 +240,14 @@ fn check_write(reader: &Reader<'_>, point: &Point, ranges: &[AddressRange]) {
     if most == 0 {
         reader.problem(
             "write",
-            format!(
-                "{} {} lies in a read-only range; set `write` there",
-                raw.table, raw.address
-            ),
+            format!("{} {} is in a read-only range", raw.table, raw.address),
+            "set `write` there",
         );
     } else if most < items {
         reader.problem(
             "write",
-            format!("the value takes {items} registers, its range writes {most}; raise `write` there"),
+            format!("the value takes {items} registers, its range writes {most}"),
+            "raise `write` there",
         );
     }
 }

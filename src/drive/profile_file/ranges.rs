@@ -11,7 +11,8 @@ pub(super) fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<T
     if table.is_none() {
         reader.problem(
             key,
-            format!("unknown table `{text}`; known: coil, discrete-input, input, holding"),
+            format!("unknown table `{text}`"),
+            "known: coil, discrete-input, input, holding",
         );
     }
     table
@@ -39,17 +40,23 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     if first > last {
         reader.problem(
             "last",
-            format!("{last} lies before the first address {first}; swap them"),
+            format!("{last} is before the first address {first}"),
+            "swap them",
         );
     }
     if read == 0 || read > table.max_read() {
         reader.problem(
             "read",
-            format!("{read} is out of range; write 1 to {}", table.max_read()),
+            format!("{read} is out of range"),
+            format!("write 1 to {}", table.max_read()),
         );
     }
     if write > 123 {
-        reader.problem("write", format!("{write} is out of range; write 0 (read-only) to 123"));
+        reader.problem(
+            "write",
+            format!("{write} is out of range"),
+            "write 0 (read-only) to 123",
+        );
     }
     reader.finish();
     Some(AddressRange {
@@ -63,12 +70,12 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
     })
 }
 
-/// An address lies in one range. A file over a base may give other limits to a part of a range of the base.
+/// Checks that an address is in one range only. A file with a base may give other limits to a part of a base's range.
 pub(super) fn check_overlaps(reader: &Reader<'_>, ranges: &[AddressRange]) {
     let tables = reader.tables("range");
     let mut seen: Vec<(&AddressRange, Option<String>)> = Vec::new();
     if tables.len() != ranges.len() {
-        // What could not be read was told.
+        // A range could not be read, which is reported.
         return;
     }
     for (table, range) in tables.iter().zip(ranges) {
@@ -83,14 +90,15 @@ pub(super) fn check_overlaps(reader: &Reader<'_>, ranges: &[AddressRange]) {
             let (first, last) = (other.addresses.start(), other.addresses.end());
             table.problem(
                 "first",
-                format!("the range overlaps the one from {first} to {last}; an address lies in one range"),
+                format!("the range overlaps the one from {first} to {last}"),
+                "put each address in one range only",
             );
         }
         seen.push((range, of));
     }
 }
 
-/// `address_offset`: what the addresses of each table are shifted by on the wire.
+/// `address_offset`: the shift of the addresses of each table on the wire.
 #[derive(Debug, Default)]
 pub(super) struct Offsets(BTreeMap<Table, i64>);
 
@@ -107,7 +115,7 @@ impl Offsets {
             if (-1..=1).contains(&shift) {
                 offsets.0.insert(table, shift);
             } else {
-                given.problem(table.name(), format!("{shift} is out of range; write -1, 0 or 1"));
+                given.problem(table.name(), format!("{shift} is out of range"), "write -1, 0 or 1");
             }
         }
         given.finish();
@@ -120,7 +128,8 @@ impl Offsets {
         if shifted.is_none() {
             reader.problem(
                 key,
-                format!("{table} {address} shifted by {offset} is no address; correct `address_offset` or the address"),
+                format!("{table} {address} shifted by {offset} is not an address"),
+                "correct `address_offset` or the address",
             );
         }
         shifted

@@ -1,14 +1,14 @@
-//! `[speed_reference]`: how the family means the register of its speed reference (drives.md 9.2, 9.3).
+//! `[speed_reference]`: meaning of the speed reference register of the family (drives.md 9.2, 9.3).
 
 use super::super::derive::{Bound, Derived};
 use super::super::profile::{Form, Point, PollClass, Source};
-use crate::document::Reader;
+use crate::document::{Finding, Reader};
 
-/// Percent that a reference may be, by whether it has a sign.
+/// Range of a reference in percent, with and without sign.
 const SIGNED: [f64; 2] = [-100.0, 100.0];
 const UNSIGNED: [f64; 2] = [0.0, 100.0];
 
-/// Changes the points of the references as the table `speed_reference` of the profile says.
+/// Applies the table `speed_reference` of the profile to the points of the references.
 pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     let Some(table) = reader.table("speed_reference") else {
         return;
@@ -23,7 +23,8 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     let (Some(speed), Some(frequency)) = (found, points.iter().position(of_reference)) else {
         reader.problem(
             "speed_reference",
-            "the family has no register with a reference in percent; leave the table out",
+            "the family has no register with a reference in percent",
+            "leave the table out",
         );
         return;
     };
@@ -31,7 +32,8 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     if let (Some(true), None) = (minimum_counts, lowest) {
         table.problem(
             "base",
-            "the profile has no point `minimum_frequency`; write \"max\" or add the point",
+            "the profile has no point `minimum_frequency`",
+            "write \"max\" or add the point",
         );
         return;
     }
@@ -48,13 +50,16 @@ pub(super) fn apply(reader: &Reader<'_>, points: &mut [Point]) {
     }
 }
 
-/// Which of two words stands there; `true` is the second.
+/// One of two words; `true` for the second.
 fn word(table: &Reader<'_>, key: &str, words: [&str; 2]) -> Option<bool> {
     let [first, second] = words;
     table.parsed(key, |text| match text {
         _ if text == first => Ok(false),
         _ if text == second => Ok(true),
-        other => Err(format!("unknown word `{other}`; write \"{first}\" or \"{second}\"")),
+        other => Err(Finding::new(
+            format!("unknown word `{other}`"),
+            format!("write \"{first}\" or \"{second}\""),
+        )),
     })
 }
 
@@ -68,7 +73,7 @@ fn sign(point: &mut Point, signed: bool) {
     point.range = Some(low..=high);
 }
 
-/// The register holds a frequency: the two points change their sources.
+/// The register holds a frequency: the two points swap their sources.
 fn in_hertz(points: &mut [Point], speed: usize, frequency: usize) {
     let Some(Source::Derived(Derived::Band { minimum, maximum, .. })) = points.get(frequency).map(|p| p.source.clone())
     else {

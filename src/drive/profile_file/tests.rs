@@ -1,4 +1,4 @@
-//! Faults of profile files, each told with its place, and what a sound file means.
+//! Errors of profile files with their places, and what a valid file means.
 
 use tempfile::TempDir;
 
@@ -8,7 +8,7 @@ use super::*;
 use crate::drive::Value;
 use crate::drive::model::Kind;
 
-/// A profile that is sound, for one more thing to be wrong with.
+/// The beginning of a valid profile.
 const HEAD: &str = r#"
 name = "meter"
 protocols = ["modbus-rtu"]
@@ -20,7 +20,7 @@ read = 10
 write = 10
 "#;
 
-fn told(file: &str, source: &str) -> String {
+fn mistakes(file: &str, source: &str) -> String {
     let found = Profile::parse(file, source, false).err().unwrap_or_default();
     found.iter().map(|p| format!("{p}\n")).collect()
 }
@@ -36,7 +36,7 @@ fn built_in_profiles_are_valid() {
 }
 
 #[test]
-fn every_mistake_is_told() {
+fn every_mistake_is_reported() {
     let source = r#"
 name = "My Meter"
 protocols = ["modbus-rut"]
@@ -59,7 +59,7 @@ unit = "V"
 [faults]
 x = "y"
 "#;
-    let all = told("meter.toml", source);
+    let all = mistakes("meter.toml", source);
     for wanted in [
         "meter.toml:2, name",
         "meter.toml:3, protocols; known: modbus-rtu, modbus-ascii, n2",
@@ -75,7 +75,7 @@ x = "y"
     }
 }
 
-/// One mistake each: what stands in a sound point named `a` in line 11, and what is told of it.
+/// One mistake each: the keys of a point named `a` in line 11, and the problem.
 #[test]
 fn each_mistake_of_a_point() {
     let cases = [
@@ -83,10 +83,10 @@ fn each_mistake_of_a_point() {
         ("at = \"holding 70000\"", "m:12, point[0].at; write table"),
         ("at = \"holding 1.8-4\"", "m:12, point[0].at; write table"),
         ("at = \"register 1\"", "unknown table `register`; m:12"),
-        ("at = \"input 1\"", "lies in no [[range]] of the profile; m:12"),
+        ("at = \"input 1\"", "is not in any [[range]] of the profile; m:12"),
         (
             "at = \"holding 99\"\ntype = \"u32\"",
-            "does not hold; m:12, point[0].at; widen the range",
+            "exceeds its [[range]]; m:12, point[0].at; extend the range",
         ),
         (
             "at = \"holding 1.3\"\ntype = \"u16\"",
@@ -110,11 +110,11 @@ fn each_mistake_of_a_point() {
         ),
         (
             "at = \"holding 1\"\nscale = nan",
-            "NaN is no finite number; m:13, point[0].scale",
+            "NaN is not a finite number; m:13, point[0].scale",
         ),
         (
             "at = \"holding 1\"\noffset = inf",
-            "inf is no finite number; m:13, point[0].offset",
+            "inf is not a finite number; m:13, point[0].offset",
         ),
         (
             "at = \"holding 1.3\"\nscale = 2",
@@ -130,7 +130,7 @@ fn each_mistake_of_a_point() {
         ),
         (
             "at = \"holding 1\"\nrange = [5, 1]",
-            "two values are wanted, the lower one first; m:13",
+            "expected two values, the lower one first; m:13",
         ),
         (
             "at = \"holding 1\"\npulse = true\nwrite = true",
@@ -138,11 +138,11 @@ fn each_mistake_of_a_point() {
         ),
         (
             "at = \"holding 1.1\"\npulse = true",
-            "only a point that can be written can be a pulse; m:13",
+            "only a writable point can be a pulse; m:13",
         ),
         (
             "at = \"holding 1\"\non_change = true",
-            "is written on change; m:13, point[0].on_change",
+            "only a writable point is written on change; m:13, point[0].on_change",
         ),
         (
             "at = \"holding 1\"\nwrite_to = \"b\"",
@@ -150,11 +150,11 @@ fn each_mistake_of_a_point() {
         ),
         (
             "at = \"holding 1\"\nwrite = true\nwrite_to = \"a\"",
-            "takes no commands itself; m:14",
+            "does not accept commands itself; m:14",
         ),
         (
             "at = \"holding 1\"\n[point.texts]\non = \"on\"",
-            "`on` is no whole number; m:14, point[0].texts.on",
+            "`on` is not a whole number; m:14, point[0].texts.on",
         ),
         (
             "derive = \"sum\"",
@@ -172,7 +172,7 @@ fn each_mistake_of_a_point() {
         ("derive = \"band\"\nof = \"a\"", "`maximum` is missing; m:10"),
     ];
     for (lines, wanted) in cases {
-        let all = told("m", &format!("{HEAD}[[point]]\nname = \"a\"\n{lines}\n"));
+        let all = mistakes("m", &format!("{HEAD}[[point]]\nname = \"a\"\n{lines}\n"));
         assert!(all.contains(wanted), "{lines}\n{wanted} is missing in\n{all}");
         assert_eq!(all.lines().count(), 1, "{lines}\n{all}");
     }
@@ -201,14 +201,14 @@ fn each_mistake_of_the_whole() {
             HEAD.to_string() + &range("").replace("200", "50"),
             "the range overlaps the one from 0 to 99; m:12, range[1].first",
         ),
-        (top("base = \"vacon\""), "there is no sound profile `vacon`; m:2, base"),
+        (top("base = \"vacon\""), "there is no valid profile `vacon`; m:2, base"),
         (
             top("addresses = [0, 5]"),
             "the first address is 0 or above the last; m:2, addresses",
         ),
         (
             top("addresses = [1]"),
-            "two values are wanted, the lower one first; m:2, addresses",
+            "expected two values, the lower one first; m:2, addresses",
         ),
         (top("turnaround = \"5\""), "m:2, turnaround"),
         (
@@ -221,10 +221,10 @@ fn each_mistake_of_the_whole() {
         ),
         (
             top("address_offset = { holding = -1 }"),
-            "holding 0 shifted by -1 is no address; m:7, range[0].first",
+            "holding 0 shifted by -1 is not an address; m:7, range[0].first",
         ),
         (top("remove = [\"b\"]"), "there is no point `b`; m:2, remove"),
-        (top("remove = \"a\""), "that is no list; m:2, remove"),
+        (top("remove = \"a\""), "not a list; m:2, remove"),
         (top("points.b.scale = 2"), "there is no point `b`; m:2, points.b"),
         (
             top("points.a.scael = 2"),
@@ -236,11 +236,11 @@ fn each_mistake_of_the_whole() {
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[\"modbus-rtu\", \"n2\"]"),
-            "n2 has a map of its own; m:4, protocols",
+            "n2 has its own map; m:4, protocols",
         ),
         (
             top("").replace("[\"modbus-rtu\"]", "[]"),
-            "no protocol is named; m:4, protocols",
+            "the list is empty; m:4, protocols",
         ),
         (
             top("").replace("modbus-rtu", "n2"),
@@ -252,7 +252,7 @@ fn each_mistake_of_the_whole() {
         ),
         (
             HEAD.to_string() + point + "[[point]]\nname = \"motor_current\"\nat = \"holding 5.1\"",
-            "`motor_current` is a figure, not a bit; m:15, point[1].at",
+            "`motor_current` is a number, not a bit; m:15, point[1].at",
         ),
         (
             HEAD.to_string() + point + "class = \"never\"\n[[point]]\nname = \"b\"\nderive = \"zero\"\nof = \"a\"",
@@ -260,11 +260,11 @@ fn each_mistake_of_the_whole() {
         ),
         (
             HEAD.to_string() + point + "[point.texts]\n1 = \"x\"\n[[point]]\nname = \"a_text\"\nat = \"holding 5\"",
-            "the text of `a` is shown as `a_text`, which is a point too; m:11, point[0].name",
+            "the text of `a` is shown as `a_text`, which is also a point; m:11, point[0].name",
         ),
     ];
     for (source, wanted) in cases {
-        let all = told("m", &source);
+        let all = mistakes("m", &source);
         assert!(all.contains(wanted), "{source}\n{wanted} is missing in\n{all}");
     }
 }
@@ -321,13 +321,13 @@ unit = "°C"
     assert_eq!(ours.fault_text(53), "fieldbus fault");
     let wrong = source.replace("scale = 0.1\nunit", "scale = 0.1\nuint");
     assert!(
-        told("m", &wrong).contains("unknown key `uint`; m:"),
+        mistakes("m", &wrong).contains("unknown key `uint`; m:"),
         "{}",
-        told("m", &wrong)
+        mistakes("m", &wrong)
     );
-    // What the file breaks in its base is told by the base's name.
+    // Problems in what comes from the base name the base.
     let wrong = source.replace("\"sensor_feedback\", \"pid_setpoint\"", "\"maximum_frequency\"");
-    let all = told("m", &wrong);
+    let all = mistakes("m", &wrong);
     assert!(
         all.contains("there is no point `maximum_frequency`; profile eaton-hvx, point["),
         "{all}"
@@ -366,9 +366,9 @@ fn choices_of_the_reference() {
     assert_eq!(cx.ranges.last().unwrap().addresses, 9901..=9999);
 }
 
-/// What commands are converted by is read again and again, whatever the file says.
+/// Points that commands are converted by are polled, whatever their class.
 #[test]
-fn ends_of_a_band_are_never_read_once_only() {
+fn ends_of_a_band_are_polled() {
     let source = HEAD.to_string()
         + "[[point]]\nname = \"speed_reference\"\nat = \"holding 1\"\n\
            [[point]]\nname = \"frequency_reference\"\nderive = \"band\"\nof = \"speed_reference\"\n\
@@ -389,7 +389,7 @@ fn ends_of_a_band_are_never_read_once_only() {
 }
 
 #[test]
-fn files_rest_on_one_another_in_any_order() {
+fn files_with_bases_in_any_order() {
     let dir = TempDir::new().unwrap();
     let write = |file: &str, text: &str| std::fs::write(dir.path().join(file), text).unwrap();
     write("a.toml", "name = \"a\"\nbase = \"b\"\ntitle = \"A\"\n");
@@ -409,7 +409,7 @@ fn files_rest_on_one_another_in_any_order() {
     let found = Profiles::built_in().load(dir.path());
     let text: Vec<String> = found.iter().map(Problem::to_string).collect();
     assert_eq!(found.len(), 2, "{text:?}");
-    assert!(text[0].contains("`b` rests on this profile in its turn;"), "{text:?}");
+    assert!(text[0].contains("`b` is itself based on this profile;"), "{text:?}");
 }
 
 #[test]
@@ -456,7 +456,7 @@ fn the_page_names_every_key() {
         let keys = rows.filter_map(|row| row.strip_prefix("| `")?.split('`').next().map(str::to_string));
         keys.collect::<Vec<_>>()
     };
-    let mut told = section("\n## Keys of a profile\n");
+    let mut named = section("\n## Keys of a profile\n");
     for (heading, path) in [
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
@@ -464,24 +464,25 @@ fn the_page_names_every_key() {
         ("\n### `[[range]]`\n", "range[]."),
         ("\n### `[[point]]`\n", "point[]."),
     ] {
-        told.extend(section(heading).into_iter().map(|key| format!("{path}{key}")));
+        named.extend(section(heading).into_iter().map(|key| format!("{path}{key}")));
     }
-    told.sort();
-    assert_eq!(told, known.into_iter().collect::<Vec<_>>());
+    named.sort();
+    assert_eq!(named, known.into_iter().collect::<Vec<_>>());
 }
 
 #[test]
-fn the_digest_tells_profiles_of_one_name_apart() {
-    let digest = |source: &str| Profile::parse("m", source, false).unwrap().digest().to_string();
-    let point = "[[point]]\nname = \"a\"\nat = \"holding 1\"\nscale = 0.1\nunit = \"V\"\n";
-    let own = digest(&format!("{HEAD}{point}"));
-    let rewritten =
-        format!("# Ours.\n\n{HEAD}[[point]]\nunit = 'V'\nscale = 1e-1\nname = \"a\" # a\nat = \"holding 1\"\n");
-    assert_eq!(digest(&rewritten), own, "the same in other words");
-    for (from, to) in [("0.1", "1.0"), ("holding 1", "holding 2"), ("\"V\"", "\"A\"")] {
-        let other = format!("{HEAD}{}", point.replace(from, to));
-        assert_ne!(digest(&other), own, "{from}");
+fn mistakes_of_identify() {
+    let text = "name = \"p\"\nprotocols = [\"modbus-rtu\"]\n[[identify]]\nread = \"holding x\"\nanswer = \"yes\"\n\
+        [[identify]]\nanswer = \"values\"\n[[range]]\ntable = \"holding\"\nfirst = 0\nlast = 9\n\
+        [[point]]\nname = \"a\"\nat = \"holding 0\"\n";
+    let found = Profile::parse("p.toml", text, false).unwrap_err();
+    let all: Vec<String> = found.iter().map(ToString::to_string).collect();
+    let all = all.join("\n");
+    for wanted in [
+        "p.toml:4, identify[0].read",
+        "p.toml:5, identify[0].answer",
+        "identify[1].read",
+    ] {
+        assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
     }
-    let over = |base: &str| digest(&format!("name = \"x\"\nbase = \"{base}\"\n"));
-    assert_ne!(over("eaton-svx"), over("eaton-hvx"), "the base counts");
 }

@@ -1,4 +1,4 @@
-//! What the JSON interface says of drives and buses. Fields are added, never renamed or removed.
+//! The JSON objects of drives and buses. Fields are added, never renamed or removed.
 
 use std::time::{Duration, Instant, SystemTime};
 
@@ -11,13 +11,13 @@ use crate::plant::{BusHandle, DriveHandle};
 
 /// An error reply.
 #[derive(Debug, Serialize)]
-pub(super) struct Problem {
+pub(super) struct ErrorReply {
     pub(super) error: String,
     #[serde(skip_serializing_if = "Vec::is_empty")]
     pub(super) known: Vec<String>,
 }
 
-/// One time on both clocks.
+/// One point in time on both clocks.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Clock {
     now: Instant,
@@ -51,7 +51,7 @@ pub(super) struct Drive<'d> {
     unit: u8,
     profile: &'d str,
     access: &'static str,
-    /// Absent (`null`) while it is not known.
+    /// `null` while it is not known.
     state: Option<State>,
     quality: Quality,
     online: bool,
@@ -141,7 +141,7 @@ impl Serialize for Points<'_> {
 #[derive(Debug, Serialize)]
 struct Point<'p> {
     value: serde_json::Value,
-    /// What the value of an enumeration means.
+    /// The text of an enumeration's value.
     #[serde(skip_serializing_if = "Option::is_none")]
     text: Option<&'p str>,
     quality: Quality,
@@ -151,12 +151,12 @@ struct Point<'p> {
 }
 
 impl Points<'_> {
-    /// A stale value is told with its quality; of a bad point there is nothing to tell.
+    /// A stale value is shown with its quality; a bad point has no value.
     fn point<'p>(&self, index: usize, point: &'p drive::Point) -> Point<'p> {
         let sample = self.reading.sample(index);
-        let told = sample.quality != Quality::Bad;
-        let at = sample.at.filter(|_| told);
-        let value = sample.value.filter(|_| told);
+        let shown = sample.quality != Quality::Bad;
+        let at = sample.at.filter(|_| shown);
+        let value = sample.value.filter(|_| shown);
         Point {
             value: value_or_null(value),
             text: value.and_then(|value| point.text_of(value)),
@@ -168,7 +168,7 @@ impl Points<'_> {
     }
 }
 
-/// One bus with its figures.
+/// One bus with its statistics.
 #[derive(Debug, Serialize)]
 pub(super) struct Bus<'b> {
     name: &'b str,
@@ -198,9 +198,9 @@ pub(super) struct Bus<'b> {
 /// Cadence of a poll class.
 #[derive(Debug, Serialize)]
 struct Cycle {
-    /// Aimed at.
+    /// As configured.
     aim_ms: f64,
-    /// Achieved by the last round.
+    /// Of the last round.
     cycle_ms: Option<f64>,
     rounds: u64,
 }
@@ -250,7 +250,7 @@ fn millis(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
-/// Milliseconds to the microsecond.
+/// Milliseconds, rounded to the microsecond.
 fn fine_millis(time: Duration) -> f64 {
     rounded(time.as_secs_f64() * 1000.0, 1000.0)
 }

@@ -1,4 +1,4 @@
-//! What is served where.
+//! The routes of the HTTP server.
 
 use std::fmt::Write as _;
 use std::sync::Arc;
@@ -21,17 +21,17 @@ use crate::plant::{Plant, SharedPlant};
 
 /// What all handlers share.
 #[derive(Debug)]
-pub(super) struct Served {
+pub(super) struct AppState {
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthStats>,
     pub(super) cancel: CancellationToken,
-    /// Places for listeners of event streams.
+    /// Permits for event streams.
     pub(super) listeners: Arc<Semaphore>,
 }
 
-/// Everything that is served.
+/// All routes.
 pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Router {
-    let served = Arc::new(Served {
+    let app = Arc::new(AppState {
         plant,
         stats,
         cancel,
@@ -58,11 +58,11 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/trace", get(streams::trace))
         .fallback(unknown)
-        .with_state(served)
+        .with_state(app)
         .layer(middleware::from_fn(guard))
 }
 
-/// Refuses all methods that could change something, and sets the headers of every reply.
+/// Refuses all methods that could change something and sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
     let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
         next.run(request).await
@@ -82,23 +82,23 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-async fn status_page(State(served): State<Arc<Served>>) -> impl IntoResponse {
+async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
     let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
-    (policy, Html(page::render(&served.plant.load(), Instant::now())))
+    (policy, Html(page::render(&app.plant.load(), Instant::now())))
 }
 
 async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {
     ([(header::CONTENT_TYPE, content_type)], body)
 }
 
-async fn exposition(State(served): State<Arc<Served>>, headers: HeaderMap) -> Response {
+async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
     let accept: Vec<&str> = headers
         .get_all(header::ACCEPT)
         .iter()
         .filter_map(|value| value.to_str().ok())
         .collect();
     let format = metrics::Format::accepted(&accept.join(","));
-    match metrics::encode(&served.plant.load(), &served.stats, Instant::now(), format) {
+    match metrics::encode(&app.plant.load(), &app.stats, Instant::now(), format) {
         Ok(text) => {
             let headers = [(header::CONTENT_TYPE, format.content_type()), (header::VARY, "accept")];
             (headers, text).into_response()
@@ -110,8 +110,8 @@ async fn exposition(State(served): State<Arc<Served>>, headers: HeaderMap) -> Re
     }
 }
 
-async fn ready(State(served): State<Arc<Served>>) -> Response {
-    let reasons = unready(&served.plant.load());
+async fn ready(State(app): State<Arc<AppState>>) -> Response {
+    let reasons = unready(&app.plant.load());
     if reasons.is_empty() {
         return "ready\n".into_response();
     }
@@ -123,7 +123,7 @@ async fn ready(State(served): State<Arc<Served>>) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-/// Why the gateway is not ready: buses that are not open and drives that were not tried yet, each by name.
+/// Why the gateway is not ready: buses that are not open and drives that were not tried yet.
 fn unready(plant: &Plant) -> Vec<String> {
     let mut reasons = Vec::new();
     for bus in &plant.buses {
@@ -132,7 +132,7 @@ fn unready(plant: &Plant) -> Vec<String> {
         if !health.up {
             let why = health
                 .reason
-                .unwrap_or_else(|| "its port was not opened yet".to_string());
+                .unwrap_or_else(|| "its port has not been opened yet".to_string());
             reasons.push(format!("bus {name}: {why}"));
         }
         for drive in &bus.image.drives {
@@ -144,16 +144,16 @@ fn unready(plant: &Plant) -> Vec<String> {
     reasons
 }
 
-async fn drives(State(served): State<Arc<Served>>) -> Response {
-    let plant = served.plant.load();
+async fn drives(State(app): State<Arc<AppState>>) -> Response {
+    let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
     let all: Vec<_> = all.iter().map(|drive| api::Drive::new(drive, clock)).collect();
     Json(all).into_response()
 }
 
-async fn drive(State(served): State<Arc<Served>>, Path(name): Path<String>) -> Response {
-    let plant = served.plant.load();
+async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
     match plant.drive(&name) {
         Some(drive) => {
             let clock = api::Clock::new(Instant::now(), SystemTime::now());
@@ -166,15 +166,15 @@ async fn drive(State(served): State<Arc<Served>>, Path(name): Path<String>) -> R
     }
 }
 
-async fn buses(State(served): State<Arc<Served>>) -> Response {
-    let plant = served.plant.load();
+async fn buses(State(app): State<Arc<AppState>>) -> Response {
+    let plant = app.plant.load();
     let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
     Json(all).into_response()
 }
 
 /// The last commands, newest last.
-async fn audit(State(served): State<Arc<Served>>) -> Response {
-    let records = served.plant.load().writes.audit().recent();
+async fn audit(State(app): State<Arc<AppState>>) -> Response {
+    let records = app.plant.load().writes.audit().recent();
     Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
@@ -186,7 +186,7 @@ async fn unknown(uri: Uri) -> Response {
     (StatusCode::NOT_FOUND, text).into_response()
 }
 
-/// A reply 404 that tells the names there are.
+/// A 404 reply that lists the known names.
 pub(super) fn not_found(error: String, known: Vec<String>) -> response::Response {
-    (StatusCode::NOT_FOUND, Json(api::Problem { error, known })).into_response()
+    (StatusCode::NOT_FOUND, Json(api::ErrorReply { error, known })).into_response()
 }

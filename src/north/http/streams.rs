@@ -1,7 +1,7 @@
-//! Server-sent events: what happens in the plant, and the frames on the buses.
+//! Server-sent events: the events of the plant, and the frames on the buses.
 //!
-//! A stream ends when the gateway stops, and when a reload takes its source away; the client then connects
-//! again. A listener that is too slow loses the oldest items and is told how many.
+//! A stream ends when the gateway stops and when a reload removes its source; the client then reconnects. A client that
+//! is too slow loses the oldest items and is sent their number.
 
 use std::convert::Infallible;
 use std::fmt::Write as _;
@@ -20,25 +20,25 @@ use tokio::sync::{OwnedSemaphorePermit, broadcast};
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
-use super::routes::{Served, not_found};
+use super::routes::{AppState, not_found};
 use super::{MAX_LISTENERS, api};
 use crate::cache::{Direction, FrameRecord};
 use crate::codec::{Protocol, describe};
 use crate::event::Event;
 
-/// Time after which a browser connects again.
+/// Time after which a browser reconnects.
 const RETRY: Duration = Duration::from_secs(2);
 
-/// Cadence of comments on a stream without news: tells dead connections, keeps proxies patient.
+/// Interval of comments on a stream without events: they detect dead connections and keep proxies from closing it.
 const KEEP_ALIVE: Duration = Duration::from_secs(10);
 
 const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
-/// `GET /api/v1/events`: the kept events that the client does not have yet, then each as it happens. A client
-/// that wants JSON instead gets the kept ones only, and no stream.
-pub(super) async fn events(State(served): State<Arc<Served>>, headers: HeaderMap) -> Response {
-    let plant = served.plant.load();
-    // Heard from before the kept ones are read: what comes between is in both, and is told once.
+/// `GET /api/v1/events`: the recent events that the client has not received yet, then each new one. A client that
+/// accepts JSON only gets the recent events without a stream.
+pub(super) async fn events(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let plant = app.plant.load();
+    // Subscribed before the recent events are read: an event in between is in both and is sent once.
     let live = plant.events.subscribe();
     let mut kept = plant.events.recent();
     let newest = kept.last().map_or(0, |event| event.id);
@@ -49,59 +49,62 @@ pub(super) async fn events(State(served): State<Arc<Served>>, headers: HeaderMap
     kept.retain(|event| event.id > seen);
     let accept = header_text(&headers, &header::ACCEPT).unwrap_or_default();
     if accept.contains("application/json") && !accept.contains("text/event-stream") {
-        let kept = Kept {
+        let kept = RecentEvents {
             last: event_id(newest),
             events: kept.iter().map(Arc::as_ref).collect(),
         };
         return ([(header::VARY, "accept")], Json(kept)).into_response();
     }
-    let Some(place) = place(&served) else {
+    let Some(permit) = stream_permit(&app) else {
         return full();
     };
     let kept: Vec<Message> = kept.iter().map(|event| event_message(event)).collect();
-    let live = hear(live, move |event| (event.id > newest).then(|| event_message(&event)));
-    respond(stream::iter(kept).chain(live), &served, place)
+    let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
+    respond(stream::iter(kept).chain(live), &app, permit)
 }
 
 /// `GET /api/v1/trace?bus=`: the frames of one bus, or of all, from now on.
-pub(super) async fn trace(State(served): State<Arc<Served>>, RawQuery(query): RawQuery) -> Response {
+pub(super) async fn trace(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
     let wanted = match query.as_deref().map(bus_of) {
         None | Some(Ok(None)) => None,
         Some(Ok(Some(name))) => Some(name),
         Some(Err(error)) => {
-            let known = Vec::new();
-            return (StatusCode::BAD_REQUEST, Json(api::Problem { error, known })).into_response();
+            let reply = api::ErrorReply {
+                error: error.to_string(),
+                known: Vec::new(),
+            };
+            return (StatusCode::BAD_REQUEST, Json(reply)).into_response();
         }
     };
-    let plant = served.plant.load();
+    let plant = app.plant.load();
     let buses = plant.buses.iter().map(|bus| &bus.image);
-    let heard: Vec<_> = buses
+    let streams: Vec<_> = buses
         .filter(|image| wanted.as_ref().is_none_or(|name| *name == image.spec.name))
         .map(|image| {
             let bus = image.spec.name.clone();
             let protocol = image.spec.protocol;
-            hear(image.trace.subscribe(), move |frame| {
+            messages_of(image.trace.subscribe(), move |frame| {
                 Some(frame_message(&bus, protocol, &frame))
             })
             .boxed()
         })
         .collect();
-    if let (Some(name), true) = (wanted, heard.is_empty()) {
+    if let (Some(name), true) = (wanted, streams.is_empty()) {
         let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
         return not_found(format!("there is no bus `{name}`"), known.collect());
     }
-    match place(&served) {
-        Some(place) => respond(stream::select_all(heard), &served, place),
+    match stream_permit(&app) {
+        Some(permit) => respond(stream::select_all(streams), &app, permit),
         None => full(),
     }
 }
 
-fn place(served: &Served) -> Option<OwnedSemaphorePermit> {
-    served.listeners.clone().try_acquire_owned().ok()
+fn stream_permit(app: &AppState) -> Option<OwnedSemaphorePermit> {
+    app.listeners.clone().try_acquire_owned().ok()
 }
 
 fn full() -> Response {
-    let problem = api::Problem {
+    let problem = api::ErrorReply {
         error: format!("{MAX_LISTENERS} event streams are open; close one and try again"),
         known: Vec::new(),
     };
@@ -109,8 +112,8 @@ fn full() -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, retry, Json(problem)).into_response()
 }
 
-/// What arrives, as messages; losses become a message of their own.
-fn hear<T: Clone + Send + 'static>(
+/// The received items as messages; a loss becomes a message of its own.
+fn messages_of<T: Clone + Send + 'static>(
     receiver: broadcast::Receiver<T>,
     message: impl Fn(T) -> Option<Message> + Send + 'static,
 ) -> impl Stream<Item = Message> + Send + 'static {
@@ -122,28 +125,28 @@ fn hear<T: Clone + Send + 'static>(
     })
 }
 
-/// The reply; `place` is given back when the stream ends or the client leaves.
+/// The reply; `permit` is released when the stream ends or the client disconnects.
 fn respond(
     messages: impl Stream<Item = Message> + Send + 'static,
-    served: &Served,
-    place: OwnedSemaphorePermit,
+    app: &AppState,
+    permit: OwnedSemaphorePermit,
 ) -> Response {
-    // Something is sent at once, so that a client sees the stream open before there is news.
+    // Something is sent at once, so that the client sees the stream open before the first event.
     let hello = Message::default().retry(RETRY).comment("open");
     let messages = stream::iter([hello])
         .chain(messages)
-        .take_until(served.cancel.clone().cancelled_owned())
+        .take_until(app.cancel.clone().cancelled_owned())
         .map(move |message| {
-            let _held = &place;
+            let _held = &permit;
             Ok::<_, Infallible>(message)
         });
     let keep_alive = KeepAlive::new().interval(KEEP_ALIVE).text("alive");
-    // Proxies of the nginx kind hold a reply back until it is whole, unless told otherwise.
+    // Proxies such as nginx would otherwise buffer the reply until it ends.
     let unbuffered = [(HeaderName::from_static("x-accel-buffering"), "no")];
     (unbuffered, Sse::new(messages).keep_alive(keep_alive)).into_response()
 }
 
-/// Tells this run of the program from others: the running numbers of events begin anew with each.
+/// Distinguishes this run of the program from others, since the numbers of events restart with each run.
 fn instance() -> &'static str {
     static INSTANCE: OnceLock<String> = OnceLock::new();
     INSTANCE.get_or_init(|| {
@@ -152,7 +155,7 @@ fn instance() -> &'static str {
     })
 }
 
-/// Number of the last event that a client has of this run; `None` if it has none.
+/// Number of the last event of this run that the client has received, if any.
 fn last_seen(id: &str, instance: &str) -> Option<u64> {
     let number = match id.split_once('-') {
         Some((run, number)) if run == instance => number,
@@ -166,10 +169,10 @@ fn event_id(number: u64) -> String {
     format!("{}-{number}", instance())
 }
 
-/// The kept events for a client that asks now and then.
+/// The recent events, for a client that polls.
 #[derive(Debug, Serialize)]
-struct Kept<'e> {
-    /// To be sent as `Last-Event-ID` the next time.
+struct RecentEvents<'e> {
+    /// For `Last-Event-ID` of the next request.
     last: String,
     events: Vec<&'e Event>,
 }
@@ -213,7 +216,7 @@ fn frame_message(bus: &str, protocol: Protocol, record: &FrameRecord) -> Message
 }
 
 fn json(message: Message, data: &impl Serialize) -> Message {
-    // Strings and numbers always serialize; an empty object would show otherwise.
+    // Strings and numbers can always be serialized.
     message.data(serde_json::to_string(data).unwrap_or_else(|_| "{}".to_string()))
 }
 
@@ -228,8 +231,13 @@ fn hex(bytes: &[u8]) -> String {
     text
 }
 
-/// The bus that a query names; an empty name is none.
-fn bus_of(query: &str) -> Result<Option<String>, String> {
+/// A parameter of a query that is not supported.
+#[derive(Debug, PartialEq, Eq, thiserror::Error)]
+#[error("unknown parameter `{0}`; the only one is `bus`")]
+struct UnknownParameter(String);
+
+/// The bus in a query; an empty name means none.
+fn bus_of(query: &str) -> Result<Option<String>, UnknownParameter> {
     let mut bus = None;
     for pair in query.split('&').filter(|pair| !pair.is_empty()) {
         match pair.split_once('=').unwrap_or((pair, "")) {
@@ -237,7 +245,7 @@ fn bus_of(query: &str) -> Result<Option<String>, String> {
                 let name = percent_decode_str(name).decode_utf8_lossy().into_owned();
                 bus = Some(name).filter(|name| !name.is_empty());
             }
-            (other, _) => return Err(format!("unknown parameter `{other}`; there is `bus`")),
+            (other, _) => return Err(UnknownParameter(other.to_string())),
         }
     }
     Ok(bus)
@@ -254,16 +262,16 @@ mod tests {
         assert_eq!(bus_of("bus=line1"), Ok(Some("line1".to_string())));
         assert_eq!(bus_of("&bus=line%201&"), Ok(Some("line 1".to_string())));
         assert!(bus_of("line=1").is_err());
-        assert!(bus_of("bus=%ff").is_ok(), "no name, but no harm either");
+        assert!(bus_of("bus=%ff").is_ok(), "not a name, but valid");
     }
 
     #[test]
-    fn ids_of_other_runs_count_for_nothing() {
+    fn event_ids_of_other_runs_are_ignored() {
         assert_eq!(last_seen("a1-7", "a1"), Some(7));
         assert_eq!(last_seen("a2-7", "a1"), None);
         assert_eq!(last_seen("7", "a1"), Some(7));
-        for rubbish in ["", "-", "a1-", "a1-x", "x"] {
-            assert_eq!(last_seen(rubbish, "a1"), None, "{rubbish}");
+        for invalid in ["", "-", "a1-", "a1-x", "x"] {
+            assert_eq!(last_seen(invalid, "a1"), None, "{invalid}");
         }
     }
 

@@ -1,4 +1,4 @@
-//! The families of series and what they are made of.
+//! The families of series and their values.
 
 use std::sync::atomic::Ordering;
 use std::time::Instant;
@@ -10,7 +10,7 @@ use crate::drive::{PollClass, State};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, Plant};
 
-/// Commit the program was built from, set by whoever builds a release.
+/// Commit of the build, set for releases.
 const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");
 
 /// Label names and values.
@@ -26,10 +26,10 @@ pub(super) enum Kind {
 
 /// Value of one series.
 #[derive(Debug)]
-pub(super) enum Figure {
+pub(super) enum SeriesValue {
     /// Of a gauge.
     Value(f64),
-    /// Of a counter of things.
+    /// Of a counter of events.
     Count(u64),
     /// Of a counter of seconds.
     Total(f64),
@@ -43,7 +43,7 @@ pub(super) struct Family {
     pub(super) name: &'static str,
     pub(super) help: &'static str,
     pub(super) kind: Kind,
-    pub(super) series: Vec<(Labels, Figure)>,
+    pub(super) series: Vec<(Labels, SeriesValue)>,
 }
 
 impl Family {
@@ -56,18 +56,18 @@ impl Family {
         }
     }
 
-    fn of(kind: Kind, name: &'static str, help: &'static str, figure: Figure) -> Family {
+    fn of(kind: Kind, name: &'static str, help: &'static str, figure: SeriesValue) -> Family {
         let mut family = Family::new(kind, name, help);
         family.add(Vec::new(), figure);
         family
     }
 
-    fn add(&mut self, labels: Labels, figure: Figure) {
+    fn add(&mut self, labels: Labels, figure: SeriesValue) {
         self.series.push((labels, figure));
     }
 }
 
-/// All families; those without a series are left out of the text.
+/// All families; those without a series are omitted from the text.
 pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
     let mut all = Vec::new();
     drives(plant, now, &mut all);
@@ -114,32 +114,32 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     );
     let mut unsupervised = gauge(
         "drivegate_drive_unsupervised",
-        "Whether a drive with supervision ran, and no client was heard of since the gateway started: 1, else 0.",
+        "Whether a drive with supervision runs that no client has commanded since the gateway started: 1, else 0.",
     );
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
-        supervision.add(labels.clone(), Figure::Count(image.supervisions()));
+        supervision.add(labels.clone(), SeriesValue::Count(image.supervisions()));
         if image.spec.supervision.is_some() {
-            unsupervised.add(labels.clone(), yes(image.is_unsupervised()));
+            unsupervised.add(labels.clone(), flag(image.is_unsupervised()));
         }
-        up.add(labels.clone(), yes(reading.snapshot.link.is_online()));
+        up.add(labels.clone(), flag(reading.snapshot.link.is_online()));
         if let Some(current) = reading.state() {
             for one in State::ALL {
-                state.add(with(&labels, "state", one.name()), yes(one == current));
+                state.add(with(&labels, "state", one.name()), flag(one == current));
             }
         }
         if let Some(time) = reading.age() {
-            age.add(labels.clone(), Figure::Value(time.as_secs_f64()));
+            age.add(labels.clone(), SeriesValue::Value(time.as_secs_f64()));
         }
         points(&reading, &labels, &mut model, &mut point);
         for outcome in Outcome::ALL {
-            let count = Figure::Count(image.counted(outcome));
+            let count = SeriesValue::Count(image.counted(outcome));
             transactions.add(with(&labels, "outcome", outcome.name()), count);
         }
         if let Some(time) = image.turnaround() {
-            turnaround.add(labels, Figure::Value(time.as_secs_f64()));
+            turnaround.add(labels, SeriesValue::Value(time.as_secs_f64()));
         }
     }
     all.extend([up, state, age]);
@@ -165,11 +165,11 @@ fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &
             model.get_mut(place)
         });
         match own {
-            Some(family) => family.add(labels.clone(), Figure::Value(value)),
+            Some(family) => family.add(labels.clone(), SeriesValue::Value(value)),
             None => {
                 let mut labels = with(labels, "point", name);
                 labels.push(("unit", point.map(|p| p.unit.clone()).unwrap_or_default()));
-                other.add(labels, Figure::Value(value));
+                other.add(labels, SeriesValue::Value(value));
             }
         }
     }
@@ -196,7 +196,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     for (name, help, value) in gauges {
         let mut family = Family::new(Kind::Gauge, name, help);
         for (labels, handle, health) in &looks {
-            family.add(labels.clone(), Figure::Value(value(&handle.image, health)));
+            family.add(labels.clone(), SeriesValue::Value(value(&handle.image, health)));
         }
         all.push(family);
     }
@@ -208,7 +208,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     let mut transactions = Family::new(
         Kind::Histogram,
         "drivegate_bus_transaction_seconds",
-        "Time of whole exchanges on the bus.",
+        "Duration of exchanges on the bus.",
     );
     let mut queue = Family::new(
         Kind::Gauge,
@@ -223,11 +223,11 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         ] {
             cycles.add(
                 with(&labels, "class", class.name()),
-                Figure::Histogram(times.snapshot()),
+                SeriesValue::Histogram(times.snapshot()),
             );
         }
-        transactions.add(labels.clone(), Figure::Histogram(image.transactions.snapshot()));
-        queue.add(labels, Figure::Value(handle.queue.lock().len() as f64));
+        transactions.add(labels.clone(), SeriesValue::Histogram(image.transactions.snapshot()));
+        queue.add(labels, SeriesValue::Value(handle.queue.lock().len() as f64));
     }
     all.extend([cycles, transactions, queue]);
 }
@@ -236,18 +236,18 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
     let mut results = Family::new(
         Kind::Counter,
         "drivegate_writes_total",
-        "Commands answered, by where they came from and how they ended.",
+        "Commands answered, by source and result.",
     );
     for ((source, result), count) in plant.writes.results() {
         let labels = vec![("source", source.name().to_string()), ("result", result.to_string())];
-        results.add(labels, Figure::Count(count));
+        results.add(labels, SeriesValue::Count(count));
     }
     all.push(results);
     all.push(Family::of(
         Kind::Histogram,
         "drivegate_write_seconds",
         "Time from the acceptance of a command to its answer.",
-        Figure::Histogram(plant.writes.seconds()),
+        SeriesValue::Histogram(plant.writes.seconds()),
     ));
 }
 
@@ -256,7 +256,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         Kind::Gauge,
         "drivegate_modbus_tcp_connections",
         "Modbus TCP clients connected now.",
-        Figure::Value(stats.modbus_tcp.connections() as f64),
+        SeriesValue::Value(stats.modbus_tcp.connections() as f64),
     ));
     let mut requests = Family::new(
         Kind::Counter,
@@ -265,16 +265,16 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     );
     for (function, outcome, count) in stats.modbus_tcp.requests() {
         let labels = vec![("function", function), ("outcome", outcome.to_string())];
-        requests.add(labels, Figure::Count(count));
+        requests.add(labels, SeriesValue::Count(count));
     }
     all.push(requests);
     let mut refused = Family::new(
         Kind::Counter,
         "drivegate_modbus_tcp_refused_total",
-        "Modbus TCP clients that were not let in, by reason.",
+        "Modbus TCP clients refused, by reason.",
     );
-    for (reason, count) in stats.modbus_tcp.refused().filter(|(_, count)| *count > 0) {
-        refused.add(vec![("reason", reason.name().to_string())], Figure::Count(count));
+    for (reason, count) in stats.modbus_tcp.refused_connections().filter(|(_, count)| *count > 0) {
+        refused.add(vec![("reason", reason.name().to_string())], SeriesValue::Count(count));
     }
     all.push(refused);
     let mqtt = &stats.mqtt;
@@ -282,19 +282,19 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         Kind::Gauge,
         "drivegate_mqtt_connected",
         "Whether the gateway is connected to its MQTT broker: 1, else 0 (also without one configured).",
-        yes(mqtt.connected.load(Ordering::Relaxed)),
+        flag(mqtt.connected.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages that the MQTT broker took.",
-        Figure::Count(mqtt.published.load(Ordering::Relaxed)),
+        "Messages that the MQTT broker acknowledged.",
+        SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(
         Kind::Gauge,
         "drivegate_mqtt_buffered_messages",
         "Messages that wait for the MQTT broker.",
-        Figure::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
+        SeriesValue::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
     ));
 }
 
@@ -307,19 +307,19 @@ fn build(plant: &Plant) -> Family {
     let mut family = Family::new(
         Kind::Gauge,
         "drivegate_build_info",
-        "Always 1; what was built, and the name of the gateway.",
+        "Always 1; version and commit of the build, and the name of the gateway.",
     );
-    family.add(labels, Figure::Value(1.0));
+    family.add(labels, SeriesValue::Value(1.0));
     family
 }
 
-fn process(figures: &process::Figures, all: &mut Vec<Family>) {
+fn process(figures: &process::ProcessStats, all: &mut Vec<Family>) {
     if let Some(seconds) = figures.cpu_seconds {
         all.push(Family::of(
             Kind::Counter,
             "process_cpu_seconds_total",
             "Processor time of the process, user and system.",
-            Figure::Total(seconds),
+            SeriesValue::Total(seconds),
         ));
     }
     let gauges = [
@@ -352,7 +352,7 @@ fn process(figures: &process::Figures, all: &mut Vec<Family>) {
     ];
     for (name, help, value) in gauges {
         if let Some(value) = value {
-            all.push(Family::of(Kind::Gauge, name, help, Figure::Value(value)));
+            all.push(Family::of(Kind::Gauge, name, help, SeriesValue::Value(value)));
         }
     }
 }
@@ -367,6 +367,6 @@ fn with(labels: &Labels, name: &'static str, value: &str) -> Labels {
     labels
 }
 
-fn yes(it_is: bool) -> Figure {
-    Figure::Value(f64::from(u8::from(it_is)))
+fn flag(it_is: bool) -> SeriesValue {
+    SeriesValue::Value(f64::from(u8::from(it_is)))
 }

@@ -1,7 +1,7 @@
-//! Prometheus metrics: one look at the plant, as families of series (`docs/http.md`).
+//! Prometheus metrics: the plant at one time as families of series (`docs/http.md`).
 //!
-//! The names are frozen. Every drive is read once a scrape, so its series belong together. A point that is
-//! not good has no series: a graph shows a gap, never an old figure.
+//! The names are frozen. Every drive is read once per scrape, so its series are consistent. A point that is not good
+//! has no series: a graph shows a gap, never an old value.
 
 mod families;
 mod model;
@@ -15,22 +15,22 @@ use prometheus_client::encoding::{DescriptorEncoder, MetricEncoder};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 
-use self::families::{Family, Figure, Kind};
+use self::families::{Family, Kind, SeriesValue};
 use super::NorthStats;
 use crate::plant::Plant;
 
 /// Text formats of an exposition.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Format {
-    /// Prometheus text format 0.0.4: a counter's family is named like its series.
+    /// Prometheus text format 0.0.4: the family of a counter is named like its series.
     Prometheus,
-    /// OpenMetrics 1.0.0: a counter's family lacks the `_total` of its series; ends with `# EOF`.
+    /// OpenMetrics 1.0.0: the family of a counter is named without the `_total` of its series; ends with `# EOF`.
     OpenMetrics,
 }
 
 impl Format {
-    /// The format for an `Accept` header: OpenMetrics for those that ask for it by name and prefer it.
-    pub fn accepted(accept: &str) -> Format {
+    /// The format for an `Accept` header: OpenMetrics if the client names and prefers it.
+    pub(crate) fn accepted(accept: &str) -> Format {
         let quality = |wanted: &[&str]| {
             accept
                 .split(',')
@@ -46,7 +46,7 @@ impl Format {
     }
 
     /// The content type.
-    pub fn content_type(self) -> &'static str {
+    pub(crate) fn content_type(self) -> &'static str {
         match self {
             Format::Prometheus => "text/plain; version=0.0.4; charset=utf-8",
             Format::OpenMetrics => "application/openmetrics-text; version=1.0.0; charset=utf-8",
@@ -71,7 +71,7 @@ fn weight(range: &str, wanted: &[&str]) -> Option<f64> {
 /// All metrics as text.
 ///
 /// # Errors
-/// Only when the encoder fails, which writing to a string does not.
+/// The encoder fails, which it does not when it writes to a string.
 pub fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -> Result<String, fmt::Error> {
     let mut registry = Registry::default();
     registry.register_collector(Box::new(Scrape {
@@ -118,17 +118,17 @@ impl Collector for Scrape {
 }
 
 impl Scrape {
-    fn figure(&self, figure: &Figure, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
+    fn figure(&self, figure: &SeriesValue, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
         type NoLabels = [(&'static str, &'static str); 0];
         match (figure, self.format) {
-            (Figure::Value(value), _) => gauge(*value, metric),
-            // The library appends `_total` to a counter; in the older format the name has it already.
-            (Figure::Count(count), Format::Prometheus) => metric.encode_gauge(count),
-            (Figure::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
-            (Figure::Total(total), Format::Prometheus) => metric.encode_gauge(total),
-            (Figure::Total(total), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, f64>(total, None),
-            (Figure::Histogram(times), _) => {
-                // The unbounded bucket of the image has the greatest number as its bound.
+            (SeriesValue::Value(value), _) => gauge(*value, metric),
+            // The library appends `_total` to a counter; in the older format the name already has it.
+            (SeriesValue::Count(count), Format::Prometheus) => metric.encode_gauge(count),
+            (SeriesValue::Count(count), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, u64>(count, None),
+            (SeriesValue::Total(total), Format::Prometheus) => metric.encode_gauge(total),
+            (SeriesValue::Total(total), Format::OpenMetrics) => metric.encode_counter::<NoLabels, _, f64>(total, None),
+            (SeriesValue::Histogram(times), _) => {
+                // The image marks the unbounded bucket by the greatest number.
                 let buckets: Vec<(f64, u64)> = times
                     .buckets
                     .iter()
@@ -140,7 +140,7 @@ impl Scrape {
     }
 }
 
-/// Whole figures without a fraction: `1`, not `1.0`.
+/// Whole numbers without a fraction: `1`, not `1.0`.
 fn gauge(value: f64, metric: &mut MetricEncoder<'_>) -> Result<(), fmt::Error> {
     const EXACT: f64 = 9_007_199_254_740_992.0;
     if value.fract() == 0.0 && value.abs() < EXACT {
@@ -222,7 +222,7 @@ mod tests {
     }
 
     #[test]
-    fn open_metrics_only_for_those_that_ask() {
+    fn open_metrics_only_on_request() {
         let prometheus = "application/openmetrics-text;version=1.0.0,application/openmetrics-text;version=0.0.1;\
             q=0.75,text/plain;version=0.0.4;q=0.5,*/*;q=0.1";
         assert_eq!(Format::accepted(prometheus), Format::OpenMetrics);

@@ -1,10 +1,10 @@
-//! Figures of the process itself, from /proc. What cannot be read is left out.
+//! Statistics of the process, from /proc. What cannot be read is omitted.
 
 use std::fs;
 
-/// Figures of the process.
+/// Statistics of the process.
 #[derive(Debug, Default, PartialEq)]
-pub(super) struct Figures {
+pub(super) struct ProcessStats {
     pub(super) cpu_seconds: Option<f64>,
     pub(super) open_fds: Option<f64>,
     pub(super) max_fds: Option<f64>,
@@ -15,14 +15,14 @@ pub(super) struct Figures {
     pub(super) threads: Option<f64>,
 }
 
-/// The figures now.
-pub(super) fn read() -> Figures {
+/// The statistics now.
+pub(super) fn read() -> ProcessStats {
     let ticks = rustix::param::clock_ticks_per_second() as f64;
     let page = rustix::param::page_size() as f64;
     let stat = fs::read_to_string("/proc/self/stat").unwrap_or_default();
     let boot = fs::read_to_string("/proc/stat").ok().and_then(|text| boot_time(&text));
     let mut figures = of_stat(&stat, ticks, page, boot);
-    // The listing itself holds one descriptor.
+    // Listing the directory opens a descriptor itself.
     figures.open_fds = fs::read_dir("/proc/self/fd")
         .ok()
         .map(|entries| entries.count().saturating_sub(1) as f64);
@@ -32,19 +32,19 @@ pub(super) fn read() -> Figures {
     figures
 }
 
-/// Figures of a line of /proc/PID/stat. The second field is the program's name in parentheses and can hold
-/// anything, so fields count from its last parenthesis: the first after it is field 3 (proc(5)).
-fn of_stat(stat: &str, ticks: f64, page: f64, boot: Option<f64>) -> Figures {
+/// Statistics from a line of /proc/PID/stat. The second field is the program's name in parentheses and can contain
+/// anything, so fields are counted from the last parenthesis: the first one after it is field 3 (proc(5)).
+fn of_stat(stat: &str, ticks: f64, page: f64, boot: Option<f64>) -> ProcessStats {
     let rest = stat.rsplit_once(')').map_or("", |(_, rest)| rest);
     let fields: Vec<&str> = rest.split_ascii_whitespace().collect();
     let field = |number: usize| -> Option<f64> { fields.get(number.checked_sub(3)?)?.parse().ok() };
-    Figures {
+    ProcessStats {
         cpu_seconds: field(14).zip(field(15)).map(|(user, system)| (user + system) / ticks),
         threads: field(20),
         start_seconds: field(22).zip(boot).map(|(start, boot)| boot + start / ticks),
         virtual_bytes: field(23),
         resident_bytes: field(24).map(|pages| pages * page),
-        ..Figures::default()
+        ..ProcessStats::default()
     }
 }
 
@@ -67,11 +67,11 @@ mod tests {
         assert_eq!(figures.start_seconds, Some(1_700_000_010.0));
         assert_eq!(figures.virtual_bytes, Some(8_192_000.0));
         assert_eq!(figures.resident_bytes, Some(300.0 * 4096.0));
-        assert_eq!(of_stat("", 100.0, 4096.0, None), Figures::default());
+        assert_eq!(of_stat("", 100.0, 4096.0, None), ProcessStats::default());
     }
 
     #[test]
-    fn this_process_has_figures() {
+    fn statistics_of_this_process() {
         let figures = read();
         assert!(figures.cpu_seconds.is_some() && figures.start_seconds.is_some());
         assert!(figures.resident_bytes.is_some_and(|b| b > 0.0));

@@ -1,127 +1,85 @@
-//! What the gateway itself reads in an X.509 certificate: subject, validity, role. Pure.
+//! What the gateway itself reads in an X.509 certificate: subject, validity and role.
 //!
-//! Trust is rustls' business: a client's certificate comes here after its chain and its signature were checked.
-//! The reader takes DER as far as these fields need it and gives up on anything else.
+//! Trust is decided by rustls: a client's certificate is read here after its chain and its signature were verified.
 
-/// 1.3.6.1.4.1.50316.802.1, the role of a client (Modbus/TCP Security protocol specification, 8.4).
-const ROLE: [u8; 11] = [0x2B, 6, 1, 4, 1, 0x83, 0x89, 0x0C, 0x86, 0x22, 1];
-/// 2.5.4.3, common name.
-const COMMON_NAME: [u8; 3] = [0x55, 4, 3];
-/// Most characters of a name in the log.
-const NAME: usize = 64;
+use x509_cert::Certificate;
+use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
+use x509_cert::der::{self, Decode, Tag, Tagged};
+use x509_cert::name::Name;
 
-const BOOLEAN: u8 = 0x01;
-const INTEGER: u8 = 0x02;
-const OCTETS: u8 = 0x04;
-const OID: u8 = 0x06;
-const UTF8: u8 = 0x0C;
-const PRINTABLE: u8 = 0x13;
-const IA5: u8 = 0x16;
-const UTC_TIME: u8 = 0x17;
-const GENERALIZED_TIME: u8 = 0x18;
-const SEQUENCE: u8 = 0x30;
-const SET: u8 = 0x31;
-const VERSION: u8 = 0xA0;
-const EXTENSIONS: u8 = 0xA3;
+/// The role of a client (Modbus/TCP Security protocol specification, 8.4).
+const ROLE: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.3.6.1.4.1.50316.802.1");
+const COMMON_NAME: ObjectIdentifier = ObjectIdentifier::new_unwrap("2.5.4.3");
+/// Longest role, bytes.
+const MAX_ROLE: usize = 256;
+/// Longest name in the log, characters.
+const MAX_NAME: usize = 64;
 
-/// What a certificate tells.
+/// The parts of a certificate that the gateway uses.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Facts {
-    /// Common name of the subject, else the serial number; printable, of bounded length.
+pub(super) struct CertificateSummary {
+    /// Common name of the subject, or the serial number; printable, at most 64 characters.
     pub(super) name: String,
-    /// Seconds since 1970; before 1970 is 0.
+    /// Seconds since 1970.
     pub(super) not_before: u64,
     /// Seconds since 1970.
     pub(super) not_after: u64,
     /// Role of a Modbus client.
-    pub(super) role: Option<String>,
+    pub(super) role: Result<Option<String>, RoleError>,
 }
 
-/// Reads a certificate; `None` when it is none.
-pub(super) fn read(der: &[u8]) -> Option<Facts> {
-    let mut certificate = Der(Der(der).take(SEQUENCE)?);
-    let mut fields = Der(certificate.take(SEQUENCE)?);
-    fields.take(VERSION);
-    let serial = fields.take(INTEGER)?;
-    fields.take(SEQUENCE)?; // signature algorithm
-    fields.take(SEQUENCE)?; // issuer
-    let mut validity = Der(fields.take(SEQUENCE)?);
-    let (not_before, not_after) = (time(&mut validity)?, time(&mut validity)?);
-    let subject = fields.take(SEQUENCE)?;
-    fields.take(SEQUENCE)?; // public key
-    let mut role = None;
-    while let Some((tag, content)) = fields.next() {
-        if tag == EXTENSIONS {
-            role = role_of(Der(Der(content).take(SEQUENCE)?));
-        }
-    }
-    Some(Facts {
-        name: common_name(Der(subject)).unwrap_or_else(|| format!("serial {}", hex(serial))),
-        not_before,
-        not_after,
-        role,
+/// Why the role in a certificate is not accepted. It grants write access, so nothing ambiguous passes.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(super) enum RoleError {
+    /// RFC 5280 allows one extension of each kind.
+    #[error("the certificate has more than one role extension")]
+    Repeated,
+    /// Another string type, invalid UTF-8, an invalid length, or data after the string.
+    #[error("the role in the certificate is not a UTF8String: {0}")]
+    Malformed(der::Error),
+    /// Longer than any role that is used.
+    #[error("the role in the certificate has {0} bytes; at most {MAX_ROLE} are allowed")]
+    TooLong(usize),
+}
+
+/// Reads a certificate.
+///
+/// # Errors
+/// The bytes are not one DER-encoded certificate.
+pub(super) fn read(der: &[u8]) -> der::Result<CertificateSummary> {
+    let certificate = Certificate::from_der(der)?;
+    let certificate = certificate.tbs_certificate();
+    let serial = || format!("serial {}", hex(certificate.serial_number().as_bytes()));
+    let validity = certificate.validity();
+    Ok(CertificateSummary {
+        name: common_name(certificate.subject()).unwrap_or_else(serial),
+        not_before: validity.not_before.to_unix_duration().as_secs(),
+        not_after: validity.not_after.to_unix_duration().as_secs(),
+        role: role(certificate.extensions().map_or(&[], Vec::as_slice)),
     })
 }
 
-/// Elements one after the other.
-struct Der<'d>(&'d [u8]);
-
-impl<'d> Der<'d> {
-    /// Tag and content of the next element.
-    fn next(&mut self) -> Option<(u8, &'d [u8])> {
-        let [tag, length, rest @ ..] = self.0 else { return None };
-        let (length, rest) = match *length {
-            short @ 0..0x80 => (usize::from(short), rest),
-            long => {
-                let digits = usize::from(long & 0x7F);
-                let (length, rest) = rest.split_at_checked(digits).filter(|_| (1..=4).contains(&digits))?;
-                let length = length.iter().fold(0usize, |sum, digit| sum << 8 | usize::from(*digit));
-                (length, rest)
-            }
-        };
-        let (content, rest) = rest.split_at_checked(length)?;
-        self.0 = rest;
-        Some((*tag, content))
+fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, RoleError> {
+    let mut roles = extensions.iter().filter(|extension| extension.extn_id == ROLE);
+    let Some(extension) = roles.next() else { return Ok(None) };
+    if roles.next().is_some() {
+        return Err(RoleError::Repeated);
     }
-
-    /// The content of the next element if it has that tag; else nothing is taken.
-    fn take(&mut self, tag: u8) -> Option<&'d [u8]> {
-        let mut ahead = Der(self.0);
-        let (found, content) = ahead.next()?;
-        (found == tag).then(|| {
-            self.0 = ahead.0;
-            content
-        })
+    let role = Utf8StringRef::from_der(extension.extn_value.as_bytes()).map_err(RoleError::Malformed)?;
+    let role = role.as_str();
+    if role.len() > MAX_ROLE {
+        return Err(RoleError::TooLong(role.len()));
     }
+    Ok(Some(role.to_string()))
 }
 
-fn role_of(mut extensions: Der<'_>) -> Option<String> {
-    while let Some(extension) = extensions.take(SEQUENCE) {
-        let mut extension = Der(extension);
-        if extension.take(OID)? != ROLE {
-            continue;
-        }
-        extension.take(BOOLEAN); // critical
-        let text = Der(extension.take(OCTETS)?).take(UTF8)?;
-        return String::from_utf8(text.to_vec()).ok();
-    }
-    None
+fn common_name(subject: &Name) -> Option<String> {
+    let value = &subject.iter().find(|attribute| attribute.oid == COMMON_NAME)?.value;
+    let is_text = matches!(value.tag(), Tag::Utf8String | Tag::PrintableString | Tag::Ia5String);
+    is_text.then(|| printable(&String::from_utf8_lossy(value.value())))
 }
 
-fn common_name(mut subject: Der<'_>) -> Option<String> {
-    while let Some(set) = subject.take(SET) {
-        let mut attribute = Der(Der(set).take(SEQUENCE)?);
-        if attribute.take(OID)? != COMMON_NAME {
-            continue;
-        }
-        let (tag, text) = attribute.next()?;
-        let text = String::from_utf8_lossy(text);
-        return [UTF8, PRINTABLE, IA5].contains(&tag).then(|| printable(&text));
-    }
-    None
-}
-
-/// For the log and the audit: nothing that could be taken for another line or another field.
+/// For the log and the audit: without characters that could imitate another line or another field.
 pub(super) fn printable(text: &str) -> String {
     let safe = |c: char| {
         if c.is_alphanumeric() || " .-_@:/+".contains(c) {
@@ -130,46 +88,12 @@ pub(super) fn printable(text: &str) -> String {
             '?'
         }
     };
-    text.chars().take(NAME).map(safe).collect()
+    text.chars().take(MAX_NAME).map(safe).collect()
 }
 
 fn hex(bytes: &[u8]) -> String {
-    bytes.iter().take(NAME / 2).map(|byte| format!("{byte:02x}")).collect()
-}
-
-/// Seconds since 1970 of a UTCTime (`YYMMDDhhmmssZ`, 1950 to 2049) or a GeneralizedTime (`YYYYMMDDhhmmssZ`).
-fn time(fields: &mut Der<'_>) -> Option<u64> {
-    let (tag, text) = fields.next()?;
-    let text = std::str::from_utf8(text).ok()?.strip_suffix('Z')?;
-    let (year, rest) = match tag {
-        UTC_TIME => text.split_at_checked(2)?,
-        GENERALIZED_TIME => text.split_at_checked(4)?,
-        _ => return None,
-    };
-    let year: i64 = year.parse().ok()?;
-    let year = match (tag, year) {
-        (UTC_TIME, 0..50) => year + 2000,
-        (UTC_TIME, _) => year + 1900,
-        _ => year,
-    };
-    if rest.len() != 10 || !rest.bytes().all(|b| b.is_ascii_digit()) {
-        return None;
-    }
-    let two = |at: usize| rest.get(at..at + 2)?.parse::<i64>().ok();
-    let [month, day, hour, minute, second] = [two(0)?, two(2)?, two(4)?, two(6)?, two(8)?];
-    let seconds = days(year, month, day) * 86_400 + hour * 3600 + minute * 60 + second;
-    Some(u64::try_from(seconds).unwrap_or(0))
-}
-
-/// Days from 1970-01-01, in the Gregorian calendar, whose year is counted from March here.
-fn days(year: i64, month: i64, day: i64) -> i64 {
-    let (year, month) = if month > 2 {
-        (year, month - 3)
-    } else {
-        (year - 1, month + 9)
-    };
-    let day_of_year = (153 * month + 2) / 5 + day - 1;
-    year * 365 + year.div_euclid(4) - year.div_euclid(100) + year.div_euclid(400) + day_of_year - 719_468
+    let shown = bytes.iter().take(MAX_NAME / 2);
+    shown.map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]
@@ -177,12 +101,26 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    const LEAP_DAY: u64 = 2_592_820_800;
+    const BOOLEAN: u8 = 0x01;
+    const INTEGER: u8 = 0x02;
+    const BITS: u8 = 0x03;
+    const OCTETS: u8 = 0x04;
+    const OID: u8 = 0x06;
+    const UTF8: u8 = 0x0C;
+    const PRINTABLE: u8 = 0x13;
+    const IA5: u8 = 0x16;
+    const UTC_TIME: u8 = 0x17;
+    const GENERALIZED_TIME: u8 = 0x18;
+    const SEQUENCE: u8 = 0x30;
+    const SET: u8 = 0x31;
+    const VERSION: u8 = 0xA0;
+    const EXTENSIONS: u8 = 0xA3;
 
     fn element(tag: u8, content: &[u8]) -> Vec<u8> {
         let length = content.len();
         let head = match length {
             0..0x80 => vec![tag, length as u8],
+            0x80..0x100 => vec![tag, 0x81, length as u8],
             _ => vec![tag, 0x82, (length >> 8) as u8, length as u8],
         };
         [head, content.to_vec()].concat()
@@ -197,17 +135,21 @@ mod tests {
             element(UTC_TIME, b"260101000000Z"),
             element(GENERALIZED_TIME, b"20520229120000Z"),
         ]);
-        let fields = sequence(&[
+        // ecdsa-with-SHA256; the key and the signature are empty.
+        let algorithm = sequence(&[element(OID, &[0x2A, 0x86, 0x48, 0xCE, 0x3D, 4, 3, 2])]);
+        let mut fields = vec![
             element(VERSION, &element(INTEGER, &[2])),
             element(INTEGER, &[0x0A, 0xBC]),
-            sequence(&[]),
+            algorithm.clone(),
             sequence(&[]),
             validity,
             subject.to_vec(),
-            sequence(&[]),
-            element(EXTENSIONS, &sequence(extensions)),
-        ]);
-        sequence(&[fields, sequence(&[]), element(3, &[0])])
+            sequence(&[algorithm.clone(), element(BITS, &[0])]),
+        ];
+        if !extensions.is_empty() {
+            fields.push(element(EXTENSIONS, &sequence(extensions)));
+        }
+        sequence(&[sequence(&fields), algorithm, element(BITS, &[0])])
     }
 
     fn name(tag: u8, text: &[u8]) -> Vec<u8> {
@@ -215,12 +157,16 @@ mod tests {
             |oid: &[u8], tag, text: &[u8]| element(SET, &sequence(&[element(OID, oid), element(tag, text)]));
         sequence(&[
             attribute(&[0x55, 4, 10], UTF8, b"Works"),
-            attribute(&COMMON_NAME, tag, text),
+            attribute(COMMON_NAME.as_bytes(), tag, text),
         ])
     }
 
     fn role(value: &[u8]) -> Vec<u8> {
-        sequence(&[element(OID, &ROLE), element(OCTETS, value)])
+        sequence(&[element(OID, ROLE.as_bytes()), element(OCTETS, value)])
+    }
+
+    fn role_of(extensions: &[Vec<u8>]) -> Result<Option<String>, RoleError> {
+        read(&certificate(&name(PRINTABLE, b"x"), extensions)).unwrap().role
     }
 
     #[test]
@@ -230,31 +176,67 @@ mod tests {
             element(BOOLEAN, &[0xFF]),
             element(OCTETS, &[3]),
         ]);
-        let facts = read(&certificate(
-            &name(UTF8, "hmi 1".as_bytes()),
-            &[usage, role(&element(UTF8, b"operator"))],
-        ));
-        let facts = facts.unwrap();
-        assert_eq!(
-            (facts.name.as_str(), facts.role.as_deref()),
-            ("hmi 1", Some("operator"))
-        );
+        let operator = role(&element(UTF8, b"operator"));
+        let summary = read(&certificate(&name(UTF8, "hmi 1".as_bytes()), &[usage, operator])).unwrap();
+        assert_eq!(summary.name, "hmi 1");
+        assert_eq!(summary.role, Ok(Some("operator".to_string())));
         // `date -u -d 2026-01-01 +%s`, `date -u -d '2052-02-29 12:00' +%s`
-        assert_eq!((facts.not_before, facts.not_after), (1_767_225_600, LEAP_DAY));
+        assert_eq!((summary.not_before, summary.not_after), (1_767_225_600, 2_592_820_800));
+        assert_eq!(role_of(&[]), Ok(None));
     }
 
     #[test]
-    fn a_role_is_a_utf8_string_and_nothing_else() {
+    fn a_role_is_one_utf8_string() {
+        let operator = element(UTF8, b"operator");
         for value in [
             &b"operator"[..],
-            &element(PRINTABLE, b"operator"),
-            &element(UTF8, &[0xFF]),
-            &[UTF8, 9, b'x'],
             &[],
+            &element(PRINTABLE, b"operator"),
+            &element(IA5, b"operator"),
+            &element(OCTETS, b"operator"),
+            &element(UTF8, &[0xFF]),
+            // The length is too long, not minimal, or indefinite.
+            &[UTF8, 9, b'o', b'p'],
+            &[&[UTF8, 0x81, 8][..], b"operator"].concat(),
+            &[&[UTF8, 0x80][..], b"operator", &[0, 0]].concat(),
+            // Something follows: a byte, or a second role.
+            &[&operator[..], &[0]].concat(),
+            &[&operator[..], &operator[..]].concat(),
+            &sequence(&[operator.clone(), element(UTF8, b"viewer")]),
         ] {
-            let facts = read(&certificate(&name(PRINTABLE, b"x"), &[role(value)])).unwrap();
-            assert_eq!(facts.role, None, "{value:?}");
+            let role = role_of(&[role(value)]);
+            assert!(matches!(role, Err(RoleError::Malformed(_))), "{value:02X?}: {role:?}");
         }
+    }
+
+    #[test]
+    fn several_role_extensions_are_refused_even_when_they_agree() {
+        let [operator, viewer] = [&b"operator"[..], b"viewer"].map(|text| role(&element(UTF8, text)));
+        for extensions in [
+            [operator.clone(), viewer.clone()],
+            [viewer, operator.clone()],
+            [operator.clone(), operator],
+        ] {
+            assert_eq!(role_of(&extensions), Err(RoleError::Repeated));
+        }
+    }
+
+    #[test]
+    fn long_roles() {
+        let of = |length: usize| role_of(&[role(&element(UTF8, &vec![b'r'; length]))]);
+        assert_eq!(of(MAX_ROLE), Ok(Some("r".repeat(MAX_ROLE))));
+        assert_eq!(of(MAX_ROLE + 1), Err(RoleError::TooLong(MAX_ROLE + 1)));
+        assert_eq!(of(60_000), Err(RoleError::TooLong(60_000)));
+    }
+
+    #[test]
+    fn a_certificate_is_complete_and_nothing_follows() {
+        let whole = certificate(&name(UTF8, b"hmi"), &[role(&element(UTF8, b"operator"))]);
+        assert!(read(&whole).is_ok());
+        for length in 0..whole.len() {
+            assert!(read(&whole[..length]).is_err(), "{length} bytes");
+        }
+        assert!(read(&[whole, vec![0]].concat()).is_err());
     }
 
     #[test]
@@ -263,7 +245,7 @@ mod tests {
         for (text, shown) in [
             ("a\nb\" who=root", "a?b? who?root"),
             ("Müller", "Müller"),
-            (&long, &long[..NAME]),
+            (&long, &long[..MAX_NAME]),
         ] {
             assert_eq!(
                 read(&certificate(&name(UTF8, text.as_bytes()), &[])).unwrap().name,

@@ -1,9 +1,8 @@
-//! One connection: bytes in, frames to the session, answers out.
+//! One connection: reads requests from the socket and writes the answers, with time limits.
 
 use std::convert::Infallible;
 use std::io;
 use std::pin::Pin;
-use std::sync::Arc;
 use std::time::Duration;
 
 use futures_util::FutureExt;
@@ -13,43 +12,42 @@ use tokio::time::{Instant, Sleep};
 use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
-use super::errand::Answered;
+use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
-use super::lookout::{Lookout, Turns};
-use super::session::Session;
+use super::session::ClientSession;
 
-/// Time for the rest of a frame.
+/// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time for the client to take some of its answers.
+/// Time limit for the client to accept part of its answers.
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
-/// Time for requests under way when the gateway stops, and for a farewell on the wire.
-const FAREWELL: Duration = Duration::from_millis(500);
-/// Requests after which other clients get their turn, should this one send on and on.
+/// Time for pending requests when the gateway stops, and for closing the connection.
+const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Number of requests after which a client that sends without pause yields to the others.
 const TURN: usize = 128;
 
 /// Why a connection ended.
 #[derive(Debug, thiserror::Error)]
 enum End {
-    #[error("the client has closed the connection")]
+    #[error("the client closed the connection")]
     Client,
-    #[error("the gateway stops")]
+    #[error("the gateway is stopping")]
     Cancelled,
     #[error("closed: not Modbus TCP: {0}")]
     NotModbus(#[from] NotModbus),
-    #[error("closed: the client did not finish a frame within {FRAME_TIMEOUT:?}")]
+    #[error("closed: the client did not complete a frame within {FRAME_TIMEOUT:?}")]
     HalfFrame,
     #[error("closed: no request for {0:?} (`idle_timeout`)")]
     Idle(Duration),
-    #[error("closed: the client took none of its answers within {WRITE_TIMEOUT:?}")]
+    #[error("closed: the client accepted none of its answers within {WRITE_TIMEOUT:?}")]
     NotReading,
     #[error("connection lost: {0}")]
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it leaves, misbehaves, is silent for `idle_timeout` or the gateway stops.
+/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or the gateway stops.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
-    session: Session,
+    session: ClientSession,
     idle_timeout: Option<Duration>,
     cancel: CancellationToken,
 ) {
@@ -57,23 +55,21 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     let now = Instant::now();
     let mut connection = Connection {
         now,
-        turns: session.turns(),
         stream,
         dialogue: Dialogue::new(session),
         since_yield: 0,
         idle: idle_timeout.map(|timeout| Idle::new(timeout, now)),
-        lookout: Lookout::new(now.into_std()),
     };
     let end = match connection.run(&cancel).await {
         Ok(never) => match never {},
         Err(end) => end,
     };
     if matches!(end, End::Cancelled) {
-        connection.farewell().await;
+        connection.finish_pending().await;
     }
-    // A TLS client wants to hear that this is the end and no cut.
+    // With TLS, a close notification distinguishes the end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
-        let _ = tokio::time::timeout(FAREWELL, connection.stream.shutdown()).await;
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.stream.shutdown()).await;
     }
     tracing::debug!(client = connection.dialogue.who(), "Modbus TCP: {end}");
 }
@@ -81,23 +77,21 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
 struct Connection<S> {
     stream: S,
     dialogue: Dialogue,
-    /// The time, as of the last wait: read once a request.
+    /// The time as of the last wait; the clock is read once per request.
     now: Instant,
-    /// Requests since others had their turn.
+    /// Requests since the last yield.
     since_yield: usize,
     idle: Option<Idle>,
-    lookout: Lookout,
-    turns: Arc<Turns>,
 }
 
 impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     async fn run(&mut self, cancel: &CancellationToken) -> Result<Infallible, End> {
         let mut client_done = false;
         let mut half_frame_since: Option<Instant> = None;
-        // One future for all turns: it enters the token's list once, not with every request.
+        // One future for the whole connection, so that it registers with the token once and not with every request.
         let mut cancelled = std::pin::pin!(cancel.cancelled());
         loop {
-            let worked = self.dialogue.work(self.now.into_std());
+            let worked = self.dialogue.process(self.now.into_std());
             self.dialogue.collect(self.now.into_std());
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
@@ -107,11 +101,11 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
                 }
                 self.now = Instant::now();
             }
-            let taken = worked?;
-            if taken.frames > 0 {
+            let consumed = worked?;
+            if consumed.frames > 0 {
                 half_frame_since = None;
-                self.touch();
-                self.give_way(taken.frames).await;
+                self.restart_idle();
+                self.yield_if_due(consumed.frames).await;
                 if self.since_yield == 0 && cancel.is_cancelled() {
                     return Err(End::Cancelled);
                 }
@@ -124,72 +118,59 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             if client_done && !self.dialogue.is_waiting() {
                 return Err(End::Client);
             }
-            // While it is the gateway that does not read on, a half frame is nobody's fault.
+            // While the gateway itself does not read, an incomplete frame is not the client's fault.
             let half = self.dialogue.has_input() && !full && !client_done;
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
-            let reads = !full && !client_done;
+            let reading = if full || client_done {
+                Reading::Paused
+            } else {
+                Reading::On
+            };
             let event = tokio::select! {
                 biased;
-                event = self.next(reads, half_frame_since) => event?,
+                event = self.next(reading, half_frame_since) => event?,
                 () = &mut cancelled => return Err(End::Cancelled),
             };
             self.now = Instant::now();
             match event {
                 Event::Answer(answered) => {
                     self.dialogue.finish(answered, self.now.into_std());
-                    self.touch();
+                    self.restart_idle();
                 }
-                Event::Input(0, _) => client_done = true,
-                Event::Input(count, looked) => {
-                    self.lookout.served(self.turns.next(), self.now.into_std(), looked);
-                    self.dialogue.received(count);
-                }
+                Event::Input(0) => client_done = true,
+                Event::Input(count) => self.dialogue.received(count),
             }
         }
     }
 
-    /// Waits for input, if the connection `reads`, and for answers of the bus.
-    async fn next(&mut self, reads: bool, half_frame_since: Option<Instant>) -> Result<Event, End> {
+    /// Waits for answers of the bus and, with `Reading::On`, for input.
+    async fn next(&mut self, reading: Reading, half_frame_since: Option<Instant>) -> Result<Event, End> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
-        let (mut read, mut looked) = (None, false);
-        if reads {
-            read = self.stream.read(space).now_or_never();
+        let reads = reading == Reading::On;
+        if reads && let Some(count) = self.stream.read(space).now_or_never() {
+            return Ok(Event::Input(count?));
         }
-        if read.is_none() {
-            // Who lets the gateway wait does not flood it; a turn is given away only where there is need, since the
-            // task may go on on another thread, later.
-            self.since_yield = 0;
-            if reads
-                && !waits
-                && let Some(patience) = self.lookout.patience()
-            {
-                looked = true;
-                read = look_out(&mut self.stream, space, &mut self.lookout, &self.turns, patience).await;
-            }
+        // A client that waits does not flood the gateway, so it need not yield.
+        self.since_yield = 0;
+        tokio::select! {
+            biased;
+            Some(answered) = waiting.next() => Ok(Event::Answer(answered)),
+            count = self.stream.read(space), if reads => Ok(Event::Input(count?)),
+            () = expired(half_frame_since) => Err(End::HalfFrame),
+            timeout = Idle::over(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
         }
-        let count = match read {
-            Some(count) => count?,
-            None => tokio::select! {
-                biased;
-                Some(answered) = waiting.next() => return Ok(Event::Answer(answered)),
-                count = self.stream.read(space), if reads => count?,
-                () = expired(half_frame_since) => return Err(End::HalfFrame),
-                timeout = Idle::over(self.idle.as_mut()), if !waits => return Err(End::Idle(timeout)),
-            },
-        };
-        Ok(Event::Input(count, looked))
     }
 
-    /// The client uses its connection.
-    fn touch(&mut self) {
+    /// Restarts the idle timeout.
+    fn restart_idle(&mut self) {
         if let Some(idle) = &mut self.idle {
             idle.since = self.now;
         }
     }
 
-    /// Lets the other clients have the processor after so many requests of this one.
-    async fn give_way(&mut self, frames: usize) {
+    /// Yields to other clients after [`TURN`] requests.
+    async fn yield_if_due(&mut self, frames: usize) {
         self.since_yield += frames;
         if self.since_yield >= TURN {
             self.since_yield = 0;
@@ -197,8 +178,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
     }
 
-    /// Gives the requests under way a last chance to be answered.
-    async fn farewell(&mut self) {
+    /// Gives pending requests a last chance to be answered.
+    async fn finish_pending(&mut self) {
         let answered = async {
             flush(&mut self.stream, &mut self.dialogue).await?;
             while let Some(answered) = self.dialogue.parts().1.next().await {
@@ -207,20 +188,28 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             }
             Ok::<(), End>(())
         };
-        // Who does not answer or listen within that time has been waited for long enough.
-        let _ = tokio::time::timeout(FAREWELL, answered).await;
+        // A client that is too slow for this is not waited for.
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, answered).await;
     }
 }
 
-/// What a connection waits for.
-enum Event {
-    /// An answer from the bus.
-    Answer(Answered),
-    /// So many bytes from the client, 0 at its end; whether they were looked out for.
-    Input(usize, bool),
+/// Whether a connection reads input.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reading {
+    On,
+    /// The client has finished, or too many of its requests wait.
+    Paused,
 }
 
-/// How long the client has been silent. The timer is set anew only when it runs out, not with each request.
+/// What a connection waited for.
+enum Event {
+    /// The bus has answered.
+    Answer(AnsweredRequest),
+    /// Number of bytes from the client; 0 at the end of the stream.
+    Input(usize),
+}
+
+/// The idle time of the client. The timer is reset only when it fires, not with each request.
 struct Idle {
     timeout: Duration,
     since: Instant,
@@ -236,7 +225,7 @@ impl Idle {
         }
     }
 
-    /// Waits until the client was silent for the whole time; for good without a limit.
+    /// Waits until the client was idle for the whole timeout; forever without one.
     async fn over(idle: Option<&mut Idle>) -> Duration {
         let Some(idle) = idle else {
             return std::future::pending().await;
@@ -252,27 +241,7 @@ impl Idle {
     }
 }
 
-/// Watches for input without sleeping; everything else on this thread goes first.
-async fn look_out<S: AsyncRead + Unpin>(
-    stream: &mut S,
-    space: &mut [u8],
-    lookout: &mut Lookout,
-    turns: &Turns,
-    patience: Duration,
-) -> Option<io::Result<usize>> {
-    let began = std::time::Instant::now();
-    let read = loop {
-        tokio::task::yield_now().await;
-        let read = stream.read(space).now_or_never();
-        if read.is_some() || began.elapsed() >= patience || lookout.is_disturbed(turns.last()) {
-            break read;
-        }
-    };
-    lookout.spent(began.elapsed());
-    read
-}
-
-/// Writes the output if the stream takes all of it without waiting, as it nearly always does: no timer, no registration.
+/// Writes the output if the stream accepts all of it at once, as it usually does: no timer, no registration.
 fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<bool, End> {
     let output = &mut dialogue.output;
     while !output.is_empty() {
@@ -289,11 +258,11 @@ fn flush_at_once<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue)
     Ok(true)
 }
 
-/// Writes the output; when it is dropped half way, the output keeps what was not written.
+/// Writes the output; if this future is dropped, the unwritten part stays in the output.
 async fn flush<S: AsyncWrite + Unpin>(stream: &mut S, dialogue: &mut Dialogue) -> Result<(), End> {
     let output = &mut dialogue.output;
     while !output.is_empty() {
-        // The time runs anew with every byte taken: a slow line is no reason to give a client up.
+        // The time limit restarts with every byte accepted: a slow network is not a stalled client.
         let written = tokio::time::timeout(WRITE_TIMEOUT, stream.write(output)).await;
         match written.map_err(|_| End::NotReading)?? {
             0 => return Err(io::Error::from(io::ErrorKind::WriteZero).into()),

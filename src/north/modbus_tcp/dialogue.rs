@@ -1,45 +1,45 @@
-//! The conversation with one client as bytes: what came in, what waits for the bus, what goes out. No sockets, no
-//! timer; the connection brings both.
+//! The byte streams of one client without sockets and timers: input, requests that wait for the bus, output. The
+//! connection adds both.
 
 use std::time::Instant;
 
 use futures_util::FutureExt;
 use futures_util::stream::{FuturesUnordered, StreamExt};
 
-use super::errand::{Answered, Waiting};
+use super::forwarded_request::{AnsweredRequest, PendingRequest};
 use super::frame::{self, MAX_FRAME, NotModbus};
-use super::session::Session;
+use super::session::ClientSession;
 
-/// Room for input at first: a frame and its successor. A thousand idle clients should cost no memory.
+/// Initial input buffer: two frames, so that a thousand idle clients use little memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
-/// Most input that is kept.
+/// Maximum input buffer.
 const INPUT_MOST: usize = 32 * MAX_FRAME;
-/// Output that is collected before it is written.
+/// Maximum output collected before it is written.
 const OUTPUT: usize = 32 * 1024;
-/// Requests of one connection that may wait for the bus; with so many under way no more are taken.
+/// Maximum number of requests of one connection that wait for the bus; beyond it no input is processed.
 pub(super) const MOST_WAITING: usize = 16;
-/// Requests that are worked off before others get their turn.
+/// Number of requests processed before other clients are served.
 const TURN: usize = 128;
 
-/// What one turn took.
+/// What one call of [`Dialogue::process`] consumed.
 #[derive(Debug, Default, Clone, Copy)]
-pub(super) struct Taken {
+pub(super) struct Consumed {
     pub(super) bytes: usize,
     pub(super) frames: usize,
 }
 
 #[derive(Debug)]
 pub(super) struct Dialogue {
-    session: Session,
-    waiting: FuturesUnordered<Waiting>,
+    session: ClientSession,
+    waiting: FuturesUnordered<PendingRequest>,
     input: Vec<u8>,
-    /// Bytes in `input` that are not worked off yet.
+    /// Bytes in `input` that are not processed yet.
     filled: usize,
     pub(super) output: Vec<u8>,
 }
 
 impl Dialogue {
-    pub(super) fn new(session: Session) -> Dialogue {
+    pub(super) fn new(session: ClientSession) -> Dialogue {
         Dialogue {
             session,
             waiting: FuturesUnordered::new(),
@@ -49,63 +49,64 @@ impl Dialogue {
         }
     }
 
-    pub(super) fn session(&self) -> &Session {
+    pub(super) fn session(&self) -> &ClientSession {
         &self.session
     }
 
-    /// The client, for the log.
+    /// Name of the client for the log.
     pub(super) fn who(&self) -> &str {
         self.session.who()
     }
 
-    /// Where more input goes, and what waits for the bus. There is room after [`Dialogue::work`] while the dialogue is
-    /// not full and has no more: a frame is shorter than the input.
-    pub(super) fn parts(&mut self) -> (&mut [u8], &mut FuturesUnordered<Waiting>) {
+    /// The free part of the input buffer, and the requests that wait for the bus. After [`Dialogue::process`] there is
+    /// free space unless the dialogue is full or has more input: a frame is shorter than the buffer.
+    pub(super) fn parts(&mut self) -> (&mut [u8], &mut FuturesUnordered<PendingRequest>) {
         (self.input.get_mut(self.filled..).unwrap_or_default(), &mut self.waiting)
     }
 
-    /// The bus has answered: so the request is answered, or waits for the next piece of what it reads.
-    pub(super) fn finish(&mut self, answered: Answered, now: Instant) {
+    /// Appends the answer to a request that the bus has answered, or requests the next part of a read.
+    pub(super) fn finish(&mut self, answered: AnsweredRequest, now: Instant) {
         self.waiting
             .extend(self.session.finish(answered, now, &mut self.output));
     }
 
-    /// So many bytes were put into the space.
+    /// The free part of the input buffer was filled with `count` bytes.
     pub(super) fn received(&mut self, count: usize) {
         self.filled = (self.filled + count).min(self.input.len());
         if self.filled == self.input.len() && self.filled < INPUT_MOST {
-            // A client that fills its room sends batches; they are read and answered as a whole.
+            // A client that fills the buffer sends batches; with a larger buffer a whole batch is read and answered at
+            // once.
             self.input.resize(INPUT_MOST, 0);
         }
     }
 
-    /// Works off the frames in the input while there is room for what they cause, a turn at most.
+    /// Processes the frames in the input, [`TURN`] at most, while there is room for their results.
     ///
     /// # Errors
-    /// When what follows is no Modbus. What came before it is answered.
-    pub(super) fn work(&mut self, now: Instant) -> Result<Taken, NotModbus> {
-        let mut taken = Taken::default();
+    /// The input is not Modbus. The requests before it are answered.
+    pub(super) fn process(&mut self, now: Instant) -> Result<Consumed, NotModbus> {
+        let mut consumed = Consumed::default();
         self.session.refresh();
         let result = loop {
-            if self.is_full() || self.output.len() >= OUTPUT || taken.frames >= TURN {
-                break Ok(taken);
+            if self.is_full() || self.output.len() >= OUTPUT || consumed.frames >= TURN {
+                break Ok(consumed);
             }
-            match frame::decode(self.input.get(taken.bytes..self.filled).unwrap_or_default()) {
+            match frame::decode(self.input.get(consumed.bytes..self.filled).unwrap_or_default()) {
                 Ok(Some(frame)) => {
-                    taken.bytes += frame.used;
-                    taken.frames += 1;
+                    consumed.bytes += frame.used;
+                    consumed.frames += 1;
                     self.waiting.extend(self.session.take(&frame, now, &mut self.output));
                 }
-                Ok(None) => break Ok(taken),
+                Ok(None) => break Ok(consumed),
                 Err(misfit) => break Err(misfit),
             }
         };
-        self.input.copy_within(taken.bytes..self.filled, 0);
-        self.filled -= taken.bytes;
+        self.input.copy_within(consumed.bytes..self.filled, 0);
+        self.filled -= consumed.bytes;
         result
     }
 
-    /// Whether the input has something to work off: a frame, or what will never become one.
+    /// Whether the input begins with a complete frame, or with data that is not Modbus.
     pub(super) fn has_more(&self) -> bool {
         self.filled > 0
             && !matches!(
@@ -114,22 +115,22 @@ impl Dialogue {
             )
     }
 
-    /// Whether there is input at all.
+    /// Whether there is any input.
     pub(super) fn has_input(&self) -> bool {
         self.filled > 0
     }
 
-    /// Whether so much waits for the bus that nothing more is taken.
+    /// Whether the maximum number of requests waits for the bus.
     pub(super) fn is_full(&self) -> bool {
         self.waiting.len() >= MOST_WAITING
     }
 
-    /// Whether anything waits for the bus.
+    /// Whether any request waits for the bus.
     pub(super) fn is_waiting(&self) -> bool {
         !self.waiting.is_empty()
     }
 
-    /// Takes the answers that have come in the meantime, to send them together.
+    /// Appends the answers that have arrived, so that they are sent together.
     pub(super) fn collect(&mut self, now: Instant) {
         while let Some(Some(answered)) = self.waiting.next().now_or_never() {
             self.finish(answered, now);

@@ -1,18 +1,18 @@
-//! MBAP framing: transaction id, protocol id 0, length, unit id, PDU. Pure.
+//! MBAP framing: transaction id, protocol id 0, length, unit id, PDU.
 
 use crate::codec::modbus::MAX_PDU;
 
 /// Bytes before the PDU: transaction id, protocol id, length, unit id.
 pub(crate) const HEADER: usize = 7;
-/// Longest frame.
+/// Maximum length of a frame.
 pub(crate) const MAX_FRAME: usize = HEADER + MAX_PDU;
-/// Offset of the length field; it counts unit id and PDU.
+/// Offset of the length field, which counts unit id and PDU.
 const LENGTH: usize = 4;
 
-/// Whom a frame belongs to.
+/// What identifies the request and the unit of a frame.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Header {
-    /// Comes back in the reply.
+    /// Transaction id; repeated in the reply.
     pub(crate) transaction: u16,
     /// Unit id.
     pub(crate) unit: u8,
@@ -22,27 +22,27 @@ pub(crate) struct Header {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(crate) struct Frame<'b> {
     pub(crate) header: Header,
-    /// At least the function code.
+    /// Function code.
     pub(crate) function: u8,
-    /// Function code and what follows.
+    /// Function code and data.
     pub(crate) pdu: &'b [u8],
-    /// Bytes that the frame takes in the buffer.
+    /// Length of the frame in the buffer.
     pub(crate) used: usize,
 }
 
-/// No Modbus client: where its next frame begins cannot be known, so the connection is closed.
+/// Not Modbus TCP. The beginning of the next frame cannot be found, so the connection is closed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum NotModbus {
     #[error("protocol id {0} instead of 0")]
     Protocol(u16),
-    #[error("length {0}, which is not 2 to 254")]
+    #[error("length {0} instead of 2 to 254")]
     Length(u16),
 }
 
-/// The frame at the beginning of `bytes`; `None` while it is not complete.
+/// The frame at the beginning of `bytes`; `None` while it is incomplete.
 ///
 /// # Errors
-/// As soon as the header shows it, without waiting for the rest.
+/// An invalid header, as soon as it is recognised.
 pub(crate) fn decode(bytes: &[u8]) -> Result<Option<Frame<'_>>, NotModbus> {
     if let [_, _, high, low, ..] = bytes
         && (*high, *low) != (0, 0)
@@ -116,7 +116,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_modbus_is_known_early() {
+    fn invalid_headers_are_recognised_early() {
         assert_eq!(decode(&[0, 1, 0, 7]), Err(NotModbus::Protocol(7)));
         assert_eq!(decode(b"GET / HTTP/1.1"), Err(NotModbus::Protocol(0x5420)));
         for length in [0, 1, 255, 65_535] {

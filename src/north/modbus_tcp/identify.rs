@@ -1,31 +1,24 @@
-//! Function 43/14: who answers under a unit id. Pure.
+//! Function 43/14: device identification of the units.
 
 use crate::codec::{Exception, Reply};
-use crate::drive::profile::Digest;
 
-/// Longest text of an object: six of them fit one reply with room to spare.
+/// Maximum length of the text of an object: six of them fit into one reply.
 const MAX_TEXT: usize = 40;
-/// Basic and regular objects, or extended ones too, one at a time or as a stream.
-const CONFORMITY_REGULAR: u8 = 0x82;
-const CONFORMITY_EXTENDED: u8 = 0x83;
+/// Basic and regular objects, both as single objects and as a stream.
+const CONFORMITY: u8 = 0x82;
 /// Read device id codes.
 const BASIC: u8 = 1;
 const REGULAR: u8 = 2;
 const EXTENDED: u8 = 3;
 const SINGLE: u8 = 4;
-/// Last object of the basic category, and of the regular one.
+/// Last object of the basic and of the regular category.
 const LAST_BASIC: u8 = 2;
 const LAST_REGULAR: u8 = 0x7F;
 
 /// VendorName of every unit.
-pub(crate) const VENDOR: &str = "drivegate";
-/// Objects by which another program of this kind knows who answers.
-pub(crate) const VENDOR_NAME: u8 = 0;
-pub(crate) const PRODUCT_CODE: u8 = 1;
-pub(crate) const MODEL_NAME: u8 = 5;
-pub(crate) const PROFILE_DIGEST: u8 = 0x80;
+const VENDOR: &str = "drivegate";
 
-/// What a unit tells of itself.
+/// The identification of a unit.
 #[derive(Debug)]
 pub(super) struct Identity<'t> {
     /// ProductCode: name of the profile, or `gateway`.
@@ -34,30 +27,24 @@ pub(super) struct Identity<'t> {
     pub(super) title: &'t str,
     /// ModelName: name of the drive or of the gateway.
     pub(super) name: &'t str,
-    /// Private object 0x80 of a drive: digest of the profile's content.
-    pub(super) digest: Option<Digest>,
 }
 
 impl Identity<'_> {
-    /// The answer to read device id code `code` from object `object` on. Without extended objects code 3 gets the
-    /// regular ones; a stream from an unknown object begins at the first one (Modbus Application Protocol 1.1b3,
-    /// 6.21).
+    /// The reply to read device id code `code`, starting at `object`. Without extended objects, code 3 returns the
+    /// regular ones; a stream that starts at an unknown object begins with the first one (Modbus Application Protocol
+    /// 1.1b3, 6.21).
     ///
     /// # Errors
-    /// 03 for a code that is not 1 to 4, 02 for a single object that does not exist.
+    /// 03 for a code other than 1 to 4, 02 for a single object that does not exist.
     pub(super) fn reply(&self, code: u8, object: u8) -> Result<Reply, Exception> {
-        let digest = self.digest.map(|digest| digest.to_string());
         let objects = [
-            (VENDOR_NAME, VENDOR),
-            (PRODUCT_CODE, self.product),
+            (0, VENDOR),
+            (1, self.product),
             (2, env!("CARGO_PKG_VERSION")),
             (4, self.title),
-            (MODEL_NAME, self.name),
+            (5, self.name),
         ];
-        let digest = digest.as_deref().map(|digest| (PROFILE_DIGEST, digest));
-        let conformity = digest.map_or(CONFORMITY_REGULAR, |_| CONFORMITY_EXTENDED);
-        let objects = || objects.into_iter().chain(digest);
-        let known = objects().any(|(id, _)| id == object);
+        let known = objects.iter().any(|(id, _)| *id == object);
         let last = match code {
             BASIC => LAST_BASIC,
             REGULAR => LAST_REGULAR,
@@ -67,14 +54,14 @@ impl Identity<'_> {
             BASIC | REGULAR | EXTENDED => {
                 let first = if known && object <= last { object } else { 0 };
                 let in_stream = |id: u8| (first..=last).contains(&id);
-                objects().filter(|(id, _)| in_stream(*id)).collect()
+                objects.into_iter().filter(|(id, _)| in_stream(*id)).collect()
             }
-            SINGLE if known => objects().filter(|(id, _)| *id == object).collect(),
+            SINGLE if known => objects.into_iter().filter(|(id, _)| *id == object).collect(),
             SINGLE => return Err(Exception::ADDRESS),
             _ => return Err(Exception::VALUE),
         };
-        // No more follows, next object 0.
-        let mut body = vec![code, conformity, 0, 0, wanted.len() as u8];
+        // "More follows" and "next object" are 0.
+        let mut body = vec![code, CONFORMITY, 0, 0, wanted.len() as u8];
         for (id, text) in wanted {
             let text = ascii(text);
             body.extend_from_slice(&[id, text.len() as u8]);
@@ -84,12 +71,7 @@ impl Identity<'_> {
     }
 }
 
-/// A text as an object holds it.
-pub(crate) fn as_told(text: &str) -> String {
-    ascii(text).into_iter().map(char::from).collect()
-}
-
-/// Objects are ASCII.
+/// Texts of objects are ASCII.
 fn ascii(text: &str) -> Vec<u8> {
     let one = |c: char| {
         if c.is_ascii_graphic() || c == ' ' {
@@ -111,24 +93,14 @@ mod tests {
         product: "vacon-nx",
         title: "Vacon NX",
         name: "pump-1",
-        digest: None,
     };
 
     /// Ids and texts in a reply.
     fn objects(code: u8, object: u8) -> Result<Vec<(u8, String)>, Exception> {
-        objects_of(&NX, 0x82, code, object)
-    }
-
-    fn objects_of(
-        identity: &Identity<'_>,
-        conformity: u8,
-        code: u8,
-        object: u8,
-    ) -> Result<Vec<(u8, String)>, Exception> {
-        let Reply::DeviceIdentification(body) = identity.reply(code, object)? else {
+        let Reply::DeviceIdentification(body) = NX.reply(code, object)? else {
             panic!("not an identification");
         };
-        assert_eq!(body[..4], [code, conformity, 0, 0]);
+        assert_eq!(body[..4], [code, 0x82, 0, 0]);
         let (mut rest, mut found) = (&body[5..], Vec::new());
         while let [id, len, tail @ ..] = rest {
             let (text, tail) = tail.split_at(usize::from(*len));
@@ -156,26 +128,6 @@ mod tests {
     }
 
     #[test]
-    fn the_digest_is_an_extended_object() {
-        let drive = Identity {
-            digest: Some(Digest::default()),
-            ..NX
-        };
-        let ids = |code, object| -> Vec<u8> {
-            let objects = objects_of(&drive, 0x83, code, object).unwrap();
-            objects.iter().map(|(id, _)| *id).collect()
-        };
-        assert_eq!(ids(1, 0), [0, 1, 2]);
-        assert_eq!(ids(2, 0), [0, 1, 2, 4, 5]);
-        assert_eq!(ids(2, 0x80), [0, 1, 2, 4, 5], "not regular: from the first");
-        assert_eq!(ids(3, 0), [0, 1, 2, 4, 5, 0x80]);
-        assert_eq!(ids(3, 0x80), [0x80]);
-        let digest = "0000000000000000".to_string();
-        assert_eq!(objects_of(&drive, 0x83, 4, 0x80), Ok(vec![(0x80, digest)]));
-        assert_eq!(objects(4, 0x80), Err(Exception::ADDRESS), "the gateway has no profile");
-    }
-
-    #[test]
     fn refused() {
         assert_eq!(objects(4, 3), Err(Exception::ADDRESS));
         assert_eq!(objects(0, 0), Err(Exception::VALUE));
@@ -189,7 +141,6 @@ mod tests {
             product: &long,
             title: &long,
             name: &long,
-            digest: Some(Digest::default()),
         };
         let request = RequestPdu::DeviceIdentification { code: 3, object: 0 };
         let mut pdu = Vec::new();

@@ -1,28 +1,29 @@
-//! The server without sockets and runtime, for whoever has bytes instead of a connection: tests, fuzz targets, virtual time.
+//! The server without sockets and runtime, for tests, fuzz targets and virtual time.
 
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
-use super::Options;
+use super::client::Client;
 use super::dialogue::Dialogue;
-use super::session::Session;
-use super::shared::{Client, Shared, View};
+use super::routes::PlantView;
+use super::session::ClientSession;
+use super::{Options, ServerState};
 use crate::command::Authority;
 use crate::north::NorthStats;
 use crate::plant::SharedPlant;
 
-/// One client of a server that has no sockets. Time is what [`Offline::receive`] is told.
+/// One client of a server without sockets. Time is an argument of [`Offline::receive`].
 #[derive(Debug)]
 pub struct Offline {
     dialogue: Dialogue,
-    /// What the dialogue had no room for yet.
+    /// Input that the dialogue has no room for yet.
     backlog: Vec<u8>,
     closed: bool,
 }
 
 impl Offline {
-    /// A client at `peer` that sees the whole plant. Of the options only `uncached` matters.
+    /// A client at `peer` that sees the whole plant. Of the options only `uncached` is used.
     pub fn new(
         options: Options,
         plant: SharedPlant,
@@ -30,17 +31,17 @@ impl Offline {
         peer: SocketAddr,
         authority: Authority,
     ) -> Offline {
-        let (shared, view) = (Shared::new(options, stats), View::new(plant, None));
+        let (state, view) = (ServerState::new(options, stats), PlantView::new(plant, None));
         let client = Client::new(peer, None, authority);
-        Offline::of(Session::new(Arc::new(shared), Arc::new(view), client))
+        Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))
     }
 
-    /// Another client of the same server.
-    pub fn beside(&self, peer: SocketAddr, authority: Authority) -> Offline {
-        Offline::of(self.dialogue.session().beside(Client::new(peer, None, authority)))
+    /// Another client of the same server, by the `name` in its certificate if it has shown one.
+    pub fn beside(&self, peer: SocketAddr, name: Option<&str>, authority: Authority) -> Offline {
+        Offline::of(self.dialogue.session().beside(Client::new(peer, name, authority)))
     }
 
-    fn of(session: Session) -> Offline {
+    fn of(session: ClientSession) -> Offline {
         Offline {
             dialogue: Dialogue::new(session),
             backlog: Vec::new(),
@@ -48,8 +49,8 @@ impl Offline {
         }
     }
 
-    /// The bytes that are answered to `bytes` so far; requests that wait for the bus are answered by a later call, with
-    /// or without further bytes. Orders are in the queue of their bus when this returns.
+    /// Processes `bytes` and returns the answers available so far; requests that wait for the bus are answered by a
+    /// later call, with or without further input. Commands are in the queue of their bus when this returns.
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         self.backlog.extend_from_slice(bytes);
         let mut answers = Vec::new();
@@ -62,7 +63,7 @@ impl Offline {
                 }
                 self.dialogue.received(count);
             }
-            self.closed = self.dialogue.work(now).is_err();
+            self.closed = self.dialogue.process(now).is_err();
             self.dialogue.collect(now);
             answers.append(&mut self.dialogue.output);
             if self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
@@ -72,7 +73,7 @@ impl Offline {
         answers
     }
 
-    /// Whether a server would have closed the connection: what came is no Modbus.
+    /// Whether a server would have closed the connection, because the input was not Modbus.
     pub fn is_closed(&self) -> bool {
         self.closed
     }

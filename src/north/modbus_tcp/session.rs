@@ -1,38 +1,39 @@
-//! What the requests of one client mean, and what is answered.
+//! Decides what the requests of one client mean and how they are answered.
 
 use std::sync::Arc;
 use std::time::Instant;
 
 use futures_util::FutureExt;
 
-use super::errand::{Answered, Errand, Step, Waiting, Work, pieces};
+use super::client::Client;
+use super::forwarded_request::{AnsweredRequest, BusWork, ForwardedRequest, PendingRequest, Progress, read_parts};
 use super::frame::{self, Frame, Header};
 use super::identify::Identity;
-use super::lookout::Turns;
-use super::shared::{Client, Routes, Shared, View};
-use super::{Seldom, Uncached};
+use super::routes::{PlantView, Routes};
+use super::{ServerState, Uncached};
 use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Authority, Order, Outcome};
 use crate::drive::{Profile, State};
 use crate::north::ModbusTcpStats;
-use crate::north::register_map::{self, BusFigures, CommandWrite, FIRST, GATEWAY_UNIT, Look};
+use crate::north::log_throttle::LogThrottle;
+use crate::north::register_map::{self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
 use crate::plant::{BusHandle, DriveHandle};
 
-/// Function codes that change something.
+/// Function codes that write.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];
-/// Function codes that every drive has here, by the blocks from 0x8000 on and the identification.
+/// Function codes that every drive supports, through the blocks from 0x8000 on and the device identification.
 const OWN_FUNCTIONS: [u8; 5] = [3, 4, 6, 16, 43];
 
-/// What becomes of a request.
+/// How a request is handled.
 enum Decision {
     /// Answered at once.
     Reply(RequestPdu, Reply),
     /// Refused at once.
     Exception(Exception),
-    /// The drive is asked, or a command refused on the way to it.
-    Drive(Errand, Work),
+    /// Forwarded to the drive, or refused on the way.
+    Drive(ForwardedRequest, BusWork),
 }
 
 impl From<Exception> for Decision {
@@ -41,97 +42,97 @@ impl From<Exception> for Decision {
     }
 }
 
-/// One client.
+/// One connected client.
 #[derive(Debug)]
-pub(super) struct Session {
-    shared: Arc<Shared>,
-    view: Arc<View>,
+pub(super) struct ClientSession {
+    state: Arc<ServerState>,
+    view: Arc<PlantView>,
     client: Client,
     routes: Arc<Routes>,
-    foreign_codes: Seldom,
+    foreign_codes: LogThrottle,
 }
 
-impl Drop for Session {
+impl Drop for ClientSession {
     fn drop(&mut self) {
         self.stats().disconnected();
     }
 }
 
-impl Session {
-    /// A client has connected; it has left when the session is dropped.
-    pub(super) fn new(shared: Arc<Shared>, view: Arc<View>, client: Client) -> Session {
-        shared.stats.modbus_tcp.connected();
+impl ClientSession {
+    /// Counts the client as connected until the session is dropped.
+    pub(super) fn new(state: Arc<ServerState>, view: Arc<PlantView>, client: Client) -> ClientSession {
+        state.stats.modbus_tcp.connected();
         let routes = view.routes();
-        Session {
-            shared,
+        ClientSession {
+            state,
             view,
             client,
             routes,
-            foreign_codes: Seldom::default(),
+            foreign_codes: LogThrottle::default(),
         }
     }
 
-    /// Another client has connected to the same server.
-    pub(super) fn beside(&self, client: Client) -> Session {
-        Session::new(self.shared.clone(), self.view.clone(), client)
+    /// A session for another client of the same server.
+    pub(super) fn beside(&self, client: Client) -> ClientSession {
+        ClientSession::new(self.state.clone(), self.view.clone(), client)
     }
 
-    /// The client, for the log.
+    /// Name of the client for the log.
     pub(super) fn who(&self) -> &str {
         &self.client.who
     }
 
-    /// The turns of all connections.
-    pub(super) fn turns(&self) -> Arc<Turns> {
-        self.shared.turns.clone()
-    }
-
     fn stats(&self) -> &ModbusTcpStats {
-        &self.shared.stats.modbus_tcp
+        &self.state.stats.modbus_tcp
     }
 
-    /// Takes over a plant that a reload has put in place.
+    /// Uses the current plant, which a reload may have replaced.
     pub(super) fn refresh(&mut self) {
         if !self.view.is_current(&self.routes) {
             self.routes = self.view.routes();
         }
     }
 
-    /// Answers a request into `out`, or gives what its answer waits for. An order has been queued when this
-    /// returns, so orders reach the bus in the order of their frames.
-    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    /// Answers a request into `out`, or returns the pending request. Its command is in the queue when this returns, so
+    /// commands reach the bus in the order of their frames.
+    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
         match self.decide(frame, now) {
             Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
                 let drive = self.routes.drive(frame.header.unit);
                 let name = drive.map_or_else(String::new, |d| d.image.spec.name.clone());
-                self.tell_foreign_code(&name, code, now);
+                self.log_foreign_code(&name, code, now);
                 self.put_exception(frame.header, frame.function, Exception::DEVICE_FAILURE, out);
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
-            Decision::Drive(errand, work) => {
-                let step = errand.send(work, &self.client, now);
+            Decision::Drive(forwarded, work) => {
+                let step = forwarded.send(work, &self.client, now);
                 return self.follow(step, now, out);
             }
         }
         None
     }
 
-    /// The bus has answered: appends the answer to the request, or gives what it waits for next. A read piece by piece
-    /// has its next order in the queue when this returns.
-    pub(super) fn finish(&mut self, answered: Answered, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    /// Appends the answer to a request that the bus has answered, or returns it if it waits for its next part, whose
+    /// command is in the queue when this returns.
+    pub(super) fn finish(
+        &mut self,
+        answered: AnsweredRequest,
+        now: Instant,
+        out: &mut Vec<u8>,
+    ) -> Option<PendingRequest> {
         let step = answered.go_on(&self.client, now);
         self.follow(step, now, out)
     }
 
-    fn follow(&mut self, mut step: Step, now: Instant, out: &mut Vec<u8>) -> Option<Waiting> {
+    fn follow(&mut self, mut step: Progress, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
         loop {
             match step {
-                Step::Done(errand, outcome) => {
-                    self.answer(&errand, &outcome, now, out);
+                Progress::Done(forwarded, outcome) => {
+                    self.answer(&forwarded, &outcome, now, out);
                     return None;
                 }
-                Step::Waits(mut waiting) => match (&mut waiting).now_or_never() {
+                Progress::Pending(mut waiting) => match (&mut waiting).now_or_never() {
                     Some(answered) => step = answered.go_on(&self.client, now),
                     None => return Some(waiting),
                 },
@@ -139,17 +140,18 @@ impl Session {
         }
     }
 
-    fn answer(&mut self, errand: &Errand, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
-        let Errand { header, request, .. } = errand;
-        let drive = &errand.drive.image.spec.name;
-        if errand.resets && !outcome.is_ok() {
-            self.shared
-                .with_command_word(drive, |word| *word = word.map(register_map::without_reset));
+    fn answer(&mut self, forwarded: &ForwardedRequest, outcome: &Outcome, now: Instant, out: &mut Vec<u8>) {
+        let ForwardedRequest { header, request, .. } = forwarded;
+        let drive = &forwarded.drive.image.spec.name;
+        if forwarded.resets && !outcome.is_ok() {
+            self.state
+                .command_words
+                .update(drive, |word| *word = word.map(register_map::without_reset));
         }
         if let Outcome::Exception(code) = outcome
             && *code > Exception::GATEWAY_TARGET
         {
-            self.tell_foreign_code(drive, *code, now);
+            self.log_foreign_code(drive, *code, now);
         }
         let exception = outcome.exception();
         match (outcome, exception) {
@@ -169,11 +171,11 @@ impl Session {
         self.stats().answered(function, code.0);
     }
 
-    /// A drive's own code is answered as 04; what it means is told here.
-    fn tell_foreign_code(&mut self, drive: &str, code: Exception, now: Instant) {
-        if let Some(more) = self.foreign_codes.tell(now) {
-            tracing::warn!(drive, client = %self.client.who, more,
-                "Modbus TCP: the drive answered {code}; the client was told 04");
+    /// Logs an exception code that only this drive uses; the client gets 04.
+    fn log_foreign_code(&self, drive: &str, code: Exception, now: Instant) {
+        if let Some(suppressed) = self.foreign_codes.permit(now) {
+            tracing::warn!(drive, client = %self.client.who, suppressed,
+                "Modbus TCP: the drive answered {code}; passed on as exception 04");
         }
     }
 
@@ -186,10 +188,15 @@ impl Session {
         };
         let profile = &drive.image.spec.profile;
         let decoded = RequestPdu::decode(frame.pdu);
-        // Authority comes before everything that the request could be wrong in.
+        // Authority is checked before anything else that could be wrong with the request.
         if WRITES.contains(&frame.function) && !self.may_write(drive) {
             return match decoded {
-                Ok(request) => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
+                Ok(request) => forwarded(
+                    frame.header,
+                    drive,
+                    request.clone(),
+                    BusWork::Order(Order::Write(request)),
+                ),
                 Err(_) => Exception::FUNCTION.into(),
             };
         }
@@ -217,14 +224,18 @@ impl Session {
                     product: &profile.name,
                     title: &profile.title,
                     name: &drive.image.spec.name,
-                    digest: Some(profile.digest()),
                 };
                 identity
                     .reply(code, object)
                     .map_or_else(Decision::from, |reply| Decision::Reply(request, reply))
             }
             RequestPdu::Read { .. } if has_function => self.raw_read(frame.header, drive, request, now),
-            _ if has_function => errand(frame.header, drive, request.clone(), Work::Order(Order::Write(request))),
+            _ if has_function => forwarded(
+                frame.header,
+                drive,
+                request.clone(),
+                BusWork::Order(Order::Write(request)),
+            ),
             _ => Exception::FUNCTION.into(),
         }
     }
@@ -233,7 +244,7 @@ impl Session {
         self.client.authority == Authority::Write && drive.image.spec.access == Access::Control
     }
 
-    /// Unit 255: input registers; holding registers alike, since many clients read nothing else.
+    /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
     fn gateway(&self, frame: &Frame<'_>) -> Result<Decision, Exception> {
         if WRITES.contains(&frame.function) {
             return Err(Exception::FUNCTION);
@@ -250,7 +261,6 @@ impl Session {
                     product: "gateway",
                     title: "drivegate",
                     name: &plant.gateway,
-                    digest: None,
                 };
                 identity.reply(code, object)?
             }
@@ -279,19 +289,19 @@ impl Session {
             Ok(words) => Decision::Reply(request, Reply::Registers(words)),
             Err(Unavailable::Refused(code)) => code.into(),
             Err(Unavailable::Stale) => Exception::GATEWAY_TARGET.into(),
-            Err(Unavailable::NotPolled) if self.shared.options.uncached == Uncached::Refuse => {
-                Exception::ADDRESS.into()
+            Err(Unavailable::NotPolled) if self.state.options.uncached == Uncached::Refuse => Exception::ADDRESS.into(),
+            Err(Unavailable::NotPolled) => {
+                match read_parts(drive.bus.image.spec.protocol, &reading, table, start, count) {
+                    Err(code) => code.into(),
+                    Ok(Some(read_parts)) => forwarded(header, drive, request, BusWork::Parts(read_parts)),
+                    Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
+                    Ok(None) => forwarded(header, drive, request.clone(), BusWork::Order(Order::Read(request))),
+                }
             }
-            Err(Unavailable::NotPolled) => match pieces(drive.bus.image.spec.protocol, &reading, table, start, count) {
-                Err(code) => code.into(),
-                Ok(Some(pieces)) => errand(header, drive, request, Work::Pieces(pieces)),
-                Ok(None) if count > read_limit(profile, table, start, count) => Exception::VALUE.into(),
-                Ok(None) => errand(header, drive, request.clone(), Work::Order(Order::Read(request))),
-            },
         }
     }
 
-    /// A write to the blocks from 0x8000 on, by a client that may write to that drive.
+    /// A write to the blocks from 0x8000 on by a client that may write to the drive.
     fn command(
         &self,
         header: Header,
@@ -303,41 +313,45 @@ impl Session {
     ) -> Decision {
         let spec = &drive.image.spec;
         let fault = drive.reading(now).state() == Some(State::Fault);
-        let write = self.shared.with_command_word(&spec.name, |last| {
-            let before = register_map::Before { word: *last, fault };
+        let write = self.state.command_words.update(&spec.name, |last| {
+            let before = register_map::CommandContext { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
             let resets = write.word.is_some_and(|word| before.resets(word));
             *last = write.word.or(*last);
             Ok((write, resets))
         });
-        let (work, resets) = match write {
-            // A heartbeat alone is no command: it is answered at once and not audited.
+        let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
+        let work = match write {
+            // A heartbeat alone is not a command: it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.image.renew_lease(now);
                 return Decision::Reply(request, Reply::Written);
             }
-            Ok((CommandWrite { points, .. }, resets)) => (Work::Order(Order::Points(points)), resets),
-            Err(refusal) => (Work::Refused(refusal), false),
+            Ok((CommandWrite { points, .. }, resets)) => {
+                forwarded.resets = resets;
+                BusWork::Order(Order::Points(points))
+            }
+            Err(refusal) => BusWork::Refused(refusal),
         };
-        Decision::Drive(Errand::new(header, drive, request, resets), work)
+        Decision::Drive(forwarded, work)
     }
 }
 
-fn errand(header: Header, drive: &DriveHandle, request: RequestPdu, work: Work) -> Decision {
-    Decision::Drive(Errand::new(header, drive, request, false), work)
+fn forwarded(header: Header, drive: &DriveHandle, request: RequestPdu, work: BusWork) -> Decision {
+    Decision::Drive(ForwardedRequest::new(header, drive, request), work)
 }
 
 fn common(drive: &DriveHandle, request: RequestPdu, start: u16, count: u16, now: Instant) -> Decision {
     let reading = drive.reading(now);
-    Look::new(&reading, drive.bus_up())
+    let bus = if drive.bus_up() { BusState::Up } else { BusState::Down };
+    DriveView::new(&reading, bus)
         .registers(start, count)
         .map_or_else(Decision::from, |words| {
             Decision::Reply(request, Reply::Registers(words))
         })
 }
 
-/// Whether a raw request with that function makes sense to the family: it has the table. No family has the
-/// functions 22 and 23.
+/// Whether the family has the table that a function code accesses. No family supports 22 and 23.
 fn has_function(profile: &Profile, function: u8) -> bool {
     let table = match function {
         1 | 5 | 15 => Table::Coil,
@@ -349,7 +363,7 @@ fn has_function(profile: &Profile, function: u8) -> bool {
     profile.ranges.iter().any(|r| r.table == table)
 }
 
-/// Items that the drive gives in one read of that span, by the ranges of the profile that it touches.
+/// Maximum number of items in one read of this span, by the ranges of the profile that it touches.
 fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
     let table = profile.canonical(table);
     let last = start.saturating_add(count.saturating_sub(1));
@@ -360,7 +374,7 @@ fn read_limit(profile: &Profile, table: Table, start: u16, count: u16) -> u16 {
     touched.map(|r| r.read).min().unwrap_or(table.max_read())
 }
 
-/// Whether a drive's reply is one to the request.
+/// Whether the reply of a drive has the form that the request expects.
 fn answers(request: &RequestPdu, reply: &Reply) -> bool {
     match (request, reply) {
         (RequestPdu::Read { table, count, .. }, Reply::Bits(bits)) => {

@@ -1,6 +1,7 @@
-//! Modbus/TCP Security: certificates of the server, who is trusted, and what a client may do by its role.
+//! Modbus/TCP Security: certificates of the server, the CA of its clients, and the rights that a role grants.
 
 use std::collections::BTreeMap;
+use std::io;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
@@ -10,35 +11,35 @@ use arc_swap::ArcSwap;
 use ipnet::IpNet;
 use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
 use rustls::{RootCertStore, ServerConfig};
-use rustls_pki_types::pem::PemObject;
 use rustls_pki_types::{CertificateDer, PrivateKeyDer};
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
-use super::certificate;
+use super::certificate::{self, RoleError};
+use crate::north::pem::{self, PemError};
 
-/// Time for a client to show who it is.
+/// Time limit of a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// How long before its end a certificate is worth a warning.
+/// How long before its expiry a certificate causes a warning.
 const SOON: Duration = Duration::from_secs(30 * 86_400);
 
-/// The listener that speaks TLS.
+/// The TLS listener.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Tls {
     /// Addresses to listen on.
     pub listen: Vec<SocketAddr>,
     /// Networks that may connect.
     pub allow: Vec<IpNet>,
-    /// Names of the buses whose drives are shown; `None` shows all.
+    /// Names of the visible buses; `None` for all.
     pub buses: Option<Vec<String>>,
-    /// Who the server is and whom it trusts.
+    /// Certificate and key of the server, and the CA of its clients.
     pub identity: Identity,
-    /// What the roles in client certificates may do.
+    /// The rights of the roles in client certificates.
     pub roles: BTreeMap<String, Role>,
 }
 
-/// What a client may do.
+/// The rights of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
     /// Read.
@@ -47,7 +48,7 @@ pub enum Role {
     Control,
 }
 
-/// Certificates and key as they stood in their files; compares equal while the files say the same.
+/// Certificates and key with the content of their files; equal while the content is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Identity {
     chain: Vec<CertificateDer<'static>>,
@@ -58,45 +59,75 @@ pub struct Identity {
 /// A file of an [`Identity`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum TlsFile {
-    /// The certificate of the server, with those between it and the CA.
+    /// The certificate of the server, followed by intermediate certificates.
     Certificate,
-    /// The private key that belongs to it.
+    /// Its private key.
     Key,
-    /// The certificates that those of the clients are checked against.
+    /// The CA certificates that client certificates are verified against.
     ClientCa,
 }
 
-/// Something about a file: what, and what to do.
-pub type Finding = (TlsFile, String);
+/// A fault of one of the files, or a warning about it: what is wrong and what to do.
+#[derive(Debug, thiserror::Error)]
+#[error("{problem}")]
+pub struct IdentityFault {
+    /// The file.
+    pub file: TlsFile,
+    problem: IdentityProblem,
+}
+
+#[derive(Debug, thiserror::Error)]
+enum IdentityProblem {
+    #[error(transparent)]
+    Pem(#[from] PemError),
+    #[error("{0} contains data that is not a certificate; specify a PEM file")]
+    NotACertificate(String),
+    #[error("certificate `{name}` in {file} expired on {end}; renew it")]
+    Expired { name: String, file: String, end: String },
+    #[error("certificate `{name}` in {file} is not valid before {begin}; check the clock of this machine")]
+    NotYetValid { name: String, file: String, begin: String },
+    /// A warning: within 30 days.
+    #[error("certificate `{name}` in {file} expires on {end}; renew it")]
+    ExpiresSoon { name: String, file: String, end: String },
+    #[error("not a usable CA certificate: {0}; specify the PEM file of the CA")]
+    UnusableCa(String),
+    #[error("the key does not match the certificate; specify the key of the certificate")]
+    KeyMismatch,
+    #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
+    Unusable(rustls::Error),
+}
+
+impl TlsFile {
+    fn fault(self, problem: impl Into<IdentityProblem>) -> IdentityFault {
+        IdentityFault {
+            file: self,
+            problem: problem.into(),
+        }
+    }
+}
 
 impl Identity {
-    /// Reads the three files and tries whether they can be used together at `now`; with what is worth a warning.
+    /// Reads the three files and checks at `now` that they can be used together; returns warnings with it.
     ///
     /// # Errors
-    /// Everything that is wrong, each with its file.
+    /// All faults of the files.
     pub fn load(
         certificate: &Path,
         key: &Path,
         client_ca: &Path,
         now: SystemTime,
-    ) -> Result<(Identity, Vec<Finding>), Vec<Finding>> {
+    ) -> Result<(Identity, Vec<IdentityFault>), Vec<IdentityFault>> {
         let (mut errors, mut warnings) = (Vec::new(), Vec::new());
-        let chain = certificates(certificate).and_then(|chain| {
-            let warning = chain
-                .first()
-                .map_or(Ok(None), |own| judge_time(certificate, own, now))?;
-            warnings.extend(warning.map(|text| (TlsFile::Certificate, text)));
-            Ok(chain)
-        });
-        let chain = chain.map_err(|text| errors.push((TlsFile::Certificate, text)));
-        let key = private_key(key).map_err(|text| errors.push((TlsFile::Key, text)));
-        let ca = certificates(client_ca).map_err(|text| errors.push((TlsFile::ClientCa, text)));
-        // An expired CA is still an anchor of trust (RFC 5280, 6.1.1), so it does not keep anybody out.
+        let chain = read_chain(certificate, now).map_err(|problem| errors.push(TlsFile::Certificate.fault(problem)));
+        let key = pem::private_key(key).map_err(|error| errors.push(TlsFile::Key.fault(error)));
+        let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
+        // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so it refuses nobody.
         for anchor in ca.iter().flatten() {
-            let told = judge_time(client_ca, anchor, now).unwrap_or_else(Some);
-            warnings.extend(told.map(|text| (TlsFile::ClientCa, text)));
+            let problem = check_validity(client_ca, anchor, now).unwrap_or_else(Some);
+            warnings.extend(problem.map(|problem| TlsFile::ClientCa.fault(problem)));
         }
-        if let (Ok(chain), Ok(key), Ok(client_ca)) = (chain, key, ca) {
+        if let (Ok((chain, warning)), Ok(key), Ok(client_ca)) = (chain, key, ca) {
+            warnings.extend(warning.map(|problem| TlsFile::Certificate.fault(problem)));
             let identity = Identity {
                 chain,
                 key: Arc::new(key),
@@ -104,43 +135,28 @@ impl Identity {
             };
             match identity.server_config() {
                 Ok(_) => return Ok((identity, warnings)),
-                Err(finding) => errors.push(finding),
+                Err(fault) => errors.push(fault),
             }
         }
         Err(errors)
     }
 
-    /// The configuration that rustls serves with. Sessions are not resumed: each connection shows its certificate,
-    /// and one that has run out is not carried on.
-    fn server_config(&self) -> Result<Arc<ServerConfig>, Finding> {
+    /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, and a session
+    /// cannot outlive it.
+    fn server_config(&self) -> Result<Arc<ServerConfig>, IdentityFault> {
+        let unusable_ca =
+            |error: &dyn std::fmt::Display| TlsFile::ClientCa.fault(IdentityProblem::UnusableCa(error.to_string()));
         let mut roots = RootCertStore::empty();
         for anchor in &self.client_ca {
-            roots.add(anchor.clone()).map_err(|why| {
-                (
-                    TlsFile::ClientCa,
-                    format!("not a usable CA certificate: {why}; give the PEM file of the CA"),
-                )
-            })?;
+            roots.add(anchor.clone()).map_err(|error| unusable_ca(&error))?;
         }
         let provider = Arc::new(rustls::crypto::ring::default_provider());
         let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider.clone())
             .build()
-            .map_err(|why| {
-                (
-                    TlsFile::ClientCa,
-                    format!("no client can be checked by it: {why}; give another file"),
-                )
-            })?;
-        let unusable = |why: rustls::Error| match why {
-            rustls::Error::InconsistentKeys(_) => (
-                TlsFile::Key,
-                "the key does not belong to the certificate; give the key that the certificate was made for"
-                    .to_string(),
-            ),
-            why => (
-                TlsFile::Certificate,
-                format!("certificate and key cannot be used: {why}; give a certificate and its key in PEM"),
-            ),
+            .map_err(|error| unusable_ca(&error))?;
+        let unusable = |error: rustls::Error| match error {
+            rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(IdentityProblem::KeyMismatch),
+            error => TlsFile::Certificate.fault(IdentityProblem::Unusable(error)),
         };
         let mut config = ServerConfig::builder_with_provider(provider)
             .with_safe_default_protocol_versions()
@@ -154,119 +170,110 @@ impl Identity {
     }
 }
 
-fn cannot_read(file: &Path, why: &rustls_pki_types::pem::Error, what: &str) -> String {
-    match why {
-        rustls_pki_types::pem::Error::Io(why) => {
-            format!(
-                "cannot read {}: {why}; check the path and its permissions",
-                file.display()
-            )
-        }
-        why => format!("{} holds no {what}: {why}; give a PEM file", file.display()),
-    }
+/// The certificates of the server, its own first, with a warning if that one expires soon.
+fn read_chain(
+    file: &Path,
+    now: SystemTime,
+) -> Result<(Vec<CertificateDer<'static>>, Option<IdentityProblem>), IdentityProblem> {
+    let chain = pem::certificates(file)?;
+    let warning = chain.first().map_or(Ok(None), |own| check_validity(file, own, now))?;
+    Ok((chain, warning))
 }
 
-fn certificates(file: &Path) -> Result<Vec<CertificateDer<'static>>, String> {
-    let bad = |why: rustls_pki_types::pem::Error| cannot_read(file, &why, "certificate");
-    let found: Vec<_> = CertificateDer::pem_file_iter(file)
-        .map_err(bad)?
-        .collect::<Result<_, _>>()
-        .map_err(bad)?;
-    if found.is_empty() {
-        return Err(format!("{} holds no certificate; give a PEM file", file.display()));
-    }
-    Ok(found)
-}
-
-fn private_key(file: &Path) -> Result<PrivateKeyDer<'static>, String> {
-    PrivateKeyDer::from_pem_file(file).map_err(|why| cannot_read(file, &why, "private key"))
-}
-
-/// An error when the certificate is not valid at `now`, a warning when it will not be for long.
-fn judge_time(file: &Path, der: &CertificateDer<'_>, now: SystemTime) -> Result<Option<String>, String> {
-    let facts = certificate::read(der).ok_or_else(|| {
-        format!(
-            "{} holds something that is no certificate; give a PEM file",
-            file.display()
-        )
-    })?;
-    let seconds = now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
+/// An error if the certificate is not valid at `now`, a warning if it expires soon.
+fn check_validity(
+    file: &Path,
+    der: &CertificateDer<'_>,
+    now: SystemTime,
+) -> Result<Option<IdentityProblem>, IdentityProblem> {
+    let file = file.display().to_string();
+    let Ok(certificate) = certificate::read(der) else {
+        return Err(IdentityProblem::NotACertificate(file));
+    };
+    let now = now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
     let date = |seconds: u64| {
         let time = UNIX_EPOCH.checked_add(Duration::from_secs(seconds.min(253_402_300_799)));
         time.map_or_else(String::new, |time| humantime::format_rfc3339_seconds(time).to_string())
     };
-    let (name, file) = (&facts.name, file.display());
-    if seconds > facts.not_after {
-        let end = date(facts.not_after);
-        return Err(format!("certificate `{name}` in {file} has expired on {end}; renew it"));
+    let (name, end) = (certificate.name, date(certificate.not_after));
+    if now > certificate.not_after {
+        return Err(IdentityProblem::Expired { name, file, end });
     }
-    if seconds < facts.not_before {
-        let begin = date(facts.not_before);
-        return Err(format!(
-            "certificate `{name}` in {file} is not valid before {begin}; check the clock of this machine"
-        ));
+    if now < certificate.not_before {
+        let begin = date(certificate.not_before);
+        return Err(IdentityProblem::NotYetValid { name, file, begin });
     }
-    let end = facts.not_after;
-    Ok((end - seconds < SOON.as_secs())
-        .then(|| format!("certificate `{name}` in {file} expires on {}; renew it", date(end))))
+    let soon = certificate.not_after - now < SOON.as_secs();
+    Ok(soon.then_some(IdentityProblem::ExpiresSoon { name, file, end }))
 }
 
-/// What a listener does handshakes with; certificates can be renewed while it serves.
+/// Authenticates the clients of a listener; its certificates can be renewed while it serves.
 #[derive(Debug)]
-pub(super) struct Gatekeeper {
+pub(super) struct TlsAuthenticator {
     config: ArcSwap<ServerConfig>,
     roles: BTreeMap<String, Role>,
 }
 
-/// A client that has shown who it is.
+/// A client whose certificate was verified.
 #[derive(Debug)]
-pub(super) struct Known {
+pub(super) struct AuthenticatedClient {
     pub(super) name: String,
     pub(super) role: Role,
 }
 
-impl Gatekeeper {
-    pub(super) fn new(tls: &Tls) -> Result<Gatekeeper, String> {
-        let config = tls.identity.server_config().map_err(|(_, text)| text)?;
-        Ok(Gatekeeper {
-            config: ArcSwap::new(config),
+/// Why a client is refused.
+#[derive(Debug, thiserror::Error)]
+pub(super) enum AuthenticationError {
+    #[error("the handshake took longer than {HANDSHAKE:?}")]
+    Timeout,
+    #[error(transparent)]
+    Handshake(#[from] io::Error),
+    #[error(transparent)]
+    Role(#[from] RoleError),
+}
+
+impl TlsAuthenticator {
+    pub(super) fn new(tls: &Tls) -> Result<TlsAuthenticator, IdentityFault> {
+        Ok(TlsAuthenticator {
+            config: ArcSwap::new(tls.identity.server_config()?),
             roles: tls.roles.clone(),
         })
     }
 
-    /// Serves with other certificates from now on; connections that are open stay.
-    pub(super) fn renew(&self, identity: &Identity) -> Result<(), String> {
-        self.config.store(identity.server_config().map_err(|(_, text)| text)?);
+    /// Uses another identity for new connections; open connections stay.
+    pub(super) fn renew(&self, identity: &Identity) -> Result<(), IdentityFault> {
+        self.config.store(identity.server_config()?);
         Ok(())
     }
 
-    /// The handshake, and who the client is by it.
+    /// Performs the handshake and reads the role of the client.
     ///
     /// # Errors
     /// Why the client is refused.
-    pub(super) async fn admit(&self, stream: TcpStream) -> Result<(TlsStream<TcpStream>, Known), String> {
+    pub(super) async fn authenticate(
+        &self,
+        stream: TcpStream,
+    ) -> Result<(TlsStream<TcpStream>, AuthenticatedClient), AuthenticationError> {
         let handshake = TlsAcceptor::from(self.config.load_full()).accept(stream);
         let stream = tokio::time::timeout(HANDSHAKE, handshake)
             .await
-            .map_err(|_| format!("no handshake within {HANDSHAKE:?}"))?
-            .map_err(|why| why.to_string())?;
-        let certificate = stream.get_ref().1.peer_certificates().and_then(|chain| chain.first());
-        // The verifier lets nobody in without one; a certificate that rustls can read and this house cannot gets no role.
-        let facts = certificate.and_then(|der| certificate::read(der));
-        let known = match facts {
-            Some(facts) => Known {
-                role: self.role(facts.role.as_deref()),
-                name: facts.name,
+            .map_err(|_| AuthenticationError::Timeout)??;
+        let chain = stream.get_ref().1.peer_certificates();
+        let client = match chain.and_then(|chain| chain.first()).map(|der| certificate::read(der)) {
+            Some(Ok(certificate)) => AuthenticatedClient {
+                role: self.role(certificate.role?.as_deref()),
+                name: certificate.name,
             },
-            None => Known {
+            // The verifier refuses clients without a certificate; one that only rustls can read grants no role.
+            Some(Err(_)) | None => AuthenticatedClient {
                 role: Role::Monitor,
                 name: "unreadable certificate".to_string(),
             },
         };
-        Ok((stream, known))
+        Ok((stream, client))
     }
 
-    /// No role and an unknown one may read.
+    /// Without a role, or with one that is not configured, a client may read.
     fn role(&self, name: Option<&str>) -> Role {
         name.and_then(|name| self.roles.get(name))
             .copied()

@@ -1,4 +1,4 @@
-//! The task that owns outbox, journal and publisher, and puts them to a connection while there is one.
+//! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
 use std::collections::BTreeSet;
 use std::hash::{BuildHasher, RandomState};
@@ -12,9 +12,9 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::commands::{Commands, Ended};
-use super::connection::{self, Bounds, Connection, KEEP_ALIVE, News};
-use super::outbox::{Acked, Message, Outbox};
+use super::commands::{Commands, FinishedCommand};
+use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
+use super::outbox::{Acknowledged, Message, Outbox};
 use super::payload::{self, Topics};
 use super::publisher::Publisher;
 use super::request::Incoming;
@@ -24,19 +24,19 @@ use crate::event::Event;
 use crate::north::NorthStats;
 use crate::plant::{Plant, SharedPlant};
 
-/// First and longest wait between two attempts to connect.
+/// First and longest wait between two connection attempts.
 const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
-/// A connection that held this long was a good one: the next attempt comes soon.
-const STEADY: Duration = Duration::from_secs(5);
-/// No sign of life for this long: the connection is dead, whatever the socket says.
+/// After a connection that lasted this long, the next attempt follows after the shortest wait.
+const STABLE: Duration = Duration::from_secs(5);
+/// Without a packet from the broker for this long, the connection is considered lost.
 const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
-/// Time for the broker to answer a subscription.
+/// Time limit for the broker to answer the subscription.
 const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Topics that are logged when the broker takes no messages on them.
-const REFUSED_TOLD: usize = 100;
-/// Time for the good-bye.
-const FAREWELL: Duration = Duration::from_millis(500);
-/// Time within it for results of commands that are under way.
+/// Maximum number of topics that are logged because the broker refuses messages on them.
+const REFUSED_LOGGED: usize = 100;
+/// Time for the orderly disconnect.
+const DISCONNECT_TIMEOUT: Duration = Duration::from_millis(500);
+/// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
 
 /// Runs the MQTT client until `cancel`.
@@ -54,51 +54,51 @@ pub(super) async fn run(
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            news = next(&mut client.link), if client.commands.has_room() => client.on_news(news),
+            event = next(&mut client.link), if client.commands.has_room() => client.on_connection_event(event),
             ended = client.commands.finished() => client.on_ended(ended),
             _ = ticks.tick() => client.on_tick().await,
         }
-        client.pump();
+        client.publish_waiting();
     }
-    client.farewell().await;
+    client.shut_down().await;
 }
 
-/// What the connection tells next; waits for ever while there is none. May be cancelled without loss.
-async fn next(link: &mut Link) -> News {
+/// The next event of the connection; pending while there is none. Cancel safe.
+async fn next(link: &mut BrokerLink) -> ConnectionEvent {
     match link {
-        Link::Away { .. } => std::future::pending().await,
-        Link::Open(session) => session.connection.next().await,
+        BrokerLink::Disconnected { .. } => std::future::pending().await,
+        BrokerLink::Open(session) => session.connection.next().await,
     }
 }
 
 #[derive(Debug)]
-enum Link {
-    /// No connection; the next attempt comes then.
-    Away { until: Instant },
-    /// A connection, not necessarily taken by the broker yet.
-    Open(Session),
+enum BrokerLink {
+    /// No connection; the next attempt follows then.
+    Disconnected { retry_at: Instant },
+    /// A connection that the broker may not have accepted yet.
+    Open(BrokerSession),
 }
 
 #[derive(Debug)]
-struct Session {
+struct BrokerSession {
     connection: Connection,
     phase: Phase,
-    /// When the broker was last heard of.
-    heard: Instant,
+    /// Time of the last packet from the broker.
+    last_packet: Instant,
 }
 
 #[derive(Debug, Clone, Copy)]
 enum Phase {
     Connecting,
-    Subscribing { bounds: Bounds, since: Instant },
-    Ready { bounds: Bounds, since: Instant },
+    Subscribing { limits: BrokerLimits, since: Instant },
+    Ready { limits: BrokerLimits, since: Instant },
 }
 
 struct Client {
     options: Options,
     plant: SharedPlant,
-    /// The plant that the publisher watches.
-    watched: Arc<Plant>,
+    /// The plant that the publisher observes.
+    observed: Arc<Plant>,
     stats: Arc<NorthStats>,
     events: Receiver<Arc<Event>>,
     topics: Topics,
@@ -106,38 +106,38 @@ struct Client {
     outbox: Outbox,
     store: EventStore,
     commands: Commands,
-    link: Link,
-    /// Wait before the next attempt.
+    link: BrokerLink,
+    /// Wait before the next connection attempt.
     back_off: Duration,
-    /// Why there is no connection, as it was last logged.
-    trouble: Option<String>,
-    /// Events that came too fast.
+    /// Why there is no connection, as last logged.
+    last_error: Option<String>,
+    /// Number of events lost because they arrived too fast.
     missed: u64,
-    dropped_told: u64,
-    /// Topics on which the broker took no messages, as far as they were logged.
-    refused_told: BTreeSet<Arc<str>>,
+    dropped_logged: u64,
+    /// Topics that were logged because the broker refuses messages on them.
+    refused_logged: BTreeSet<Arc<str>>,
 }
 
 impl Client {
     async fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, events: Receiver<Arc<Event>>) -> Client {
-        let watched = plant.load_full();
-        let topics = Topics::new(&options.base, &watched.gateway);
+        let observed = plant.load_full();
+        let topics = Topics::new(&options.base, &observed.gateway);
         let mut publisher = Publisher::new(topics.clone(), options.min_interval, options.max_interval);
-        publisher.adopt(&watched);
+        publisher.adopt(&observed);
         let now = Instant::now();
         Client {
             store: EventStore::open(options.buffer.clone()).await,
             commands: Commands::new(topics.clone()),
             outbox: Outbox::default(),
-            link: Link::Away { until: now },
+            link: BrokerLink::Disconnected { retry_at: now },
             back_off: BACK_OFF.0,
-            trouble: None,
+            last_error: None,
             missed: 0,
-            dropped_told: 0,
-            refused_told: BTreeSet::new(),
+            dropped_logged: 0,
+            refused_logged: BTreeSet::new(),
             options,
             plant,
-            watched,
+            observed,
             stats,
             events,
             topics,
@@ -145,26 +145,26 @@ impl Client {
         }
     }
 
-    /// Fine enough that `min_interval` is met closely.
+    /// Short enough to keep `min_interval` accurately.
     fn tick_interval(&self) -> Duration {
         (self.options.min_interval / 4).clamp(Duration::from_millis(10), Duration::from_millis(25))
     }
 
     fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
         match event {
-            Ok(event) => self.take_event(&event),
+            Ok(event) => self.store_event(&event),
             Err(RecvError::Lagged(lost)) => self.missed(lost),
-            // The plant that told them is gone; there is a new one.
+            // The plant was replaced.
             Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
         }
-        self.take_told();
+        self.take_pending_events();
     }
 
-    /// Takes in at once what was told: who falls behind loses events.
-    fn take_told(&mut self) {
+    /// Stores all pending events at once, before newer ones displace them.
+    fn take_pending_events(&mut self) {
         loop {
             match self.events.try_recv() {
-                Ok(event) => self.take_event(&event),
+                Ok(event) => self.store_event(&event),
                 Err(TryRecvError::Lagged(lost)) => self.missed(lost),
                 Err(TryRecvError::Empty | TryRecvError::Closed) => return,
             }
@@ -174,95 +174,101 @@ impl Client {
     fn missed(&mut self, lost: u64) {
         self.missed += lost;
         tracing::error!(
-            "{lost} events came faster than they could be taken and are lost, {} since the start; the log has them",
+            "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
             self.missed
         );
     }
 
-    fn take_event(&mut self, event: &Event) {
+    fn store_event(&mut self, event: &Event) {
         let Some((topic, payload)) = payload::event(&self.topics, event) else {
             return;
         };
-        self.store.push(Message::passing(topic, payload), &mut self.outbox);
+        self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
     }
 
-    fn on_news(&mut self, news: News) {
-        let Link::Open(session) = &mut self.link else { return };
-        if !matches!(news, News::Sent(_)) {
-            session.heard = Instant::now();
+    fn on_connection_event(&mut self, event: ConnectionEvent) {
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
+        if !matches!(event, ConnectionEvent::Sent(_)) {
+            session.last_packet = Instant::now();
         }
-        match news {
-            News::Connected(bounds) => self.connected(bounds),
-            News::Subscribed(refused) => {
+        match event {
+            ConnectionEvent::Connected(limits) => self.connected(limits),
+            ConnectionEvent::Subscribed(refused) => {
                 if let Some(why) = refused {
                     tracing::error!(
-                        "the broker refuses the set topics ({why}): no commands by MQTT; allow the client to subscribe to {}",
+                        "the broker refuses the set topics ({why}): no commands over MQTT; allow the client to subscribe to {}",
                         self.topics.set_filters().join(" and ")
                     );
                 }
-                if let Phase::Subscribing { bounds, since } = session.phase {
-                    self.ready(bounds, since);
+                if let Phase::Subscribing { limits, since } = session.phase {
+                    self.ready(limits, since);
                 }
             }
-            News::Sent(packet) => {
+            ConnectionEvent::Sent(packet) => {
                 if let Err(why) = self.outbox.numbered(packet) {
                     self.lost(why);
                 }
             }
-            News::Acked(packet) => {
+            ConnectionEvent::Acked(packet) => {
                 self.stats.mqtt.published.fetch_add(1, Ordering::Relaxed);
                 let acked = self.outbox.acked(packet);
                 self.done(acked);
             }
-            News::Refused(packet, why) => {
+            ConnectionEvent::Refused(packet, why) => {
                 let acked = self.outbox.acked(packet);
-                if let Some(Acked { topic, .. }) = &acked {
-                    self.tell_refused(topic, &format!("the broker refuses it: {why}"));
+                if let Some(Acknowledged { topic, .. }) = &acked {
+                    self.log_refused(topic, &format!("the broker refuses it: {why}"));
                 }
                 self.done(acked);
             }
-            News::Command(publish) => self.on_command(*publish),
-            News::Alive => {}
-            News::Lost(why) => self.lost(&why),
+            ConnectionEvent::SetMessage(publish) => self.on_command(*publish),
+            ConnectionEvent::Alive => {}
+            ConnectionEvent::Lost(why) => self.lost(&why),
         }
     }
 
-    /// Once for each topic and connection.
-    fn tell_refused(&mut self, topic: &Arc<str>, why: &str) {
-        if self.refused_told.len() < REFUSED_TOLD && self.refused_told.insert(topic.clone()) {
-            tracing::warn!("a message on {topic} is dropped: {why}");
+    /// Logs once per topic and connection.
+    fn log_refused(&mut self, topic: &Arc<str>, why: &str) {
+        if self.refused_logged.len() < REFUSED_LOGGED && self.refused_logged.insert(topic.clone()) {
+            tracing::warn!("dropped a message on {topic}: {why}");
         }
     }
 
-    /// An entry left the outbox: the disk need not keep it.
-    fn done(&mut self, acked: Option<Acked>) {
+    /// Removes the record of a message that left the outbox.
+    fn done(&mut self, acked: Option<Acknowledged>) {
         if let Some(record) = acked.and_then(|a| a.record) {
             self.store.acknowledge(record);
         }
     }
 
-    fn connected(&mut self, bounds: Bounds) {
+    fn connected(&mut self, limits: BrokerLimits) {
         let since = Instant::now();
-        let Link::Open(session) = &mut self.link else { return };
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
         if !self.options.commands {
-            self.ready(bounds, since);
+            self.ready(limits, since);
         } else if session.connection.subscribe(self.topics.set_filters()) {
-            // Who reads `online` may command: first the subscription, then the birth.
-            session.phase = Phase::Subscribing { bounds, since };
+            // A client that reads `online` may send commands, so the subscription comes first.
+            session.phase = Phase::Subscribing { limits, since };
         } else {
             self.lost("the subscription could not be sent");
         }
     }
 
-    /// Birth: status first, then everything there is.
-    fn ready(&mut self, bounds: Bounds, since: Instant) {
-        let Link::Open(session) = &mut self.link else { return };
-        session.phase = Phase::Ready { bounds, since };
+    /// Publishes the status, then everything else.
+    fn ready(&mut self, limits: BrokerLimits, since: Instant) {
+        let BrokerLink::Open(session) = &mut self.link else {
+            return;
+        };
+        session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
-        self.trouble = None;
-        self.dropped_told = self.dropped();
-        self.refused_told.clear();
+        self.last_error = None;
+        self.dropped_logged = self.dropped();
+        self.refused_logged.clear();
         self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
         self.publisher.restart();
     }
@@ -270,22 +276,22 @@ impl Client {
     fn lost(&mut self, why: &str) {
         let now = Instant::now();
         let held = match &self.link {
-            Link::Open(Session {
+            BrokerLink::Open(BrokerSession {
                 phase: Phase::Ready { since, .. },
                 ..
             }) => now.saturating_duration_since(*since),
             _ => Duration::ZERO,
         };
-        if held >= STEADY {
+        if held >= STABLE {
             self.back_off = BACK_OFF.0;
         }
         let wait = jittered(self.back_off, RandomState::new().hash_one(0));
         self.back_off = (self.back_off * 2).min(BACK_OFF.1);
-        // Dropping the session ends its task and closes the socket.
-        self.link = Link::Away { until: now + wait };
+        // Dropping the session aborts its task and closes the socket.
+        self.link = BrokerLink::Disconnected { retry_at: now + wait };
         self.outbox.lost();
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
-        if self.trouble.as_deref() == Some(why) {
+        if self.last_error.as_deref() == Some(why) {
             tracing::debug!("no connection to the broker: {why}");
         } else {
             let (host, port) = (&self.options.host, self.options.port);
@@ -294,10 +300,8 @@ impl Client {
             } else {
                 ""
             };
-            tracing::warn!(
-                "no connection to the broker at {host}:{port}: {why}{hint}; trying again until there is one"
-            );
-            self.trouble = Some(why.to_string());
+            tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
+            self.last_error = Some(why.to_string());
         }
     }
 
@@ -324,23 +328,23 @@ impl Client {
         }
     }
 
-    fn on_ended(&mut self, ended: Ended) {
+    fn on_ended(&mut self, ended: FinishedCommand) {
         let result = self.commands.result(ended, SystemTime::now());
         self.outbox.push_result(result);
     }
 
     async fn on_tick(&mut self) {
         let now = Instant::now();
-        self.follow_plant();
+        self.update_plant();
         match &self.link {
-            Link::Away { until } if now >= *until => self.connect().await,
-            Link::Away { .. } => {}
-            Link::Open(session) => match session.phase {
+            BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
+            BrokerLink::Disconnected { .. } => {}
+            BrokerLink::Open(session) => match session.phase {
                 Phase::Subscribing { since, .. } if now.saturating_duration_since(since) > SUBSCRIBE_TIMEOUT => {
                     self.lost("the broker does not answer the subscription");
                 }
-                _ if now.saturating_duration_since(session.heard) > SILENCE => {
-                    self.lost("the broker gives no sign of life");
+                _ if now.saturating_duration_since(session.last_packet) > SILENCE => {
+                    self.lost("the broker is silent");
                 }
                 Phase::Ready { .. } => {
                     for update in self.publisher.tick(now, SystemTime::now()) {
@@ -351,65 +355,66 @@ impl Client {
             },
         }
         self.store.sync(now);
-        self.tell_dropped();
+        self.log_dropped();
     }
 
-    /// After a reload there is another plant.
-    fn follow_plant(&mut self) {
+    /// Observes the current plant, which a reload may have replaced.
+    fn update_plant(&mut self) {
         let plant = self.plant.load_full();
-        if Arc::ptr_eq(&plant, &self.watched) {
+        if Arc::ptr_eq(&plant, &self.observed) {
             return;
         }
         let events = plant.events.subscribe();
         if !events.same_channel(&self.events) {
-            self.take_told();
+            self.take_pending_events();
             self.events = events;
         }
         self.publisher.adopt(&plant);
-        self.watched = plant;
+        self.observed = plant;
     }
 
     async fn connect(&mut self) {
         let now = Instant::now();
         let options = self.options.clone();
-        // Read anew for each attempt: a renewed certificate is taken without a restart.
+        // Read for each attempt, so that renewed certificates are used without a restart.
         let config = tokio::task::spawn_blocking(move || tls::client_config(&options)).await;
-        match config.unwrap_or_else(|e| Err(e.to_string())) {
+        let config = config.map_err(|error| error.to_string());
+        match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
                 let connection = Connection::open(&self.options, self.topics.status(), config);
-                self.link = Link::Open(Session {
+                self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
-                    heard: now,
+                    last_packet: now,
                 });
             }
             Err(why) => self.lost(&why),
         }
     }
 
-    /// Hands over to the connection what may go.
-    fn pump(&mut self) {
+    /// Publishes from the outbox as far as the connection allows.
+    fn publish_waiting(&mut self) {
         self.store.refill(&mut self.outbox);
-        if let Link::Open(Session {
+        if let BrokerLink::Open(BrokerSession {
             connection,
-            phase: Phase::Ready { bounds, .. },
+            phase: Phase::Ready { limits, .. },
             ..
         }) = &self.link
         {
-            let most = bounds.max_packet;
+            let most = limits.max_packet;
             let mut oversized = Vec::new();
-            while let Some((key, message)) = self.outbox.next(bounds.limit) {
+            while let Some((key, message)) = self.outbox.next(limits.limit) {
                 if connection::packet_size(&message) > most {
                     oversized.push(self.outbox.give_up(key));
                 } else if connection.publish(message) {
-                    self.outbox.handed_over(key);
+                    self.outbox.mark_published(key);
                 } else {
                     break;
                 }
             }
             for acked in oversized {
-                if let Some(Acked { topic, .. }) = &acked {
-                    self.tell_refused(topic, &format!("the broker takes packets of {most} bytes at most"));
+                if let Some(Acknowledged { topic, .. }) = &acked {
+                    self.log_refused(topic, &format!("the broker accepts at most {most} bytes per packet"));
                 }
                 self.done(acked);
             }
@@ -422,60 +427,60 @@ impl Client {
         self.outbox.dropped() + self.store.dropped()
     }
 
-    /// Once for each time that the broker is away.
-    fn tell_dropped(&mut self) {
+    /// Logs once per connection outage.
+    fn log_dropped(&mut self) {
         let dropped = self.dropped();
-        if dropped > self.dropped_told && self.dropped_told != u64::MAX {
-            tracing::warn!("the buffer is full or damaged: the oldest events or results are dropped");
-            self.dropped_told = u64::MAX;
+        if dropped > self.dropped_logged && self.dropped_logged != u64::MAX {
+            tracing::warn!("the buffer is full or damaged: dropping the oldest events or results");
+            self.dropped_logged = u64::MAX;
         }
     }
 
-    /// Sends what waits, then `offline`, then says good-bye; all within half a second.
-    async fn farewell(mut self) {
-        self.take_told();
+    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second.
+    async fn shut_down(mut self) {
+        self.take_pending_events();
         let begun = tokio::time::Instant::now();
-        // When the time is over the connection is cut, and the broker publishes the last will.
-        let in_time = tokio::time::timeout_at(begun + FAREWELL, self.say_goodbye(begun + LAST_RESULTS)).await;
+        // After that time the connection is closed, and the broker publishes the last will.
+        let in_time = tokio::time::timeout_at(begun + DISCONNECT_TIMEOUT, self.disconnect(begun + LAST_RESULTS)).await;
         if in_time.is_err() {
-            tracing::warn!("the broker did not take the good-bye in time; it publishes the last will");
+            tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
     }
 
-    async fn say_goodbye(&mut self, last_results: tokio::time::Instant) {
+    async fn disconnect(&mut self, last_results: tokio::time::Instant) {
         let status = self.topics.status();
         self.options.commands = false;
         self.outbox.drop_telemetry();
-        let mut offline_put = false;
-        while matches!(&self.link, Link::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
-            self.pump();
+        let mut offline_queued = false;
+        while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
+            self.publish_waiting();
             let quiet = self.commands.is_idle() && self.outbox.waiting() == 0;
-            if !offline_put && (quiet || tokio::time::Instant::now() >= last_results) {
+            if !offline_queued && (quiet || tokio::time::Instant::now() >= last_results) {
                 self.outbox.put_first(status.as_str().into(), b"offline".to_vec());
-                offline_put = true;
+                offline_queued = true;
                 continue;
             }
-            if offline_put && !self.outbox.has_telemetry(&status) {
+            if offline_queued && !self.outbox.has_telemetry(&status) {
                 break;
             }
             tokio::select! {
-                news = next(&mut self.link), if self.commands.has_room() => self.on_news(news),
+                event = next(&mut self.link), if self.commands.has_room() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
-                () = tokio::time::sleep_until(last_results), if !offline_put => {}
+                () = tokio::time::sleep_until(last_results), if !offline_queued => {}
             }
         }
-        if let Link::Open(session) = &mut self.link
+        if let BrokerLink::Open(session) = &mut self.link
             && !matches!(session.phase, Phase::Connecting)
             && session.connection.disconnect()
         {
-            while !matches!(session.connection.next().await, News::Lost(_)) {}
+            while !matches!(session.connection.next().await, ConnectionEvent::Lost(_)) {}
         }
     }
 }
 
-/// Three quarters to all of `wait`, by a random number: gateways that lost one broker do not come back in step.
+/// 75 to 100 % of `wait`, by a random number, so that gateways do not reconnect to a broker at the same time.
 fn jittered(wait: Duration, random: u64) -> Duration {
     wait.mul_f64(0.75 + 0.25 * (random as f64 / u64::MAX as f64))
 }

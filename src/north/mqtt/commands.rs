@@ -1,5 +1,5 @@
-//! The set topics: from a message to one order, and from its answer to one result. Pure: time is an argument, and
-//! waiting is all that is left to a task.
+//! The set topics: turns a message into one command, and the answer to that command into one result. Time is an
+//! argument; a task only has to wait.
 
 use std::collections::VecDeque;
 use std::future::poll_fn;
@@ -19,51 +19,51 @@ use crate::document::nearest;
 use crate::drive::ModelPoint;
 use crate::plant::{Placed, Plant};
 
-/// Commands that wait for their answer from the bus, and bytes that are kept for their results. Only stops can be so many:
-/// of all else the queues of the buses take fewer.
-const WAITING: Bound = Bound {
+/// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
+/// commands.
+const WAITING: QueueLimit = QueueLimit {
     most: 4096,
     bytes: 8 << 20,
 };
-/// The same of commands that the drive acknowledged and that wait for the read that shows their effect.
-const CONFIRMING: Bound = Bound {
+/// Limits of the commands that the drive acknowledged and whose effect has not been read yet.
+const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
-/// Messages remembered to recognise a repetition.
+/// Number of recent commands in which a repetition is recognised.
 const REMEMBERED: usize = 256;
-/// Time for which a command with an `id` is recognised when it comes again.
+/// Time for which a command with an `id` is recognised when it is repeated.
 const REPLAYED: Duration = Duration::from_secs(60);
 
-/// Takes commands and gives their results.
+/// Processes commands and returns their results.
 #[derive(Debug)]
 pub(super) struct Commands {
     topics: Topics,
-    /// All that comes over the connection to the broker is one client.
+    /// Everything from the connection to the broker counts as one client.
     client: Arc<str>,
-    /// In the order in which they were taken.
-    waiting: Row,
-    /// In the order in which they were acknowledged.
-    confirming: Row,
+    /// In the order of acceptance.
+    waiting: PendingCommands,
+    /// In the order of acknowledgement.
+    confirming: PendingCommands,
     hasher: RandomState,
-    /// Commands taken, oldest first.
-    recent: VecDeque<Taken>,
-    /// Commands taken so far: their numbers.
+    /// Accepted commands, oldest first.
+    recent: VecDeque<RecentCommand>,
+    /// Number of commands accepted so far.
     taken: u64,
 }
 
-/// A command under way.
+/// A command that is not finished.
 #[derive(Debug)]
-struct Running {
+struct PendingCommand {
     number: u64,
     id: Option<Json>,
     reply: Reply,
     placed: Placed,
 }
 
-/// A command of which all is known that its result tells.
+/// A command whose result is known.
 #[derive(Debug)]
-pub(super) struct Ended {
+pub(super) struct FinishedCommand {
     number: u64,
     id: Option<Json>,
     reply: Reply,
@@ -71,18 +71,18 @@ pub(super) struct Ended {
     confirmed: Option<Duration>,
 }
 
-/// A command that was taken.
+/// An accepted command.
 #[derive(Debug)]
-struct Taken {
+struct RecentCommand {
     number: u64,
     fingerprint: u64,
     packet: u16,
-    /// Hash of topic and `id`, where it has one.
+    /// Hash of topic and `id`, if it has one.
     identity: Option<u64>,
-    /// Stops of the drive by then.
+    /// Number of stops of the drive at that time.
     stops: u64,
     at: Instant,
-    /// Once it is there.
+    /// `None` until it is finished.
     result: Option<Message>,
 }
 
@@ -91,24 +91,24 @@ impl Commands {
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
-            waiting: Row::default(),
-            confirming: Row::default(),
+            waiting: PendingCommands::default(),
+            confirming: PendingCommands::default(),
             hasher: RandomState::new(),
             recent: VecDeque::new(),
             taken: 0,
         }
     }
 
-    /// Whether more may be taken. While not, messages stay with the broker, whoever sends them: no stop is refused for
-    /// want of room here.
+    /// Whether another message may be processed. If not, messages stay with the broker, so that no stop is refused for
+    /// lack of room.
     pub(super) fn has_room(&self) -> bool {
         !self.waiting.is_full(WAITING)
     }
 
-    /// Takes a message at `now`, which is `time` on the calendar; returns its result if it is there at once, else its
-    /// order is in the queue of the bus. A repetition of a command is answered from memory and not carried out again: one
-    /// that the broker marks as such, or the same message with the same `id` within a minute. A stop is carried out
-    /// whenever it comes.
+    /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
+    /// otherwise its command is in the queue of the bus. A repeated command is answered with the previous result and
+    /// not executed again: one that the broker marks as repeated, or the same message with the same `id` within a
+    /// minute. A stop is always executed.
     pub(super) fn take(
         &mut self,
         incoming: Incoming,
@@ -118,7 +118,7 @@ impl Commands {
     ) -> Option<Message> {
         let target = self.topics.parse_set(&incoming.topic)?;
         if incoming.retain && incoming.payload.is_empty() {
-            return None; // somebody takes a retained message away
+            return None; // a retained message was cleared
         }
         let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
         let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, incoming.topic.as_str());
@@ -147,27 +147,28 @@ impl Commands {
             if known.stops == drive.stops() {
                 return known.result.clone();
             }
-            // The motor was stopped since: the old result would be untrue, and to do it again would start it.
-            let why = "it repeats an earlier command, and a stop came since; send it anew, with another `id`";
+            // The motor was stopped since: the previous result is no longer true, and a repetition would start it
+            // again.
+            let why = "it repeats an earlier command, but a stop was received since; send it with another `id`";
             let answer = drive.refuse(&what(), Refusal::NotAllowed(why.to_string()), origin, now);
             return Some(reply.message(request.id, &answer, None, time));
         }
         let stops = drive.stops();
-        let running = Running {
+        let pending = PendingCommand {
             number: self.remember(fingerprint, &incoming, identity, stops, now),
             id: request.id,
             reply,
             placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
         };
-        self.follow(running, time)
+        self.follow(pending, time)
     }
 
-    /// What was refused has its result at once; all else waits.
-    fn follow(&mut self, mut running: Running, time: SystemTime) -> Option<Message> {
-        match running.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
-            Some(answer) => Some(self.result(running.end(answer, None), time)),
+    /// Returns the result of a refused command; any other waits.
+    fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
+        match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            Some(answer) => Some(self.result(pending.end(answer, None), time)),
             None => {
-                self.waiting.push(running);
+                self.waiting.push(pending);
                 None
             }
         }
@@ -184,10 +185,16 @@ impl Commands {
         self.hasher.hash_one((topic, payload, response_topic, correlation))
     }
 
-    /// The command that a message repeats. An `id` that was used for something else since is no sign of a repetition.
-    fn repeated(&self, incoming: &Incoming, fingerprint: u64, identity: Option<u64>, now: Instant) -> Option<&Taken> {
+    /// The command that a message repeats. An `id` that has been used for another command since does not count.
+    fn repeated(
+        &self,
+        incoming: &Incoming,
+        fingerprint: u64,
+        identity: Option<u64>,
+        now: Instant,
+    ) -> Option<&RecentCommand> {
         let newest_first = || self.recent.iter().rev();
-        let same = |known: &&Taken| known.fingerprint == fingerprint;
+        let same = |known: &&RecentCommand| known.fingerprint == fingerprint;
         let marked = newest_first().find(|known| incoming.dup && known.packet == incoming.packet && same(known));
         let by_id = || {
             let last = newest_first().find(|known| identity.is_some() && known.identity == identity);
@@ -208,7 +215,7 @@ impl Commands {
             self.recent.pop_front();
         }
         self.taken += 1;
-        self.recent.push_back(Taken {
+        self.recent.push_back(RecentCommand {
             number: self.taken,
             fingerprint,
             packet: incoming.packet,
@@ -220,58 +227,60 @@ impl Commands {
         self.taken
     }
 
-    /// The next command that ends; waits for ever when none is under way. May be cancelled without loss.
-    pub(super) async fn finished(&mut self) -> Ended {
+    /// The next command that finishes; pending while there is none. Cancel safe.
+    pub(super) async fn finished(&mut self) -> FinishedCommand {
         poll_fn(|cx| self.poll_finished(cx)).await
     }
 
-    /// The next command that has ended, if there is one.
-    pub(super) fn try_finished(&mut self) -> Option<Ended> {
+    /// A command that has finished, if there is one.
+    pub(super) fn try_finished(&mut self) -> Option<FinishedCommand> {
         match self.poll_finished(&mut Context::from_waker(Waker::noop())) {
-            Poll::Ready(ended) => Some(ended),
+            Poll::Ready(finished) => Some(finished),
             Poll::Pending => None,
         }
     }
 
-    /// Those that the drive acknowledged make room for those that wait for the bus; if too many wait for the read that
-    /// shows their effect, the oldest stays "acknowledged".
-    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Ended> {
-        while let Some(mut running) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
-            match running.placed.answer() {
-                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(running.end(answer, None)),
-                _ => self.confirming.push(running),
+    /// An acknowledged command no longer occupies the queue for the bus. If too many wait for confirmation, the oldest
+    /// finishes as "acknowledged".
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
+        while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
+            match pending.placed.answer() {
+                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, None)),
+                _ => self.confirming.push(pending),
             }
         }
-        let settled = |running: &mut Running| running.placed.poll_confirmation(cx).is_ready();
+        let settled = |pending: &mut PendingCommand| pending.placed.poll_confirmation(cx).is_ready();
         let next = self.confirming.take(settled).or_else(|| {
             let full = self.confirming.is_full(CONFIRMING);
             full.then(|| self.confirming.take(|_| true)).flatten()
         });
-        let ended = next.and_then(|mut running| {
-            let (answer, confirmed) = (running.placed.answer()?, running.placed.confirmation().flatten());
-            Some(running.end(answer, confirmed))
+        let finished = next.and_then(|mut pending| {
+            let (answer, confirmed) = (pending.placed.answer()?, pending.placed.confirmation().flatten());
+            Some(pending.end(answer, confirmed))
         });
-        ended.map_or(Poll::Pending, Poll::Ready)
+        finished.map_or(Poll::Pending, Poll::Ready)
     }
 
-    /// The one result of a command that ended, at `time`.
-    pub(super) fn result(&mut self, ended: Ended, time: SystemTime) -> Message {
-        let message = ended.reply.message(ended.id, &ended.answer, ended.confirmed, time);
-        if let Some(known) = self.recent.iter_mut().find(|known| known.number == ended.number) {
+    /// The one result of a finished command, at `time`.
+    pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
+        let message = finished
+            .reply
+            .message(finished.id, &finished.answer, finished.confirmed, time);
+        if let Some(known) = self.recent.iter_mut().find(|known| known.number == finished.number) {
             known.result = Some(message.clone());
         }
         message
     }
 
-    /// Whether no command is under way.
+    /// Whether all commands are finished.
     pub(super) fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.confirming.is_empty()
     }
 }
 
-impl Running {
-    fn end(self, answer: Answer, confirmed: Option<Duration>) -> Ended {
-        Ended {
+impl PendingCommand {
+    fn end(self, answer: Answer, confirmed: Option<Duration>) -> FinishedCommand {
+        FinishedCommand {
             number: self.number,
             id: self.id,
             reply: self.reply,
@@ -280,41 +289,41 @@ impl Running {
         }
     }
 
-    /// Bytes that a client may make long.
+    /// Number of bytes whose length the client controls.
     fn bytes(&self) -> usize {
         self.reply.bytes() + self.id.as_ref().and_then(Json::as_str).map_or(0, str::len)
     }
 }
 
-/// How much a row may hold.
+/// Limits of a queue.
 #[derive(Debug, Clone, Copy)]
-struct Bound {
+struct QueueLimit {
     most: usize,
     bytes: usize,
 }
 
-/// Commands in their order.
+/// Commands in order.
 #[derive(Debug, Default)]
-struct Row {
-    commands: VecDeque<Running>,
+struct PendingCommands {
+    commands: VecDeque<PendingCommand>,
     bytes: usize,
 }
 
-impl Row {
-    fn push(&mut self, running: Running) {
-        self.bytes += running.bytes();
-        self.commands.push_back(running);
+impl PendingCommands {
+    fn push(&mut self, pending: PendingCommand) {
+        self.bytes += pending.bytes();
+        self.commands.push_back(pending);
     }
 
-    /// Takes out the first one that `is_it`.
-    fn take(&mut self, is_it: impl FnMut(&mut Running) -> bool) -> Option<Running> {
+    /// Removes the first command for which `is_it` holds.
+    fn take(&mut self, is_it: impl FnMut(&mut PendingCommand) -> bool) -> Option<PendingCommand> {
         let place = self.commands.iter_mut().position(is_it)?;
-        let running = self.commands.remove(place)?;
-        self.bytes -= running.bytes();
-        Some(running)
+        let pending = self.commands.remove(place)?;
+        self.bytes -= pending.bytes();
+        Some(pending)
     }
 
-    fn is_full(&self, bound: Bound) -> bool {
+    fn is_full(&self, bound: QueueLimit) -> bool {
         self.commands.len() >= bound.most || self.bytes >= bound.bytes
     }
 

@@ -1,8 +1,8 @@
-//! One connection to the broker: a rumqttc client of its own, polled by a task of its own.
+//! One connection to the broker: a rumqttc client, polled by its own task.
 //!
-//! rumqttc is used for one connection only. After any error client and event loop are thrown away: what it
-//! would keep (messages in flight, a packet id that collided) is kept better by the outbox. The polling task
-//! never publishes, and publishing never waits: `try_publish` into a channel that always has room.
+//! Client and event loop are discarded after any error: the outbox is better at keeping what rumqttc would keep
+//! (messages in flight, a packet id collision). The polling task never publishes, and publishing never waits: it uses
+//! `try_publish` on a channel that always has room.
 
 use std::sync::Arc;
 use std::time::Duration;
@@ -22,68 +22,69 @@ use tokio::task::JoinHandle;
 use super::Options;
 use super::outbox::Message;
 
-/// Time between two signs of life to the broker.
+/// Keep-alive interval.
 pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(10);
-/// Most messages that are sent and not acknowledged; the broker may want fewer.
+/// Maximum number of unacknowledged messages; the broker may allow fewer.
 const INFLIGHT: u16 = 100;
 /// Room for half of them, the subscription and the disconnect.
 const REQUESTS: usize = INFLIGHT as usize;
-/// What happened that the client has not looked at; when full, polling pauses.
-const NEWS: usize = 64;
-/// Largest packet taken from the broker. Larger than any command, so that one that is too long is answered.
+/// Number of events that the client has not processed; beyond it, polling pauses.
+const EVENTS: usize = 64;
+/// Maximum size of a packet from the broker; larger than any valid command, so that one that is too long gets an
+/// answer.
 const MAX_PACKET: u32 = 256 * 1024;
-/// Commands that the broker may send before the first is acknowledged.
+/// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
-/// TCP, TLS and CONNACK within this time, s.
+/// Time limit for TCP, TLS and CONNACK, s.
 const CONNECT_TIMEOUT: u64 = 5;
 
-/// What happened on the connection.
+/// An event of the connection.
 #[derive(Debug)]
-pub(super) enum News {
-    /// The broker took the connection.
-    Connected(Bounds),
-    /// The broker answered the subscription; with what it refused.
+pub(super) enum ConnectionEvent {
+    /// The broker accepted the connection.
+    Connected(BrokerLimits),
+    /// The broker answered the subscription; with the reason if it refused part of it.
     Subscribed(Option<String>),
-    /// The oldest message handed over was sent under this packet id.
+    /// The oldest published message was sent with this packet id.
     Sent(u16),
-    /// The broker has the message.
+    /// The broker acknowledged the message.
     Acked(u16),
-    /// The broker refuses the message for good.
+    /// The broker refused the message.
     Refused(u16, String),
     /// A message on a set topic.
-    Command(Box<Publish>),
-    /// The broker is alive.
+    SetMessage(Box<Publish>),
+    /// Any other packet from the broker.
     Alive,
-    /// The connection is gone, and why. Nothing comes after this.
+    /// The connection is lost, with the reason. The last event.
     Lost(String),
 }
 
-/// What the broker allows.
+/// Limits that the broker sets.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Bounds {
-    /// Messages under way at one time: half the inflight window.
+pub(super) struct BrokerLimits {
+    /// Number of unacknowledged messages: half the inflight window.
     pub(super) limit: usize,
-    /// Largest packet.
+    /// Maximum packet size, bytes.
     pub(super) max_packet: usize,
 }
 
-impl Bounds {
-    fn of(ack: &ConnAck) -> Bounds {
+impl BrokerLimits {
+    fn of(ack: &ConnAck) -> BrokerLimits {
         let properties = ack.properties.as_ref();
         let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
         let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
-        Bounds {
+        BrokerLimits {
             limit: usize::from(window / 2).max(1),
             max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
         }
     }
 }
 
-/// One connection, from the first attempt to its end.
+/// One connection, from the connection attempt to its end.
 #[derive(Debug)]
 pub(super) struct Connection {
     client: AsyncClient,
-    news: mpsc::Receiver<News>,
+    event: mpsc::Receiver<ConnectionEvent>,
     task: JoinHandle<()>,
 }
 
@@ -94,23 +95,23 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Begins to connect; `will` is the topic of the last will `offline`.
+    /// Starts to connect; `will` is the topic of the last will `offline`.
     pub(super) fn open(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> Connection {
         let (client, eventloop) = AsyncClient::new(mqtt_options(options, will, tls), REQUESTS);
-        let (sender, news) = mpsc::channel(NEWS);
+        let (sender, event) = mpsc::channel(EVENTS);
         let task = tokio::spawn(poll(eventloop, sender));
-        Connection { client, news, task }
+        Connection { client, event, task }
     }
 
-    /// What happens next; may be cancelled without loss.
-    pub(super) async fn next(&mut self) -> News {
-        // The sender only goes without a word when the task panicked.
-        let silent = || News::Lost("the MQTT client failed".to_string());
-        self.news.recv().await.unwrap_or_else(silent)
+    /// The next event. Cancel safe.
+    pub(super) async fn next(&mut self) -> ConnectionEvent {
+        // The sender is dropped without a last event only if the task panicked.
+        let silent = || ConnectionEvent::Lost("the MQTT client failed".to_string());
+        self.event.recv().await.unwrap_or_else(silent)
     }
 
-    /// Asks for all set topics. Retained messages are sent too, marked as such even when they arrive while
-    /// the subscription stands: they must be seen to be refused.
+    /// Subscribes to all set topics. Retained messages are requested too, and stay marked even if they arrive during
+    /// the subscription, so that they can be refused.
     pub(super) fn subscribe(&self, filters: [String; 2]) -> bool {
         let filters = filters.map(|path| Filter {
             path,
@@ -121,7 +122,7 @@ impl Connection {
         self.client.try_subscribe_many(filters).is_ok()
     }
 
-    /// Hands a message over; false when there is no room now.
+    /// Publishes a message; false if there is no room at the moment.
     pub(super) fn publish(&self, message: Message) -> bool {
         let properties = PublishProperties {
             correlation_data: message.correlation.map(Into::into),
@@ -133,26 +134,26 @@ impl Connection {
             .is_ok()
     }
 
-    /// Says good-bye, so that the broker does not publish the last will.
+    /// Disconnects in order, so that the broker does not publish the last will.
     pub(super) fn disconnect(&self) -> bool {
         self.client.try_disconnect().is_ok()
     }
 }
 
-/// Bytes of the packet that carries `message`, at most.
+/// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
     message.topic.len() + message.payload.len() + correlation + 16
 }
 
-/// Whether something can be published on that topic.
+/// Whether messages can be published on that topic.
 pub(super) fn is_topic(topic: &str) -> bool {
     let long = u16::try_from(topic.len()).is_err();
     !topic.is_empty() && !long && !topic.contains(['+', '#', '\0'])
 }
 
 fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
-    // rumqttc wants an IPv6 address without brackets, or TLS takes it for a name.
+    // rumqttc requires IPv6 addresses without brackets; TLS would take one with brackets for a name.
     let host = options.host.trim_start_matches('[').trim_end_matches(']');
     let mut mqtt = MqttOptions::new(&options.client_id, host, options.port);
     mqtt.set_keep_alive(KEEP_ALIVE)
@@ -177,42 +178,44 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
     mqtt
 }
 
-/// Polls until the first error, and tells what happens.
-async fn poll(mut eventloop: EventLoop, news: mpsc::Sender<News>) {
+/// Polls until the first error and reports the events.
+async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>) {
     loop {
         let item = match eventloop.poll().await {
             Ok(event) => interpret(event),
-            Err(error) => Some(News::Lost(reason(&error))),
+            Err(error) => Some(ConnectionEvent::Lost(reason(&error))),
         };
         let Some(item) = item else { continue };
-        let end = matches!(item, News::Lost(_));
-        if news.send(item).await.is_err() || end {
+        let end = matches!(item, ConnectionEvent::Lost(_));
+        if event.send(item).await.is_err() || end {
             return;
         }
     }
 }
 
-fn interpret(event: Event) -> Option<News> {
+fn interpret(event: Event) -> Option<ConnectionEvent> {
     match event {
-        Event::Incoming(Packet::ConnAck(ack)) => Some(News::Connected(Bounds::of(&ack))),
+        Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
             let granted = |code: &SubscribeReasonCode| matches!(code, SubscribeReasonCode::Success(_));
             let refused = ack.return_codes.iter().find(|code| !granted(code));
-            Some(News::Subscribed(refused.map(|code| format!("{code:?}"))))
+            Some(ConnectionEvent::Subscribed(refused.map(|code| format!("{code:?}"))))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
-            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => News::Acked(ack.pkid),
+            PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),
             PubAckReason::NotAuthorized | PubAckReason::TopicNameInvalid | PubAckReason::PayloadFormatInvalid => {
-                News::Refused(ack.pkid, format!("{:?}", ack.reason))
+                ConnectionEvent::Refused(ack.pkid, format!("{:?}", ack.reason))
             }
-            // The broker cannot take it now: try again on a new connection, a little later.
-            other => News::Lost(format!("the broker cannot take messages now: {other:?}")),
+            // The broker cannot accept it now: retry on a new connection.
+            other => ConnectionEvent::Lost(format!("the broker does not accept messages at the moment: {other:?}")),
         }),
-        Event::Incoming(Packet::Publish(publish)) => Some(News::Command(Box::new(publish))),
-        Event::Incoming(_) => Some(News::Alive),
-        Event::Outgoing(Outgoing::Publish(packet)) => Some(News::Sent(packet)),
-        // A packet id was to be used again before it was free. rumqttc could wait for ever.
-        Event::Outgoing(Outgoing::AwaitAck(_)) => Some(News::Lost("the broker left a message unacknowledged".into())),
+        Event::Incoming(Packet::Publish(publish)) => Some(ConnectionEvent::SetMessage(Box::new(publish))),
+        Event::Incoming(_) => Some(ConnectionEvent::Alive),
+        Event::Outgoing(Outgoing::Publish(packet)) => Some(ConnectionEvent::Sent(packet)),
+        // A packet id was about to be used again before its acknowledgement, for which rumqttc could wait forever.
+        Event::Outgoing(Outgoing::AwaitAck(_)) => {
+            Some(ConnectionEvent::Lost("the broker did not acknowledge a message".into()))
+        }
         Event::Outgoing(_) => None,
     }
 }
@@ -221,18 +224,18 @@ fn reason(error: &ConnectionError) -> String {
     use ConnectReturnCode::{BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported};
     let ConnectionError::ConnectionRefused(code) = error else {
         return match error {
-            ConnectionError::Timeout(_) => "no answer in time".to_string(),
-            ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker does not answer any more".to_string(),
+            ConnectionError::Timeout(_) => "timed out".to_string(),
+            ConnectionError::MqttState(StateError::AwaitPingResp) => "the broker no longer responds".to_string(),
             ConnectionError::MqttState(StateError::ConnectionAborted) => "the broker closed the connection".to_string(),
             _ => error.to_string(),
         };
     };
     let advice = match code {
         BadUserNamePassword | NotAuthorized | Banned => {
-            "; check mqtt.username, mqtt.password_file and what the broker allows"
+            "; check mqtt.username, mqtt.password_file and the permissions at the broker"
         }
         ClientIdentifierNotValid => "; change mqtt.client_id",
-        RetainNotSupported => "; the gateway needs a broker with retained messages",
+        RetainNotSupported => "; the gateway requires a broker that supports retained messages",
         _ => "",
     };
     format!("the broker refuses the connection ({code:?}){advice}")

@@ -1,10 +1,10 @@
-//! Events on disk until the broker has them: survives a restart and a killed process.
+//! Keeps events on disk until the broker has acknowledged them, across restarts and crashes.
 //!
-//! Segment files `mqtt-events-{number}.log` in one directory, each a row of records: state (`L` waits, `A`
-//! acknowledged), length of the body (u32, little endian), CRC-32 of the body (u32, little endian), body: length
-//! of the topic (u16, little endian), topic, payload. Records are only appended; an acknowledgement overwrites
-//! the state byte. A record that is torn or damaged ends its segment. When all records of a segment are
-//! acknowledged it is deleted (the last one: emptied); when the directory is full, the oldest segment goes.
+//! Segment files `mqtt-events-{number}.log` in one directory, each a sequence of records: state (`L` waiting, `A`
+//! acknowledged), length of the body (u32, little endian), CRC-32 of the body (u32, little endian), body: length of the
+//! topic (u16, little endian), topic, payload. Records are only appended; an acknowledgement overwrites the state byte.
+//! An incomplete or damaged record ends its segment. A segment whose records are all acknowledged is deleted (the last
+//! one: truncated); when the directory is full, the oldest segment is deleted.
 
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
@@ -22,12 +22,12 @@ const LOCK: &str = "mqtt-events.lock";
 const WAITS: u8 = b'L';
 const ACKNOWLEDGED: u8 = b'A';
 const HEADER: usize = 9;
-/// No record is longer: a longer length is damage.
+/// Maximum length of a record; a longer one is damaged.
 const LONGEST: usize = 1 << 20;
-/// Segments that a full directory has; one of them is dropped at a time.
+/// Number of segments in a full directory; the oldest one is dropped.
 const SEGMENTS: u64 = 8;
 
-/// Where a record lies.
+/// Position of a record.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct RecordId {
     segment: u64,
@@ -39,11 +39,11 @@ struct Segment {
     number: u64,
     path: PathBuf,
     file: File,
-    /// End of the last whole record.
+    /// End of the last complete record.
     end: u64,
-    /// Records that are not acknowledged.
+    /// Number of records that are not acknowledged.
     waiting: u64,
-    /// Where the next record to be loaded lies, and how many from there on wait.
+    /// Position of the next record to be loaded, and the number of waiting records from there on.
     cursor: u64,
     unloaded: u64,
 }
@@ -57,15 +57,15 @@ pub(super) struct Journal {
     next_number: u64,
     unsynced: bool,
     dropped: u64,
-    /// Held while the journal is open: two gateways on one directory would spoil each other's files.
+    /// Locked while the journal is open, since two gateways would damage each other's files.
     _lock: File,
 }
 
 impl Journal {
-    /// Opens the journal in `dir`, which is created if need be, and finds what still waits there.
+    /// Opens the journal in `dir`, which is created if necessary, and finds the waiting events.
     ///
     /// # Errors
-    /// When the directory cannot be used, or (`WouldBlock`) somebody else uses it.
+    /// The directory cannot be used, or another process uses it (`WouldBlock`).
     pub(super) fn open(dir: &Path, max_bytes: u64) -> io::Result<Journal> {
         fs::create_dir_all(dir)?;
         let lock = OpenOptions::new()
@@ -108,7 +108,7 @@ impl Journal {
     /// Appends an event.
     ///
     /// # Errors
-    /// When it cannot be written, or is larger than the whole buffer may be; the journal stays as it was.
+    /// The event cannot be written, or exceeds the size of the buffer; the journal is unchanged.
     pub(super) fn append(&mut self, message: &Message) -> io::Result<()> {
         let record = encode(message)?;
         let length = record.len() as u64;
@@ -157,7 +157,7 @@ impl Journal {
         self.segments.iter().map(|s| s.end).sum()
     }
 
-    /// Loads the next event that waits, oldest first; each is loaded once.
+    /// Loads the oldest waiting event that is not loaded yet.
     pub(super) fn load(&mut self) -> Option<(RecordId, Message)> {
         let segment = self.segments.iter_mut().find(|s| s.unloaded > 0)?;
         match segment.load() {
@@ -177,23 +177,23 @@ impl Journal {
         }
     }
 
-    /// Events that wait and were not loaded.
+    /// Number of waiting events that are not loaded.
     pub(super) fn unloaded(&self) -> u64 {
         self.segments.iter().map(|s| s.unloaded).sum()
     }
 
-    /// Events that were dropped because the buffer was full or damaged.
+    /// Number of events dropped because the buffer was full or damaged.
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// The broker has this event.
+    /// Marks an event as acknowledged by the broker.
     ///
     /// # Errors
-    /// When that cannot be noted; the event is delivered a second time after a restart.
+    /// The mark cannot be written; the event is delivered again after a restart.
     pub(super) fn acknowledge(&mut self, record: RecordId) -> io::Result<()> {
         let Some(index) = self.segments.iter().position(|s| s.number == record.segment) else {
-            return Ok(()); // dropped meanwhile, because the buffer was full
+            return Ok(()); // dropped in the meantime, because the buffer was full
         };
         let last = index + 1 == self.segments.len();
         let Some(segment) = self.segments.get_mut(index) else {
@@ -215,7 +215,7 @@ impl Journal {
         Ok(())
     }
 
-    /// A file that is to be synced to the disk, if anything was written since the last call.
+    /// A file to be synced to disk, if anything was written since the last call.
     pub(super) fn unsynced(&mut self) -> Option<File> {
         std::mem::take(&mut self.unsynced)
             .then(|| self.segments.back()?.file.try_clone().ok())
@@ -224,7 +224,7 @@ impl Journal {
 }
 
 impl Segment {
-    /// Finds the whole records of a segment; what follows the last one is cut off.
+    /// Finds the complete records of a segment and truncates the rest.
     fn scan(number: u64, path: PathBuf) -> io::Result<Segment> {
         let file = OpenOptions::new().read(true).write(true).open(&path)?;
         let bytes = fs::read(&path)?;
@@ -234,7 +234,7 @@ impl Segment {
             end += record.length;
         }
         if end < bytes.len() {
-            tracing::warn!(file = %path.display(), "{} bytes of a torn or damaged record are ignored", bytes.len() - end);
+            tracing::warn!(file = %path.display(), "ignoring {} bytes of an incomplete or damaged record", bytes.len() - end);
             file.set_len(end as u64)?;
         }
         Ok(Segment {
@@ -248,7 +248,7 @@ impl Segment {
         })
     }
 
-    /// The next record that waits; `None` when there is no sound one, though there should be.
+    /// The next waiting record; `None` if a record is damaged.
     fn load(&mut self) -> io::Result<Option<(RecordId, Message)>> {
         while self.cursor < self.end {
             let mut header = [0; HEADER];
@@ -279,12 +279,12 @@ impl Segment {
 struct Record {
     waits: bool,
     message: Message,
-    /// Bytes of the whole record.
+    /// Length of the whole record, bytes.
     length: usize,
 }
 
 impl Record {
-    /// The record at the beginning of `bytes`, if it is whole and sound.
+    /// The record at the beginning of `bytes`, if it is complete and undamaged.
     fn decode(bytes: &[u8]) -> Option<Record> {
         let (header, rest) = bytes.split_first_chunk::<HEADER>()?;
         let body = rest.get(..body_length(header)?)?;
@@ -297,7 +297,7 @@ impl Record {
         let (topic, payload) = rest.split_at_checked(usize::from(u16::from_le_bytes(*topic_length)))?;
         Some(Record {
             waits,
-            message: Message::passing(std::str::from_utf8(topic).ok()?, payload.to_vec()),
+            message: Message::not_retained(std::str::from_utf8(topic).ok()?, payload.to_vec()),
             length: HEADER + body.len(),
         })
     }
@@ -331,7 +331,7 @@ fn segment_number(path: &Path) -> Option<u64> {
     name.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)?.parse().ok()
 }
 
-/// CRC-32 (reflected polynomial 0xEDB88320, start and final inversion), as of zip files.
+/// CRC-32 (reflected polynomial 0xEDB88320, initial value and final XOR 0xFFFFFFFF), as in zip files.
 fn crc32(bytes: &[u8]) -> u32 {
     let step = |crc: u32, _| {
         if crc & 1 == 1 {
@@ -352,7 +352,7 @@ mod tests {
     const BIG: u64 = 1 << 20;
 
     fn event(n: usize) -> Message {
-        Message::passing("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
+        Message::not_retained("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
     }
 
     fn number(message: &Message) -> usize {
@@ -380,7 +380,7 @@ mod tests {
     }
 
     #[test]
-    fn what_is_not_acknowledged_is_there_after_a_restart() {
+    fn unacknowledged_events_survive_a_restart() {
         let dir = tempfile::tempdir().unwrap();
         let mut journal = Journal::open(dir.path(), BIG).unwrap();
         (1..=4).for_each(|n| journal.append(&event(n)).unwrap());
@@ -416,7 +416,7 @@ mod tests {
     }
 
     #[test]
-    fn a_torn_or_damaged_tail_is_cut_off() {
+    fn an_incomplete_or_damaged_tail_is_truncated() {
         let whole = encode(&event(9)).unwrap();
         let mut damaged = whole.clone();
         damaged[HEADER + 4] ^= 1;
@@ -439,7 +439,7 @@ mod tests {
     }
 
     #[test]
-    fn the_oldest_segment_goes_when_the_buffer_is_full() {
+    fn a_full_buffer_drops_its_oldest_segment() {
         let dir = tempfile::tempdir().unwrap();
         let max = 4000;
         let mut journal = Journal::open(dir.path(), max).unwrap();
@@ -465,11 +465,11 @@ mod tests {
             journal.acknowledge(record).unwrap();
         }
         assert_eq!((journal.bytes(), segments(dir.path()).len()), (0, 1));
-        assert!(journal.append(&Message::passing("t", vec![0; 5000])).is_err());
+        assert!(journal.append(&Message::not_retained("t", vec![0; 5000])).is_err());
     }
 
     #[test]
-    fn an_acknowledgement_after_the_segment_was_dropped_means_nothing() {
+    fn an_acknowledgement_for_a_dropped_segment_is_ignored() {
         let dir = tempfile::tempdir().unwrap();
         let mut journal = Journal::open(dir.path(), 500).unwrap();
         journal.append(&event(0)).unwrap();
@@ -484,7 +484,7 @@ mod tests {
     }
 
     #[test]
-    fn one_process_a_directory() {
+    fn a_directory_belongs_to_one_process() {
         let dir = tempfile::tempdir().unwrap();
         let _journal = Journal::open(dir.path(), BIG).unwrap();
         let error = Journal::open(dir.path(), BIG).unwrap_err();
@@ -492,7 +492,7 @@ mod tests {
     }
 
     #[test]
-    fn crc_of_the_catalogue() {
+    fn crc_32_check_value() {
         assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
     }
 }

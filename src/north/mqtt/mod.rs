@@ -7,9 +7,10 @@
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher`, `commands`, `reply` and `outbox` are pure: what is said, when, and in which order; `offline` is
-//! `commands` for whoever has no broker. `client` is the one task that owns them; `connection` wraps rumqttc, which keeps nothing for us: every connection is a new
-//! client with a clean session, and what the broker did not acknowledge is sent again from the outbox.
+//! `payload`, `publisher`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and in which
+//! order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps rumqttc,
+//! which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are sent again
+//! from the outbox.
 
 mod client;
 mod commands;
@@ -39,8 +40,9 @@ use crate::plant::SharedPlant;
 
 pub use self::offline::{Offline, Published};
 pub use self::request::Incoming;
+pub(super) use self::request::resolve as point_value;
 
-/// A secret that does not show in logs.
+/// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]
 pub struct Secret(pub String);
 
@@ -50,7 +52,7 @@ impl fmt::Debug for Secret {
     }
 }
 
-/// What the MQTT client is told.
+/// Configuration of the MQTT client.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Options {
     /// Host of the broker.
@@ -65,19 +67,19 @@ pub struct Options {
     pub username: Option<String>,
     /// Password.
     pub password: Option<Secret>,
-    /// CA certificates (PEM) for the broker; the system's when absent.
+    /// CA certificates (PEM) for the broker; those of the system if absent.
     pub ca: Option<PathBuf>,
     /// Client certificate chain and key (PEM).
     pub identity: Option<(PathBuf, PathBuf)>,
     /// First level of all topics.
     pub base: String,
-    /// Least time between two publications of a topic.
+    /// Minimum time between two publications of a topic.
     pub min_interval: Duration,
-    /// Most time between two publications of a topic.
+    /// Maximum time between two publications of a topic.
     pub max_interval: Duration,
     /// Whether the set topics are served.
     pub commands: bool,
-    /// Where events are kept while the broker is away, and how many bytes; in memory only when absent.
+    /// Disk buffer for events while the broker is not connected; in memory only if absent.
     pub buffer: Option<Buffer>,
 }
 
@@ -86,7 +88,7 @@ pub struct Options {
 pub struct Buffer {
     /// Directory.
     pub dir: PathBuf,
-    /// Most bytes on disk.
+    /// Maximum size on disk, bytes.
     pub max_bytes: u64,
 }
 
@@ -95,8 +97,8 @@ pub struct Buffer {
 pub struct Mqtt(JoinHandle<()>);
 
 impl Mqtt {
-    /// Waits until the client has ended: at most about half a second after the cancellation, in which
-    /// `offline` is published and the connection closed.
+    /// Waits until the client has ended: at most about half a second after the cancellation, in which it publishes
+    /// `offline` and disconnects.
     pub async fn stopped(self) {
         if let Err(error) = self.0.await {
             tracing::error!("the MQTT client ended unexpectedly: {error}");
@@ -104,10 +106,10 @@ impl Mqtt {
     }
 }
 
-/// Starts the MQTT client; must be called within a Tokio runtime. It never gives up: a broker that is away is
-/// tried again and again. Events told from now on are published, so start it before the buses.
+/// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
+/// raised from now on are published, so start it before the buses.
 pub fn start(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
-    // Subscribed here and not in the task: nothing told after this call is missed.
+    // Subscribed here and not in the task, so that no event after this call is missed.
     let events = plant.load().events.subscribe();
     Mqtt(tokio::spawn(client::run(options, plant, stats, events, cancel)))
 }

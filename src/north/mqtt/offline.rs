@@ -1,5 +1,4 @@
-//! The set topics without a broker and without a runtime, for whoever has messages instead of a connection: tests and
-//! virtual time.
+//! The set topics without a broker and a runtime, for tests and virtual time.
 
 use std::collections::VecDeque;
 use std::time::{Duration, Instant, SystemTime};
@@ -31,13 +30,13 @@ impl From<Message> for Published {
     }
 }
 
-/// The MQTT client's way with commands, between a plant and whoever stands for the broker. Time is an argument; the
-/// calendar runs along with it from the moment of [`Offline::new`].
+/// The commands of an MQTT client without its connection. Time is an argument; the calendar advances with it from
+/// [`Offline::new`] on.
 #[derive(Debug)]
 pub struct Offline {
     plant: SharedPlant,
     commands: Commands,
-    /// What the broker still holds: the commands have no room for it.
+    /// Messages that stay with the broker because there is no room for more commands.
     held: VecDeque<Incoming>,
     results: Vec<Published>,
     begun: (Instant, SystemTime),
@@ -56,14 +55,14 @@ impl Offline {
         }
     }
 
-    /// A message arrives. Its order is in the queue of its bus when this returns, unless so many wait that the broker
-    /// holds it back until a later [`Offline::poll`].
+    /// Receives a message. Its command is in the queue of its bus when this returns, unless so many wait that the
+    /// broker keeps the message until a later [`Offline::poll`].
     pub fn receive(&mut self, message: Incoming, now: Instant) {
         self.held.push_back(message);
         self.work(now);
     }
 
-    /// The results that are there by now, in the order in which they came.
+    /// The results since the last call, in order.
     pub fn poll(&mut self, now: Instant) -> Vec<Published> {
         let time = self.time(now);
         while let Some(ended) = self.commands.try_finished() {

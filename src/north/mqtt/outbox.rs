@@ -1,22 +1,22 @@
-//! What is sent next, and what waits for its acknowledgement. Pure.
+//! Decides what is sent next, and tracks what waits for its acknowledgement.
 //!
-//! Telemetry: the latest value per topic, the newest wins, one message per topic under way. Events and
-//! results: bounded queues in order. An entry leaves on its PubAck only. At most `limit` messages are under
-//! way: half the inflight window of the connection, so that packet ids are never used twice at one time.
+//! Telemetry: only the latest value of a topic waits, and one message per topic is in flight. Events and results:
+//! bounded queues in order. An entry leaves only when it is acknowledged (PUBACK). At most `limit` messages are in
+//! flight: half the inflight window of the connection, so that no packet id is used twice at a time.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
 
 use super::journal::RecordId;
 
-/// Results that may wait, as many as commands may, and their bytes; the oldest is dropped.
+/// Maximum number of waiting results, the same as that of commands, and their size in bytes; the oldest is dropped.
 const RESULTS: usize = 4096;
 const RESULT_BYTES: usize = 32 << 20;
-/// Events that may wait in memory; with a buffer on disk the rest waits there.
+/// Maximum number of events waiting in memory; with a buffer, the others wait on disk.
 const EVENTS: usize = crate::event::BURST;
-/// Events loaded from the disk at one time.
+/// Maximum number of events loaded from disk at a time.
 const LOADED: usize = 64;
-/// Connections that may break under a result before it is given up: its response topic may be the cause.
+/// Number of lost connections after which a result is dropped: its response topic may be the cause.
 const RESULT_ATTEMPTS: u8 = 2;
 
 /// A message for the broker, QoS 1.
@@ -30,8 +30,8 @@ pub(super) struct Message {
 }
 
 impl Message {
-    /// A message that the broker does not keep.
-    pub(super) fn passing(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
+    /// A message that is not retained.
+    pub(super) fn not_retained(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
         Message {
             topic: topic.into(),
             payload,
@@ -45,20 +45,20 @@ impl Message {
     }
 }
 
-/// Names an entry while its message is under way.
+/// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
-    /// Telemetry of that topic.
+    /// Telemetry of this topic.
     Latest(Arc<str>),
-    /// Result of that serial number.
+    /// Result with this serial number.
     Result(u64),
-    /// Event of that serial number.
+    /// Event with this serial number.
     Event(u64),
 }
 
-/// What was acknowledged.
+/// An entry whose message was acknowledged.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Acked {
+pub(super) struct Acknowledged {
     /// Topic of the message.
     pub(super) topic: Arc<str>,
     /// Its record on disk.
@@ -67,9 +67,9 @@ pub(super) struct Acked {
 
 #[derive(Debug, Default)]
 struct Slot {
-    /// The newest payload that was not handed over yet.
+    /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
-    under_way: bool,
+    in_flight: bool,
 }
 
 #[derive(Debug)]
@@ -77,32 +77,32 @@ struct Entry {
     serial: u64,
     message: Message,
     record: Option<RecordId>,
-    under_way: bool,
+    in_flight: bool,
     attempts: u8,
 }
 
-/// Everything that is to be published.
+/// All messages that wait or are in flight.
 #[derive(Debug, Default)]
 pub(super) struct Outbox {
     latest: BTreeMap<Arc<str>, Slot>,
-    /// Topics with a payload to hand over, oldest change first.
+    /// Topics with a waiting payload, oldest change first.
     order: VecDeque<Arc<str>>,
     results: VecDeque<Entry>,
     events: VecDeque<Entry>,
     serial: u64,
-    /// Handed over, packet id not known yet.
-    handed: VecDeque<Key>,
-    /// Handed over, by packet id.
-    flying: HashMap<u16, Key>,
-    /// The first topic of `order` goes before everything else.
-    lead: bool,
-    /// Whose turn it is of events and telemetry.
+    /// Published, packet id not known yet.
+    published: VecDeque<Key>,
+    /// Published, by packet id.
+    unacknowledged: HashMap<u16, Key>,
+    /// The first topic of `order` is published before everything else.
+    has_leader: bool,
+    /// Whether events come before telemetry next time.
     events_turn: bool,
     dropped: u64,
 }
 
 impl Outbox {
-    /// Telemetry: replaces what waits for that topic.
+    /// Adds telemetry; replaces the waiting payload of the topic.
     pub(super) fn put(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         let slot = self.latest.entry(topic.clone()).or_default();
         if slot.waiting.replace(payload).is_none() {
@@ -110,15 +110,15 @@ impl Outbox {
         }
     }
 
-    /// Telemetry that goes before everything else.
+    /// Adds telemetry that is published before everything else.
     pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
         self.latest.entry(topic.clone()).or_default().waiting = Some(payload);
         self.order.retain(|t| *t != topic);
         self.order.push_front(topic);
-        self.lead = true;
+        self.has_leader = true;
     }
 
-    /// A result; when too many wait the oldest is dropped.
+    /// Adds a result; if too many wait, the oldest is dropped.
     pub(super) fn push_result(&mut self, message: Message) {
         self.serial += 1;
         let full = |results: &VecDeque<Entry>| {
@@ -128,48 +128,48 @@ impl Outbox {
         self.dropped += push(&mut self.results, self.serial, message, None, full);
     }
 
-    /// An event, with its record when it is on disk; when too many wait the oldest is dropped.
+    /// Adds an event, with its record if it is on disk; if too many wait, the oldest is dropped.
     pub(super) fn push_event(&mut self, message: Message, record: Option<RecordId>) {
         self.serial += 1;
         let full = |events: &VecDeque<Entry>| events.len() >= EVENTS;
         self.dropped += push(&mut self.events, self.serial, message, record, full);
     }
 
-    /// How many events may be loaded from the disk now.
+    /// Number of events that may be loaded from disk now.
     pub(super) fn room(&self) -> usize {
         LOADED.saturating_sub(self.events.len())
     }
 
-    /// Events and results that wait, those under way included.
+    /// Number of events and results that wait or are in flight.
     pub(super) fn waiting(&self) -> usize {
         self.results.len() + self.events.len()
     }
 
-    /// Whether telemetry of that topic waits or is under way.
+    /// Whether telemetry of that topic waits or is in flight.
     pub(super) fn has_telemetry(&self, topic: &str) -> bool {
         self.latest.contains_key(topic)
     }
 
-    /// Events and results that were dropped because too many waited.
+    /// Number of events and results dropped because too many waited.
     pub(super) fn dropped(&self) -> u64 {
         self.dropped
     }
 
-    /// Messages handed over and not acknowledged.
-    pub(super) fn under_way(&self) -> usize {
-        self.handed.len() + self.flying.len()
+    /// Number of messages in flight.
+    pub(super) fn in_flight(&self) -> usize {
+        self.published.len() + self.unacknowledged.len()
     }
 
-    /// The message to be handed over next: a leading one, then results, then events and telemetry by turns.
-    /// It stays here: tell with [`Outbox::handed_over`] that it was taken.
+    /// The message to publish next: the leading one, then results, then events and telemetry alternately. It stays in
+    /// the outbox; confirm with [`Outbox::mark_published`] that it was published.
     pub(super) fn next(&self, limit: usize) -> Option<(Key, Message)> {
-        if self.under_way() >= limit {
+        if self.in_flight() >= limit {
             return None;
         }
-        if self.lead
-            && let Some(lead) = self.next_latest()
+        if self.has_leader
+            && let Some(leader) = self.next_latest()
         {
-            return Some(lead);
+            return Some(leader);
         }
         next_entry(&self.results, Key::Result).or_else(|| {
             let events = || next_entry(&self.events, Key::Event);
@@ -184,7 +184,7 @@ impl Outbox {
 
     fn next_latest(&self) -> Option<(Key, Message)> {
         self.order.iter().find_map(|topic| {
-            let slot = self.latest.get(topic).filter(|slot| !slot.under_way)?;
+            let slot = self.latest.get(topic).filter(|slot| !slot.in_flight)?;
             let message = Message {
                 topic: topic.clone(),
                 payload: slot.waiting.clone()?,
@@ -195,19 +195,19 @@ impl Outbox {
         })
     }
 
-    /// The message of `key` was handed over to the connection.
-    pub(super) fn handed_over(&mut self, key: Key) {
+    /// The message of `key` was published on the connection.
+    pub(super) fn mark_published(&mut self, key: Key) {
         match &key {
             Key::Latest(topic) => {
                 if let Some(slot) = self.latest.get_mut(topic) {
                     slot.waiting = None;
-                    slot.under_way = true;
+                    slot.in_flight = true;
                 }
-                // Found at or near the front: before it lie only topics that are under way.
+                // At or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
-                self.lead = false;
+                self.has_leader = false;
                 self.events_turn = true;
             }
             Key::Result(serial) => mark(&mut self.results, *serial),
@@ -216,31 +216,31 @@ impl Outbox {
                 self.events_turn = false;
             }
         }
-        self.handed.push_back(key);
+        self.published.push_back(key);
     }
 
-    /// The connection gave the oldest message handed over this packet id.
+    /// The connection assigned this packet id to the oldest published message.
     ///
     /// # Errors
-    /// When the books do not agree: the connection must be given up.
+    /// The state is inconsistent; the connection must be closed.
     pub(super) fn numbered(&mut self, packet: u16) -> Result<(), &'static str> {
         let key = self
-            .handed
+            .published
             .pop_front()
-            .ok_or("a message was sent that nobody handed over")?;
-        match self.flying.insert(packet, key) {
+            .ok_or("a message was sent that was not published by the outbox")?;
+        match self.unacknowledged.insert(packet, key) {
             None => Ok(()),
             Some(_) => Err("a packet id was used twice"),
         }
     }
 
-    /// The broker acknowledged a message: its entry leaves.
-    pub(super) fn acked(&mut self, packet: u16) -> Option<Acked> {
-        self.settle(self.flying.get(&packet).cloned()?, Some(packet))
+    /// The broker acknowledged a message; its entry is removed.
+    pub(super) fn acked(&mut self, packet: u16) -> Option<Acknowledged> {
+        self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }
 
-    /// Gives up the message of `key`, which cannot be sent.
-    pub(super) fn give_up(&mut self, key: Key) -> Option<Acked> {
+    /// Drops the message of `key`, which cannot be sent.
+    pub(super) fn give_up(&mut self, key: Key) -> Option<Acknowledged> {
         if let Key::Latest(topic) = &key {
             self.latest.get_mut(topic)?.waiting = None;
             self.order.retain(|t| t != topic);
@@ -248,53 +248,53 @@ impl Outbox {
         self.settle(key, None)
     }
 
-    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acked> {
+    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acknowledged> {
         if let Some(packet) = packet {
-            self.flying.remove(&packet);
+            self.unacknowledged.remove(&packet);
         }
         match key {
             Key::Latest(topic) => {
                 let slot = self.latest.get_mut(&topic)?;
-                slot.under_way = false;
+                slot.in_flight = false;
                 if slot.waiting.is_none() {
                     self.latest.remove(&topic);
                 }
-                Some(Acked { topic, record: None })
+                Some(Acknowledged { topic, record: None })
             }
             Key::Result(serial) => take(&mut self.results, serial),
             Key::Event(serial) => take(&mut self.events, serial),
         }
     }
 
-    /// The connection is lost. Events and results that were under way wait again, in their order; telemetry
-    /// is forgotten: the process image knows better by then.
+    /// The connection is lost. Events and results in flight wait again, in their order; telemetry is dropped, since the
+    /// process image has newer values.
     pub(super) fn lost(&mut self) {
         self.latest.clear();
         self.order.clear();
-        self.handed.clear();
-        self.flying.clear();
-        self.lead = false;
+        self.published.clear();
+        self.unacknowledged.clear();
+        self.has_leader = false;
         for entry in self.results.iter_mut().chain(&mut self.events) {
-            entry.attempts = entry.attempts.saturating_add(u8::from(entry.under_way));
-            entry.under_way = false;
+            entry.attempts = entry.attempts.saturating_add(u8::from(entry.in_flight));
+            entry.in_flight = false;
         }
         let before = self.results.len();
         self.results.retain(|entry| entry.attempts < RESULT_ATTEMPTS);
         self.dropped += (before - self.results.len()) as u64;
     }
 
-    /// Telemetry is not sent any more.
+    /// Stops sending telemetry.
     pub(super) fn drop_telemetry(&mut self) {
         self.order.clear();
         self.latest.retain(|_, slot| {
             slot.waiting = None;
-            slot.under_way
+            slot.in_flight
         });
     }
 }
 
-/// Appends an entry; returns how many were dropped to make room. One that is under way is dropped last: it is
-/// probably delivered.
+/// Appends an entry and returns the number of entries dropped to make room. Entries in flight are dropped last: they
+/// have probably been delivered.
 fn push(
     queue: &mut VecDeque<Entry>,
     serial: u64,
@@ -304,7 +304,7 @@ fn push(
 ) -> u64 {
     let mut dropped = 0;
     while is_full(queue) {
-        let victim = queue.iter().position(|e| !e.under_way).unwrap_or(0);
+        let victim = queue.iter().position(|e| !e.in_flight).unwrap_or(0);
         queue.remove(victim);
         dropped += 1;
     }
@@ -312,26 +312,26 @@ fn push(
         serial,
         message,
         record,
-        under_way: false,
+        in_flight: false,
         attempts: 0,
     });
     dropped
 }
 
 fn next_entry(queue: &VecDeque<Entry>, key: fn(u64) -> Key) -> Option<(Key, Message)> {
-    let entry = queue.iter().find(|e| !e.under_way)?;
+    let entry = queue.iter().find(|e| !e.in_flight)?;
     Some((key(entry.serial), entry.message.clone()))
 }
 
 fn mark(queue: &mut VecDeque<Entry>, serial: u64) {
     if let Some(entry) = queue.iter_mut().find(|e| e.serial == serial) {
-        entry.under_way = true;
+        entry.in_flight = true;
     }
 }
 
-fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acked> {
+fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acknowledged> {
     let index = queue.iter().position(|e| e.serial == serial)?;
-    queue.remove(index).map(|entry| Acked {
+    queue.remove(index).map(|entry| Acknowledged {
         topic: entry.message.topic,
         record: entry.record,
     })
@@ -346,14 +346,14 @@ mod tests {
     }
 
     fn event(name: &str) -> Message {
-        Message::passing(name, Vec::new())
+        Message::not_retained(name, Vec::new())
     }
 
-    /// Hands everything over that may go; returns topics and payloads.
+    /// Publishes everything allowed; returns topics and payloads.
     fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
         let mut sent = Vec::new();
         while let Some((key, message)) = outbox.next(limit) {
-            outbox.handed_over(key);
+            outbox.mark_published(key);
             sent.push((message.topic.to_string(), message.payload));
         }
         sent
@@ -364,7 +364,7 @@ mod tests {
     }
 
     #[test]
-    fn newest_telemetry_wins_and_one_message_per_topic_is_under_way() {
+    fn newest_telemetry_wins_and_one_message_per_topic_is_in_flight() {
         let mut outbox = Outbox::default();
         outbox.put(topic("a"), vec![1]);
         outbox.put(topic("b"), vec![1]);
@@ -372,7 +372,7 @@ mod tests {
         assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![2]), ("b".into(), vec![1])]);
         outbox.put(topic("a"), vec![3]);
         outbox.put(topic("a"), vec![4]);
-        assert!(outbox.next(10).is_none(), "a is under way");
+        assert!(outbox.next(10).is_none(), "a is in flight");
         outbox.numbered(1).unwrap();
         outbox.numbered(2).unwrap();
         assert!(outbox.acked(2).is_some(), "acknowledgements come in any order");
@@ -382,21 +382,21 @@ mod tests {
     }
 
     #[test]
-    fn the_limit_bounds_what_is_under_way() {
+    fn the_limit_bounds_what_is_in_flight() {
         let mut outbox = Outbox::default();
         for i in 0..10 {
             outbox.put(topic(&format!("t{i}")), Vec::new());
             outbox.push_event(event("e"), None);
         }
         assert_eq!(drain(&mut outbox, 3).len(), 3);
-        assert_eq!(outbox.under_way(), 3);
+        assert_eq!(outbox.in_flight(), 3);
         outbox.numbered(1).unwrap();
         outbox.acked(1);
         assert_eq!(drain(&mut outbox, 3).len(), 1);
     }
 
     #[test]
-    fn results_first_then_events_and_telemetry_by_turns_but_the_leader_leads() {
+    fn leader_then_results_then_events_and_telemetry_alternately() {
         let mut outbox = Outbox::default();
         for i in 1..=3 {
             outbox.put(topic(&format!("t{i}")), Vec::new());
@@ -409,7 +409,7 @@ mod tests {
     }
 
     #[test]
-    fn after_a_loss_events_come_again_in_order_and_telemetry_does_not() {
+    fn after_a_lost_connection_events_are_sent_again_in_order() {
         let mut outbox = Outbox::default();
         outbox.put(topic("t"), Vec::new());
         for name in ["e1", "e2", "e3"] {
@@ -422,7 +422,7 @@ mod tests {
         assert_eq!(outbox.acked(2).unwrap().topic.as_ref(), "e1");
         outbox.lost();
         assert_eq!(outbox.waiting(), 2);
-        assert_eq!(outbox.under_way(), 0);
+        assert_eq!(outbox.in_flight(), 0);
         assert!(
             outbox.acked(3).is_none(),
             "an acknowledgement of the lost connection means nothing"
@@ -431,7 +431,7 @@ mod tests {
     }
 
     #[test]
-    fn a_result_that_breaks_connections_is_given_up() {
+    fn a_result_that_breaks_connections_is_dropped() {
         let mut outbox = Outbox::default();
         outbox.push_result(event("bad"));
         for _ in 0..2 {
@@ -458,7 +458,7 @@ mod tests {
     }
 
     #[test]
-    fn long_results_are_fewer() {
+    fn results_are_bounded_by_size() {
         let mut outbox = Outbox::default();
         let long = Message {
             correlation: Some(vec![0; 60_000]),
@@ -471,7 +471,7 @@ mod tests {
     }
 
     #[test]
-    fn books_that_do_not_agree_are_noticed() {
+    fn inconsistent_packet_ids_are_detected() {
         let mut outbox = Outbox::default();
         assert!(outbox.numbered(1).is_err());
         for name in ["a", "b"] {
@@ -483,7 +483,7 @@ mod tests {
     }
 
     #[test]
-    fn what_cannot_be_sent_is_given_up() {
+    fn messages_that_cannot_be_sent_are_dropped() {
         let mut outbox = Outbox::default();
         outbox.put(topic("big"), vec![0; 10]);
         let (key, _) = outbox.next(1).unwrap();

@@ -1,4 +1,4 @@
-//! What is said: topics and payloads. Pure.
+//! The topics and payloads.
 
 use std::time::{Duration, SystemTime};
 
@@ -9,7 +9,7 @@ use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::BusHandle;
 
-/// Keys of the state object that are no points; a profile point of that name is left out of it.
+/// Keys of the state object that are not points; a profile point of that name is omitted.
 const STATE_KEYS: [&str; 6] = ["state", "quality", "time", "age_ms", "fault_text", "point_quality"];
 
 /// The topics of one gateway.
@@ -72,9 +72,9 @@ pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
     points
 }
 
-/// What the state object of a drive tells, its times apart: a change of it is worth a message.
+/// The state object of a drive without its times; a change of it is published.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Shown {
+pub(super) struct StateContent {
     /// `None` while it is not known.
     pub(super) state: Option<State>,
     pub(super) quality: Quality,
@@ -82,19 +82,19 @@ pub(super) struct Shown {
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
 
-/// The text beside a point's value: its key and, while the value is good, the text of it.
+/// The key and the text of an enumeration; the text is empty unless the value is good.
 pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String, &str)> {
     let text = value.and_then(|value| point.text_of(value)).unwrap_or_default();
     (!point.texts.is_empty()).then(|| (format!("{}_text", point.name), text))
 }
 
-impl Shown {
-    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> Shown {
+impl StateContent {
+    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
             (sample.good(), sample.quality)
         };
-        Shown {
+        StateContent {
             state: reading.state(),
             quality: reading.overall(),
             points: points.map(shown).collect(),
@@ -104,7 +104,7 @@ impl Shown {
 
 /// The state object of a drive.
 pub(super) struct StateObject<'s> {
-    pub(super) shown: &'s Shown,
+    pub(super) shown: &'s StateContent,
     /// Names in the order of `shown.points`.
     pub(super) names: &'s [String],
     /// Their indices in the profile.
@@ -112,7 +112,7 @@ pub(super) struct StateObject<'s> {
     pub(super) profile: &'s Profile,
     pub(super) fault_text: String,
     pub(super) age: Option<Duration>,
-    /// The time of day now.
+    /// Time of day.
     pub(super) wall: SystemTime,
 }
 
@@ -146,7 +146,7 @@ impl Serialize for StateObject<'_> {
     }
 }
 
-/// A negative zero is a zero.
+/// Turns a negative zero into zero.
 fn tidy(value: Value) -> Value {
     match value {
         Value::Number(n) => Value::Number(n + 0.0),
@@ -156,48 +156,48 @@ fn tidy(value: Value) -> Value {
 
 /// The payload of a point topic.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(super) enum Bare {
-    /// Nothing good is known: an empty payload, which takes the retained value away.
+pub(super) enum PointPayload {
+    /// Nothing good is known: an empty payload, which clears the retained value.
     Nothing,
     /// A value.
     Value(Value),
-    /// The drive in one word.
+    /// The state of the drive.
     State(State),
     /// The text of this fault code.
     FaultText(i64),
 }
 
-impl Bare {
+impl PointPayload {
     /// The value, if it is good.
-    pub(super) fn of(value: Option<Value>) -> Bare {
-        value.map_or(Bare::Nothing, Bare::Value)
+    pub(super) fn of(value: Option<Value>) -> PointPayload {
+        value.map_or(PointPayload::Nothing, PointPayload::Value)
     }
 
-    /// The drive in one word, if that is known.
-    pub(super) fn state(state: Option<State>) -> Bare {
-        state.map_or(Bare::Nothing, Bare::State)
+    /// The state of the drive, if it is known.
+    pub(super) fn state(state: Option<State>) -> PointPayload {
+        state.map_or(PointPayload::Nothing, PointPayload::State)
     }
 
     /// The text of the active fault, if the fault code is good.
-    pub(super) fn fault_text(reading: &Reading<'_>) -> Bare {
+    pub(super) fn fault_text(reading: &Reading<'_>) -> PointPayload {
         match reading.model(ModelPoint::FaultCode).good() {
-            Some(Value::Integer(code)) => Bare::FaultText(code),
-            _ => Bare::Nothing,
+            Some(Value::Integer(code)) => PointPayload::FaultText(code),
+            _ => PointPayload::Nothing,
         }
     }
 
     /// The bytes: `true`, `false`, a shortest decimal, a word, or nothing.
     pub(super) fn render(self, profile: &Profile) -> Vec<u8> {
         match self {
-            Bare::Nothing => Vec::new(),
-            Bare::Value(value) => tidy(value).to_string().into_bytes(),
-            Bare::State(state) => state.name().into(),
-            Bare::FaultText(code) => profile.fault_text(code).into_bytes(),
+            PointPayload::Nothing => Vec::new(),
+            PointPayload::Value(value) => tidy(value).to_string().into_bytes(),
+            PointPayload::State(state) => state.name().into(),
+            PointPayload::FaultText(code) => profile.fault_text(code).into_bytes(),
         }
     }
 }
 
-/// What a bus message tells at once when it changes.
+/// The part of a bus message whose changes are published at once.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusState {
     up: bool,
@@ -206,7 +206,7 @@ pub(super) struct BusState {
     online: usize,
 }
 
-/// What a bus message tells besides; these change all the time.
+/// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
     load: f64,
@@ -217,7 +217,7 @@ pub(super) struct BusFigures {
     queue: usize,
 }
 
-/// State and figures of a bus now.
+/// State and figures of a bus.
 pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
     let BusHealth {
         up,
@@ -262,10 +262,10 @@ pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTim
     object.to_string().into_bytes()
 }
 
-/// The event object; `None` for an event of a whole bus, which its bus topic tells.
+/// The event object; `None` for an event of a whole bus, which is part of the bus topic.
 pub(super) fn event(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
     let drive = event.drive.as_deref()?;
-    // Strings and figures only: this cannot fail.
+    // Strings and numbers can always be serialized.
     let payload = serde_json::to_vec(event).ok()?;
     Some((topics.drive(drive, "event"), payload))
 }
@@ -321,7 +321,7 @@ mod tests {
             .get("vacon-nx")
             .unwrap()
             .clone();
-        let text = |bare: Bare| String::from_utf8(bare.render(&profile)).unwrap();
+        let text = |bare: PointPayload| String::from_utf8(bare.render(&profile)).unwrap();
         for (value, expected) in [
             (Value::Number(25.0), "25"),
             (Value::Number(0.1), "0.1"),
@@ -330,10 +330,10 @@ mod tests {
             (Value::Integer(-7), "-7"),
             (Value::Bool(true), "true"),
         ] {
-            assert_eq!(text(Bare::Value(value)), expected);
+            assert_eq!(text(PointPayload::Value(value)), expected);
         }
-        assert_eq!(text(Bare::FaultText(53)), "fieldbus fault");
-        assert_eq!(text(Bare::FaultText(0)), "");
+        assert_eq!(text(PointPayload::FaultText(53)), "fieldbus fault");
+        assert_eq!(text(PointPayload::FaultText(0)), "");
     }
 
     #[test]
@@ -342,7 +342,7 @@ mod tests {
              [[point]]\nname = \"mode\"\nat = \"holding 1\"\n[point.texts]\n3 = \"auto\"\n";
         let profile = Profile::parse("m.toml", source, false).unwrap();
         let state = |value: Option<i64>| {
-            let shown = Shown {
+            let shown = StateContent {
                 state: Some(State::NotReady),
                 quality: Quality::Good,
                 points: vec![(value.map(Value::Integer), Quality::Good)],
@@ -358,13 +358,13 @@ mod tests {
             };
             serde_json::to_value(&object).unwrap()
         };
-        let told = state(Some(3));
-        assert_eq!((&told["mode"], &told["mode_text"]), (&3.into(), &"auto".into()));
-        let told = state(Some(4));
-        assert_eq!((&told["mode"], &told["mode_text"]), (&4.into(), &"".into()));
-        let told = state(None);
+        let object = state(Some(3));
+        assert_eq!((&object["mode"], &object["mode_text"]), (&3.into(), &"auto".into()));
+        let object = state(Some(4));
+        assert_eq!((&object["mode"], &object["mode_text"]), (&4.into(), &"".into()));
+        let object = state(None);
         assert_eq!(
-            (&told["mode"], &told["mode_text"]),
+            (&object["mode"], &object["mode_text"]),
             (&serde_json::Value::Null, &"".into())
         );
     }
@@ -385,7 +385,7 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -395,26 +395,26 @@ mod tests {
             age: None,
             wall: SystemTime::UNIX_EPOCH,
         };
-        let told = serde_json::to_value(&object).unwrap();
+        let object = serde_json::to_value(&object).unwrap();
         assert_eq!(
-            (&told["state"], &told["quality"]),
+            (&object["state"], &object["quality"]),
             (&serde_json::Value::Null, &"bad".into())
         );
         assert_eq!(
-            (&told["running"], &told["ready"]),
+            (&object["running"], &object["ready"]),
             (&serde_json::Value::Null, &true.into())
         );
-        assert_eq!(told["point_quality"], serde_json::json!({"ready": "good"}));
-        assert_eq!(Bare::state(shown.state), Bare::Nothing);
+        assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
+        assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = Shown::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 
     #[test]
     fn events_of_drives_go_to_their_topic() {
         let topics = Topics::new("drivegate", "hall");
-        let mut told = Event {
+        let mut object = Event {
             id: 4,
             time: SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
             kind: crate::event::EventKind::FaultEnd,
@@ -423,13 +423,13 @@ mod tests {
             fault_code: Some(53),
             text: "gone".to_string(),
         };
-        let (topic, payload) = event(&topics, &told).unwrap();
+        let (topic, payload) = event(&topics, &object).unwrap();
         assert_eq!(topic, "drivegate/hall/drive/p1/event");
         let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
         let expected = serde_json::json!({"id": 4, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
         assert_eq!(payload, expected);
-        told.drive = None;
-        assert_eq!(event(&topics, &told), None);
+        object.drive = None;
+        assert_eq!(event(&topics, &object), None);
     }
 }

@@ -1,15 +1,15 @@
-//! When something is said: on change, not more often than `min_interval`, at least every `max_interval`.
-//! Pure; time is an argument.
+//! Decides when a topic is published: on change, but not before `min_interval`, and at the latest after `max_interval`.
+//! Time is an argument.
 
 use std::collections::BTreeSet;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::payload::{self, Bare, BusFigures, BusState, Shown, StateObject, Topics};
+use super::payload::{self, BusFigures, BusState, PointPayload, StateContent, StateObject, Topics};
 use crate::drive::ModelPoint;
 use crate::plant::{BusHandle, DriveHandle, Plant};
 
-/// Counters and load of a bus change all the time: they are no reason to publish more often than this.
+/// Minimum time between publications because counters or load of a bus changed, which they do all the time.
 const FIGURES_INTERVAL: Duration = Duration::from_secs(1);
 
 /// A retained message to be published.
@@ -19,29 +19,30 @@ pub(super) struct Update {
     pub(super) payload: Vec<u8>,
 }
 
-/// Watches the process image and tells what is to be published.
+/// Observes the process image and returns what is to be published.
 #[derive(Debug)]
 pub(super) struct Publisher {
     topics: Topics,
-    pace: Pace,
+    pace: PublishInterval,
     drives: Vec<DriveTopics>,
     buses: Vec<BusTopic>,
-    /// Topics of drives and buses that are not configured any more, for the broker to forget.
+    /// Topics of drives and buses that are no longer configured, to be cleared at the broker.
     vanished: BTreeSet<Arc<str>>,
-    vanished_told: bool,
+    vanished_cleared: bool,
 }
 
 #[derive(Debug, Clone, Copy)]
-struct Pace {
+struct PublishInterval {
     min: Duration,
     max: Duration,
 }
 
-impl Pace {
-    fn due(self, last: Option<Instant>, now: Instant, changed: bool) -> bool {
-        last.is_none_or(|last| {
-            let since = now.saturating_duration_since(last);
-            since >= self.max || changed && since >= self.min
+impl PublishInterval {
+    /// Whether `current` is published now, if the last publication and its time were `last`.
+    fn is_due<T: PartialEq>(self, last: Option<&(T, Instant)>, current: &T, now: Instant) -> bool {
+        last.is_none_or(|(last, at)| {
+            let since = now.saturating_duration_since(*at);
+            since >= self.max || last != current && since >= self.min
         })
     }
 }
@@ -53,20 +54,20 @@ struct DriveTopics {
     /// Index in the profile and name of each published point.
     indices: Vec<usize>,
     names: Vec<String>,
-    last: Option<(Shown, Instant)>,
+    last: Option<(StateContent, Instant)>,
     points: Vec<PointTopic>,
 }
 
 #[derive(Debug)]
 struct PointTopic {
     topic: Arc<str>,
-    what: What,
-    last: Option<(Bare, Instant)>,
+    source: PointSource,
+    last: Option<(PointPayload, Instant)>,
 }
 
 #[derive(Debug, Clone, Copy)]
-enum What {
-    /// Place in [`Shown::points`].
+enum PointSource {
+    /// Index in [`StateContent::points`].
     Point(usize),
     State,
     FaultText,
@@ -76,7 +77,9 @@ enum What {
 struct BusTopic {
     bus: BusHandle,
     topic: Arc<str>,
-    last: Option<(BusState, BusFigures, Instant)>,
+    /// As last published.
+    state: Option<(BusState, Instant)>,
+    figures: Option<(BusFigures, Instant)>,
 }
 
 impl Publisher {
@@ -84,16 +87,15 @@ impl Publisher {
     pub(super) fn new(topics: Topics, min: Duration, max: Duration) -> Publisher {
         Publisher {
             topics,
-            pace: Pace { min, max },
+            pace: PublishInterval { min, max },
             drives: Vec::new(),
             buses: Vec::new(),
             vanished: BTreeSet::new(),
-            vanished_told: false,
+            vanished_cleared: false,
         }
     }
 
-    /// Watches this plant from now on; everything is published anew, and the topics that no longer exist are
-    /// cleared.
+    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
     pub(super) fn adopt(&mut self, plant: &Plant) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
         self.drives = plant
@@ -103,13 +105,14 @@ impl Publisher {
         let bus_topic = |bus: &BusHandle| BusTopic {
             bus: bus.clone(),
             topic: self.topics.bus(&bus.image.spec.name).into(),
-            last: None,
+            state: None,
+            figures: None,
         };
         self.buses = plant.buses.iter().map(bus_topic).collect();
         let present: BTreeSet<Arc<str>> = self.all_topics().cloned().collect();
         self.vanished.extend(old);
         self.vanished.retain(|topic| !present.contains(topic));
-        self.vanished_told = false;
+        self.vanished_cleared = false;
     }
 
     fn all_topics(&self) -> impl Iterator<Item = &Arc<str>> {
@@ -120,20 +123,20 @@ impl Publisher {
         drives.chain(self.buses.iter().map(|b| &b.topic))
     }
 
-    /// Everything is to be published again: the broker may have forgotten it.
+    /// Publishes everything again, since the broker may have lost it.
     pub(super) fn restart(&mut self) {
-        self.vanished_told = false;
+        self.vanished_cleared = false;
         for drive in &mut self.drives {
             drive.last = None;
             drive.points.iter_mut().for_each(|p| p.last = None);
         }
-        self.buses.iter_mut().for_each(|b| b.last = None);
+        self.buses.iter_mut().for_each(|b| (b.state, b.figures) = (None, None));
     }
 
-    /// What is to be published now; `wall` is the time of day at `now`.
+    /// The messages to publish now; `wall` is the time of day at `now`.
     pub(super) fn tick(&mut self, now: Instant, wall: SystemTime) -> Vec<Update> {
         let mut updates = Vec::new();
-        if !std::mem::replace(&mut self.vanished_told, true) {
+        if !std::mem::replace(&mut self.vanished_cleared, true) {
             updates.extend(self.vanished.iter().map(|topic| Update {
                 topic: topic.clone(),
                 payload: Vec::new(),
@@ -153,19 +156,19 @@ impl DriveTopics {
     fn new(topics: &Topics, drive: DriveHandle) -> DriveTopics {
         let spec = &drive.image.spec;
         let published = payload::published_points(&spec.profile);
-        let topic = |name: &str, what| PointTopic {
+        let topic = |name: &str, source| PointTopic {
             topic: topics.point(&spec.name, name).into(),
-            what,
+            source,
             last: None,
         };
         let mut points: Vec<_> = published
             .iter()
             .enumerate()
-            .map(|(place, (_, name))| topic(name, What::Point(place)))
+            .map(|(place, (_, name))| topic(name, PointSource::Point(place)))
             .collect();
-        points.push(topic("state", What::State));
+        points.push(topic("state", PointSource::State));
         if spec.profile.model_index(ModelPoint::FaultCode).is_some() {
-            points.push(topic("fault_text", What::FaultText));
+            points.push(topic("fault_text", PointSource::FaultText));
         }
         DriveTopics {
             state: topics.drive(&spec.name, "state").into(),
@@ -177,25 +180,24 @@ impl DriveTopics {
         }
     }
 
-    fn tick(&mut self, pace: Pace, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
+    fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let reading = self.drive.reading(now);
-        let shown = Shown::of(&reading, self.indices.iter().copied());
+        let shown = StateContent::of(&reading, self.indices.iter().copied());
         for point in &mut self.points {
-            let bare = match point.what {
-                What::Point(place) => Bare::of(shown.points.get(place).and_then(|(value, _)| *value)),
-                What::State => Bare::state(shown.state),
-                What::FaultText => Bare::fault_text(&reading),
+            let payload = match point.source {
+                PointSource::Point(place) => PointPayload::of(shown.points.get(place).and_then(|(value, _)| *value)),
+                PointSource::State => PointPayload::state(shown.state),
+                PointSource::FaultText => PointPayload::fault_text(&reading),
             };
-            if point.due(pace, now, bare) {
-                point.last = Some((bare, now));
+            if point.due(pace, now, payload) {
+                point.last = Some((payload, now));
                 updates.push(Update {
                     topic: point.topic.clone(),
-                    payload: bare.render(&reading.spec.profile),
+                    payload: payload.render(&reading.spec.profile),
                 });
             }
         }
-        let changed = self.last.as_ref().is_none_or(|(last, _)| *last != shown);
-        if pace.due(self.last.as_ref().map(|(_, at)| *at), now, changed) {
+        if pace.is_due(self.last.as_ref(), &shown, now) {
             let object = StateObject {
                 shown: &shown,
                 names: &self.names,
@@ -205,7 +207,7 @@ impl DriveTopics {
                 age: reading.age(),
                 wall,
             };
-            // Strings, figures and null only: this cannot fail.
+            // Strings, numbers and null can always be serialized.
             if let Ok(payload) = serde_json::to_vec(&object) {
                 updates.push(Update {
                     topic: self.state.clone(),
@@ -218,34 +220,29 @@ impl DriveTopics {
 }
 
 impl PointTopic {
-    /// A value that is not good any more is taken away at once, and once only.
-    fn due(&self, pace: Pace, now: Instant, bare: Bare) -> bool {
-        match (&self.last, bare) {
-            (Some((last, _)), Bare::Nothing) => *last != Bare::Nothing,
-            (last, _) => {
-                let changed = last.as_ref().is_none_or(|(last, _)| *last != bare);
-                pace.due(last.as_ref().map(|(_, at)| *at), now, changed)
-            }
+    /// A value that is no longer good is cleared at once, and only once.
+    fn due(&self, pace: PublishInterval, now: Instant, payload: PointPayload) -> bool {
+        match (&self.last, payload) {
+            (Some((last, _)), PointPayload::Nothing) => *last != PointPayload::Nothing,
+            (last, _) => pace.is_due(last.as_ref(), &payload, now),
         }
     }
 }
 
 impl BusTopic {
-    fn tick(&mut self, pace: Pace, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
+    fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let (state, figures) = payload::bus_now(&self.bus);
-        let due = self.last.as_ref().is_none_or(|(last_state, last_figures, at)| {
-            let slower = Pace {
-                min: pace.min.max(FIGURES_INTERVAL),
-                ..pace
-            };
-            pace.due(Some(*at), now, *last_state != state) || slower.due(Some(*at), now, *last_figures != figures)
-        });
-        if due {
+        let slower = PublishInterval {
+            min: pace.min.max(FIGURES_INTERVAL),
+            ..pace
+        };
+        let due = pace.is_due(self.state.as_ref(), &state, now);
+        if due || slower.is_due(self.figures.as_ref(), &figures, now) {
             updates.push(Update {
                 topic: self.topic.clone(),
                 payload: payload::bus_object(&state, &figures, wall),
             });
-            self.last = Some((state, figures, now));
+            (self.state, self.figures) = (Some((state, now)), Some((figures, now)));
         }
     }
 }
@@ -308,7 +305,7 @@ mod tests {
     }
 
     #[test]
-    fn the_state_object_tells_values_quality_and_time() {
+    fn the_state_object_has_values_quality_and_time() {
         let mut bench = Bench::new();
         let all = bench.after(20);
         let state: Json = serde_json::from_str(payload(&all, "drive/p1/state").unwrap()).unwrap();
@@ -352,7 +349,7 @@ mod tests {
         }
         assert_eq!(payload(&all, "drive/p2/point/running"), Some(""));
         assert_eq!(payload(&all, "drive/p2/point/state"), Some("offline"));
-        // Stale after 1 s: taken away at once, and once only.
+        // Stale after 1 s: cleared at once, and only once.
         let stale = bench.after(1001);
         assert_eq!(payload(&stale, "drive/p1/point/output_frequency"), Some(""));
         assert_eq!(payload(&stale, "drive/p1/point/state"), Some("offline"));
@@ -366,7 +363,7 @@ mod tests {
     }
 
     #[test]
-    fn changes_wait_for_the_least_interval() {
+    fn changes_wait_for_min_interval() {
         let mut bench = Bench::new();
         bench.after(0);
         bench.read(0x0023, 2501);
@@ -384,7 +381,7 @@ mod tests {
     }
 
     #[test]
-    fn everything_good_is_repeated_at_the_longest_interval() {
+    fn good_values_are_repeated_after_max_interval() {
         let mut bench = Bench::new();
         bench.after(0);
         bench.now += Duration::from_secs(60);
@@ -428,7 +425,7 @@ mod tests {
     }
 
     #[test]
-    fn the_bus_tells_changes_at_once_and_figures_every_second() {
+    fn bus_changes_are_published_at_once_and_figures_every_second() {
         let mut bench = Bench::new();
         let first: Json = serde_json::from_str(payload(&bench.after(0), "bus/line1").unwrap()).unwrap();
         assert_eq!(

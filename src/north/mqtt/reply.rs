@@ -1,4 +1,4 @@
-//! Results of commands: where they go and what they tell. Pure.
+//! Destination and content of the results of commands.
 
 use std::time::{Duration, SystemTime};
 
@@ -11,7 +11,7 @@ use super::payload;
 use super::request::Incoming;
 use crate::command::{Answer, CONFIRMED};
 
-/// Where a result goes.
+/// Destination of a result.
 #[derive(Debug)]
 pub(super) struct Reply {
     topic: String,
@@ -41,7 +41,7 @@ struct ErrorObject<'r> {
 }
 
 impl Reply {
-    /// To the response topic of a request that names one, else to the result topic of the drive.
+    /// The response topic of the request, or the result topic of the drive if it has none.
     pub(super) fn to(incoming: &Incoming, result: String, drive: &str) -> Reply {
         let asked = incoming.response_topic.clone().filter(|topic| is_topic(topic));
         Reply {
@@ -51,12 +51,12 @@ impl Reply {
         }
     }
 
-    /// Bytes that a client may make long.
+    /// Number of bytes whose length the client controls.
     pub(super) fn bytes(&self) -> usize {
         self.topic.len() + self.correlation.as_ref().map_or(0, Vec::len)
     }
 
-    /// The one result: `confirmed` when a read showed the effect in time, else how the bus answered.
+    /// The one result: `confirmed` if a read showed the effect in time, else the answer of the bus.
     pub(super) fn message(
         &self,
         id: Option<Json>,
@@ -79,11 +79,11 @@ impl Reply {
             confirmed_ms: confirmed.map(payload::milliseconds),
             time: payload::rfc3339(time),
         };
-        // Strings, figures and what was JSON before: this cannot fail.
+        // Strings, numbers and previous JSON can always be serialized.
         let payload = serde_json::to_vec(&object).unwrap_or_default();
         Message {
             correlation: self.correlation.clone(),
-            ..Message::passing(self.topic.as_str(), payload)
+            ..Message::not_retained(self.topic.as_str(), payload)
         }
     }
 }

@@ -1,4 +1,4 @@
-//! What a message on a set topic asks for. Pure.
+//! Parses the messages on set topics.
 
 use std::borrow::Cow;
 use std::collections::BTreeSet;
@@ -13,37 +13,37 @@ use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{Profile, Value};
 
-/// Largest payload of a command.
+/// Maximum size of the payload of a command, bytes.
 const MAX_PAYLOAD: usize = 64 * 1024;
-/// Longest `id`.
+/// Maximum length of an `id`, bytes.
 const MAX_ID: usize = 256;
-/// Longest `expires_ms`.
+/// Maximum of `expires_ms`.
 const MAX_EXPIRY_MS: u64 = 60_000;
-/// Longest name that is compared with the known ones.
+/// Maximum length of a name that is compared with the known ones, bytes.
 pub(super) const MAX_NAME: usize = 64;
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
 pub struct Incoming {
-    /// Where it was published.
+    /// Its topic.
     pub topic: String,
     /// A JSON object, or a bare value.
     pub payload: Vec<u8>,
-    /// It was or is retained, so it is no command.
+    /// The message is or was retained, so it is not a command.
     pub retain: bool,
-    /// The broker sends it again.
+    /// The broker marks it as a repetition.
     pub dup: bool,
-    /// Packet id, by which the broker's repetition is known.
+    /// Packet id, which identifies the repetition of the broker.
     pub packet: u16,
-    /// Where the client wants its result.
+    /// Where the client expects its result.
     pub response_topic: Option<String>,
-    /// What the client knows its result by.
+    /// Sent back with the result.
     pub correlation: Option<Vec<u8>>,
-    /// What is left of the message's life, s.
+    /// Remaining life of the message, s.
     pub expiry: Option<u32>,
 }
 
-/// The payload for people: what can be printed, not too long.
+/// The payload for messages: printable and short.
 pub(super) fn excerpt(payload: &[u8]) -> String {
     let text = String::from_utf8_lossy(payload.get(..payload.len().min(200)).unwrap_or_default());
     let mut short = String::new();
@@ -58,28 +58,28 @@ pub(super) fn excerpt(payload: &[u8]) -> String {
     format!("`{short}{dots}`")
 }
 
-/// What a message asks for.
+/// The content of a message.
 #[derive(Debug, PartialEq)]
-pub(super) struct Request {
-    /// The `id`, also when the rest is refused.
+pub(super) struct SetRequest {
+    /// The `id`, also if the rest is refused.
     pub(super) id: Option<Json>,
-    /// Points and time to live.
+    /// Points and expiry.
     pub(super) order: Result<(Points, Duration), Refusal>,
 }
 
 /// Points to be set: index in the profile and value.
 type Points = Vec<(usize, Value)>;
 
-/// Reads a message on a set topic; `point` is given for a bare value.
-pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Request {
-    Request {
+/// Parses a message on a set topic; `point` is the point of a bare value.
+pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> SetRequest {
+    SetRequest {
         id: id(incoming, point),
         order: order(incoming, point, profile),
     }
 }
 
-/// The `id` of a message, before anything of it is judged: whatever else is wrong, the client finds its request in the
-/// result. None where the text is no JSON, or where nobody knows which `id` is meant.
+/// The `id` of a message, read before the rest, so that a client finds its request in the result whatever else is
+/// wrong. `None` if the payload is not JSON or contains several.
 pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Json> {
     if point.is_some() {
         return None;
@@ -143,15 +143,15 @@ fn request_expiry(value: &Json) -> Result<Duration, Refusal> {
     })
 }
 
-/// The point of that name and its value in the kind that it has. Limits are checked where the order is.
-fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
+/// The point of that name with its value. Limits are checked with the command.
+pub(in crate::north) fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value), Refusal> {
     let Some(index) = profile.point_index(name) else {
         let writable = || profile.points.iter().filter(|p| p.write).map(|p| p.name.as_str());
         let all = || profile.points.iter().map(|p| p.name.as_str());
         let likely = || nearest(name, writable()).or_else(|| nearest(name, all()));
         let hint = match (name.len() <= MAX_NAME).then(likely).flatten() {
             Some(near) => format!("did you mean `{near}`?"),
-            None => format!("what can be set: {}", writable().collect::<Vec<_>>().join(", ")),
+            None => format!("writable points: {}", writable().collect::<Vec<_>>().join(", ")),
         };
         let name = excerpt(name.as_bytes());
         return Err(Refusal::NotWritable(format!("there is no point {name}; {hint}")));
@@ -169,7 +169,7 @@ fn resolve(profile: &Profile, name: &str, value: &Json) -> Result<(usize, Value)
         (Kind::Number | Kind::Integer, Json::Number(n)) => {
             Value::Number(n.as_f64().filter(|n| n.is_finite()).ok_or_else(|| wrong("a number"))?)
         }
-        (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; leave the quotes away")),
+        (Kind::Number | Kind::Integer, Json::String(_)) => return Err(wrong("a number; remove the quotes")),
         (Kind::Number | Kind::Integer, _) => return Err(wrong("a number")),
     };
     Ok((index, value))
@@ -190,7 +190,7 @@ fn bare(payload: &[u8]) -> Result<Json, Refusal> {
     match text {
         "true" => Ok(Json::Bool(true)),
         "false" => Ok(Json::Bool(false)),
-        // Only JSON numbers, and what people type in their place: +5, .5, 007. No NaN, no infinity.
+        // JSON numbers, and what people write instead: +5, .5, 007. No NaN, no infinity.
         _ if text.chars().all(|c| c.is_ascii_digit() || "+-.eE".contains(c)) => {
             let number: f64 = text.parse().map_err(|_| bad())?;
             serde_json::Number::from_f64(number).map(Json::Number).ok_or_else(bad)
@@ -202,17 +202,17 @@ fn bare(payload: &[u8]) -> Result<Json, Refusal> {
 fn object(payload: &[u8]) -> Result<Fields, Refusal> {
     let shape = "send a JSON object such as {\"run\": true, \"speed_reference\": 50}";
     let value: Json = serde_json::from_slice(payload)
-        .map_err(|e| Refusal::BadValue(format!("{} is no JSON: {e}; {shape}", excerpt(payload))))?;
+        .map_err(|e| Refusal::BadValue(format!("{} is not JSON: {e}; {shape}", excerpt(payload))))?;
     if !value.is_object() {
         return Err(Refusal::BadValue(format!(
-            "{} is no JSON object; {shape}",
+            "{} is not a JSON object; {shape}",
             excerpt(payload)
         )));
     }
     serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))
 }
 
-/// The fields of an object; a name that comes twice is an error, because nobody knows which was meant.
+/// The fields of an object. A repeated name is an error, since it is ambiguous.
 #[derive(Debug)]
 struct Fields(Vec<(String, Json)>);
 
@@ -236,7 +236,7 @@ impl<'de> Visitor<'de> for FieldsVisitor {
         let mut names = BTreeSet::new();
         while let Some((name, value)) = map.next_entry::<String, Json>()? {
             if !names.insert(name.clone()) {
-                let text = format!("{} comes twice; nothing was written", excerpt(name.as_bytes()));
+                let text = format!("{} appears twice; nothing was written", excerpt(name.as_bytes()));
                 return Err(serde::de::Error::custom(text));
             }
             fields.push((name, value));
@@ -245,7 +245,7 @@ impl<'de> Visitor<'de> for FieldsVisitor {
     }
 }
 
-/// The `id` of an object, if it has exactly one. What the other fields hold does not matter.
+/// The `id` of an object, if it has exactly one; other fields are ignored.
 struct Id(Option<Json>);
 
 impl<'de> Deserialize<'de> for Id {
@@ -294,7 +294,7 @@ mod tests {
         }
     }
 
-    fn set(payload: &str) -> Request {
+    fn set(payload: &str) -> SetRequest {
         read(&message(payload), None, &profile())
     }
 
@@ -303,7 +303,7 @@ mod tests {
         order.map(|(points, _)| points[0].1)
     }
 
-    fn code(request: Request) -> (&'static str, String) {
+    fn code(request: SetRequest) -> (&'static str, String) {
         let refusal = request.order.unwrap_err();
         (refusal.code(), refusal.to_string())
     }
@@ -322,20 +322,20 @@ mod tests {
         assert_eq!(expiry, Duration::from_millis(500));
         let (points, expiry) = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
         assert_eq!((points[0].1, expiry), (Value::Bool(false), DEFAULT_EXPIRY));
-        assert_eq!(set("{}").order.unwrap().0, [], "told as an empty order later");
+        assert_eq!(set("{}").order.unwrap().0, [], "refused as an empty command later");
     }
 
     #[test]
-    fn what_is_wrong_is_told() {
+    fn errors_are_described() {
         for (payload, wanted, text) in [
-            ("run", "bad_value", "`run` is no JSON"),
-            ("", "bad_value", "is no JSON"),
-            ("[1]", "bad_value", "is no JSON object"),
-            ("true", "bad_value", "is no JSON object"),
-            ("NaN", "bad_value", "is no JSON"),
-            (r#"{"run": NaN}"#, "bad_value", "is no JSON"),
-            (r#"{"speed_reference": 1e999}"#, "bad_value", "is no JSON"),
-            (r#"{"run": true, "run": false}"#, "bad_value", "`run` comes twice"),
+            ("run", "bad_value", "`run` is not JSON"),
+            ("", "bad_value", "is not JSON"),
+            ("[1]", "bad_value", "is not a JSON object"),
+            ("true", "bad_value", "is not a JSON object"),
+            ("NaN", "bad_value", "is not JSON"),
+            (r#"{"run": NaN}"#, "bad_value", "is not JSON"),
+            (r#"{"speed_reference": 1e999}"#, "bad_value", "is not JSON"),
+            (r#"{"run": true, "run": false}"#, "bad_value", "`run` appears twice"),
             (
                 r#"{"sped_reference": 5}"#,
                 "not_writable",
@@ -344,10 +344,10 @@ mod tests {
             (
                 r#"{"gobbledygook": 5}"#,
                 "not_writable",
-                "what can be set: run, reverse",
+                "writable points: run, reverse",
             ),
             (r#"{"ready": true}"#, "not_writable", "`ready` is read-only"),
-            (r#"{"speed_reference": "50"}"#, "bad_value", "leave the quotes away"),
+            (r#"{"speed_reference": "50"}"#, "bad_value", "remove the quotes"),
             (r#"{"speed_reference": true}"#, "bad_value", "is not a number"),
             (r#"{"speed_reference": null}"#, "bad_value", "is not a number"),
             (r#"{"run": "true"}"#, "bad_value", "is not true or false"),
@@ -455,7 +455,7 @@ mod tests {
     }
 
     #[test]
-    fn the_life_of_the_message_bounds_its_expiry() {
+    fn message_expiry_limits_command_expiry() {
         let expiry = |payload: &str, life| {
             let incoming = Incoming {
                 expiry: Some(life),
@@ -472,7 +472,7 @@ mod tests {
     }
 
     #[test]
-    fn messages_for_people_stay_short() {
+    fn excerpts_are_short() {
         let long = format!(r#"{{"{}": 1}}"#, "n".repeat(60_000));
         let (_, text) = code(set(&long));
         assert!(text.len() < 400, "{}", text.len());

@@ -1,4 +1,4 @@
-//! The events that wait: on disk where a buffer is configured and usable, else in memory.
+//! Stores the events that wait for the broker: on disk if a buffer is configured and usable, else in memory.
 
 use std::io;
 use std::path::{Path, PathBuf};
@@ -8,24 +8,24 @@ use super::Buffer;
 use super::journal::{Journal, RecordId};
 use super::outbox::{Message, Outbox};
 
-/// Time after which events on disk are safe from a power cut.
+/// Time after which events on disk survive a power failure.
 const SYNC: Duration = Duration::from_secs(1);
-/// Attempts to get the directory, and the wait between them: a process that is just ending still holds it.
+/// Attempts to lock the directory, and the wait between them: a process that is stopping may still hold it.
 const LOCK_ATTEMPTS: u32 = 20;
 const LOCK_WAIT: Duration = Duration::from_millis(50);
 
-/// The way of an event into the outbox: over the disk, or straight on.
+/// Passes events to the outbox, through the disk if possible.
 #[derive(Debug, Default)]
 pub(super) struct EventStore {
     dir: PathBuf,
     journal: Option<Journal>,
-    /// The last attempt to write failed, which was logged.
+    /// Whether the last write failed; logged once.
     failing: bool,
     synced: Option<Instant>,
 }
 
 impl EventStore {
-    /// Opens the buffer. One that cannot be used is logged, and events are kept in memory.
+    /// Opens the buffer. If it cannot be used, that is logged and events are kept in memory.
     pub(super) async fn open(buffer: Option<Buffer>) -> EventStore {
         let Some(Buffer { dir, max_bytes }) = buffer else {
             return EventStore::default();
@@ -41,14 +41,17 @@ impl EventStore {
                     tokio::time::sleep(LOCK_WAIT).await;
                 }
                 Err(error) => {
-                    tell_unusable(&dir, &error);
+                    log_unusable(&dir, &error);
                     break None;
                 }
             }
         };
         let waiting = journal.as_ref().map_or(0, Journal::unloaded);
         if waiting > 0 {
-            tracing::info!("{waiting} events from before wait in {} for the broker", dir.display());
+            tracing::info!(
+                "{waiting} earlier events in {} are waiting for the broker",
+                dir.display()
+            );
         }
         EventStore {
             dir,
@@ -57,13 +60,13 @@ impl EventStore {
         }
     }
 
-    /// Takes an event in.
+    /// Stores an event.
     pub(super) fn push(&mut self, message: Message, outbox: &mut Outbox) {
         match self.journal.as_mut().map(|journal| journal.append(&message)) {
             Some(Ok(())) => self.failing = false,
             Some(Err(error)) => {
                 if !std::mem::replace(&mut self.failing, true) {
-                    tell_unusable(&self.dir, &error);
+                    log_unusable(&self.dir, &error);
                 }
                 outbox.push_event(message, None);
             }
@@ -71,7 +74,7 @@ impl EventStore {
         }
     }
 
-    /// Loads events from the disk as far as the outbox has room.
+    /// Loads events from disk while the outbox has room.
     pub(super) fn refill(&mut self, outbox: &mut Outbox) {
         let Some(journal) = &mut self.journal else { return };
         for _ in 0..outbox.room() {
@@ -82,14 +85,14 @@ impl EventStore {
         }
     }
 
-    /// The broker has the event of that record.
+    /// Marks the event of that record as acknowledged.
     pub(super) fn acknowledge(&mut self, record: RecordId) {
         if let Some(Err(error)) = self.journal.as_mut().map(|journal| journal.acknowledge(record)) {
             tracing::warn!("{}: {error}; events may be delivered twice", self.dir.display());
         }
     }
 
-    /// Makes what was written safe from a power cut, now and then and not in this thread.
+    /// Syncs the written events to disk in another thread, at most once a second.
     pub(super) fn sync(&mut self, now: Instant) {
         if self
             .synced
@@ -102,26 +105,26 @@ impl EventStore {
             let dir = self.dir.display().to_string();
             tokio::task::spawn_blocking(move || {
                 if let Err(error) = file.sync_data() {
-                    tracing::warn!("{dir}: {error}; buffered events may not survive a power cut");
+                    tracing::warn!("{dir}: {error}; buffered events may not survive a power failure");
                 }
             });
         }
     }
 
-    /// Events on disk that are not in the outbox.
+    /// Number of events on disk that are not in the outbox.
     pub(super) fn waiting(&self) -> u64 {
         self.journal.as_ref().map_or(0, Journal::unloaded)
     }
 
-    /// Events that were dropped because the buffer was full or damaged.
+    /// Number of events dropped because the buffer was full or damaged.
     pub(super) fn dropped(&self) -> u64 {
         self.journal.as_ref().map_or(0, Journal::dropped)
     }
 }
 
-fn tell_unusable(dir: &Path, error: &io::Error) {
+fn log_unusable(dir: &Path, error: &io::Error) {
     tracing::error!(
-        "events cannot be kept in {}: {error}; they are kept in memory; check mqtt.buffer",
+        "cannot store events in {}: {error}; keeping them in memory; check mqtt.buffer",
         dir.display()
     );
 }

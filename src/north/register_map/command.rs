@@ -8,50 +8,55 @@ const FAULT_RESET: u16 = 1 << 2;
 
 /// What a write to the command block means.
 #[derive(Debug, Clone, Default, PartialEq)]
-pub struct CommandWrite {
+pub(crate) struct CommandWrite {
     /// Points to set as one command: index in the profile, value in engineering units. May be empty when
     /// only the heartbeat was written.
-    pub points: Vec<(usize, Value)>,
+    pub(crate) points: Vec<(usize, Value)>,
     /// The word at 0x8100, if it was written.
-    pub word: Option<u16>,
+    pub(crate) word: Option<u16>,
     /// The heartbeat was written.
-    pub heartbeat: bool,
+    pub(crate) heartbeat: bool,
 }
 
-/// What stands before a write of 0x8100.
+/// What decides whether a write of 0x8100 resets a fault.
 #[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Before {
-    /// The word that was written there last; none since the server started.
-    pub word: Option<u16>,
-    /// The drive tells of a fault.
-    pub fault: bool,
+pub(crate) struct CommandContext {
+    /// The word last written there; `None` if none was written since the server started.
+    pub(crate) word: Option<u16>,
+    /// The drive has a fault.
+    pub(crate) fault: bool,
 }
 
-impl Before {
-    /// Whether `word` asks for a fault reset: bit 2 changes from 0 to 1, or it comes without run while the drive has a
-    /// fault, whatever was written before: no client has to take back a bit that reads as 0. With run only the change
-    /// counts, so a client that repeats its word does not start a motor again after each fault; nor does the first word
-    /// after a start of the server, which may be such a repetition.
-    pub fn resets(self, word: u16) -> bool {
+impl CommandContext {
+    /// Whether `word` requests a fault reset: bit 2 changes from 0 to 1, or it is set without run while the drive has a
+    /// fault, whatever was written before, so that no client has to clear a bit that reads as 0. With run only the
+    /// change counts, so that a client that repeats its word does not restart a motor after each fault. The first word
+    /// with run after the server started does not count, since it may be such a repetition.
+    pub(crate) fn resets(self, word: u16) -> bool {
         let runs = word & RUN != 0;
         let changes = self.word.map_or(!runs, |last| last & FAULT_RESET == 0);
         word & FAULT_RESET != 0 && (changes || (self.fault && !runs))
     }
 }
 
-/// What writing `values` from `start` on means to a drive of that family.
+/// Translates a write of `values` from `start` on for a drive of that family.
 ///
-/// Where one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is left alone.
+/// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored.
 ///
 /// # Errors
-/// An address that takes no command or that the family lacks, then a value that is none.
-pub fn command(profile: &Profile, start: u16, values: &[u16], before: Before) -> Result<CommandWrite, Refusal> {
+/// An address that is not writable or that the family lacks; else an invalid value.
+pub(crate) fn command(
+    profile: &Profile,
+    start: u16,
+    values: &[u16],
+    before: CommandContext,
+) -> Result<CommandWrite, Refusal> {
     let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);
     if let Some((address, _)) = writes.iter().find(|(a, _)| outside(a)) {
         return Err(Refusal::NotWritable(format!(
-            "register 0x{address:04X} takes no writes; commands go to 0x8100 to 0x8103"
+            "register 0x{address:04X} is not writable; commands are written to 0x8100 to 0x8103"
         )));
     }
     let mut write = CommandWrite::default();
@@ -88,7 +93,7 @@ pub fn command(profile: &Profile, start: u16, values: &[u16], before: Before) ->
     match bad {
         Some(refusal) => Err(refusal),
         None if references > 1 => Err(Refusal::BadValue(
-            "two references in one command; send one and \"not available\" for the other; nothing was written"
+            "two references in one command; write one and \"not available\" for the other; nothing was written"
                 .to_string(),
         )),
         None if write.points.is_empty() && !write.heartbeat => Err(Refusal::BadValue(
@@ -100,7 +105,7 @@ pub fn command(profile: &Profile, start: u16, values: &[u16], before: Before) ->
 
 fn no_value(address: u32) -> Refusal {
     Refusal::BadValue(format!(
-        "\"not available\" is no reference for register 0x{address:04X}; nothing was written"
+        "\"not available\" is not a valid reference for register 0x{address:04X}; nothing was written"
     ))
 }
 
@@ -116,20 +121,20 @@ fn writable(profile: &Profile, point: ModelPoint) -> Result<usize, Refusal> {
     })
 }
 
-/// The points that the word at 0x8100 sets, or what is wrong with its value.
+/// The points that the word at 0x8100 sets, or why its value is invalid.
 fn command_word(
     profile: &Profile,
     word: u16,
-    before: Before,
+    before: CommandContext,
     points: &mut Vec<(usize, Value)>,
 ) -> Result<Option<Refusal>, Refusal> {
     points.push((writable(profile, ModelPoint::Run)?, Value::Bool(word & RUN != 0)));
     if word & !(RUN | REVERSE | FAULT_RESET) != 0 {
         return Ok(Some(Refusal::BadValue(format!(
-            "0x{word:04X} is no command: bits 3 to 15 must be 0; nothing was written"
+            "0x{word:04X} is not a command: bits 3 to 15 must be 0; nothing was written"
         ))));
     }
-    // Nothing is dropped in silence: a bit that the family lacks must be 0.
+    // No bit is ignored silently: one that the family lacks must be 0.
     let lacks = |refusal: Refusal| Ok(Some(Refusal::BadValue(refusal.to_string())));
     let reverse = word & REVERSE != 0;
     match writable(profile, ModelPoint::Reverse) {
@@ -146,7 +151,7 @@ fn command_word(
     Ok(None)
 }
 
-/// The word at 0x8100 after its fault reset did not reach the drive: the next write with bit 2 resets again.
-pub fn without_reset(word: u16) -> u16 {
+/// The word at 0x8100 after its fault reset did not reach the drive, so that the next write with bit 2 resets again.
+pub(crate) fn without_reset(word: u16) -> u16 {
     word & !FAULT_RESET
 }

@@ -5,43 +5,43 @@ use std::time::Duration;
 use super::{Form, high_low};
 use crate::codec::Exception;
 
-/// Registers of a bus.
-pub const BUS_BLOCK: u16 = 16;
+/// Number of registers of a bus.
+pub(crate) const BUS_BLOCK: u16 = 16;
 
-/// What the gateway tells of one bus.
+/// The statistics of one bus in the register map.
 #[derive(Debug, Clone, PartialEq)]
-pub struct BusFigures {
+pub(crate) struct BusFigures {
     /// Whether the port is open.
-    pub up: bool,
+    pub(crate) up: bool,
     /// Drives configured.
-    pub drives: usize,
-    /// Drives that answer.
-    pub online: usize,
-    /// Share of the time in which the line is in use, 0..=1.
-    pub load: f64,
-    /// Achieved cycle of the fast class.
-    pub cycle: Option<Duration>,
+    pub(crate) drives: usize,
+    /// Drives online.
+    pub(crate) online: usize,
+    /// Line load, 0 to 1.
+    pub(crate) load: f64,
+    /// Achieved cycle of the fast poll class.
+    pub(crate) cycle: Option<Duration>,
     /// Exchanges so far.
-    pub transactions: u64,
+    pub(crate) transactions: u64,
     /// Exchanges that failed so far.
-    pub errors: u64,
-    /// Writes that wait for the line.
-    pub queued: usize,
+    pub(crate) errors: u64,
+    /// Writes in the queue.
+    pub(crate) queued: usize,
 }
 
 /// A register of a bus under unit 255, for the printed map.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct BusRegister {
-    /// Place in the block of the bus.
-    pub offset: u16,
-    /// What it tells.
-    pub name: &'static str,
-    /// How it lies there.
-    pub form: Form,
+pub(crate) struct BusRegister {
+    /// Offset in the block of the bus.
+    pub(crate) offset: u16,
+    /// What it contains.
+    pub(crate) name: &'static str,
+    /// How it is encoded.
+    pub(crate) form: Form,
     /// Engineering value of one count.
-    pub scale: &'static str,
+    pub(crate) scale: &'static str,
     /// Unit.
-    pub unit: &'static str,
+    pub(crate) unit: &'static str,
 }
 
 const fn bus_register(offset: u16, name: &'static str, form: Form) -> BusRegister {
@@ -55,7 +55,7 @@ const fn bus_register(offset: u16, name: &'static str, form: Form) -> BusRegiste
 }
 
 /// The registers of a bus under unit 255; the rest of its block is reserved and reads 0.
-pub const BUS_REGISTERS: [BusRegister; 8] = [
+pub(crate) const BUS_REGISTERS: [BusRegister; 8] = [
     bus_register(0, "state: 0 down, 1 up", Form::U16),
     bus_register(1, "drives configured", Form::U16),
     bus_register(2, "drives online", Form::U16),
@@ -74,9 +74,9 @@ pub const BUS_REGISTERS: [BusRegister; 8] = [
 ];
 
 impl BusFigures {
-    /// The block of the bus. A bus that is down has no drive online and no load; a cycle that was never
-    /// measured is 0xFFFFFFFF; the counters run modulo 2^32; reserved registers are 0.
-    pub fn registers(&self) -> [u16; BUS_BLOCK as usize] {
+    /// The block of the bus. A bus that is down has no drives online and no load; a cycle that was never measured is
+    /// 0xFFFFFFFF; counters are modulo 2^32; reserved registers are 0.
+    pub(crate) fn registers(&self) -> [u16; BUS_BLOCK as usize] {
         let count = |n: usize| n.min(usize::from(u16::MAX - 1)) as u16;
         let ms = |cycle: Duration| (cycle.as_secs_f64() * 1000.0).round().min(f64::from(u32::MAX - 1)) as u32;
         let [cycle_high, cycle_low] = high_low(self.cycle.map_or(u32::MAX, ms));
@@ -107,11 +107,15 @@ impl BusFigures {
     }
 }
 
-/// Registers of the gateway itself; `bus` gives the figures of a bus by its place in the file.
+/// Registers of the gateway itself; `bus` returns the statistics of a bus by its index in the configuration.
 ///
 /// # Errors
-/// 02 when the span goes beyond the last bus.
-pub fn gateway(start: u16, count: u16, bus: impl Fn(usize) -> Option<BusFigures>) -> Result<Vec<u16>, Exception> {
+/// 02 if the span goes beyond the last bus.
+pub(crate) fn gateway(
+    start: u16,
+    count: u16,
+    bus: impl Fn(usize) -> Option<BusFigures>,
+) -> Result<Vec<u16>, Exception> {
     let mut registers = Vec::with_capacity(usize::from(count));
     let end = start.checked_add(count).ok_or(Exception::ADDRESS)?;
     for block in start / BUS_BLOCK..end.div_ceil(BUS_BLOCK) {

@@ -39,7 +39,7 @@ fn running(now: Instant) -> DriveImage {
 }
 
 fn read(image: &DriveImage, now: Instant, start: u16, count: u16) -> Result<Vec<u16>, Exception> {
-    Look::new(&image.reading(now, STALE_AFTER), true).registers(start, count)
+    DriveView::new(&image.reading(now, STALE_AFTER), BusState::Up).registers(start, count)
 }
 
 #[test]
@@ -126,7 +126,7 @@ fn spans_that_leave_a_block() {
 }
 
 #[test]
-fn a_stale_drive_tells_why_and_nothing_else() {
+fn a_stale_drive_has_status_and_age_but_no_values() {
     let now = Instant::now();
     let late = now + Duration::from_millis(1001);
     let image = running(now);
@@ -149,7 +149,11 @@ fn a_stale_drive_tells_why_and_nothing_else() {
     assert!(floats.chunks(2).all(|w| w == [0x7FC0, 0]), "{floats:04X?}");
 
     let reading = image.reading(now, STALE_AFTER);
-    nothing(&Look::new(&reading, false).registers(0x8000, 19).unwrap(), STALE, 0);
+    nothing(
+        &DriveView::new(&reading, BusState::Down).registers(0x8000, 19).unwrap(),
+        STALE,
+        0,
+    );
 
     image.update(|s| s.link = Link::Offline(SystemTime::now()));
     nothing(&read(&image, now, 0x8000, 19).unwrap(), STALE, 0);
@@ -230,7 +234,7 @@ fn bits_that_are_not_known() {
     assert_eq!(
         read(&image, now, 0x8100, 1),
         Ok(vec![0xFFFF]),
-        "it may be told to turn the other way"
+        "it may be commanded to reverse"
     );
     assert_eq!(read(&image, now, 0x8000, 2), Ok(vec![all, 3]));
 }
@@ -246,7 +250,7 @@ fn a_refused_point_is_not_available() {
 }
 
 #[test]
-fn what_does_not_fit_is_not_available() {
+fn values_out_of_range_are_not_available() {
     let one = |form: Form, value: f64, per_unit| form.registers_of(Some(value), per_unit)[0];
     assert_eq!(one(Form::I16, 327.67, 100.0), 32_767);
     assert_eq!(one(Form::I16, 327.68, 100.0), NO_I16);
@@ -334,13 +338,13 @@ fn command_writes() {
     }
 }
 
-fn before(word: u16, fault: bool) -> Before {
+fn before(word: u16, fault: bool) -> CommandContext {
     let word = Some(word);
-    Before { word, fault }
+    CommandContext { word, fault }
 }
 
 #[test]
-fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
+fn fault_resets() {
     for (word, last, fault, resets) in [
         (4, 0, false, true),
         (4, 0, true, true),
@@ -368,7 +372,7 @@ fn a_reset_is_a_change_or_a_stop_that_finds_a_fault() {
         (1, true, false),
     ] {
         assert_eq!(
-            Before { word: None, fault }.resets(word),
+            CommandContext { word: None, fault }.resets(word),
             resets,
             "{word} first, fault {fault}"
         );
@@ -410,10 +414,10 @@ fn refused_command_writes() {
         (&lacking, 0x8100, &[8, 100, 2500], address),
     ];
     for (profile, start, values, wanted) in table {
-        let refusal = command(profile, *start, values, Before::default()).unwrap_err();
+        let refusal = command(profile, *start, values, CommandContext::default()).unwrap_err();
         assert_eq!(refusal.exception(), *wanted, "{start:04X} {values:04X?}: {refusal}");
     }
-    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], Before::default()).unwrap();
+    let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], CommandContext::default()).unwrap();
     assert_eq!(named(&lacking, &word), ["run=true", "speed_reference=50"]);
 }
 

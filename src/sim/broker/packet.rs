@@ -1,18 +1,73 @@
-//! What clients and broker say to each other, whichever version of MQTT they speak.
+//! MQTT packets as bytes, of 3.1.1 and 5.0 alike: both versions are read into the same types. Pure; whatever comes in, a
+//! reader returns a [`Fault`] and never panics.
 //!
-//! Both versions are brought to these types at the wire; the reason codes are those of v5, which
-//! has all that 3.1.1 has.
+//! Section numbers are those of the MQTT 5.0 specification.
+
+mod reader;
+#[cfg(test)]
+mod tests;
+mod writer;
 
 use std::time::{Duration, Instant};
 
-use bytes::Bytes;
-use rumqttc::v5::mqttbytes::QoS;
-use rumqttc::v5::mqttbytes::v5::{
-    ConnectReturnCode, DisconnectReasonCode, Filter, LastWill, LastWillProperties, PubAckReason, PublishProperties,
-    SubscribeReasonCode, UnsubAckReason,
+use self::reader::{Properties, Reader};
+pub(super) use self::writer::{
+    PINGRESP, PUBACK, SUBACK, UNSUBACK, UNSUPPORTED_CONNACK, acknowledge, connack, disconnect, publish,
 };
+use super::{MAX_CLIENT_ID_BYTES, MAX_PACKET_BYTES, topic};
 
-/// Version a client chose with the level byte of its CONNECT.
+/// Reason codes (section 2.4); 3.1.1 has only some of them, in other numbers.
+pub(super) mod reason {
+    pub(crate) const SUCCESS: u8 = 0x00;
+    pub(crate) const NO_SUBSCRIPTION_EXISTED: u8 = 0x11;
+    pub(crate) const MALFORMED_PACKET: u8 = 0x81;
+    pub(crate) const PROTOCOL_ERROR: u8 = 0x82;
+    pub(crate) const UNSUPPORTED_VERSION: u8 = 0x84;
+    pub(crate) const CLIENT_ID_NOT_VALID: u8 = 0x85;
+    pub(crate) const SERVER_SHUTTING_DOWN: u8 = 0x8B;
+    pub(crate) const BAD_AUTHENTICATION_METHOD: u8 = 0x8C;
+    pub(crate) const KEEP_ALIVE_TIMEOUT: u8 = 0x8D;
+    pub(crate) const SESSION_TAKEN_OVER: u8 = 0x8E;
+    pub(crate) const TOPIC_FILTER_INVALID: u8 = 0x8F;
+    pub(crate) const TOPIC_NAME_INVALID: u8 = 0x90;
+    pub(crate) const TOPIC_ALIAS_INVALID: u8 = 0x94;
+    pub(crate) const PACKET_TOO_LARGE: u8 = 0x95;
+    pub(crate) const QUOTA_EXCEEDED: u8 = 0x97;
+    pub(crate) const QOS_NOT_SUPPORTED: u8 = 0x9B;
+    pub(crate) const SHARED_SUBSCRIPTIONS_NOT_SUPPORTED: u8 = 0x9E;
+    pub(crate) const SUBSCRIPTION_IDS_NOT_SUPPORTED: u8 = 0xA1;
+}
+
+/// Identifiers of properties (section 2.2.2.2) that are named here; those left out are lists below.
+mod property {
+    pub(crate) const MESSAGE_EXPIRY: u8 = 2;
+    pub(crate) const RESPONSE_TOPIC: u8 = 8;
+    pub(crate) const SUBSCRIPTION_ID: u8 = 11;
+    pub(crate) const SESSION_EXPIRY: u8 = 17;
+    pub(crate) const ASSIGNED_CLIENT_ID: u8 = 18;
+    pub(crate) const AUTHENTICATION_METHOD: u8 = 21;
+    pub(crate) const RECEIVE_MAXIMUM: u8 = 33;
+    pub(crate) const TOPIC_ALIAS: u8 = 35;
+    pub(crate) const MAXIMUM_QOS: u8 = 36;
+    pub(crate) const USER: u8 = 38;
+    pub(crate) const MAXIMUM_PACKET: u8 = 39;
+    pub(crate) const SUBSCRIPTION_IDS_AVAILABLE: u8 = 41;
+    pub(crate) const SHARED_SUBSCRIPTIONS_AVAILABLE: u8 = 42;
+
+    /// Session expiry, authentication, problem and response information, receive maximum, alias maximum, packet size.
+    pub(crate) const OF_CONNECT: &[u8] = &[17, 21, 22, 23, 25, 33, 34, USER, 39];
+    /// Those of a message: payload format, expiry, content type, response topic, correlation data, topic alias.
+    pub(crate) const OF_PUBLISH: &[u8] = &[1, 2, 3, 8, 9, 35, USER];
+    /// The same, with the delay in the place of the alias.
+    pub(crate) const OF_WILL: &[u8] = &[1, 2, 3, 8, 9, 24, USER];
+    /// Those that subscribers get as they came.
+    pub(crate) const FORWARDED: &[u8] = &[1, 3, 8, 9, USER];
+    /// Reason string.
+    pub(crate) const OF_ACK: &[u8] = &[31, USER];
+    pub(crate) const OF_DISCONNECT: &[u8] = &[17, 31, USER];
+}
+
+/// Version that a client chose by the level byte of its CONNECT.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Version {
     /// Level 4.
@@ -21,273 +76,300 @@ pub(super) enum Version {
     V5,
 }
 
-/// Why a connection is closed by the broker.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Fault {
-    /// Told to v5 clients in a DISCONNECT.
-    pub(super) reason: DisconnectReasonCode,
-    /// For the log.
-    pub(super) what: String,
+/// Quality of service; QoS 2 is not served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) enum Qos {
+    AtMostOnce,
+    AtLeastOnce,
 }
 
-impl Fault {
-    pub(super) fn malformed(what: impl Into<String>) -> Fault {
-        Fault {
-            reason: DisconnectReasonCode::MalformedPacket,
-            what: what.into(),
-        }
-    }
-
-    pub(super) fn protocol(what: impl Into<String>) -> Fault {
-        Fault {
-            reason: DisconnectReasonCode::ProtocolError,
-            what: what.into(),
-        }
-    }
-}
-
-/// How long a session outlives its connection.
+/// Why the broker ends a connection.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Expiry {
-    /// It ends with the connection.
-    AtOnce,
-    /// It ends this long after the connection.
-    After(Duration),
-    /// It ends with the broker, or when the broker needs its place.
-    Never,
+pub(super) struct Fault {
+    /// What v5 clients are sent, see [`reason`].
+    pub(super) reason: u8,
+    /// For the log.
+    pub(super) what: &'static str,
 }
 
-impl Expiry {
-    /// The v5 property in seconds; absent is 0, all ones is never (MQTT 5.0 section 3.1.2.11.2).
-    pub(super) fn from_seconds(seconds: Option<u32>) -> Expiry {
-        match seconds {
-            None | Some(0) => Expiry::AtOnce,
-            Some(u32::MAX) => Expiry::Never,
-            Some(seconds) => Expiry::After(Duration::from_secs(u64::from(seconds))),
-        }
-    }
+pub(super) const fn fault(reason: u8, what: &'static str) -> Fault {
+    Fault { reason, what }
 }
 
-/// A client's CONNECT.
-#[derive(Debug, Clone)]
-pub(super) struct Connect {
-    pub(super) version: Version,
-    pub(super) client_id: String,
-    pub(super) clean_start: bool,
-    pub(super) expiry: Expiry,
-    /// Zero: no supervision.
-    pub(super) keep_alive: Duration,
-    /// QoS 1 messages the client takes without having acknowledged them.
-    pub(super) receive_maximum: u16,
-    /// Largest packet the client takes, bytes.
-    pub(super) max_packet: u32,
-    pub(super) will: Option<Will>,
-    /// The client asked for an extended authentication method.
-    pub(super) authentication: bool,
+const fn malformed(what: &'static str) -> Fault {
+    fault(reason::MALFORMED_PACKET, what)
 }
 
-/// Message published for a client that goes away without saying so.
-#[derive(Debug, Clone)]
-pub(super) struct Will {
-    pub(super) publish: Publish,
-    pub(super) delay: Duration,
-}
-
-impl Will {
-    /// From the v5 packet. `None` when the topic is no topic name.
-    pub(super) fn new(will: LastWill) -> Option<Will> {
-        let LastWill {
-            topic,
-            message,
-            qos,
-            retain,
-            properties,
-        } = will;
-        let topic = String::from_utf8(topic.to_vec())
-            .ok()
-            .filter(|topic| super::topic::is_name(topic))?;
-        let delay = properties
-            .as_ref()
-            .and_then(|properties| properties.delay_interval)
-            .unwrap_or(0);
-        let properties = properties.map(|properties| {
-            let LastWillProperties {
-                delay_interval: _,
-                payload_format_indicator,
-                message_expiry_interval,
-                content_type,
-                response_topic,
-                correlation_data,
-                user_properties,
-            } = properties;
-            PublishProperties {
-                payload_format_indicator,
-                message_expiry_interval,
-                content_type,
-                response_topic,
-                correlation_data,
-                user_properties,
-                ..PublishProperties::default()
-            }
-        });
-        let publish = Publish {
-            topic,
-            payload: message,
-            qos,
-            retain,
-            pkid: 0,
-            alias: None,
-            properties,
-        };
-        Some(Will {
-            publish,
-            delay: Duration::from_secs(u64::from(delay)),
-        })
-    }
-}
-
-/// A client's PUBLISH.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Publish {
-    /// Empty when only the alias is given.
-    pub(super) topic: String,
-    pub(super) payload: Bytes,
-    pub(super) qos: QoS,
-    pub(super) retain: bool,
-    /// 0 at QoS 0.
-    pub(super) pkid: u16,
-    pub(super) alias: Option<u16>,
-    /// Without topic alias and subscription identifiers: those belong to one connection.
-    pub(super) properties: Option<PublishProperties>,
+const fn protocol(what: &'static str) -> Fault {
+    fault(reason::PROTOCOL_ERROR, what)
 }
 
 /// A message on its way through the broker.
-#[derive(Debug, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Message {
     pub(super) topic: String,
-    pub(super) payload: Bytes,
-    pub(super) qos: QoS,
+    pub(super) payload: Vec<u8>,
+    pub(super) qos: Qos,
     pub(super) retain: bool,
-    /// Without topic alias, subscription identifiers and message expiry.
-    pub(super) properties: Option<PublishProperties>,
-    /// Not delivered from this time on.
-    pub(super) expires: Option<Instant>,
+    /// Encoded properties that subscribers get as they came.
+    pub(super) properties: Vec<u8>,
+    /// Time after `published` in which it may be delivered.
+    pub(super) lifetime: Option<Duration>,
+    pub(super) published: Instant,
 }
 
 impl Message {
-    /// The message of `publish`, received at `now`, its topic alias resolved.
-    pub(super) fn new(publish: Publish, now: Instant) -> Message {
-        let Publish {
-            topic,
-            payload,
-            qos,
-            retain,
-            pkid: _,
-            alias: _,
-            mut properties,
-        } = publish;
-        let expires = properties
-            .as_mut()
-            .and_then(|properties| properties.message_expiry_interval.take())
-            .and_then(|seconds| now.checked_add(Duration::from_secs(u64::from(seconds))));
-        let properties = properties.filter(|properties| *properties != PublishProperties::default());
-        Message {
-            topic,
-            payload,
-            qos,
-            retain,
-            properties,
-            expires,
-        }
+    /// Bytes that it counts for in a bound; the constant is what the type and an entry in a queue take.
+    pub(super) fn weight(&self) -> usize {
+        192 + self.topic.len() + self.payload.len() + self.properties.len()
     }
 
-    /// Bytes it counts for in a bound.
-    pub(super) fn weight(&self) -> usize {
-        // The constant is what the type and an entry in a queue take.
-        256 + self.topic.len() + self.payload.len() + self.properties.as_ref().map_or(0, properties_weight)
+    /// Time in which it may still be delivered; `None` without a limit, zero when it is over.
+    fn left(&self, now: Instant) -> Option<Duration> {
+        let age = now.saturating_duration_since(self.published);
+        self.lifetime.map(|lifetime| lifetime.saturating_sub(age))
     }
 
     /// Whether it may still be delivered.
     pub(super) fn is_current(&self, now: Instant) -> bool {
-        self.expires.is_none_or(|expires| now < expires)
+        self.left(now) != Some(Duration::ZERO)
     }
 }
 
-fn properties_weight(properties: &PublishProperties) -> usize {
-    let user: usize = properties
-        .user_properties
-        .iter()
-        .map(|(key, value)| 48 + key.len() + value.len())
-        .sum();
-    user + properties.response_topic.as_ref().map_or(0, String::len)
-        + properties.content_type.as_ref().map_or(0, String::len)
-        + properties.correlation_data.as_ref().map_or(0, Bytes::len)
+/// A client's CONNECT.
+#[derive(Debug)]
+pub(super) struct Connect {
+    pub(super) version: Version,
+    /// Empty: the broker assigns one.
+    pub(super) client_id: String,
+    /// Zero: no supervision.
+    pub(super) keep_alive: Duration,
+    /// QoS 1 messages that the client takes without having acknowledged them.
+    pub(super) receive_maximum: usize,
+    /// Largest packet that the client takes, bytes.
+    pub(super) max_packet: usize,
+    /// Published when the connection ends without a good-bye.
+    pub(super) will: Option<Message>,
+    /// It is well-formed, but asks for what is not served: reason code for the CONNACK.
+    pub(super) refused: Option<u8>,
+}
+
+/// One filter of a SUBSCRIBE with its options.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Subscription {
+    pub(super) filter: String,
+    pub(super) qos: Qos,
+    /// The client's own messages are left out.
+    pub(super) no_local: bool,
+    /// Messages keep the retain flag that they were published with.
+    pub(super) retain_as_published: bool,
+    /// Retained messages are sent: 0 at each subscription, 1 if it is new, 2 never.
+    pub(super) retain_handling: u8,
 }
 
 /// What a client sends after its CONNECT.
 #[derive(Debug, PartialEq, Eq)]
 pub(super) enum Incoming {
-    Publish(Publish),
-    /// Acknowledges a QoS 1 message.
+    /// A message; the packet identifier is 0 at QoS 0.
+    Publish(Message, u16),
     PubAck(u16),
-    /// Releases the identifier of a QoS 2 message.
-    PubRel(u16),
-    Subscribe {
-        pkid: u16,
-        filters: Vec<Filter>,
-        /// Subscription identifier.
-        id: Option<usize>,
-    },
-    Unsubscribe {
-        pkid: u16,
-        filters: Vec<String>,
-    },
+    Subscribe(u16, Vec<Subscription>),
+    Unsubscribe(u16, Vec<String>),
     PingReq,
+    /// The end, with or without the will.
     Disconnect {
-        reason: DisconnectReasonCode,
-        /// New session expiry, seconds.
-        session_expiry: Option<u32>,
+        with_will: bool,
     },
 }
 
-/// What the broker sends.
-#[derive(Debug)]
-pub(super) enum Outgoing {
-    ConnAck(ConnAck),
-    Publish(Outbound),
-    PubAck(u16, PubAckReason),
-    /// Takes over a QoS 2 message, or refuses it.
-    PubRec(u16, PubAckReason),
-    /// Whether the identifier was known.
-    PubComp(u16, bool),
-    SubAck(u16, Vec<SubscribeReasonCode>),
-    UnsubAck(u16, Vec<UnsubAckReason>),
-    PingResp,
-    /// 3.1.1 has no such packet from the broker.
-    Disconnect(DisconnectReasonCode),
+/// Length of the packet at the start of `bytes`, as soon as the whole of it is there.
+///
+/// # Errors
+/// A malformed length, or more than [`MAX_PACKET_BYTES`].
+pub(super) fn packet_length(bytes: &[u8]) -> Result<Option<usize>, Fault> {
+    let mut rest = Reader(bytes.get(1..).unwrap_or_default());
+    let available = rest.0.len();
+    let Ok(body) = rest.variable() else {
+        return match available {
+            0..4 => Ok(None),
+            _ => Err(malformed("remaining length of more than four bytes")),
+        };
+    };
+    let length = 1 + (available - rest.0.len()) + body as usize;
+    if length > MAX_PACKET_BYTES {
+        return Err(fault(reason::PACKET_TOO_LARGE, "packet too large"));
+    }
+    Ok((bytes.len() >= length).then_some(length))
 }
 
-/// The answer to a CONNECT.
-#[derive(Debug)]
-pub(super) struct ConnAck {
-    pub(super) code: ConnectReturnCode,
-    pub(super) session_present: bool,
-    /// Client id the broker gave to a client without one.
-    pub(super) assigned: Option<String>,
+/// Reads the first packet of a connection.
+///
+/// # Errors
+/// [`reason::UNSUPPORTED_VERSION`] for a protocol level that is not served; others for what is not a valid CONNECT.
+pub(super) fn read_connect(packet: &[u8], now: Instant) -> Result<Connect, Fault> {
+    let (first, mut body) = open(packet)?;
+    if first != 0x10 {
+        return Err(protocol("the first packet is not a CONNECT"));
+    }
+    let name = body.binary()?;
+    let version = match (name, body.u8()?) {
+        (b"MQTT", 4) => Version::V311,
+        (b"MQTT", 5) => Version::V5,
+        (b"MQTT" | b"MQIsdp", _) => {
+            return Err(fault(reason::UNSUPPORTED_VERSION, "protocol level is not 4 or 5"));
+        }
+        _ => return Err(protocol("CONNECT without the name of the protocol")),
+    };
+    let flags = body.u8()?;
+    let has = |bit: u8| flags & (1 << bit) != 0;
+    let will_qos = (flags >> 3) & 3;
+    if has(0) || will_qos == 3 || (!has(2) && (flags & 0x38) != 0) {
+        return Err(malformed("flags of CONNECT"));
+    }
+    let keep_alive = Duration::from_secs(body.u16()?.into());
+    let properties = body.properties(version, property::OF_CONNECT)?;
+    let limit = |id, otherwise: u32| properties.number(id).unwrap_or(otherwise) as usize;
+    let receive_maximum = limit(property::RECEIVE_MAXIMUM, u16::MAX.into());
+    let max_packet = limit(property::MAXIMUM_PACKET, u32::MAX);
+    if receive_maximum == 0 || max_packet == 0 {
+        return Err(protocol("receive maximum or maximum packet size 0"));
+    }
+    let client_id = body.text()?;
+    let will = if has(2) {
+        let properties = body.properties(version, property::OF_WILL)?;
+        let topic = body.text()?;
+        let payload = body.binary()?.to_vec();
+        Some(message(topic, payload, Qos::of(will_qos), has(5), properties, now)?)
+    } else {
+        None
+    };
+    // The demo has no accounts: name and password are read over.
+    if has(7) {
+        body.text()?;
+    }
+    if has(6) {
+        body.binary()?;
+    }
+    body.end()?;
+    // 3.1.1 section 3.1.3.1: a client without an id cannot ask for a session to come back to.
+    let nameless = client_id.is_empty() && version == Version::V311 && !has(1);
+    let refused = if properties.has(property::AUTHENTICATION_METHOD) {
+        Some(reason::BAD_AUTHENTICATION_METHOD)
+    } else if nameless || client_id.len() > MAX_CLIENT_ID_BYTES {
+        Some(reason::CLIENT_ID_NOT_VALID)
+    } else if will_qos == 2 && version == Version::V5 {
+        Some(reason::QOS_NOT_SUPPORTED)
+    } else {
+        None
+    };
+    Ok(Connect {
+        version,
+        client_id,
+        keep_alive,
+        receive_maximum,
+        max_packet,
+        will,
+        refused,
+    })
 }
 
-/// One message for one client.
-#[derive(Debug, Clone)]
-pub(super) struct Outbound {
-    pub(super) message: std::sync::Arc<Message>,
-    pub(super) qos: QoS,
-    pub(super) retain: bool,
-    /// 0 at QoS 0.
-    pub(super) pkid: u16,
-    /// Sent on an earlier connection of this session already.
-    pub(super) dup: bool,
-    /// Identifiers of the subscriptions that matched.
-    pub(super) subscription_ids: Vec<usize>,
-    /// Seconds left until the message expires.
-    pub(super) expires_in: Option<u32>,
+/// Reads a packet that follows the CONNECT and came at `now`.
+///
+/// # Errors
+/// It is malformed, or not served: close the connection.
+pub(super) fn read(version: Version, packet: &[u8], now: Instant) -> Result<Incoming, Fault> {
+    let (first, mut body) = open(packet)?;
+    let incoming = match first {
+        0x30..=0x3F => read_publish(version, first, &mut body, now)?,
+        0x40 => {
+            let pkid = body.packet_id()?;
+            body.reason(version, property::OF_ACK)?;
+            Incoming::PubAck(pkid)
+        }
+        0x82 => {
+            let pkid = body.packet_id()?;
+            let properties = body.properties(version, &[property::SUBSCRIPTION_ID, property::USER])?;
+            if properties.has(property::SUBSCRIPTION_ID) {
+                return Err(fault(reason::SUBSCRIPTION_IDS_NOT_SUPPORTED, "subscription identifier"));
+            }
+            Incoming::Subscribe(pkid, body.list(|body| body.subscription(version))?)
+        }
+        0xA2 => {
+            let pkid = body.packet_id()?;
+            body.properties(version, &[property::USER])?;
+            Incoming::Unsubscribe(pkid, body.list(Reader::text)?)
+        }
+        0xC0 => Incoming::PingReq,
+        0xE0 => {
+            let reason = body.reason(version, property::OF_DISCONNECT)?;
+            let with_will = reason != reason::SUCCESS;
+            Incoming::Disconnect { with_will }
+        }
+        0x10 => return Err(protocol("second CONNECT")),
+        0x20 | 0x50 | 0x62 | 0x70 | 0x90 | 0xB0 | 0xD0 | 0xF0 => return Err(protocol("packet type not served")),
+        _ => return Err(malformed("packet type or its flags")),
+    };
+    body.end()?;
+    Ok(incoming)
+}
+
+fn read_publish(version: Version, first: u8, body: &mut Reader<'_>, now: Instant) -> Result<Incoming, Fault> {
+    let qos = match (first >> 1) & 3 {
+        qos @ (0 | 1) => Qos::of(qos),
+        2 => return Err(fault(reason::QOS_NOT_SUPPORTED, "PUBLISH at QoS 2")),
+        _ => return Err(malformed("QoS 3")),
+    };
+    let topic = body.text()?;
+    let pkid = match qos {
+        Qos::AtMostOnce => 0,
+        Qos::AtLeastOnce => body.packet_id()?,
+    };
+    let properties = body.properties(version, property::OF_PUBLISH)?;
+    if properties.has(property::TOPIC_ALIAS) {
+        return Err(fault(reason::TOPIC_ALIAS_INVALID, "topic alias"));
+    }
+    let payload = std::mem::take(&mut body.0).to_vec();
+    let message = message(topic, payload, qos, first & 1 != 0, properties, now)?;
+    Ok(Incoming::Publish(message, pkid))
+}
+
+fn message(
+    topic: String,
+    payload: Vec<u8>,
+    qos: Qos,
+    retain: bool,
+    properties: Properties,
+    published: Instant,
+) -> Result<Message, Fault> {
+    if !topic::is_name(&topic) {
+        return Err(fault(reason::TOPIC_NAME_INVALID, "not a topic to publish to"));
+    }
+    let lifetime = properties.number(property::MESSAGE_EXPIRY);
+    Ok(Message {
+        topic,
+        payload,
+        qos,
+        retain,
+        properties: properties.forwarded,
+        lifetime: lifetime.map(|seconds| Duration::from_secs(seconds.into())),
+        published,
+    })
+}
+
+/// First byte and body of a whole packet.
+fn open(packet: &[u8]) -> Result<(u8, Reader<'_>), Fault> {
+    let mut reader = Reader(packet);
+    let first = reader.u8()?;
+    let length = reader.variable()? as usize;
+    if length != reader.0.len() {
+        return Err(malformed("length of the packet"));
+    }
+    Ok((first, reader))
+}
+
+impl Qos {
+    /// Of two bits, QoS 2 being served as QoS 1.
+    fn of(bits: u8) -> Qos {
+        if bits == 0 { Qos::AtMostOnce } else { Qos::AtLeastOnce }
+    }
 }

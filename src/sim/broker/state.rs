@@ -1,321 +1,454 @@
-//! The broker without its sockets: sessions, retained messages, wills. No clock and no I/O.
+//! The broker without its sockets: clients, subscriptions, retained messages, wills. No clock and no I/O.
+//!
+//! A client is known for as long as it is connected: no session outlives its connection.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Instant;
 
-use rumqttc::v5::mqttbytes::v5::{
-    ConnectReturnCode, DisconnectReasonCode, Filter, PubAckReason, SubscribeReasonCode, UnsubAckReason,
-};
 use tokio::sync::{Notify, oneshot};
 
-use super::packet::{Connect, Expiry, Fault, Message, Outbound, Version, Will};
-use super::session::{Link, Session};
-use super::{MAX_CLIENT_ID_BYTES, MAX_RETAINED_BYTES, MAX_RETAINED_MESSAGES, MAX_SESSIONS};
+use super::packet::{Fault, Message, Qos, Subscription, reason};
+use super::{MAX_QUEUE_BYTES, MAX_QUEUE_MESSAGES, MAX_RETAINED_BYTES, MAX_RETAINED_MESSAGES, MAX_SUBSCRIPTIONS, topic};
 
-/// All the broker knows.
+/// All that the broker knows.
 #[derive(Debug, Default)]
 pub(super) struct State {
-    sessions: BTreeMap<String, Session>,
+    /// By the number of their connection.
+    clients: BTreeMap<u64, Client>,
     retained: BTreeMap<String, Arc<Message>>,
     retained_bytes: usize,
-    connections: u64,
-    assigned: u64,
 }
 
-/// A client that was let in.
+/// A connected client.
 #[derive(Debug)]
-pub(super) struct Attached {
-    pub(super) client_id: String,
-    /// Number of the connection.
-    pub(super) link: u64,
-    pub(super) session_present: bool,
-    /// The broker chose the client id.
-    pub(super) assigned: bool,
+struct Client {
+    id: String,
+    will: Option<Message>,
+    subscriptions: Vec<Subscription>,
+    queue: VecDeque<Delivery>,
+    queue_bytes: usize,
+    /// Notified when there is something to send.
+    wake: Arc<Notify>,
+    /// Ends the connection, once.
+    end: Option<oneshot::Sender<Fault>>,
+}
+
+/// A message for one client.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Delivery {
+    pub(super) message: Arc<Message>,
+    pub(super) qos: Qos,
+    pub(super) retain: bool,
 }
 
 /// How a connection ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Leave {
-    /// The client said good-bye: no will.
+    /// The client took its leave: no will.
     Clean,
-    /// Anything else: the will is due.
+    /// Anything else: the will is published.
     Lost,
 }
 
 impl State {
-    /// Gives a client its session. An earlier connection of the same client is ended, and its will
-    /// is published before the new one goes on.
-    ///
-    /// # Errors
-    /// The code for the CONNACK that refuses.
+    /// Takes in the client `id` on the connection of that number; an earlier connection of the same client ends, and its
+    /// will is published.
     pub(super) fn attach(
         &mut self,
-        now: Instant,
-        connect: &Connect,
+        number: u64,
+        id: &str,
+        will: Option<Message>,
         wake: Arc<Notify>,
         end: oneshot::Sender<Fault>,
-    ) -> Result<Attached, ConnectReturnCode> {
-        if connect.authentication {
-            return Err(ConnectReturnCode::BadAuthenticationMethod);
+        now: Instant,
+    ) {
+        let earlier = self
+            .clients
+            .iter()
+            .find(|(_, client)| client.id == id)
+            .map(|(number, _)| *number);
+        if let Some(earlier) = earlier {
+            let reason = reason::SESSION_TAKEN_OVER;
+            if let Some(client) = self.clients.get_mut(&earlier) {
+                client.end(reason, "the client connected again");
+            }
+            self.detach(earlier, Leave::Lost, now);
         }
-        // 3.1.1 section 3.1.3.1: a client without an id cannot have a session to come back to.
-        let nameless_session = connect.client_id.is_empty() && !connect.clean_start;
-        if (nameless_session && connect.version == Version::V311) || connect.client_id.len() > MAX_CLIENT_ID_BYTES {
-            return Err(ConnectReturnCode::ClientIdentifierNotValid);
-        }
-        let assigned = connect.client_id.is_empty();
-        let client_id = if assigned {
-            self.assign_client_id()
-        } else {
-            connect.client_id.clone()
-        };
-
-        self.take_over(now, &client_id, connect.clean_start);
-        let session_present = self.sessions.contains_key(&client_id);
-        if !session_present {
-            self.make_room(now);
-        }
-        self.connections += 1;
-        let link = self.connections;
-        let session = self
-            .sessions
-            .entry(client_id.clone())
-            .or_insert_with(|| Session::new(connect.expiry));
-        session.expiry = connect.expiry;
-        session.ends = None;
-        session.left = None;
-        session.will = connect.will.clone();
-        session.will_due = None;
-        let receive_maximum = usize::from(connect.receive_maximum);
-        session.link = Some(Link {
-            number: link,
+        let client = Client {
+            id: id.to_string(),
+            will,
+            subscriptions: Vec::new(),
+            queue: VecDeque::new(),
+            queue_bytes: 0,
             wake,
             end: Some(end),
-            receive_maximum,
-        });
-        Ok(Attached {
-            client_id,
-            link,
-            session_present,
-            assigned,
-        })
-    }
-
-    /// Ends an earlier connection of the client, and its session if it asks for a new one. The will
-    /// is published unless it has a delay and the session goes on (MQTT 5.0 section 3.1.3.2.2).
-    fn take_over(&mut self, now: Instant, client_id: &str, clean_start: bool) {
-        if let Some(session) = self.sessions.get_mut(client_id)
-            && let Some(mut link) = session.link.take()
-        {
-            let what = String::from("the client connected again");
-            link.end(Fault {
-                reason: DisconnectReasonCode::SessionTakenOver,
-                what,
-            });
-            self.suspend(now, client_id, Leave::Lost);
-        }
-        if clean_start {
-            self.end_session(now, client_id);
-        }
-    }
-
-    /// The connection `link` of a client is gone. `expiry` replaces that of its CONNECT.
-    pub(super) fn detach(&mut self, now: Instant, client_id: &str, link: u64, leave: Leave, expiry: Option<Expiry>) {
-        let Some(session) = self.linked(client_id, link) else {
-            return;
         };
-        session.expiry = expiry.unwrap_or(session.expiry);
-        self.suspend(now, client_id, leave);
+        self.clients.insert(number, client);
     }
 
-    fn suspend(&mut self, now: Instant, client_id: &str, leave: Leave) {
-        let Some(session) = self.sessions.get_mut(client_id) else {
-            return;
-        };
-        session.suspend(now);
-        match leave {
-            Leave::Clean => session.will = None,
-            Leave::Lost => session.will_due = session.will.as_ref().and_then(|will| now.checked_add(will.delay)),
-        }
-        self.settle(now, client_id);
-    }
-
-    /// Does what is due for a client without connection: publishes its will, ends its session.
-    fn settle(&mut self, now: Instant, client_id: &str) {
-        let Some(session) = self.sessions.get_mut(client_id) else {
-            return;
-        };
-        if session.link.is_some() {
-            return;
-        }
-        if session.ends.is_some_and(|ends| ends <= now) {
-            self.end_session(now, client_id);
-        } else if session.will_due.is_some_and(|due| due <= now) {
-            session.will_due = None;
-            let will = session.will.take();
-            self.publish_will(now, client_id, will);
+    /// The connection of that number is gone.
+    pub(super) fn detach(&mut self, number: u64, leave: Leave, now: Instant) {
+        let will = self.clients.remove(&number).and_then(|client| client.will);
+        if let (Leave::Lost, Some(will)) = (leave, will) {
+            self.publish(number, Message { published: now, ..will }, now);
         }
     }
 
-    /// A will is published at the latest when the session ends.
-    fn end_session(&mut self, now: Instant, client_id: &str) {
-        if let Some(session) = self.sessions.remove(client_id) {
-            self.publish_will(now, client_id, session.will);
-        }
-    }
-
-    fn publish_will(&mut self, now: Instant, client_id: &str, will: Option<Will>) {
-        if let Some(will) = will {
-            self.publish(now, client_id, Message::new(will.publish, now));
-        }
-    }
-
-    /// Does what time brings: delayed wills, ends of sessions, expiry of retained messages.
-    pub(super) fn tick(&mut self, now: Instant) {
-        let due = |at: Option<Instant>| at.is_some_and(|at| at <= now);
-        let clients: Vec<String> = self
-            .sessions
-            .iter()
-            .filter(|(_, session)| session.link.is_none() && (due(session.ends) || due(session.will_due)))
-            .map(|(client_id, _)| client_id.clone())
-            .collect();
-        for client_id in clients {
-            self.settle(now, &client_id);
-        }
-        self.retained.retain(|_, message| message.is_current(now));
-        self.retained_bytes = self.retained.values().map(|message| message.weight()).sum();
-    }
-
-    /// Retains and passes on a message of `client_id`.
-    pub(super) fn publish(&mut self, now: Instant, client_id: &str, message: Message) -> PubAckReason {
+    /// Retains and passes on a message; false when there was no room to retain it.
+    pub(super) fn publish(&mut self, publisher: u64, message: Message, now: Instant) -> bool {
         let message = Arc::new(message);
-        let retained = !message.retain || self.retain(now, &message);
-        let mut subscribers = 0_usize;
-        for (subscriber, session) in &mut self.sessions {
-            subscribers += usize::from(session.offer(&message, subscriber == client_id));
+        let kept = !message.retain || self.retain(&message, now);
+        for (number, client) in &mut self.clients {
+            client.offer(&message, *number == publisher);
         }
-        match (retained, subscribers) {
-            (false, _) => PubAckReason::QuotaExceeded,
-            (true, 0) => PubAckReason::NoMatchingSubscribers,
-            (true, _) => PubAckReason::Success,
-        }
+        kept
     }
 
-    /// Sets, replaces or (without payload) deletes the retained message of a topic; false when the
-    /// bounds leave no place for it.
-    fn retain(&mut self, now: Instant, message: &Arc<Message>) -> bool {
+    /// Sets, replaces or, without payload, deletes the retained message of a topic; false when there is no room for it.
+    fn retain(&mut self, message: &Arc<Message>, now: Instant) -> bool {
         if let Some(old) = self.retained.remove(&message.topic) {
-            self.retained_bytes = self.retained_bytes.saturating_sub(old.weight());
+            self.retained_bytes -= old.weight();
         }
-        if message.payload.is_empty() || !message.is_current(now) {
+        if message.payload.is_empty() {
             return true;
         }
-        let bytes = self.retained_bytes.saturating_add(message.weight());
-        if self.retained.len() >= MAX_RETAINED_MESSAGES || bytes > MAX_RETAINED_BYTES {
-            return false;
+        if !self.has_room(message) {
+            self.retained.retain(|_, message| message.is_current(now));
+            self.retained_bytes = self.retained.values().map(|message| message.weight()).sum();
         }
-        self.retained_bytes = bytes;
-        self.retained.insert(message.topic.clone(), Arc::clone(message));
-        true
+        let room = self.has_room(message);
+        if room {
+            self.retained_bytes += message.weight();
+            self.retained.insert(message.topic.clone(), Arc::clone(message));
+        }
+        room
     }
 
-    /// Subscribes a client; retained messages go into its queue.
-    pub(super) fn subscribe(
-        &mut self,
-        now: Instant,
-        client_id: &str,
-        link: u64,
-        filters: &[Filter],
-        id: Option<usize>,
-    ) -> Vec<SubscribeReasonCode> {
-        let Some(session) = self
-            .sessions
-            .get_mut(client_id)
-            .filter(|session| is_linked(session, link))
-        else {
-            return vec![SubscribeReasonCode::Unspecified; filters.len()];
+    fn has_room(&self, message: &Message) -> bool {
+        self.retained.len() < MAX_RETAINED_MESSAGES && self.retained_bytes + message.weight() <= MAX_RETAINED_BYTES
+    }
+
+    /// Subscribes a client and queues the retained messages; a reason code for each filter.
+    pub(super) fn subscribe(&mut self, number: u64, wanted: Vec<Subscription>, now: Instant) -> Vec<u8> {
+        let Some(client) = self.clients.get_mut(&number) else {
+            return vec![reason::PROTOCOL_ERROR; wanted.len()];
         };
-        let mut codes = Vec::with_capacity(filters.len());
-        for filter in filters {
-            let subscribed = session.subscribe(filter, id);
-            codes.push(subscribed.code);
-            if !subscribed.wants_retained {
+        let mut codes = Vec::with_capacity(wanted.len());
+        for subscription in wanted {
+            let new = client.unsubscribe(&subscription.filter) != reason::SUCCESS;
+            let code = client.check(&subscription.filter);
+            codes.push(code.err().unwrap_or(subscription.qos as u8));
+            if code.is_err() {
                 continue;
             }
-            for message in self.retained.values() {
-                if message.is_current(now) && super::topic::matches(&message.topic, &filter.path) {
-                    session.offer_retained(message, &filter.path);
+            if subscription.retain_handling == 0 || (subscription.retain_handling == 1 && new) {
+                let matching = |message: &&Arc<Message>| {
+                    message.is_current(now) && topic::matches(&message.topic, &subscription.filter)
+                };
+                for message in self.retained.values().filter(matching) {
+                    client.push(Delivery {
+                        message: Arc::clone(message),
+                        qos: subscription.qos.min(message.qos),
+                        retain: true,
+                    });
                 }
             }
+            client.subscriptions.push(subscription);
         }
         codes
     }
 
-    /// Takes subscriptions back.
-    pub(super) fn unsubscribe(&mut self, client_id: &str, link: u64, filters: &[String]) -> Vec<UnsubAckReason> {
-        match self.linked(client_id, link) {
-            Some(session) => filters.iter().map(|filter| session.unsubscribe(filter)).collect(),
-            None => vec![UnsubAckReason::UnspecifiedError; filters.len()],
-        }
+    /// Takes subscriptions back; a reason code for each filter.
+    pub(super) fn unsubscribe(&mut self, number: u64, filters: &[String]) -> Vec<u8> {
+        let Some(client) = self.clients.get_mut(&number) else {
+            return vec![reason::PROTOCOL_ERROR; filters.len()];
+        };
+        filters.iter().map(|filter| client.unsubscribe(filter)).collect()
     }
 
-    /// Messages to send on the connection `link`, see [`Session::take`].
-    pub(super) fn take(&mut self, now: Instant, client_id: &str, link: u64, budget: usize) -> Vec<Outbound> {
-        self.linked(client_id, link)
-            .map(|session| session.take(now, budget))
-            .unwrap_or_default()
-    }
-
-    /// The session of a client as long as `link` is its connection.
-    pub(super) fn linked(&mut self, client_id: &str, link: u64) -> Option<&mut Session> {
-        self.sessions
-            .get_mut(client_id)
-            .filter(|session| is_linked(session, link))
-    }
-
-    /// Number of clients that are connected and subscribed to the topic `name`.
-    pub(super) fn subscribers(&self, name: &str) -> usize {
-        self.sessions
-            .values()
-            .filter(|session| session.link.is_some() && session.is_subscribed(name))
-            .count()
-    }
-
-    /// Number of clients that are connected.
-    pub(super) fn clients(&self) -> usize {
-        self.sessions.values().filter(|session| session.link.is_some()).count()
-    }
-
-    fn assign_client_id(&mut self) -> String {
+    /// The next message for a client, a QoS 1 message only where `acknowledged` are wanted; those behind it wait.
+    pub(super) fn take(&mut self, number: u64, acknowledged: bool, now: Instant) -> Option<Delivery> {
+        let client = self.clients.get_mut(&number)?;
         loop {
-            self.assigned += 1;
-            let client_id = format!("assigned-{}", self.assigned);
-            if !self.sessions.contains_key(&client_id) {
-                return client_id;
+            let next = client.queue.front()?;
+            let current = next.message.is_current(now);
+            if current && next.qos == Qos::AtLeastOnce && !acknowledged {
+                return None;
+            }
+            let next = client.queue.pop_front()?;
+            client.queue_bytes -= next.message.weight();
+            if current {
+                return Some(next);
             }
         }
     }
+}
 
-    /// Ends the session that has been left longest when there is no place for another one.
-    fn make_room(&mut self, now: Instant) {
-        if self.sessions.len() < MAX_SESSIONS {
+impl Client {
+    fn end(&mut self, reason: u8, what: &'static str) {
+        if let Some(end) = self.end.take() {
+            // A connection that is gone already needs no end.
+            let _ = end.send(Fault { reason, what });
+        }
+    }
+
+    /// Whether one more subscription to `filter` is allowed.
+    fn check(&self, filter: &str) -> Result<(), u8> {
+        if !topic::is_filter(filter) {
+            Err(reason::TOPIC_FILTER_INVALID)
+        } else if filter.starts_with("$share/") {
+            Err(reason::SHARED_SUBSCRIPTIONS_NOT_SUPPORTED)
+        } else if self.subscriptions.len() >= MAX_SUBSCRIPTIONS {
+            Err(reason::QUOTA_EXCEEDED)
+        } else {
+            Ok(())
+        }
+    }
+
+    fn unsubscribe(&mut self, filter: &str) -> u8 {
+        let before = self.subscriptions.len();
+        self.subscriptions.retain(|known| known.filter != filter);
+        if self.subscriptions.len() < before {
+            reason::SUCCESS
+        } else {
+            reason::NO_SUBSCRIPTION_EXISTED
+        }
+    }
+
+    /// Queues `message` if it is subscribed to: once, at the highest QoS of all subscriptions that match. `own`: the
+    /// client published it.
+    fn offer(&mut self, message: &Arc<Message>, own: bool) {
+        let matches = |subscription: &&Subscription| {
+            !(own && subscription.no_local) && topic::matches(&message.topic, &subscription.filter)
+        };
+        let matching = || self.subscriptions.iter().filter(matches);
+        let Some(qos) = matching().map(|subscription| subscription.qos).max() else {
+            return;
+        };
+        let retain = message.retain && matching().any(|subscription| subscription.retain_as_published);
+        self.push(Delivery {
+            message: Arc::clone(message),
+            qos: qos.min(message.qos),
+            retain,
+        });
+    }
+
+    /// A client that does not take its messages loses its connection: nothing is dropped in silence.
+    fn push(&mut self, delivery: Delivery) {
+        let bytes = self.queue_bytes + delivery.message.weight();
+        if self.queue.len() >= MAX_QUEUE_MESSAGES || bytes > MAX_QUEUE_BYTES {
+            self.end(reason::QUOTA_EXCEEDED, "the client does not take its messages");
             return;
         }
-        let oldest = self
-            .sessions
-            .iter()
-            .filter_map(|(client_id, session)| session.left.map(|left| (left, client_id.clone())))
-            .min();
-        if let Some((_, client_id)) = oldest {
-            self.end_session(now, &client_id);
-        }
+        self.queue_bytes = bytes;
+        self.queue.push_back(delivery);
+        self.wake.notify_one();
     }
 }
 
-fn is_linked(session: &Session, link: u64) -> bool {
-    session.link.as_ref().is_some_and(|known| known.number == link)
-}
-
 #[cfg(test)]
-mod tests;
+mod tests {
+    use super::*;
+    use std::time::Duration;
+
+    fn message(topic: &str, payload: &[u8]) -> Message {
+        Message {
+            topic: topic.to_string(),
+            payload: payload.to_vec(),
+            qos: Qos::AtLeastOnce,
+            retain: true,
+            properties: Vec::new(),
+            lifetime: None,
+            published: Instant::now(),
+        }
+    }
+
+    fn attach(state: &mut State, number: u64, id: &str, will: Option<Message>) -> oneshot::Receiver<Fault> {
+        let (end, ended) = oneshot::channel();
+        state.attach(number, id, will, Arc::default(), end, Instant::now());
+        ended
+    }
+
+    fn subscription(filter: &str) -> Subscription {
+        Subscription {
+            filter: filter.to_string(),
+            qos: Qos::AtLeastOnce,
+            no_local: false,
+            retain_as_published: false,
+            retain_handling: 0,
+        }
+    }
+
+    fn subscribe(state: &mut State, number: u64, subscription: Subscription) -> u8 {
+        state.subscribe(number, vec![subscription], Instant::now())[0]
+    }
+
+    /// Topics, payloads and retain flags of all that waits.
+    fn waiting(state: &mut State, number: u64) -> Vec<(String, Vec<u8>, bool)> {
+        let now = Instant::now();
+        let all = std::iter::from_fn(|| state.take(number, true, now));
+        all.map(|d| (d.message.topic.clone(), d.message.payload.clone(), d.retain))
+            .collect()
+    }
+
+    fn seen(topic: &str, payload: &[u8], retain: bool) -> (String, Vec<u8>, bool) {
+        (topic.to_string(), payload.to_vec(), retain)
+    }
+
+    #[test]
+    fn options_of_subscriptions() {
+        let (mut state, now) = (State::default(), Instant::now());
+        let _end = attach(&mut state, 1, "a", None);
+        assert!(state.publish(9, message("t/1", b"old"), now));
+        assert_eq!(subscribe(&mut state, 1, subscription("t/#")), 1);
+        assert_eq!(waiting(&mut state, 1), [seen("t/1", b"old", true)]);
+        for (handling, comes) in [(0, 1), (1, 0), (2, 0)] {
+            subscribe(
+                &mut state,
+                1,
+                Subscription {
+                    retain_handling: handling,
+                    ..subscription("t/#")
+                },
+            );
+            assert_eq!(waiting(&mut state, 1).len(), comes, "retain handling {handling}");
+        }
+        state.publish(1, message("t/1", b"x"), now);
+        assert_eq!(waiting(&mut state, 1), [seen("t/1", b"x", false)]);
+        // Two filters match: once, and the flag as published if one of them wants it.
+        let as_published = Subscription {
+            retain_as_published: true,
+            retain_handling: 2,
+            ..subscription("+/1")
+        };
+        subscribe(&mut state, 1, as_published);
+        state.publish(1, message("t/1", b"y"), now);
+        assert_eq!(waiting(&mut state, 1), [seen("t/1", b"y", true)]);
+        assert_eq!(state.unsubscribe(1, &["+/1".to_string(), "x".to_string()]), [0, 0x11]);
+        let no_local = Subscription {
+            no_local: true,
+            retain_handling: 2,
+            ..subscription("t/#")
+        };
+        subscribe(&mut state, 1, no_local);
+        state.publish(1, message("t/1", b"own"), now);
+        state.publish(2, message("t/1", b"other"), now);
+        assert_eq!(waiting(&mut state, 1), [seen("t/1", b"other", false)]);
+        assert_eq!(
+            subscribe(&mut state, 1, subscription("a#")),
+            reason::TOPIC_FILTER_INVALID
+        );
+        assert_eq!(
+            subscribe(&mut state, 1, subscription("$share/g/t")),
+            reason::SHARED_SUBSCRIPTIONS_NOT_SUPPORTED
+        );
+    }
+
+    #[test]
+    fn wills_and_take_over() {
+        let (mut state, now) = (State::default(), Instant::now());
+        let _watcher = attach(&mut state, 1, "watcher", None);
+        subscribe(&mut state, 1, subscription("status/#"));
+        let mut first = attach(&mut state, 2, "twin", Some(message("status/2", b"gone")));
+        let _second = attach(&mut state, 3, "twin", Some(message("status/3", b"gone")));
+        assert_eq!(first.try_recv().unwrap().reason, reason::SESSION_TAKEN_OVER);
+        assert_eq!(waiting(&mut state, 1), [seen("status/2", b"gone", false)]);
+        state.detach(2, Leave::Lost, now);
+        assert!(waiting(&mut state, 1).is_empty(), "it was published already");
+        state.detach(3, Leave::Clean, now);
+        assert!(waiting(&mut state, 1).is_empty(), "a client that took its leave");
+    }
+
+    #[test]
+    fn retained_messages_are_deleted_and_expire() {
+        let (mut state, now) = (State::default(), Instant::now());
+        let _end = attach(&mut state, 1, "a", None);
+        let short = Message {
+            lifetime: Some(Duration::from_secs(1)),
+            ..message("short", b"x")
+        };
+        state.publish(
+            9,
+            Message {
+                published: now,
+                ..short
+            },
+            now,
+        );
+        state.publish(9, message("gone", b"x"), now);
+        state.publish(9, message("gone", b""), now);
+        state.subscribe(1, vec![subscription("#")], now + Duration::from_secs(1));
+        assert!(waiting(&mut state, 1).is_empty());
+        assert_eq!(
+            (state.retained.len(), state.retained_bytes),
+            (1, state.retained["short"].weight())
+        );
+    }
+
+    #[test]
+    fn everything_is_bounded() {
+        let (mut state, now) = (State::default(), Instant::now());
+        let short = Message {
+            lifetime: Some(Duration::from_secs(1)),
+            published: now,
+            ..message("short", b"x")
+        };
+        state.publish(9, short, now);
+        for number in 1..MAX_RETAINED_MESSAGES {
+            assert!(state.publish(9, message(&number.to_string(), b"x"), now));
+        }
+        assert!(!state.publish(9, message("one more", b"x"), now), "not retained");
+        let later = now + Duration::from_secs(2);
+        assert!(
+            state.publish(9, message("one more", b"x"), later),
+            "in the place of one that has expired"
+        );
+        assert!(
+            state.publish(9, message("7", b"new"), now),
+            "one in the place of another"
+        );
+        let mut slow = attach(&mut state, 1, "slow", None);
+        let mut quick = attach(&mut state, 2, "quick", None);
+        subscribe(&mut state, 1, subscription("#"));
+        subscribe(&mut state, 2, subscription("#"));
+        assert_eq!(
+            waiting(&mut state, 2).len(),
+            MAX_RETAINED_MESSAGES,
+            "all retained messages fit a queue"
+        );
+        let large = Message {
+            retain: false,
+            ..message("t", &vec![7; 200_000])
+        };
+        while slow.try_recv().is_err() {
+            state.publish(9, large.clone(), now);
+            assert_eq!(waiting(&mut state, 2).len(), 1);
+            assert!(state.clients[&1].queue_bytes <= MAX_QUEUE_BYTES);
+        }
+        assert!(quick.try_recv().is_err(), "a slow client harms no other");
+        let codes: Vec<u8> = (0..=MAX_SUBSCRIPTIONS)
+            .map(|n| subscribe(&mut state, 2, subscription(&format!("x/{n}"))))
+            .collect();
+        assert_eq!(codes.last(), Some(&reason::QUOTA_EXCEEDED));
+        assert_eq!(state.clients[&2].subscriptions.len(), MAX_SUBSCRIPTIONS);
+    }
+
+    #[test]
+    fn a_message_waits_for_acknowledgements_and_not_beyond_its_life() {
+        let (mut state, now) = (State::default(), Instant::now());
+        let _end = attach(&mut state, 1, "a", None);
+        subscribe(&mut state, 1, subscription("#"));
+        let short = Message {
+            lifetime: Some(Duration::from_secs(1)),
+            published: now,
+            ..message("t", b"short")
+        };
+        state.publish(9, short, now);
+        state.publish(9, message("t", b"long"), now);
+        assert_eq!(state.take(1, false, now), None);
+        let next = state.take(1, true, now + Duration::from_secs(2)).unwrap();
+        assert_eq!(next.message.payload, b"long");
+        assert_eq!(state.clients[&1].queue_bytes, 0);
+    }
+}

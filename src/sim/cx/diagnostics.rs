@@ -18,7 +18,7 @@ mod subfunction {
 /// Event counters; they wrap at 16 bits.
 #[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
 pub struct Counters {
-    /// Sound frames on the line, whomever they are for.
+    /// Valid frames on the line, for any address.
     pub bus_messages: u16,
     /// Frames with a wrong checksum.
     pub bus_errors: u16,

@@ -9,14 +9,14 @@ mod registers;
 #[cfg(test)]
 mod tests;
 
-pub use diagnostics::Counters;
-pub use options::{AddressOffset, CxOptions, Limits, OutOfRange};
+pub(crate) use diagnostics::Counters;
+pub(crate) use options::{AddressOffset, CxOptions, OutOfRange};
 
 use self::diagnostics::{Diagnostics, count};
 use self::parameters::Parameters;
 use super::SimTime;
-use super::model::{AT_REFERENCE_BAND, Command, DriveState, Latch, Model, Steps, UPDATE_PERIOD, unsigned};
-use super::motor::{Feed, Motor, Ratings};
+use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD, unsigned};
+use super::motor::{Feed, Ratings};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// The control bits (drives.md 4.2).
@@ -58,7 +58,7 @@ pub struct CxDrive {
     options: CxOptions,
     parameters: Parameters,
     ratings: Ratings,
-    motor: Motor,
+    body: Body,
     totals: Totals,
     diagnostics: Diagnostics,
     coils: Coils,
@@ -68,12 +68,8 @@ pub struct CxDrive {
     fieldbus: bool,
     /// What the panel commands; obeyed while the fieldbus is not the control source.
     local: Command,
-    latch: Latch,
-    running: bool,
-    powered: bool,
     failed: bool,
     busy_until: SimTime,
-    steps: Steps,
 }
 
 impl CxDrive {
@@ -87,19 +83,15 @@ impl CxDrive {
         }
         CxDrive {
             ratings: parameters.ratings(),
-            motor: Motor::new(&options.load),
+            body: Body::new(&options.load, now),
             totals: Totals::default(),
             diagnostics: Diagnostics::default(),
             coils: Coils::default(),
             reference: 0,
             fieldbus: options.fieldbus,
             local: Command::default(),
-            latch: Latch::new(),
-            running: false,
-            powered: true,
             failed: false,
             busy_until: SimTime::ZERO,
-            steps: Steps::new(now),
             parameters,
             options,
         }
@@ -134,15 +126,15 @@ impl CxDrive {
         self.coils.run = on;
         // A pulse shorter than a step counts.
         if self.fieldbus && !on {
-            self.latch.obeys(false);
+            self.body.latch.obeys(false);
         }
     }
 
     fn pull_reset(&mut self, on: bool) {
         if self.fieldbus && on && !self.coils.reset {
-            self.latch.reset();
+            self.body.latch.reset();
             // A run coil that is off already is seen off now.
-            self.latch.obeys(self.coils.run);
+            self.body.latch.obeys(self.coils.run);
         }
         self.coils.reset = on;
     }
@@ -168,44 +160,10 @@ impl CxDrive {
         }
     }
 
-    fn step(&mut self) {
-        let (run, target) = self.held();
-        self.running = self.latch.obeys(run);
-        let feed = if self.running {
-            Feed::To(target)
-        } else if self.latch.fault() == 0 && self.motor.fed && self.motor.output != 0.0 {
-            Feed::To(0.0)
-        } else {
-            Feed::Off
-        };
-        let seconds = UPDATE_PERIOD.as_secs_f64();
-        self.motor.step(seconds, feed, &self.ratings, &self.options.load);
-        let hours = seconds / 3600.0;
-        let energy = self.nominal_power() / 1000.0 * self.motor.power(&self.ratings).max(0.0) / 100.0 * hours;
-        self.totals.days += hours / 24.0;
-        self.totals.trip_hours += hours;
-        self.totals.energy += energy;
-        self.totals.trip_energy += energy;
-    }
-
     /// kW at the shaft, with an efficiency of 85 %.
     fn nominal_power(&self) -> f64 {
         let plate = &self.ratings;
         3f64.sqrt() * plate.voltage * plate.current * plate.cos_phi * 0.85 / 1000.0
-    }
-
-    fn ready(&self) -> bool {
-        self.latch.fault() == 0
-    }
-
-    fn shows_running(&self) -> bool {
-        self.motor.fed && self.latch.fault() == 0
-    }
-
-    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
-    fn turns_reverse(&self) -> bool {
-        let shaft = self.motor.shaft;
-        shaft < 0.0 || (shaft == 0.0 && self.running && self.held().1 < 0.0)
     }
 
     /// Counts the outcome of a message to this drive.
@@ -231,12 +189,36 @@ impl CxDrive {
 }
 
 impl Model for CxDrive {
-    fn advance(&mut self, now: SimTime) {
-        while self.steps.due(now).is_some() {
-            if self.powered {
-                self.step();
-            }
-        }
+    fn body(&self) -> &Body {
+        &self.body
+    }
+
+    fn body_mut(&mut self) -> &mut Body {
+        &mut self.body
+    }
+
+    fn step(&mut self, _now: SimTime) {
+        let (run, target) = self.held();
+        self.body.running = self.body.latch.obeys(run);
+        let feed = if self.body.running {
+            Feed::To(target)
+        } else if self.body.latch.fault() == 0 && self.body.motor.fed && self.body.motor.output != 0.0 {
+            Feed::To(0.0)
+        } else {
+            Feed::Off
+        };
+        let seconds = UPDATE_PERIOD.as_secs_f64();
+        self.body.motor.step(seconds, feed, &self.ratings, &self.options.load);
+        let hours = seconds / 3600.0;
+        let energy = self.nominal_power() / 1000.0 * self.body.motor.power(&self.ratings).max(0.0) / 100.0 * hours;
+        self.totals.days += hours / 24.0;
+        self.totals.trip_hours += hours;
+        self.totals.energy += energy;
+        self.totals.trip_energy += energy;
+    }
+
+    fn ready(&self) -> bool {
+        self.body.latch.fault() == 0
     }
 
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
@@ -286,14 +268,6 @@ impl Model for CxDrive {
         count(&mut self.diagnostics.counters.bus_errors);
     }
 
-    fn powered(&self) -> bool {
-        self.powered
-    }
-
-    fn power_off(&mut self) {
-        self.powered = false;
-    }
-
     fn power_on(&mut self, now: SimTime) {
         let fresh = CxDrive::new(self.options.clone(), now);
         *self = CxDrive {
@@ -302,13 +276,6 @@ impl Model for CxDrive {
             totals: self.totals,
             ..fresh
         };
-    }
-
-    fn trip(&mut self, fault: u16) {
-        if self.latch.trip(fault) {
-            self.running = false;
-            self.motor.release();
-        }
     }
 
     /// Overcurrent, drive overtemperature, motor underload, external fault.
@@ -331,14 +298,11 @@ impl Model for CxDrive {
         self.fieldbus = on;
     }
 
-    fn state(&self) -> DriveState {
-        DriveState {
-            ready: self.ready(),
-            running: self.shows_running(),
-            reverse: self.turns_reverse(),
-            fault: self.latch.fault(),
-            output: self.motor.output,
-            remote: self.fieldbus,
-        }
+    fn remote(&self) -> bool {
+        self.fieldbus
+    }
+
+    fn target(&self) -> f64 {
+        self.held().1
     }
 }

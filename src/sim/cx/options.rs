@@ -1,4 +1,4 @@
-//! How a simulated CX is made.
+//! Options of a simulated CX.
 
 use super::super::model::Beyond;
 use super::super::motor::Load;
@@ -60,12 +60,13 @@ impl FromStr for AddressOffset {
         let mut offset = AddressOffset::default();
         for part in text.split(',') {
             let (table, value) = part.split_once('=').unwrap_or((part, ""));
-            let table = Table::from_name(table.trim())
-                .ok_or_else(|| format!("`{part}` names no table; write coil, discrete-input, input or holding"))?;
+            let table = Table::from_name(table.trim()).ok_or_else(|| {
+                format!("`{part}` does not name a table; write coil, discrete-input, input or holding")
+            })?;
             let value = match value.trim() {
                 "0" => 0,
                 "1" => 1,
-                _ => return Err(format!("`{part}` is no offset; write 0 or 1, such as {table}=1")),
+                _ => return Err(format!("`{part}` is not an offset; write 0 or 1, such as {table}=1")),
             };
             match table {
                 Table::Coil => offset.coil = value,
@@ -87,7 +88,7 @@ pub enum OutOfRange {
     Clamp,
 }
 
-/// How a simulated CX is made.
+/// Options of a simulated CX.
 #[derive(Debug, Clone)]
 pub struct CxOptions {
     /// Load and mains.

@@ -78,9 +78,9 @@ impl CxDrive {
         let inputs = [
             self.fieldbus,
             self.ready(),
-            self.shows_running(),
-            self.turns_reverse(),
-            self.latch.fault() != 0,
+            self.body.shows_running(),
+            self.body.turns_reverse(self.target()),
+            self.body.latch.fault() != 0,
         ];
         let bits: &[bool] = if table == Table::Coil { &coils } else { &inputs };
         bits.get(usize::from(item)).copied().ok_or(Exception::ADDRESS)
@@ -92,7 +92,7 @@ impl CxDrive {
         }
         let item = self.item(table, address)?;
         let value = match (table, item) {
-            (Table::Input, FAULT) => Some(self.latch.fault()),
+            (Table::Input, FAULT) => Some(self.body.latch.fault()),
             (Table::Input, _) => self.variable(item),
             (_, REFERENCE) => Some(self.reference),
             _ => self.parameters.get(item),
@@ -102,7 +102,7 @@ impl CxDrive {
 
     /// Monitoring variable n1 and following, by its item, which is one less (drives.md 4.4).
     fn variable(&self, item: u16) -> Option<u16> {
-        let (motor, ratings, totals) = (&self.motor, &self.ratings, &self.totals);
+        let (motor, ratings, totals) = (&self.body.motor, &self.ratings, &self.totals);
         let step = self.options.time_step;
         Some(match item {
             0 => signed(motor.output * 100.0),
@@ -119,7 +119,7 @@ impl CxDrive {
             11 => unsigned((totals.trip_energy * 1000.0).floor()),
             // Terminals with nothing connected.
             12..=15 => 0,
-            16 => bit(self.ready(), 1) | bit(self.shows_running(), 2) | bit(self.latch.fault() != 0, 4),
+            16 => bit(self.ready(), 1) | bit(self.body.shows_running(), 2) | bit(self.body.latch.fault() != 0, 4),
             17 => PROGRAM,
             18 => unsigned(self.nominal_power() * 10.0),
             19 => unsigned(motor.heat),

@@ -1,6 +1,7 @@
 //! Behaviour of the simulated CX against drives.md, sections 4, 7.2 and 10, in virtual time.
 
 use super::super::model::Beyond;
+use super::options::Limits;
 use super::*;
 use crate::codec::{Table, rtu};
 use std::time::Duration;

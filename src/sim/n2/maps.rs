@@ -57,7 +57,7 @@ pub struct Map {
 }
 
 /// The map of a model's family.
-pub fn of(model: &ModelOptions) -> &'static Map {
+pub(crate) fn of(model: &ModelOptions) -> &'static Map {
     match model {
         ModelOptions::Nx(nx) if nx.hvac_control => &HVX,
         ModelOptions::Nx(_) => &NX,
@@ -153,7 +153,7 @@ macro_rules! nx_entries {
 }
 
 /// Vacon NX (tables 19 to 23). The model keeps no counters: AI 5 and 11 to 14 stand still.
-pub const NX: Map = Map {
+pub(crate) const NX: Map = Map {
     entries: nx_entries![
         entry(Bi, 7, Bit(HOLDING, 2100, 6)),
         entry(Bi, 13, Bit(HOLDING, 2101, 5)),
@@ -175,7 +175,7 @@ pub const NX: Map = Map {
 };
 
 /// Eaton HVX (tables 6-1 to 6-5): BI 7, AO 9 and 10, BO 9, 10 and 16 do not exist.
-pub const HVX: Map = Map {
+pub(crate) const HVX: Map = Map {
     entries: nx_entries![
         entry(Ao, 7, Signed(HOLDING, 2003, 0.01)),
         entry(Ao, 8, Signed(HOLDING, 2004, 0.01)),
@@ -184,10 +184,10 @@ pub const HVX: Map = Map {
 };
 
 /// A family without N2.
-pub const NONE: Map = Map { entries: &[], ..NX };
+pub(crate) const NONE: Map = Map { entries: &[], ..NX };
 
 /// TECO 7300PA with its PA-C card: the column Modbus of the tables.
-pub const TECO: Map = Map {
+pub(crate) const TECO: Map = Map {
     entries: &[
         entry(Ai, 1, Unsigned(HOLDING, 0x0023, 0.01)),
         entry(Ai, 2, Unsigned(HOLDING, 0x0024, 0.01)),

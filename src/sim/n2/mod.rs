@@ -4,14 +4,14 @@
 //! The drive behind it is asked through the same requests as by Modbus, see [`maps`]. What no manual says is an option
 //! or stands in [`crate::codec::n2::assumptions`].
 
-pub mod maps;
+pub(crate) mod maps;
 #[cfg(test)]
 mod tests;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-pub use maps::{Entry, Map};
+pub(crate) use maps::{Entry, Map};
 
 use self::maps::{Beyond, Place};
 use super::SimTime;
@@ -21,9 +21,9 @@ use crate::codec::n2::{Answer, Command, Object, Region};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Without a poll for that time a drive takes itself for alone (drives.md 6.5).
-pub const ALONE: Duration = Duration::from_secs(600);
+pub(crate) const ALONE: Duration = Duration::from_secs(600);
 
-/// How a board is made.
+/// Options of a board.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct BoardOptions {
     /// A byte, the object's status, stands before the value of a read.
@@ -32,7 +32,7 @@ pub struct BoardOptions {
     pub nak_checksum: bool,
     /// Bit of a status byte that is the state of BI and BO.
     pub state_bit: u8,
-    /// Device type that Identify tells.
+    /// Device type that Identify returns.
     pub device_type: u8,
     /// Nothing is answered before Identify.
     pub waits_for_identify: bool,
@@ -51,12 +51,12 @@ impl Default for BoardOptions {
 }
 
 /// The drive behind a board; it may stay silent.
-pub type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
+pub(crate) type Model<'m> = &'m mut dyn FnMut(&RequestPdu) -> Option<Reply>;
 
 /// The board of one drive.
 #[derive(Debug, Clone)]
 pub struct Board {
-    /// How it is made; may change while it works.
+    /// Its options; may change at any time.
     pub options: BoardOptions,
     map: &'static Map,
     waiting: bool,
@@ -68,7 +68,7 @@ pub struct Board {
     reported: BTreeMap<Object, u8>,
     /// Records that are not acknowledged yet, a reply each.
     reports: VecDeque<Vec<u8>>,
-    /// The first of them was told.
+    /// The first of them was sent.
     told: bool,
     polled: SimTime,
     /// Power cycles of the drive that the board has gone through with it.
@@ -92,7 +92,7 @@ impl Board {
         }
     }
 
-    /// The board starts anew: as after a power cycle or a warm reset.
+    /// The board restarts, as after a power cycle or a warm reset.
     pub fn restart(&mut self, now: SimTime) {
         let (options, power_cycles) = (self.options, self.power_cycles);
         *self = Board {
@@ -403,7 +403,7 @@ fn store(address: u16, value: u16, model: Model<'_>) -> Result<(), u8> {
 }
 
 /// The board's code for what the drive says on Modbus.
-pub fn code_of(exception: Exception) -> u8 {
+pub(crate) fn code_of(exception: Exception) -> u8 {
     match exception.0 {
         0x01 => UNKNOWN,
         // A parameter of TECO that is written in DRIVE mode.

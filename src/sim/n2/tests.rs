@@ -103,15 +103,15 @@ fn reports_come_in_pieces_until_they_are_acknowledged() {
     assert!(longest <= 1 + LONGEST_REPORT + 2);
     assert_eq!(bench.ask("0104"), "A");
     bench.ask("01F");
-    assert_eq!(bench.ask("0104"), first, "everything anew after each Identify");
+    assert_eq!(bench.ask("0104"), first, "a full report after each Identify");
     bench.ask("01F");
     assert_eq!(
         bench.ask("0105"),
         first,
-        "what was told before is not what is acknowledged"
+        "what was sent before is not what is acknowledged"
     );
     while bench.ask("0105") != "A" {}
-    // BI 2 reports its changes once it is told to.
+    // BI 2 reports its changes once that is switched on.
     assert_eq!(bench.ask("0121020101"), "A");
     assert_eq!(bench.ask("0122020101"), "A");
     bench.ask("0104");

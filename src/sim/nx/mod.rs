@@ -21,8 +21,8 @@ pub use signals::StatusBits;
 
 use self::parameters::{Parameters, Settings, StopFunction};
 use super::SimTime;
-use super::model::{AT_REFERENCE_BAND, DriveState, Latch, Model, Steps};
-use super::motor::{Feed, Motor};
+use super::model::{AT_REFERENCE_BAND, Body, Model};
+use super::motor::Feed;
 use crate::codec::{Reply, RequestPdu};
 
 /// Registers of process data in and out, IDs 2001..=2011 and 2101..=2111.
@@ -133,7 +133,7 @@ pub struct NxDrive {
     options: NxOptions,
     parameters: Parameters,
     settings: Settings,
-    motor: Motor,
+    body: Body,
     /// Process data in as written, IDs 2001 to 2011.
     input: [u16; PROCESS_DATA],
     /// Process data out as last refreshed, IDs 2101 to 2111.
@@ -142,8 +142,6 @@ pub struct NxDrive {
     last_control: u16,
     /// Commands of panel and terminals.
     local: Command,
-    latch: Latch,
-    running: bool,
     /// A fault that stops by ramp: the motor is still brought down.
     stopping: bool,
     warning: bool,
@@ -151,10 +149,8 @@ pub struct NxDrive {
     interlock: bool,
     /// The hand-off-auto switch of an HVX stands at off.
     switched_off: bool,
-    powered: bool,
     busy_until: SimTime,
     heard: Option<SimTime>,
-    steps: Steps,
 }
 
 impl NxDrive {
@@ -166,24 +162,20 @@ impl NxDrive {
         }
         let mut drive = NxDrive {
             settings: parameters.settings(),
-            motor: Motor::new(&options.load),
+            body: Body::new(&options.load, now),
             parameters,
             options,
             input: [0; PROCESS_DATA],
             output: [0; PROCESS_DATA],
             last_control: 0,
             local: Command::default(),
-            latch: Latch::new(),
-            running: false,
             stopping: false,
             warning: false,
             lost_master: false,
             interlock: false,
             switched_off: false,
-            powered: true,
             busy_until: SimTime::ZERO,
             heard: None,
-            steps: Steps::new(now),
         };
         drive.refresh();
         drive
@@ -226,8 +218,8 @@ impl NxDrive {
             status: self.status(),
             control: self.input(0),
             reference: self.input(2) as i16,
-            output: self.motor.output,
-            fault: self.latch.fault(),
+            output: self.body.motor.output,
+            fault: self.body.latch.fault(),
         }
     }
 
@@ -242,42 +234,13 @@ impl NxDrive {
     }
 
     fn fail(&mut self, code: u16, stop: StopFunction) {
-        if self.latch.trip(code) {
-            self.stopping = stop == StopFunction::Ramp && self.motor.fed;
-            self.running = false;
+        if self.body.latch.trip(code) {
+            self.stopping = stop == StopFunction::Ramp && self.body.motor.fed;
+            self.body.running = false;
             if !self.stopping {
-                self.motor.release();
+                self.body.motor.release();
             }
         }
-    }
-
-    /// One update period: supervision, commands, motor, process data out.
-    fn step(&mut self, now: SimTime) {
-        self.supervise(now);
-        let command = self.take_over();
-        let free = !self.interlock && !self.switched_off && !self.bypassed();
-        self.running = self.latch.obeys(command.run) && free;
-        let target = self.target(command);
-        // A ramped stop keeps the inverter on until the motor stands.
-        let ramping_down = self.motor.fed
-            && self.motor.output != 0.0
-            && if self.latch.fault() == 0 {
-                self.settings.stop == StopFunction::Ramp && free
-            } else {
-                self.stopping
-            };
-        let feed = match (self.running, ramping_down) {
-            (true, _) => Feed::To(target),
-            (false, true) => Feed::To(0.0),
-            (false, false) => Feed::Off,
-        };
-        self.motor.step(
-            UPDATE_PERIOD.as_secs_f64(),
-            feed,
-            &self.settings.motor,
-            &self.options.load,
-        );
-        self.refresh();
     }
 
     /// The drive's own bus watchdog and P2.7.22 (drives.md 3.11). It starts with the first message: a board that never
@@ -302,7 +265,7 @@ impl NxDrive {
         let risen = word & !self.last_control;
         self.last_control = word;
         if self.settings.place == ControlPlace::Fieldbus && risen & control_word::RESET != 0 {
-            self.latch.reset();
+            self.body.latch.reset();
             self.stopping = false;
         }
         self.held()
@@ -324,7 +287,7 @@ impl NxDrive {
     }
 
     /// The output frequency for a command, drives.md 3.5: the sign exclusive-or the direction bit.
-    fn target(&self, command: Command) -> f64 {
+    fn frequency(&self, command: Command) -> f64 {
         let (minimum, maximum) = (self.settings.minimum, self.settings.motor.maximum);
         if self.fire_mode() {
             return maximum;
@@ -357,12 +320,53 @@ impl NxDrive {
 }
 
 impl Model for NxDrive {
-    fn advance(&mut self, now: SimTime) {
-        while let Some(at) = self.steps.due(now) {
-            if self.powered {
-                self.step(at);
-            }
-        }
+    fn body(&self) -> &Body {
+        &self.body
+    }
+
+    fn body_mut(&mut self) -> &mut Body {
+        &mut self.body
+    }
+
+    /// One update period: supervision, commands, motor, process data out.
+    fn step(&mut self, now: SimTime) {
+        self.supervise(now);
+        let command = self.take_over();
+        let free = !self.interlock && !self.switched_off && !self.bypassed();
+        self.body.running = self.body.latch.obeys(command.run) && free;
+        let target = self.frequency(command);
+        // A ramped stop keeps the inverter on until the motor stands.
+        let ramping_down = self.body.motor.fed
+            && self.body.motor.output != 0.0
+            && if self.body.latch.fault() == 0 {
+                self.settings.stop == StopFunction::Ramp && free
+            } else {
+                self.stopping
+            };
+        let feed = match (self.body.running, ramping_down) {
+            (true, _) => Feed::To(target),
+            (false, true) => Feed::To(0.0),
+            (false, false) => Feed::Off,
+        };
+        self.body.motor.step(
+            UPDATE_PERIOD.as_secs_f64(),
+            feed,
+            &self.settings.motor,
+            &self.options.load,
+        );
+        self.refresh();
+    }
+
+    fn ready(&self) -> bool {
+        self.body.latch.fault() == 0 && !self.interlock
+    }
+
+    fn target(&self) -> f64 {
+        self.frequency(self.held())
+    }
+
+    fn remote(&self) -> bool {
+        self.settings.place == ControlPlace::Fieldbus
     }
 
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
@@ -386,14 +390,6 @@ impl Model for NxDrive {
     fn heard(&mut self, now: SimTime) {
         self.heard = Some(now);
         self.lost_master = false;
-    }
-
-    fn powered(&self) -> bool {
-        self.powered
-    }
-
-    fn power_off(&mut self) {
-        self.powered = false;
     }
 
     fn power_on(&mut self, now: SimTime) {
@@ -430,17 +426,5 @@ impl Model for NxDrive {
         } else {
             ControlPlace::Panel
         });
-    }
-
-    fn state(&self) -> DriveState {
-        let status = self.status();
-        DriveState {
-            ready: status & status_word::READY != 0,
-            running: status & status_word::RUN != 0,
-            reverse: status & status_word::REVERSE != 0,
-            fault: self.latch.fault(),
-            output: self.motor.output,
-            remote: self.settings.place == ControlPlace::Fieldbus,
-        }
     }
 }

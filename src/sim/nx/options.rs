@@ -1,4 +1,4 @@
-//! How a simulated NX, SVX or HVX is made. The drives of the family differ in this data and in nothing else.
+//! Options of a simulated NX, SVX or HVX. The drives of the family differ in this data only.
 
 use super::super::motor::Load;
 use super::{Beyond, Hole, Limits, ReadOnly, StatusBits};
@@ -43,7 +43,7 @@ pub struct SpeedReference {
     pub unit: Unit,
 }
 
-/// How a simulated drive of the family is made.
+/// Options of a simulated drive of the family.
 #[derive(Debug, Clone)]
 pub struct NxOptions {
     /// Load and mains.

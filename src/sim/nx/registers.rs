@@ -120,7 +120,7 @@ impl NxDrive {
     fn register(&self, id: u16, group: Group) -> Result<u16, Exception> {
         let value = match group {
             Group::Actual => self.actual_value(id),
-            Group::FaultCode => Some(self.latch.fault()),
+            Group::FaultCode => Some(self.body.latch.fault()),
             Group::Parameter if id == TRIP && self.options.trip_register => return Ok(0),
             Group::Parameter => return self.parameters.get(id).ok_or(Exception::ADDRESS),
             Group::ProcessIn => {
@@ -192,7 +192,7 @@ impl NxDrive {
 
     /// Actual values, IDs 1 to 98 (drives.md 11.1), as refreshed with the process data.
     fn actual_value(&self, id: u16) -> Option<u16> {
-        let (motor, settings, ratings) = (&self.motor, &self.settings, &self.settings.motor);
+        let (motor, settings, ratings) = (&self.body.motor, &self.settings, &self.settings.motor);
         let tenths_of_current = unsigned(motor.current(ratings) * 10.0);
         Some(match id {
             1 => signed(motor.output / self.options.frequency_step),
@@ -208,9 +208,9 @@ impl NxDrive {
             13 | 14 | 16 | 18 => 0,
             15 => u16::from(self.local.run && settings.place == ControlPlace::Terminals),
             17 => self.outputs(),
-            25 => signed(self.target(self.held()) * 100.0),
+            25 => signed(self.target() * 100.0),
             26 => unsigned(20.0 * 100.0 * (motor.output / ratings.maximum).abs()),
-            37 => self.latch.fault(),
+            37 => self.body.latch.fault(),
             _ => return None,
         })
     }
@@ -226,7 +226,7 @@ impl NxDrive {
             let on = bits.iter().enumerate().filter(|(_, mask)| self.hvac(**mask));
             on.fold(0, |word, (bit, _)| word | (1 << bit))
         } else {
-            u16::from(self.running) | (u16::from(self.latch.fault() != 0) << 1)
+            u16::from(self.body.running) | (u16::from(self.body.latch.fault() != 0) << 1)
         }
     }
 
@@ -237,7 +237,11 @@ impl NxDrive {
 
     /// The output frequency in the scale of the speed reference, 0.01 %.
     fn actual_speed(&self) -> f64 {
-        let (output, minimum, maximum) = (self.motor.output, self.settings.minimum, self.settings.motor.maximum);
+        let (output, minimum, maximum) = (
+            self.body.motor.output,
+            self.settings.minimum,
+            self.settings.motor.maximum,
+        );
         let (share, whole) = match self.options.reference.base {
             Base::Maximum => (output.abs(), maximum),
             // Below the minimum frequency there is no reference to compare with.

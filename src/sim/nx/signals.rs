@@ -1,8 +1,9 @@
 //! Status word and general status word of the family: which drive shows which signal in which bit.
 
+use super::super::model::Model;
 use super::{AT_REFERENCE_BAND, ControlPlace, NxDrive};
 
-/// What a status bit can tell.
+/// What a status bit can show.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Signal {
     Ready,
@@ -111,14 +112,14 @@ impl NxDrive {
     }
 
     fn shows(&self, signal: Signal) -> bool {
-        let (motor, fault) = (&self.motor, self.latch.fault());
+        let (motor, fault) = (&self.body.motor, self.body.latch.fault());
         match signal {
-            Signal::Ready => fault == 0 && !self.interlock,
-            Signal::Running => motor.fed && fault == 0,
-            Signal::Reverse => self.turns_reverse(),
+            Signal::Ready => self.ready(),
+            Signal::Running => self.body.shows_running(),
+            Signal::Reverse => self.body.turns_reverse(self.target()),
             Signal::Fault => fault != 0,
             Signal::Warning => self.warning || (self.lost_master && self.settings.fieldbus_fault == 1),
-            Signal::AtReference => self.running && (motor.output - self.target(self.held())).abs() < AT_REFERENCE_BAND,
+            Signal::AtReference => self.body.running && (motor.output - self.target()).abs() < AT_REFERENCE_BAND,
             Signal::ZeroSpeed => motor.shaft == 0.0,
             Signal::FluxReady => motor.fed,
             Signal::NoSpeedLimit | Signal::NoUndervoltageStop => true,
@@ -131,11 +132,5 @@ impl NxDrive {
             Signal::Auto => self.settings.place == ControlPlace::Fieldbus,
             Signal::HoaOn => !self.switched_off,
         }
-    }
-
-    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
-    pub(super) fn turns_reverse(&self) -> bool {
-        let shaft = self.motor.shaft;
-        shaft < 0.0 || (shaft == 0.0 && self.running && self.target(self.held()) < 0.0)
     }
 }

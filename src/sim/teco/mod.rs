@@ -1,7 +1,7 @@
 //! A TECO 7300PA drive with its PA-C card, as drives.md sections 5 and 10 describe it.
 //!
 //! Pure: the time is an argument. Cn-31 supervises the link between the drive and its card only, which never fails here,
-//! so a lost bus master changes nothing: the motor goes on as it was last told.
+//! so a lost bus master changes nothing: the motor goes on as it was last commanded.
 
 mod options;
 mod parameters;
@@ -10,48 +10,48 @@ mod signals;
 #[cfg(test)]
 mod tests;
 
-pub use options::{DetectionLevels, Digits, Mode, TecoOptions};
+pub(crate) use options::{Mode, TecoOptions};
 
 use self::parameters::{Parameters, function};
 use super::SimTime;
-use super::model::{Command, DriveState, Latch, Model, Steps, UPDATE_PERIOD, unsigned};
-use super::motor::{Feed, Motor, Ratings};
+use super::model::{Body, Command, Model, UPDATE_PERIOD, unsigned};
+use super::motor::{Feed, Ratings};
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Bits of the operation signals, register 0001H (drives.md 5.3).
-pub mod operation {
+pub(crate) mod operation {
     /// Run.
-    pub const RUN: u16 = 1 << 0;
+    pub(crate) const RUN: u16 = 1 << 0;
     /// Reverse.
-    pub const REVERSE: u16 = 1 << 1;
+    pub(crate) const REVERSE: u16 = 1 << 1;
     /// External fault.
-    pub const EXTERNAL_FAULT: u16 = 1 << 2;
+    pub(crate) const EXTERNAL_FAULT: u16 = 1 << 2;
     /// Fault reset.
-    pub const RESET: u16 = 1 << 3;
+    pub(crate) const RESET: u16 = 1 << 3;
     /// Multifunction reference 1; 2 to 4 follow.
-    pub const MULTIFUNCTION_1: u16 = 1 << 4;
+    pub(crate) const MULTIFUNCTION_1: u16 = 1 << 4;
 }
 
 /// Bits of the fault contents, register 0021H (drives.md 5.4).
-pub mod fault {
+pub(crate) mod fault {
     /// Overcurrent or ground fault.
-    pub const OVERCURRENT: u16 = 1 << 0;
+    pub(crate) const OVERCURRENT: u16 = 1 << 0;
     /// Overvoltage.
-    pub const OVERVOLTAGE: u16 = 1 << 1;
+    pub(crate) const OVERVOLTAGE: u16 = 1 << 1;
     /// Inverter overload.
-    pub const INVERTER_OVERLOAD: u16 = 1 << 2;
+    pub(crate) const INVERTER_OVERLOAD: u16 = 1 << 2;
     /// Inverter overheat.
-    pub const OVERHEAT: u16 = 1 << 3;
+    pub(crate) const OVERHEAT: u16 = 1 << 3;
     /// External fault.
-    pub const EXTERNAL: u16 = 1 << 7;
+    pub(crate) const EXTERNAL: u16 = 1 << 7;
     /// Control circuit.
-    pub const CONTROL_CIRCUIT: u16 = 1 << 8;
+    pub(crate) const CONTROL_CIRCUIT: u16 = 1 << 8;
     /// Motor overload.
-    pub const MOTOR_OVERLOAD: u16 = 1 << 9;
+    pub(crate) const MOTOR_OVERLOAD: u16 = 1 << 9;
     /// Undervoltage or power loss.
-    pub const POWER: u16 = 1 << 12;
+    pub(crate) const POWER: u16 = 1 << 12;
     /// All bits with a meaning.
-    pub const ALL: u16 =
+    pub(crate) const ALL: u16 =
         OVERCURRENT | OVERVOLTAGE | INVERTER_OVERLOAD | OVERHEAT | EXTERNAL | CONTROL_CIRCUIT | MOTOR_OVERLOAD | POWER;
 }
 
@@ -83,19 +83,15 @@ pub struct TecoDrive {
     options: TecoOptions,
     parameters: Parameters,
     ratings: Ratings,
-    motor: Motor,
+    body: Body,
     mode: Mode,
     control: Control,
     /// Terminals 1 to 8.
     terminals: u16,
-    latch: Latch,
-    running: bool,
     /// Frequency detection 1 and 2, with their hysteresis.
     detected: [bool; 2],
     /// Time above the level of overtorque detection, s.
     overtorque: f64,
-    powered: bool,
-    steps: Steps,
 }
 
 impl TecoDrive {
@@ -104,16 +100,12 @@ impl TecoDrive {
         let parameters = Parameters::new(options.digits, &options.parameters);
         TecoDrive {
             ratings: parameters.ratings(),
-            motor: Motor::new(&options.load),
+            body: Body::new(&options.load, now),
             mode: options.mode,
             control: Control::default(),
             terminals: 0,
-            latch: Latch::new(),
-            running: false,
             detected: [false; 2],
             overtorque: 0.0,
-            powered: true,
-            steps: Steps::new(now),
             parameters,
             options,
         }
@@ -122,13 +114,8 @@ impl TecoDrive {
     /// Switches the operator between PRGM and DRIVE. A running motor is brought down; it needs a new run command then.
     pub fn set_mode(&mut self, mode: Mode) {
         self.mode = mode;
-        self.latch.disarm();
+        self.body.latch.disarm();
         self.take_over();
-    }
-
-    /// The operator's mode.
-    pub fn mode(&self) -> Mode {
-        self.mode
     }
 
     /// Closes and opens terminals 1 to 8, bit 0 terminal 1.
@@ -197,14 +184,6 @@ impl TecoDrive {
             .min(bound(parameters::CN_14))
     }
 
-    fn target(&self) -> f64 {
-        if self.run_command().1 {
-            -self.frequency()
-        } else {
-            self.frequency()
-        }
-    }
-
     /// What takes effect at once when a command or a terminal changes: an external fault, and a run command that is seen
     /// off.
     fn take_over(&mut self) {
@@ -212,10 +191,10 @@ impl TecoDrive {
             self.trip(fault::EXTERNAL);
         }
         let (run, _) = self.run_command();
-        self.running = match self.mode {
-            Mode::Drive => self.latch.obeys(run),
+        self.body.running = match self.mode {
+            Mode::Drive => self.body.latch.obeys(run),
             Mode::Program => {
-                self.latch.disarm();
+                self.body.latch.disarm();
                 false
             }
         };
@@ -225,49 +204,39 @@ impl TecoDrive {
         let risen = word & !self.control.operation;
         self.control.operation = word;
         if risen & operation::RESET != 0 {
-            self.latch.reset();
+            self.body.latch.reset();
         }
         self.take_over();
     }
+}
 
-    fn step(&mut self) {
+impl Model for TecoDrive {
+    fn body(&self) -> &Body {
+        &self.body
+    }
+
+    fn body_mut(&mut self) -> &mut Body {
+        &mut self.body
+    }
+
+    fn step(&mut self, _now: SimTime) {
         self.take_over();
-        let feed = if self.latch.fault() != 0 || self.baseblocked() {
+        let feed = if self.body.latch.fault() != 0 || self.baseblocked() {
             Feed::Off
-        } else if self.running {
+        } else if self.body.running {
             Feed::To(self.target())
-        } else if self.motor.fed && self.motor.output != 0.0 {
+        } else if self.body.motor.fed && self.body.motor.output != 0.0 {
             Feed::To(0.0)
         } else {
             Feed::Off
         };
         let seconds = UPDATE_PERIOD.as_secs_f64();
-        self.motor.step(seconds, feed, &self.ratings, &self.options.load);
+        self.body.motor.step(seconds, feed, &self.ratings, &self.options.load);
         self.detect(seconds);
     }
 
-    fn shows_running(&self) -> bool {
-        self.motor.fed && self.latch.fault() == 0
-    }
-
     fn ready(&self) -> bool {
-        self.mode == Mode::Drive && self.latch.fault() == 0 && !self.baseblocked()
-    }
-
-    /// The direction that the motor turns in; at rest, the one a running drive is about to turn it in.
-    fn turns_reverse(&self) -> bool {
-        let shaft = self.motor.shaft;
-        shaft < 0.0 || (shaft == 0.0 && self.running && self.target() < 0.0)
-    }
-}
-
-impl Model for TecoDrive {
-    fn advance(&mut self, now: SimTime) {
-        while self.steps.due(now).is_some() {
-            if self.powered {
-                self.step();
-            }
-        }
+        self.mode == Mode::Drive && self.body.latch.fault() == 0 && !self.baseblocked()
     }
 
     fn answer(&mut self, request: &RequestPdu, now: SimTime) -> Option<Reply> {
@@ -290,14 +259,6 @@ impl Model for TecoDrive {
         }
     }
 
-    fn powered(&self) -> bool {
-        self.powered
-    }
-
-    fn power_off(&mut self) {
-        self.powered = false;
-    }
-
     fn power_on(&mut self, now: SimTime) {
         let fresh = TecoDrive::new(self.options.clone(), now);
         let mut parameters = self.parameters.clone();
@@ -308,14 +269,23 @@ impl Model for TecoDrive {
             terminals: self.terminals,
             ..fresh
         };
-        self.latch.disarm();
+        self.body.latch.disarm();
         self.take_over();
     }
 
     fn trip(&mut self, fault: u16) {
-        if self.latch.trip(fault & fault::ALL) {
-            self.running = false;
-            self.motor.release();
+        self.body.trip(fault & fault::ALL);
+    }
+
+    fn remote(&self) -> bool {
+        self.run_from_bus()
+    }
+
+    fn target(&self) -> f64 {
+        if self.run_command().1 {
+            -self.frequency()
+        } else {
+            self.frequency()
         }
     }
 
@@ -343,16 +313,5 @@ impl Model for TecoDrive {
         let word = self.options.digits.register([true, true, !on, !on]);
         let _ = self.parameters.set(parameters::SN_08, word);
         self.take_over();
-    }
-
-    fn state(&self) -> DriveState {
-        DriveState {
-            ready: self.ready(),
-            running: self.shows_running(),
-            reverse: self.turns_reverse(),
-            fault: self.latch.fault(),
-            output: self.motor.output,
-            remote: self.run_from_bus(),
-        }
     }
 }

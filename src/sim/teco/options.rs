@@ -1,4 +1,4 @@
-//! How a simulated TECO 7300PA is made.
+//! Options of a simulated TECO 7300PA.
 
 use super::super::model::ReadOnly;
 use super::super::motor::Load;
@@ -65,7 +65,7 @@ pub enum DetectionLevels {
     Cn32AndCn33,
 }
 
-/// How a simulated TECO 7300PA is made.
+/// Options of a simulated TECO 7300PA.
 #[derive(Debug, Clone)]
 pub struct TecoOptions {
     /// Load and mains.

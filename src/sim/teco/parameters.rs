@@ -1,6 +1,6 @@
 //! Parameters of the simulated TECO 7300PA by register (drives.md 5.8): which exist, and their images in RAM and EEPROM.
 //!
-//! Ranges are those of the N2 map (drives.md 6.7), where it has one. Defaults that the manual does not tell are plausible
+//! Ranges are those of the N2 map (drives.md 6.7), where it has one. Defaults that the manual does not state are plausible
 //! values for a small 440 V drive.
 
 use super::super::motor::Ratings;
@@ -80,7 +80,7 @@ pub(super) const AN_09: u16 = 0x0408;
 const BN_01: u16 = 0x0500;
 const BN_02: u16 = 0x0501;
 
-/// Functions of Sn-15 to Sn-18. The manual tells the default functions and not their numbers.
+/// Functions of Sn-15 to Sn-18. The manual states the default functions but not their numbers.
 pub(super) mod function {
     pub(in super::super) const STEP_1: u16 = 2;
     pub(in super::super) const STEP_2: u16 = 3;

@@ -52,8 +52,8 @@ pub(super) fn allows_broadcast(request: &RequestPdu) -> bool {
     }
 }
 
-/// The answer to a PDU that is no request, for which a plain slave has `exception`. Incomplete messages get none, nor do
-/// those whose byte count does not match the bytes (drives.md 5.6, 9.8).
+/// The reply to a PDU that is not a valid request, for which a plain slave returns `exception`. Incomplete messages get
+/// none, nor do those whose byte count does not match the bytes (drives.md 5.6, 9.8).
 pub(super) fn refusal(pdu: &[u8], exception: Exception) -> Option<Exception> {
     let (&function, body) = pdu.split_first()?;
     if !FUNCTIONS.contains(&function) {
@@ -126,10 +126,10 @@ impl TecoDrive {
     }
 
     fn monitor(&self, address: u16) -> u16 {
-        let (motor, ratings) = (&self.motor, &self.ratings);
+        let (motor, ratings) = (&self.body.motor, &self.ratings);
         match address {
             0x0020 => self.status(),
-            0x0021 => self.latch.fault(),
+            0x0021 => self.body.latch.fault(),
             0x0023 => unsigned(self.frequency() * 100.0),
             0x0024 => unsigned(motor.output.abs() * 100.0),
             0x0027 => unsigned(motor.current(ratings) * 10.0),
@@ -174,7 +174,7 @@ impl TecoDrive {
     fn mode_forbids(&self, register: Register) -> bool {
         match register {
             Register::Parameter(place) => place.program_only && self.mode == Mode::Drive,
-            Register::Save => self.motor.fed,
+            Register::Save => self.body.motor.fed,
             _ => false,
         }
     }

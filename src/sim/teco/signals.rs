@@ -1,6 +1,6 @@
 //! Status registers and outputs of the simulated TECO 7300PA (drives.md 5.4).
 
-use super::super::model::bit;
+use super::super::model::{AT_REFERENCE_BAND, Model, bit};
 use super::options::DetectionLevels;
 use super::{TecoDrive, fault, parameters};
 
@@ -12,16 +12,16 @@ const OUTPUTS: u16 = 3;
 impl TecoDrive {
     /// 0020H.
     pub(super) fn status(&self) -> u16 {
-        bit(self.shows_running(), 1 << 0)
-            | bit(self.turns_reverse(), 1 << 1)
+        bit(self.body.shows_running(), 1 << 0)
+            | bit(self.body.turns_reverse(self.target()), 1 << 1)
             | bit(self.ready(), 1 << 2)
-            | bit(self.latch.fault() != 0, 1 << 3)
+            | bit(self.body.latch.fault() != 0, 1 << 3)
             | (self.outputs() << 5)
     }
 
     /// 002CH.
     pub(super) fn inverter_status(&self) -> u16 {
-        bit(self.shows_running(), 1 << 0)
+        bit(self.body.shows_running(), 1 << 0)
             | bit(self.at_zero_speed(), 1 << 1)
             | bit(self.coincides(), 1 << 2)
             | bit(
@@ -31,19 +31,19 @@ impl TecoDrive {
             | bit(self.detected[0], 1 << 4)
             | bit(self.detected[1], 1 << 5)
             | bit(self.ready(), 1 << 6)
-            | bit(self.latch.fault() & fault::POWER != 0, 1 << 7)
+            | bit(self.body.latch.fault() & fault::POWER != 0, 1 << 7)
             | bit(self.baseblocked(), 1 << 8)
             | bit(!self.frequency_from_bus(), 1 << 9)
             | bit(!self.run_from_bus(), 1 << 10)
             | bit(self.overtorque_detected(), 1 << 11)
-            | bit(self.latch.fault() != 0, 1 << 14)
+            | bit(self.body.latch.fault() != 0, 1 << 14)
     }
 
     /// 002DH: bit 0 R2A-R2C, bit 1 DO1, bit 2 R1A-R1C.
     pub(super) fn outputs(&self) -> u16 {
         (0..OUTPUTS).fold(0, |word, index| {
             let on = match self.parameters.number(parameters::SN_20 + index) {
-                0 => self.shows_running(),
+                0 => self.body.shows_running(),
                 1 => self.at_zero_speed(),
                 2 => self.coincides(),
                 BY_REGISTER => self.control.outputs & (1 << index) != 0,
@@ -54,18 +54,18 @@ impl TecoDrive {
     }
 
     fn at_zero_speed(&self) -> bool {
-        self.motor.output == 0.0
+        self.body.motor.output == 0.0
     }
 
     /// Output within Cn-22 of the reference. A stopped drive does not follow a reference.
     fn coincides(&self) -> bool {
-        self.running && self.shows_running() && self.near(self.frequency())
+        self.body.running && self.body.shows_running() && self.near(self.frequency())
     }
 
     fn near(&self, frequency: f64) -> bool {
         // An output that is just there counts with a width of 0 too.
-        let width = self.width().max(super::super::model::AT_REFERENCE_BAND);
-        (self.motor.output.abs() - frequency).abs() < width
+        let width = self.width().max(AT_REFERENCE_BAND);
+        (self.body.motor.output.abs() - frequency).abs() < width
     }
 
     /// Cn-22, Hz.
@@ -79,7 +79,7 @@ impl TecoDrive {
 
     /// Frequency and overtorque detection, a step of `seconds` later.
     pub(super) fn detect(&mut self, seconds: f64) {
-        let output = self.motor.output.abs();
+        let output = self.body.motor.output.abs();
         let (first, second) = match self.options.detection_levels {
             DetectionLevels::Cn21 => (parameters::CN_21, parameters::CN_21),
             DetectionLevels::Cn32AndCn33 => (parameters::CN_32, parameters::CN_33),
@@ -95,7 +95,7 @@ impl TecoDrive {
             output < below || (was_below && output < below + width),
         ];
         let level = f64::from(self.parameters.number(parameters::CN_26));
-        if self.motor.torque.abs() > level {
+        if self.body.motor.torque.abs() > level {
             self.overtorque += seconds;
         } else {
             self.overtorque = 0.0;

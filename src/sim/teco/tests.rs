@@ -2,6 +2,7 @@
 
 use super::super::model::ReadOnly;
 use super::super::motor::Load;
+use super::options::{DetectionLevels, Digits};
 use super::*;
 use crate::codec::{Table, lrc};
 use std::time::Duration;

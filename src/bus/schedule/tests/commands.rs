@@ -159,3 +159,38 @@ fn a_stop_goes_before_the_due_poll_even_after_eight_commands() {
         Decision::Command(Urgency::Stop)
     );
 }
+
+#[test]
+fn what_was_never_read_and_a_flood_of_stops_leave_process_data_its_share() {
+    let mut bench = Bench::new(60, Duration::from_millis(10));
+    while !(0..60).all(|drive| bench.schedule.is_online(drive)) {
+        bench.step(None);
+    }
+    bench.log.clear();
+    for _ in 0..160 {
+        bench.step(Some(Urgency::Stop));
+    }
+    let fast: usize = bench.polls(PollClass::Fast).values().sum();
+    let others = [PollClass::Slow, PollClass::Once].map(|class| bench.polls(class).values().sum::<usize>());
+    assert!(fast >= 35 && others[0] + others[1] >= 30, "{fast} {others:?}");
+}
+
+#[test]
+fn a_command_does_not_pay_for_all_the_stops_before_it() {
+    let mut bench = Bench::new(2, Duration::from_millis(10));
+    bench.run(Duration::from_secs(1));
+    for _ in 0..400 {
+        match bench.schedule.next(bench.now, Some(Urgency::Stop)) {
+            Decision::Command(urgency) => {
+                bench.now += COST * 3;
+                bench.schedule.command_done(urgency, COST * 3);
+            }
+            _ => {
+                bench.step(None);
+            }
+        }
+    }
+    bench.log.clear();
+    while !matches!(bench.step(Some(Urgency::Command)), Decision::Command(_)) {}
+    assert!(bench.log.len() <= 3, "{} polls before it", bench.log.len());
+}

@@ -1,7 +1,7 @@
-//! The status page: one document, its style and its script, all from this server.
+//! The status page: one document with its style and its script, all served by this server.
 //!
-//! The script shows the JSON interface live. Without scripts the page shows the tables made here and loads
-//! itself anew every few seconds.
+//! The script shows the JSON interface live. Without scripts the page has the tables rendered here and reloads every
+//! few seconds.
 
 use std::fmt::{self, Write as _};
 use std::time::Instant;
@@ -21,11 +21,11 @@ pub(in crate::north::http) const SCRIPT: &str = include_str!("page.js");
 /// Icon.
 pub(in crate::north::http) const ICON: &str = include_str!("icon.svg");
 
-/// Nothing but this server's own files, no inline code, no forms.
+/// Only this server's own files, no inline code, no forms.
 pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
     img-src 'self'; connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'self'";
 
-/// Columns of the drives' table without scripts.
+/// Columns of the table of drives without scripts.
 const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::ActualSpeed, "Speed"),
     (ModelPoint::OutputFrequency, "Frequency"),
@@ -33,7 +33,7 @@ const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::MotorTorque, "Torque"),
 ];
 
-/// The document as the plant is at `now`.
+/// The document with the state of the plant at `now`.
 pub(in crate::north::http) fn render(plant: &Plant, now: Instant) -> String {
     let mut tables = String::new();
     // Writing to a string cannot fail.
@@ -95,7 +95,7 @@ fn drives(out: &mut String, plant: &Plant, now: Instant) -> fmt::Result {
     out.write_str("</tbody></table>")
 }
 
-/// A value that is not good is shown as such, or not at all.
+/// A value that is not good is marked or omitted.
 fn cell(out: &mut String, reading: &Reading<'_>, point: ModelPoint) -> fmt::Result {
     let sample = reading.model(point);
     match (sample.value, sample.quality) {
@@ -105,7 +105,7 @@ fn cell(out: &mut String, reading: &Reading<'_>, point: ModelPoint) -> fmt::Resu
     }
 }
 
-/// Text between tags or in a quoted attribute.
+/// Text that is escaped for use between tags or in a quoted attribute.
 struct Escaped<'t>(&'t str);
 
 impl fmt::Display for Escaped<'_> {

@@ -15,7 +15,7 @@ function make(tag, className, ...children) {
   return element;
 }
 
-// Touches the page only where something changed: selections, focus and screen readers stay undisturbed.
+// Updates only what changed, so that selections, focus and screen readers are not disturbed.
 function text(element, value) {
   if (element.textContent !== value) element.textContent = value;
 }
@@ -69,10 +69,10 @@ const COLUMNS = [
 const rows = new Map();
 
 function valueInto(span, unitSpan, point) {
-  const told = point && point.value !== null;
+  const shown = point && point.value !== null;
   const quality = point ? point.quality : "absent";
-  text(span, told ? figure(point.value, point.unit) : point ? "—" : "");
-  text(unitSpan, told && point.unit ? ` ${point.unit}` : "");
+  text(span, shown ? figure(point.value, point.unit) : point ? "—" : "");
+  text(unitSpan, shown && point.unit ? ` ${point.unit}` : "");
   className(span, `value ${quality === "good" ? "main" : quality}`);
   const title = { stale: `stale, ${age(point && point.age_ms)} old`, bad: "bad: refused by the drive or never read" }[quality];
   if (title) span.title = title; else span.removeAttribute("title");
@@ -213,16 +213,16 @@ function cycle(element, cadence, up) {
   className(element, known && cadence.cycle_ms > 1.2 * cadence.aim_ms ? "value slow" : "value");
 }
 
-// Over the last seconds, from the counters.
+// Rate over the last seconds, from the counters.
 function rate(card, bus, now) {
   card.history = (card.history || []).filter((h) => now - h.at < 5000 && h.count <= bus.transactions);
   const oldest = card.history[0];
   card.history.push({ at: now, count: bus.transactions });
-  if (!oldest || now === oldest.at) return `${bus.transactions} in all`;
+  if (!oldest || now === oldest.at) return `${bus.transactions} in total`;
   return `${Math.round(1000 * (bus.transactions - oldest.count) / (now - oldest.at))} /s`;
 }
 
-// ---- All together
+// ---- Everything
 
 function keyed(map, items, create, show, element) {
   const names = new Set(items.map((item) => item.name));
@@ -276,7 +276,7 @@ function connected(good) {
   $("link").hidden = false;
   text($("link-text"), lost ? "Connection lost" : "Live");
   const since = lastGoodTime ? `since ${clock(lastGoodTime)}` : "yet";
-  text($("banner"), lost ? `No connection to the gateway ${since}. What you see below is old. Trying again…` : "");
+  text($("banner"), lost ? `No connection to the gateway ${since}. The values below are old. Reconnecting…` : "");
   $("banner").hidden = !lost;
 }
 
@@ -321,8 +321,8 @@ function addEvent(time, kind, subject, words) {
   while ($("events").children.length > EVENTS_SHOWN) $("events").lastChild.remove();
 }
 
-// Asked for like the rest, not heard as a stream: a browser has few connections to one server, and each
-// open stream would hold one.
+// Polled like the rest instead of streamed: a browser has few connections to one server, and each
+// open stream would occupy one.
 function showEvents(news) {
   const anew = news.last.split("-")[0] !== lastEvent.split("-")[0];
   if (anew) $("events").replaceChildren();
@@ -331,7 +331,7 @@ function showEvents(news) {
   $("events-note").hidden = $("events").children.length > 0;
 }
 
-// A page that nobody looks at costs the gateway nothing.
+// A hidden page does not poll.
 function visible() {
   clearTimeout(timer);
   if (document.hidden) return;

@@ -4,8 +4,9 @@ use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
 
-use super::super::shared::{Client, Shared, View};
-use super::super::{Options, Uncached};
+use super::super::client::Client;
+use super::super::routes::PlantView;
+use super::super::{Options, ServerState, Uncached};
 use super::*;
 use crate::command::Authority;
 use crate::north::NorthStats;
@@ -44,10 +45,10 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         writes: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
-    let shared = Shared::new(options, stats.clone());
-    let view = View::new(Arc::new(ArcSwap::from_pointee(plant)), None);
+    let state = ServerState::new(options, stats.clone());
+    let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), None);
     let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);
-    let session = Session::new(Arc::new(shared), Arc::new(view), client);
+    let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
     let (client, end) = tokio::io::duplex(pipe);
     let cancel = CancellationToken::new();
     let server = tokio::spawn(serve(end, session, idle_timeout, cancel.clone()));
@@ -70,7 +71,7 @@ impl Bench {
         bytes
     }
 
-    /// What comes until the connection is closed.
+    /// Everything received until the connection is closed.
     async fn rest(&mut self) -> Vec<u8> {
         let mut bytes = Vec::new();
         self.client.read_to_end(&mut bytes).await.unwrap();
@@ -79,13 +80,13 @@ impl Bench {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_half_frame_is_given_ten_seconds() {
+async fn an_incomplete_frame_times_out_after_ten_seconds() {
     let mut bench = bench(1024);
     bench.send(&REQUEST).await;
     assert_eq!(bench.receive(9).await, ANSWER);
     let begin = Instant::now();
     for byte in &REQUEST[..5] {
-        // Single bytes do not win more time.
+        // Single bytes do not extend the time limit.
         bench.send(&[*byte]).await;
         tokio::time::sleep(Duration::from_secs(1)).await;
     }
@@ -96,10 +97,10 @@ async fn a_half_frame_is_given_ten_seconds() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_silent_client_may_stay_and_a_slow_one_too() {
+async fn silent_and_slow_clients_stay_connected() {
     let mut bench = bench(1024);
     tokio::time::sleep(Duration::from_secs(100_000)).await;
-    // There always is a half frame, but each is complete within its time.
+    // There is always an incomplete frame, but each is completed in time.
     bench.send(&REQUEST[..5]).await;
     for _ in 0..5 {
         tokio::time::sleep(FRAME_TIMEOUT - Duration::from_secs(1)).await;
@@ -110,14 +111,14 @@ async fn a_silent_client_may_stay_and_a_slow_one_too() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_takes_no_answers_is_given_up() {
+async fn a_client_that_reads_no_answers_is_disconnected() {
     let mut bench = bench(64);
     let begin = Instant::now();
     let mut sent = 0usize;
-    // The client writes on and reads nothing: the server must stop reading, then close.
+    // The client keeps writing and reads nothing: the server must stop reading, then close.
     while bench.client.write_all(&REQUEST).await.is_ok() {
         sent += 1;
-        assert!(sent < 10_000, "the server takes requests without end");
+        assert!(sent < 10_000, "the server never stops reading");
     }
     assert_eq!(begin.elapsed(), WRITE_TIMEOUT);
     bench.server.await.unwrap();
@@ -125,18 +126,18 @@ async fn a_client_that_takes_no_answers_is_given_up() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_stopped_client_does_not_hold_up_the_end() {
+async fn a_stopped_client_does_not_delay_shutdown() {
     let mut bench = bench(16);
     let flood: Vec<u8> = REQUEST.iter().copied().cycle().take(12 * 20).collect();
     let _ = tokio::time::timeout(Duration::from_secs(1), bench.send(&flood)).await;
     let begin = Instant::now();
     bench.cancel.cancel();
     bench.server.await.unwrap();
-    assert!(begin.elapsed() <= FAREWELL, "{:?}", begin.elapsed());
+    assert!(begin.elapsed() <= CLOSE_TIMEOUT, "{:?}", begin.elapsed());
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_batch_in_any_pieces_is_answered_whole() {
+async fn a_batch_is_answered_however_it_is_segmented() {
     for piece in [1, 2, 5, 7, 11, 12, 13, 100, 4096] {
         let mut bench = bench(4096);
         let requests: Vec<u8> = (0..100u16)
@@ -158,7 +159,7 @@ async fn a_batch_in_any_pieces_is_answered_whole() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn what_came_before_the_nonsense_is_answered() {
+async fn requests_before_invalid_data_are_answered() {
     for nonsense in [
         &b"GET / HTTP/1.1\r\n"[..],
         &[0, 2, 0, 0, 0, 0],
@@ -173,7 +174,7 @@ async fn what_came_before_the_nonsense_is_answered() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_only_stops_sending_gets_its_answer() {
+async fn a_half_closed_connection_gets_its_answers() {
     let mut bench = bench(1024);
     bench.send(&REQUEST).await;
     bench.client.shutdown().await.unwrap();
@@ -182,7 +183,7 @@ async fn a_client_that_only_stops_sending_gets_its_answer() {
 }
 
 #[tokio::test(start_paused = true)]
-async fn a_client_that_asks_nothing_is_let_go() {
+async fn an_idle_client_is_disconnected() {
     let timeout = Duration::from_secs(60);
     let mut bench = bench_with(1024, Some(timeout));
     for _ in 0..5 {

@@ -28,7 +28,7 @@ async fn client(buffer: Option<Buffer>) -> Client {
     Client::new(options(buffer), plant, Arc::default(), events).await
 }
 
-/// Tells events while the client does something else, then lets it hear them.
+/// Raises events while the client is busy, then lets it receive them.
 async fn burst(client: &mut Client, count: usize) {
     for n in 0..count {
         client.plant.load().events.tell(Event {
@@ -41,12 +41,12 @@ async fn burst(client: &mut Client, count: usize) {
             text: format!("event {n}"),
         });
     }
-    let heard = client.events.recv().await;
-    client.on_event(heard);
+    let received = client.events.recv().await;
+    client.on_event(received);
 }
 
 #[tokio::test]
-async fn a_burst_told_to_a_busy_client_is_all_there() {
+async fn a_busy_client_loses_no_event_of_a_burst() {
     let mut client = client(None).await;
     burst(&mut client, 1000).await;
     assert_eq!((client.outbox.waiting(), client.missed, client.dropped()), (1000, 0, 0));
@@ -72,7 +72,7 @@ async fn a_burst_goes_to_the_disk_where_there_is_a_buffer() {
 }
 
 #[tokio::test]
-async fn what_comes_too_fast_is_counted() {
+async fn lost_events_are_counted() {
     let mut client = client(None).await;
     burst(&mut client, BURST + 10).await;
     assert_eq!((client.outbox.waiting(), client.missed), (BURST, 10));

@@ -36,7 +36,7 @@ impl Bench {
         Some(json(&self.commands.result(ended, SystemTime::UNIX_EPOCH)))
     }
 
-    /// The drive takes the next order; whether it shows its effect is not known yet.
+    /// The drive acknowledges the next command; its effect has not been read yet.
     fn take_order(&self) -> Option<(Order, Receipt)> {
         let pop = |bus: &crate::plant::BusHandle| bus.queue.lock().pop(Urgency::Read, self.now);
         let command = self.plant.buses.iter().find_map(pop)?;
@@ -44,7 +44,7 @@ impl Bench {
         Some((command.order, command.ticket.acknowledge(outcome, self.now)))
     }
 
-    /// The drive takes the next order and never shows it; its result.
+    /// The result of the next command, which the drive acknowledges but never shows.
     fn acknowledge(&mut self) -> Json {
         drop(self.take_order().unwrap());
         self.finished().unwrap()
@@ -65,7 +65,7 @@ fn set(topic: &str, payload: &str) -> Incoming {
 }
 
 #[test]
-fn a_command_is_carried_out_and_answered() {
+fn a_command_is_executed_and_answered() {
     let mut bench = Bench::new();
     assert_eq!(bench.take(set("p1/set", r#"{"id": 5, "run": true}"#)), None);
     let result = bench.acknowledge();
@@ -103,7 +103,7 @@ fn a_response_topic_gets_the_result_and_the_correlation() {
 }
 
 #[test]
-fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
+fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
     let mut bench = Bench::new();
     for (incoming, code) in [
         (set("p1/set", "{"), "bad_value"),
@@ -143,12 +143,12 @@ fn refusals_are_told_audited_and_answered_and_nothing_is_queued() {
         retain: true,
         ..set("p1/set", "")
     };
-    assert_eq!(bench.take(cleared), None, "somebody cleans up");
+    assert_eq!(bench.take(cleared), None, "clears the retained message");
     assert!(bench.events.try_recv().is_err());
 }
 
 #[test]
-fn limits_are_refused_where_all_orders_are() {
+fn commands_outside_the_limits_are_refused() {
     let mut bench = Bench::new();
     let result = json(&bench.take(set("p1/set/speed_reference", "101")).unwrap());
     assert_eq!(result["error"]["code"], "bad_value");
@@ -159,7 +159,7 @@ fn limits_are_refused_where_all_orders_are() {
 }
 
 #[test]
-fn a_repetition_is_answered_from_memory() {
+fn a_repetition_gets_the_previous_result() {
     let mut bench = Bench::new();
     let first = set("p1/set", r#"{"id": 1, "run": true}"#);
     assert_eq!(bench.take(first.clone()), None);
@@ -181,7 +181,7 @@ fn a_repetition_is_answered_from_memory() {
         ..first.clone()
     };
     assert_eq!(json(&bench.take(again.clone()).unwrap()), result);
-    // Another order under the same id, and the same one a minute later, are new commands.
+    // Another command with the same id, and the same one a minute later, are new commands.
     assert_eq!(
         bench.take(set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#)),
         None
@@ -197,7 +197,7 @@ fn a_repetition_is_answered_from_memory() {
     bench.now += REPLAYED;
     assert_eq!(bench.take(again), None);
     bench.acknowledge();
-    // Without an id only the broker's mark tells a repetition.
+    // Without an id only the mark of the broker shows a repetition.
     let bare = set("p1/set", r#"{"speed_reference": 5}"#);
     for _ in 0..2 {
         assert_eq!(bench.take(bare.clone()), None);
@@ -207,7 +207,7 @@ fn a_repetition_is_answered_from_memory() {
 }
 
 #[test]
-fn a_stop_is_carried_out_whenever_it_comes() {
+fn a_repeated_stop_is_executed_again() {
     let mut bench = Bench::new();
     let stop = set("p1/set", r#"{"id": 2, "run": false}"#);
     for _ in 0..2 {
@@ -217,7 +217,7 @@ fn a_stop_is_carried_out_whenever_it_comes() {
 }
 
 #[test]
-fn orders_are_queued_as_the_messages_came() {
+fn commands_are_queued_in_the_order_of_their_messages() {
     let mut bench = Bench::new();
     let set_points = [
         ("run", "1"),
@@ -285,7 +285,7 @@ fn a_thousand_drives_are_stopped_at_once() {
 }
 
 #[test]
-fn who_waits_for_confirmation_is_in_nobodys_way() {
+fn commands_waiting_for_confirmation_do_not_block_others() {
     let (mut bench, names) = halls(10);
     let mut receipts = VecDeque::new();
     let mut early = Vec::new();
@@ -313,7 +313,7 @@ fn who_waits_for_confirmation_is_in_nobodys_way() {
 }
 
 #[test]
-fn what_cannot_be_kept_stays_with_the_broker() {
+fn messages_beyond_the_limit_stay_with_the_broker() {
     let (mut bench, names) = halls(25);
     let mut taken = 0;
     while bench.commands.has_room() {
@@ -332,7 +332,7 @@ fn what_cannot_be_kept_stays_with_the_broker() {
 }
 
 #[test]
-fn a_refusal_of_the_queue_tells_its_reason() {
+fn a_refusal_of_the_queue_has_its_reason() {
     let mut bench = Bench::new();
     let results: Vec<Json> = (0..crate::command::CAPACITY + 2)
         .filter_map(|_| bench.take(set("p1/set/run", "1")))
@@ -346,7 +346,7 @@ fn a_refusal_of_the_queue_tells_its_reason() {
 }
 
 #[test]
-fn a_repetition_behind_a_stop_is_neither_answered_nor_done() {
+fn a_repetition_after_a_stop_is_refused() {
     let mut bench = Bench::new();
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
     assert_eq!(bench.take(run.clone()), None);

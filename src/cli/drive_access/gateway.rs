@@ -1,0 +1,122 @@
+//! Through the running gateway: a client of its local socket.
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::time::timeout;
+
+use super::Target;
+use crate::cli::report;
+use crate::north::local::protocol::{FailureCode, MAX_RESPONSE, Outcome, Request, Response, request_line};
+use crate::north::local::{RuntimeDirectories, SocketPath};
+
+/// Time for a response: a command may wait for its turn and its confirmation, a read for a slow line.
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(40);
+
+/// Why no gateway was asked, for the message when the port cannot be opened either.
+#[derive(Debug)]
+pub(super) struct NotFound(pub(super) String);
+
+/// Sends the request to the gateway of the target's configuration, if one runs.
+///
+/// # Errors
+/// When one runs but gives no outcome; the line must not be tried then.
+pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Outcome, NotFound>, String> {
+    let paths = target.settings.socket.of_client(&RuntimeDirectories::of_this_process());
+    let (mut reasons, mut others) = (Vec::new(), Vec::new());
+    for path in &paths {
+        let stream = match UnixStream::connect(path).await {
+            Ok(stream) => stream,
+            Err(error) if is_nobody(&error) => continue,
+            Err(error) => {
+                let reason = format!("cannot connect to {}: {error}", path.display());
+                // A serial port is locked by its owner; with a device server there would be two masters on the line.
+                if target.bus.spec.port.starts_with("tcp://") {
+                    return Err(format!(
+                        "{reason}; bus `{}`; use sudo, or join the group of the socket",
+                        target.bus.spec.name
+                    ));
+                }
+                reasons.push(reason);
+                continue;
+            }
+        };
+        let response = exchange(stream, request)
+            .await
+            .map_err(|error| lost(path, request, &error))?;
+        match response.result {
+            Outcome::Error(failure) if failure.code == FailureCode::OtherGateway => {
+                others.push(format!("at {} {}", path.display(), failure.message));
+            }
+            Outcome::Error(failure) => return Err(refused(path, failure.code, &failure.message)),
+            outcome => return Ok(Ok(outcome)),
+        }
+    }
+    if !others.is_empty() {
+        report::note(&format!("{}; the command opens the port itself", others.join(", ")));
+    }
+    reasons.extend(others);
+    Ok(Err(NotFound(not_found(target, &paths, reasons))))
+}
+
+/// Whether no gateway listens there.
+fn is_nobody(error: &io::Error) -> bool {
+    use io::ErrorKind::{ConnectionRefused, NotADirectory, NotFound};
+    matches!(error.kind(), ConnectionRefused | NotFound | NotADirectory)
+}
+
+async fn exchange(mut stream: UnixStream, request: &Request) -> io::Result<Response> {
+    let exchange = async {
+        // A gateway that turns a client away answers without waiting for its request.
+        let written = stream.write_all(&request_line(request)).await;
+        let mut line = Vec::new();
+        BufReader::new((&mut stream).take(MAX_RESPONSE as u64))
+            .read_until(b'\n', &mut line)
+            .await?;
+        if line.last() != Some(&b'\n') {
+            written?;
+            return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it closed the connection"));
+        }
+        serde_json::from_slice(&line).map_err(io::Error::from)
+    };
+    timeout(RESPONSE_TIMEOUT, exchange).await.map_err(io::Error::from)?
+}
+
+fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
+    let remedy = match request {
+        Request::Read(_) => "try again",
+        Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
+    };
+    format!("the gateway did not answer: {error}; {}; {remedy}", path.display())
+}
+
+fn refused(path: &Path, code: FailureCode, message: &str) -> String {
+    let remedy = match code {
+        FailureCode::Busy => "try again",
+        FailureCode::OtherConfiguration | FailureCode::UnknownDrive | FailureCode::UnknownPoint => {
+            "the gateway there runs with another configuration: reload it, or name its file by --config"
+        }
+        _ => "gateway and command may be of different versions: restart the gateway",
+    };
+    format!("{message}; {}; {remedy}", path.display())
+}
+
+fn not_found(target: &Target, paths: &[PathBuf], reasons: Vec<String>) -> String {
+    match &target.settings.socket {
+        _ if !reasons.is_empty() => reasons.join(", "),
+        SocketPath::Off => "`socket` of [gateway] is off, so a running gateway cannot be asked".to_string(),
+        SocketPath::At(path) => format!("no gateway listens at {}", path.display()),
+        SocketPath::Default => {
+            let mut directories: Vec<String> = paths
+                .iter()
+                .filter_map(|path| path.parent())
+                .map(|dir| dir.display().to_string())
+                .collect();
+            directories.dedup();
+            format!("no gateway listens in {}", directories.join(" or "))
+        }
+    }
+}

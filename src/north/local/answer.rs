@@ -1,0 +1,255 @@
+//! What a request means: points from the process image, commands by the order function of all north sides. No socket: a
+//! command line without a gateway asks the same of a bus of its own.
+
+use std::time::{Duration, Instant};
+
+use serde_json::Value as Json;
+
+use super::protocol::{
+    Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, Request, Setting, WriteOutcome,
+    WriteRequest, port_of,
+};
+use crate::cache::{Link, Reading, Unavailable, public_points};
+use crate::codec::{Reply, RequestPdu};
+use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
+use crate::document::nearest;
+use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
+use crate::north::mqtt::point_value;
+use crate::plant::{DriveHandle, Plant};
+
+/// Most points of one request; a profile has some hundred.
+const MAX_POINTS: usize = 1024;
+/// Time for all points that are not polled and have to be read from the drive.
+const FORWARDED: Duration = Duration::from_secs(10);
+
+/// Does what `request` asks for, as `origin`; waits for the drive where that is needed.
+pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome {
+    let answered = match request {
+        Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
+        Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
+    };
+    answered.unwrap_or_else(Outcome::Error)
+}
+
+/// The drive that is meant.
+fn drive_of(plant: &Plant, name: &str, expect: Option<&Expected>) -> Result<DriveHandle, Failure> {
+    let drive = plant.drive(name);
+    if let Some(expect) = expect {
+        is_expected(plant, name, drive.as_ref(), expect)?;
+    }
+    drive.ok_or_else(|| {
+        let names: Vec<String> = plant.drives().map(|drive| drive.image.spec.name.clone()).collect();
+        let hint = match nearest(name, names.iter().map(String::as_str)) {
+            Some(near) => format!("did you mean `{near}`?"),
+            None => format!("known: {}", names.join(", ")),
+        };
+        Failure::new(FailureCode::UnknownDrive, format!("there is no drive `{name}`; {hint}"))
+    })
+}
+
+/// Whether gateway and drive are what the client's file says. What owns the file's port is its gateway, or was before the
+/// file was edited; any other gateway has nothing to do with it.
+fn is_expected(plant: &Plant, name: &str, drive: Option<&DriveHandle>, expect: &Expected) -> Result<(), Failure> {
+    let names_differ = (plant.gateway != expect.gateway)
+        .then(|| format!("the gateway is `{}`, the file has `{}`", plant.gateway, expect.gateway));
+    let fail = |code, message: String| Err(Failure::new(code, message));
+    if !plant.buses.iter().any(|bus| port_of(&bus.image.spec) == expect.port) {
+        let why = names_differ.unwrap_or_else(|| format!("the gateway has no bus on {}", expect.port));
+        return fail(FailureCode::OtherGateway, why);
+    }
+    if let Some(why) = names_differ {
+        return fail(FailureCode::OtherConfiguration, why);
+    }
+    let Some(drive) = drive else {
+        return fail(
+            FailureCode::OtherConfiguration,
+            format!("the gateway has no drive `{name}`"),
+        );
+    };
+    let runs = Expected::new(&plant.gateway, &drive.bus.image.spec, &drive.image.spec);
+    let pairs = [
+        ("port", runs.port, &expect.port),
+        ("address", runs.address.to_string(), &expect.address.to_string()),
+        ("profile", runs.profile, &expect.profile),
+    ];
+    match pairs.into_iter().find(|(_, runs, wanted)| runs != *wanted) {
+        Some((what, runs, wanted)) => fail(
+            FailureCode::OtherConfiguration,
+            format!("the gateway has `{name}` with the {what} `{runs}`, the file has it with `{wanted}`"),
+        ),
+        None => Ok(()),
+    }
+}
+
+async fn read(request: &ReadRequest, plant: &Plant, origin: &Origin) -> Result<ReadOutcome, Failure> {
+    let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
+    let profile = &drive.image.spec.profile;
+    let indices = indices(profile, &request.points)?;
+    let now = Instant::now();
+    // One look at the image, so that all values of one poll are of one poll.
+    let reading = drive.reading(now);
+    let mut points = Vec::with_capacity(indices.len());
+    for index in indices {
+        let Some(point) = profile.points.get(index) else {
+            continue;
+        };
+        points.push(match point.raw().filter(|_| point.class == PollClass::Never) {
+            Some(raw) => forwarded(&drive, point, raw, origin.clone(), now + FORWARDED).await,
+            None => PointValue::new(point, &reading.sample(index), || why_not_good(&drive, &reading, index)),
+        });
+    }
+    Ok(ReadOutcome { points })
+}
+
+fn indices(profile: &Profile, names: &[String]) -> Result<Vec<usize>, Failure> {
+    if names.len() > MAX_POINTS {
+        let message = format!("{} points are asked for; {MAX_POINTS} are allowed", names.len());
+        return Err(Failure::new(FailureCode::BadRequest, message));
+    }
+    if names.is_empty() {
+        return Ok(public_points(profile).into_iter().map(|(index, _)| index).collect());
+    }
+    let index = |name: &String| {
+        profile.point_index(name).ok_or_else(|| {
+            let message = format!("profile `{}` has no point `{name}`", profile.name);
+            Failure::new(FailureCode::UnknownPoint, message)
+        })
+    };
+    names.iter().map(index).collect()
+}
+
+/// A point that is not polled: the drive is asked for it.
+async fn forwarded(drive: &DriveHandle, point: &Point, raw: &Raw, origin: Origin, deadline: Instant) -> PointValue {
+    let pdu = RequestPdu::Read {
+        table: raw.table,
+        start: raw.address,
+        count: raw.form.items(),
+    };
+    let now = Instant::now();
+    let expiry = deadline.saturating_duration_since(now);
+    let mut placed = drive.place(Order::Read(pdu), origin, Authority::ReadOnly, expiry, now);
+    let outcome = placed.answered().await.outcome;
+    let words: Option<Vec<u16>> = match &outcome {
+        command::Outcome::Acknowledged(Reply::Registers(words)) => Some(words.clone()),
+        command::Outcome::Acknowledged(Reply::Bits(bits)) => Some(bits.iter().map(|b| u16::from(*b)).collect()),
+        _ => None,
+    };
+    let was_read = words.is_some();
+    let value = words.and_then(|words| raw.decode(&words, point.kind()));
+    let sample = Sample {
+        value,
+        quality: if value.is_some() { Quality::Good } else { Quality::Bad },
+        at: None,
+    };
+    PointValue::new(point, &sample, || match was_read {
+        true => NO_NUMBER.to_string(),
+        false => outcome.to_string(),
+    })
+}
+
+const NO_NUMBER: &str = "the register does not hold a number";
+
+/// Why a polled or derived point has no good value.
+fn why_not_good(drive: &DriveHandle, reading: &Reading<'_>, index: usize) -> String {
+    if !drive.bus_up() {
+        let reason = drive.bus.image.health().reason;
+        return reason.map_or("the bus is down".to_string(), |why| format!("the bus is down: {why}"));
+    }
+    match reading.snapshot.link {
+        Link::Untried => return "the drive has not been polled yet".to_string(),
+        Link::Offline(_) => return "the drive does not answer".to_string(),
+        Link::Online(_) => {}
+    }
+    let profile = &reading.spec.profile;
+    let point = profile.points.get(index);
+    let rests_on = match point.map(|point| &point.source) {
+        Some(Source::Derived(derived)) => derived.rests_on(),
+        _ => vec![index],
+    };
+    let sources = rests_on.into_iter().filter_map(|source| profile.points.get(source));
+    let because = sources.filter_map(|source| {
+        let why = why_no_words(reading, source.raw()?)?;
+        let is_itself = point.is_some_and(|point| point.name == source.name);
+        Some(if is_itself {
+            why
+        } else {
+            format!("`{}`: {why}", source.name)
+        })
+    });
+    because
+        .into_iter()
+        .next()
+        .unwrap_or_else(|| match point.map(|point| &point.source) {
+            Some(Source::Derived(_)) => "it cannot be derived: its range is not known".to_string(),
+            _ => NO_NUMBER.to_string(),
+        })
+}
+
+/// Why the words of a register are not good, if they are not.
+fn why_no_words(reading: &Reading<'_>, raw: &Raw) -> Option<String> {
+    match reading.words(raw.table, raw.address, raw.form.items()).err()? {
+        Unavailable::Refused(code) => Some(format!("the drive refused it with {code}")),
+        Unavailable::NotPolled => Some("it is not polled".to_string()),
+        Unavailable::Stale => Some(match reading.snapshot.read_at(raw.table, raw.address) {
+            Some(at) => {
+                let age = reading.now.saturating_duration_since(at).as_secs_f64();
+                format!("last read {age:.1} s ago")
+            }
+            None => "it has not been read yet".to_string(),
+        }),
+    }
+}
+
+async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<WriteOutcome, Failure> {
+    let now = Instant::now();
+    let drive = match drive_of(plant, &request.drive, request.expect.as_ref()) {
+        Err(failure) if failure.code == FailureCode::UnknownDrive => {
+            let answer = plant.refuse_unknown(
+                &request.drive,
+                &described(&request.points),
+                failure.message,
+                origin,
+                now,
+            );
+            return Ok(WriteOutcome::new(&answer, None));
+        }
+        drive => drive?,
+    };
+    let profile = &drive.image.spec.profile;
+    let values: Result<Vec<(usize, Value)>, Refusal> = request
+        .points
+        .iter()
+        .map(|setting| value_of(profile, setting))
+        .collect();
+    let mut placed = match values {
+        Ok(values) => drive.place(Order::Points(values), origin, Authority::Write, DEFAULT_EXPIRY, now),
+        Err(refusal) => {
+            let answer = drive.refuse(&described(&request.points), refusal, origin, now);
+            return Ok(WriteOutcome::new(&answer, None));
+        }
+    };
+    let answer = placed.answered().await;
+    Ok(WriteOutcome::new(&answer, placed.confirmed().await))
+}
+
+/// The point and its value: as over MQTT, and the text of an enumeration too.
+fn value_of(profile: &Profile, setting: &Setting) -> Result<(usize, Value), Refusal> {
+    let point = profile
+        .point_index(&setting.point)
+        .and_then(|index| profile.points.get(index));
+    let code = match (&setting.value, point) {
+        (Json::String(text), Some(point)) => point.texts.iter().find(|(_, meaning)| *meaning == text),
+        _ => None,
+    };
+    match code {
+        Some((code, _)) => point_value(profile, &setting.point, &(*code).into()),
+        None => point_value(profile, &setting.point, &setting.value),
+    }
+}
+
+/// A command that was not understood, for the audit.
+fn described(points: &[Setting]) -> String {
+    let one = |setting: &Setting| format!("{}={}", setting.point, setting.value);
+    let all: Vec<String> = points.iter().take(16).map(one).collect();
+    all.join(" ").chars().take(200).collect()
+}

@@ -1,0 +1,157 @@
+//! The local socket: what `drivegate read` and `drivegate write` speak to, on the machine of the gateway.
+//!
+//! Who may connect is decided by the permissions of the socket's file, and whoever may connect may command, as far as the
+//! drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited with the user
+//! id of the client's process. A client can hold a place and nothing else: lines, places and times are bounded.
+
+mod answer;
+mod path;
+pub mod protocol;
+
+use std::io;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
+use tokio::net::UnixStream;
+use tokio::sync::{OwnedSemaphorePermit, Semaphore};
+use tokio::task::JoinHandle;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+
+use self::path::Bound;
+use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Response, VERSION};
+use crate::command::{Origin, SourceKind};
+use crate::plant::{Plant, SharedPlant};
+
+pub use answer::answer;
+pub use path::{RuntimeDirectories, SocketPath};
+
+/// Clients at one time.
+const MAX_CLIENTS: usize = 32;
+/// Time for a request to arrive, counted from the connection or from the response before.
+const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
+/// Time for a client to take its response.
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(5);
+/// Wait after an accept error, such as no free descriptors.
+const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// The running server.
+#[derive(Debug)]
+pub struct Local {
+    path: PathBuf,
+    task: JoinHandle<()>,
+}
+
+impl Local {
+    /// Where it listens.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Waits until it takes no more clients and its file is removed. A request that is being carried out gets its
+    /// response from the bus.
+    pub async fn stopped(self) {
+        if let Err(error) = self.task.await {
+            tracing::error!(target: "drivegate::local", "the local socket ended by itself: {error}; report this");
+        }
+    }
+}
+
+/// Starts the server at the first path that it can have. It runs until `cancel`, whatever clients do.
+///
+/// # Errors
+/// When the socket cannot be bound: what and where.
+pub async fn start(path: &SocketPath, plant: SharedPlant, cancel: CancellationToken) -> io::Result<Local> {
+    let paths = path.of_gateway(&RuntimeDirectories::of_this_process());
+    let first = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
+    let bound = path::bind_first(&paths)
+        .await
+        .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))?;
+    let path = bound.path.clone();
+    tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
+    let task = tokio::spawn(accept(bound, plant, cancel));
+    Ok(Local { path, task })
+}
+
+async fn accept(bound: Bound, plant: SharedPlant, cancel: CancellationToken) {
+    let places = Arc::new(Semaphore::new(MAX_CLIENTS));
+    while let Some(accepted) = cancel.run_until_cancelled(bound.listener.accept()).await {
+        match accepted {
+            Ok((stream, _)) => match places.clone().try_acquire_owned() {
+                Ok(place) => drop(tokio::spawn(serve(stream, plant.clone(), cancel.clone(), place))),
+                Err(_) => turn_away(&stream, &plant.load()),
+            },
+            Err(error) => {
+                tracing::debug!(target: "drivegate::local", "cannot accept a local client: {error}; trying again");
+                cancel.run_until_cancelled(tokio::time::sleep(ACCEPT_PAUSE)).await;
+            }
+        }
+    }
+}
+
+/// Answers a client there is no place for. What does not fit the socket's buffer at once is dropped.
+fn turn_away(stream: &UnixStream, plant: &Plant) {
+    let message = format!("{MAX_CLIENTS} local clients are connected already; try again");
+    let failure = Failure::new(FailureCode::Busy, message);
+    let _ = stream.try_write(&response(plant, Outcome::Error(failure)));
+}
+
+fn response(plant: &Plant, result: Outcome) -> Vec<u8> {
+    protocol::line(&Response {
+        v: VERSION,
+        gateway: plant.gateway.clone(),
+        result,
+    })
+}
+
+/// Serves one client until it leaves, falls silent or takes no response.
+async fn serve(mut stream: UnixStream, plant: SharedPlant, cancel: CancellationToken, place: OwnedSemaphorePermit) {
+    // Without a user id there is nobody to hold the command against.
+    let Ok(peer) = stream.peer_cred() else { return };
+    let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
+    let (read_half, mut write_half) = stream.split();
+    let mut reader = BufReader::new(read_half);
+    loop {
+        let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader));
+        let Some(Ok(Ok(line))) = cancel.run_until_cancelled(request).await else {
+            break;
+        };
+        let plant = plant.load_full();
+        let (result, goes_on) = match line {
+            Line::End => break,
+            Line::TooLong => {
+                let message = format!("the request is longer than {MAX_REQUEST} bytes");
+                (Outcome::Error(Failure::new(FailureCode::BadRequest, message)), false)
+            }
+            Line::Whole(line) => match protocol::parse(&line) {
+                Ok(request) => (answer(&request, &plant, origin.clone()).await, true),
+                Err(failure) => (Outcome::Error(failure), true),
+            },
+        };
+        let response = response(&plant, result);
+        let written = timeout(RESPONSE_TIMEOUT, write_half.write_all(&response)).await;
+        if !matches!(written, Ok(Ok(()))) || !goes_on {
+            break;
+        }
+    }
+    drop(place);
+}
+
+enum Line {
+    /// With its end: what a client began and did not end is not carried out.
+    Whole(Vec<u8>),
+    TooLong,
+    End,
+}
+
+async fn next_line(reader: &mut (impl AsyncBufReadExt + Unpin)) -> io::Result<Line> {
+    let mut line = Vec::new();
+    reader.take(MAX_REQUEST as u64).read_until(b'\n', &mut line).await?;
+    Ok(match line.last() {
+        Some(b'\n') => Line::Whole(line),
+        _ if line.len() == MAX_REQUEST => Line::TooLong,
+        _ => Line::End,
+    })
+}

@@ -1,0 +1,369 @@
+//! What is said over the socket: one JSON object a line, a request and its response. Pure.
+//!
+//! ```text
+//! {"v":1,"read":{"drive":"pump-1","points":["output_frequency"]}}
+//! {"v":1,"gateway":"plant","read":{"points":[{"point":"output_frequency","value":25.0,"unit":"Hz","quality":"good"}]}}
+//! {"v":1,"write":{"drive":"pump-1","points":[{"point":"run","value":false}]}}
+//! {"v":1,"gateway":"plant","write":{"ok":true,"result":"confirmed","message":"…","latency_ms":9.1,"confirmed_ms":31.4}}
+//! ```
+
+use std::path::Path;
+use std::time::Duration;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value as Json;
+
+use crate::cache::{BusSpec, DriveSpec, value_or_null};
+use crate::command::{Answer, CONFIRMED};
+use crate::drive::{Point, Sample};
+
+/// Version of requests and responses. A field that is added does not change it.
+pub const VERSION: u64 = 1;
+/// Longest request in bytes, with its end of line.
+pub const MAX_REQUEST: usize = 64 * 1024;
+/// Longest response in bytes, with its end of line.
+pub const MAX_RESPONSE: usize = 4 * 1024 * 1024;
+
+/// What a client wants.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Request {
+    /// Points of one drive.
+    Read(ReadRequest),
+    /// Points of one drive set as one command.
+    Write(WriteRequest),
+}
+
+/// Points of one drive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReadRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
+    /// Names of points; none: all that are polled.
+    #[serde(default)]
+    pub points: Vec<String>,
+}
+
+/// Points of one drive set as one command.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WriteRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
+    /// What is set.
+    pub points: Vec<Setting>,
+}
+
+/// One value of a command.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Setting {
+    /// Name of the point.
+    pub point: String,
+    /// True or false, a number in the unit of the point, or the text of an enumeration.
+    pub value: Json,
+}
+
+/// What the client's configuration file says of gateway and drive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Expected {
+    /// Name of the gateway.
+    pub gateway: String,
+    /// Port of the bus, as [`port_of`] gives it.
+    pub port: String,
+    /// Address on the bus.
+    pub address: u8,
+    /// Name of the profile.
+    pub profile: String,
+}
+
+impl Expected {
+    /// What a configuration says.
+    pub fn new(gateway: &str, bus: &BusSpec, drive: &DriveSpec) -> Expected {
+        Expected {
+            gateway: gateway.to_string(),
+            port: port_of(bus),
+            address: drive.address,
+            profile: drive.profile.name.clone(),
+        }
+    }
+}
+
+/// The port of a bus, the same from whatever directory and by whatever link it is named.
+pub fn port_of(bus: &BusSpec) -> String {
+    if bus.port.starts_with("tcp://") {
+        return bus.port.clone();
+    }
+    let path = Path::new(&bus.port);
+    let found = path.canonicalize().or_else(|_| std::path::absolute(path));
+    found.map_or_else(|_| bus.port.clone(), |path| path.display().to_string())
+}
+
+/// The gateway's answer to a request.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Response {
+    /// [`VERSION`].
+    pub v: u64,
+    /// Name of the gateway.
+    pub gateway: String,
+    /// What came of the request.
+    #[serde(flatten)]
+    pub result: Outcome,
+}
+
+/// What came of a request.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Outcome {
+    /// The points that were asked for, in their order.
+    Read(ReadOutcome),
+    /// The command was carried out, or refused.
+    Write(WriteOutcome),
+    /// Nothing was read or written.
+    Error(Failure),
+}
+
+impl Outcome {
+    /// The message where another outcome was to be expected.
+    pub fn not_asked_for(self) -> String {
+        match self {
+            Outcome::Error(failure) => failure.message,
+            _ => "the response does not fit the request; the local socket; restart the gateway".to_string(),
+        }
+    }
+}
+
+/// The points that were asked for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ReadOutcome {
+    /// In the order of the request.
+    pub points: Vec<PointValue>,
+}
+
+/// A point with what is known of it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct PointValue {
+    /// Name.
+    pub point: String,
+    /// `null` unless the quality is good.
+    pub value: Json,
+    /// What the value of an enumeration means.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+    /// Unit of the value.
+    pub unit: String,
+    /// `good`, `stale` or `bad`.
+    pub quality: String,
+    /// Why there is no value.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub why: Option<String>,
+}
+
+impl PointValue {
+    /// The point with its sample; `why` is asked only where that is not good.
+    pub(super) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
+        let value = sample.good();
+        PointValue {
+            point: point.name.clone(),
+            value: value_or_null(value),
+            text: value.and_then(|v| point.text_of(v).map(ToString::to_string)),
+            unit: point.unit.clone(),
+            quality: sample.quality.name().to_string(),
+            why: value.is_none().then(why),
+        }
+    }
+
+    /// Whether it has a value.
+    pub fn is_good(&self) -> bool {
+        !self.value.is_null()
+    }
+}
+
+/// How a command ended.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct WriteOutcome {
+    /// The drive acknowledged it.
+    pub ok: bool,
+    /// Result code, as over MQTT.
+    pub result: String,
+    /// The outcome for people.
+    pub message: String,
+    /// From acceptance to answer, ms.
+    pub latency_ms: f64,
+    /// From acceptance to the read that showed the effect, ms.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub confirmed_ms: Option<f64>,
+}
+
+impl WriteOutcome {
+    pub(super) fn new(answer: &Answer, confirmed: Option<Duration>) -> WriteOutcome {
+        let millis = |time: Duration| (time.as_secs_f64() * 1e6).round() / 1e3;
+        WriteOutcome {
+            ok: answer.outcome.is_ok(),
+            result: confirmed.map_or(answer.outcome.code(), |_| CONFIRMED).to_string(),
+            message: answer.outcome.to_string(),
+            latency_ms: millis(answer.latency),
+            confirmed_ms: confirmed.map(millis),
+        }
+    }
+}
+
+/// Why nothing was read or written.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Failure {
+    /// The kind of reason.
+    pub code: FailureCode,
+    /// The reason for people.
+    pub message: String,
+}
+
+/// Kinds of reasons why nothing was read or written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum FailureCode {
+    /// It is not a request of this version, or too long.
+    BadRequest,
+    /// All places for clients are taken.
+    Busy,
+    /// There is no drive of that name.
+    UnknownDrive,
+    /// The drive has no point of that name.
+    UnknownPoint,
+    /// The client's port is none of this gateway's.
+    OtherGateway,
+    /// The gateway owns the client's port and runs with another configuration.
+    OtherConfiguration,
+    /// One that this version does not know.
+    #[serde(other)]
+    Other,
+}
+
+impl Failure {
+    pub(super) fn new(code: FailureCode, message: impl Into<String>) -> Failure {
+        Failure {
+            code,
+            message: message.into(),
+        }
+    }
+}
+
+/// Reads a line of a client.
+///
+/// # Errors
+/// What is wrong with it.
+pub(super) fn parse(line: &[u8]) -> Result<Request, Failure> {
+    let bad = |message: String| Failure::new(FailureCode::BadRequest, message);
+    let mut fields: serde_json::Map<String, Json> =
+        serde_json::from_slice(line).map_err(|error| bad(format!("expected a JSON object on one line: {error}")))?;
+    match fields.remove("v").as_ref().and_then(Json::as_u64) {
+        Some(VERSION) => {}
+        Some(other) => {
+            return Err(bad(format!(
+                "version {other} is not supported; this gateway has {VERSION}"
+            )));
+        }
+        None => return Err(bad(format!("expected the version as \"v\":{VERSION}"))),
+    }
+    // Besides the version there is one field, the name of the request.
+    serde_json::from_value(Json::Object(fields)).map_err(|error| bad(format!("expected one request: {error}")))
+}
+
+/// A line, with its end.
+pub(super) fn line(message: &impl Serialize) -> Vec<u8> {
+    // Strings, figures and JSON: this cannot fail.
+    let mut line = serde_json::to_vec(message).unwrap_or_default();
+    line.push(b'\n');
+    line
+}
+
+/// A request as a line, with its end.
+pub fn request_line(request: &Request) -> Vec<u8> {
+    #[derive(Serialize)]
+    struct Versioned<'r> {
+        v: u64,
+        #[serde(flatten)]
+        request: &'r Request,
+    }
+    line(&Versioned { v: VERSION, request })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_survives_its_line() {
+        let request = Request::Write(WriteRequest {
+            drive: "pump-1".to_string(),
+            expect: Some(Expected {
+                gateway: "plant".to_string(),
+                port: "/dev/ttyUSB0".to_string(),
+                address: 1,
+                profile: "vacon-nx".to_string(),
+            }),
+            points: vec![Setting {
+                point: "run".to_string(),
+                value: true.into(),
+            }],
+        });
+        let line = request_line(&request);
+        assert_eq!(line.iter().filter(|byte| **byte == b'\n').count(), 1);
+        assert_eq!(parse(&line), Ok(request));
+        let short = br#"{"v":1,"read":{"drive":"pump-1"}}"#;
+        let read = ReadRequest {
+            drive: "pump-1".to_string(),
+            expect: None,
+            points: Vec::new(),
+        };
+        assert_eq!(parse(short), Ok(Request::Read(read)));
+    }
+
+    #[test]
+    fn what_is_not_one_request_is_refused() {
+        for (line, why) in [
+            ("", "expected a JSON object"),
+            ("[]", "expected a JSON object"),
+            ("run", "expected a JSON object"),
+            (r#"{"read":{"drive":"a"}}"#, "expected the version"),
+            (r#"{"v":"1","read":{"drive":"a"}}"#, "expected the version"),
+            (r#"{"v":2,"read":{"drive":"a"}}"#, "version 2 is not supported"),
+            (r#"{"v":1}"#, "expected one request"),
+            (r#"{"v":1,"erase":{}}"#, "unknown variant `erase`"),
+            (
+                r#"{"v":1,"read":{"drive":"a"},"write":{"drive":"a","points":[]}}"#,
+                "expected one request",
+            ),
+            (r#"{"v":1,"write":{"drive":"a"}}"#, "missing field `points`"),
+            (
+                r#"{"v":1,"write":{"drive":"a","points":[],"dry_run":true}}"#,
+                "unknown field `dry_run`",
+            ),
+            (
+                r#"{"v":1,"write":{"drive":"a","points":{"run":true}}}"#,
+                "expected one request",
+            ),
+        ] {
+            let failure = parse(line.as_bytes()).unwrap_err();
+            assert_eq!(failure.code, FailureCode::BadRequest);
+            assert!(failure.message.contains(why), "{line}: {}", failure.message);
+        }
+    }
+
+    #[test]
+    fn a_reason_of_a_later_version_is_one_too() {
+        let text = r#"{"v":1,"gateway":"g","error":{"code":"too_warm","message":"m"},"since":5}"#;
+        let response: Response = serde_json::from_str(text).unwrap();
+        let Outcome::Error(failure) = response.result else {
+            panic!("{response:?}");
+        };
+        assert_eq!(failure.code, FailureCode::Other);
+    }
+}

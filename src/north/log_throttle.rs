@@ -1,0 +1,45 @@
+//! Limits how often one kind of message is logged. Time is an argument.
+
+use std::sync::{Mutex, PoisonError};
+use std::time::{Duration, Instant};
+
+/// Minimum time between two log lines of one kind.
+const INTERVAL: Duration = Duration::from_secs(10);
+
+/// Lets one log line of a kind through every ten seconds and counts the others.
+#[derive(Debug, Default)]
+pub(super) struct LogThrottle(Mutex<Throttled>);
+
+#[derive(Debug, Default)]
+struct Throttled {
+    last: Option<Instant>,
+    suppressed: u64,
+}
+
+impl LogThrottle {
+    /// `None` if the line must not be logged now, otherwise the number of lines suppressed since the last one.
+    pub(super) fn permit(&self, now: Instant) -> Option<u64> {
+        let mut state = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let too_soon = |last| now.saturating_duration_since(last) < INTERVAL;
+        if state.last.is_some_and(too_soon) {
+            state.suppressed += 1;
+            return None;
+        }
+        state.last = Some(now);
+        Some(std::mem::take(&mut state.suppressed))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_line_in_ten_seconds() {
+        let (throttle, now) = (LogThrottle::default(), Instant::now());
+        assert_eq!(throttle.permit(now), Some(0));
+        assert_eq!(throttle.permit(now), None);
+        assert_eq!(throttle.permit(now + Duration::from_secs(9)), None);
+        assert_eq!(throttle.permit(now + Duration::from_secs(10)), Some(2));
+    }
+}

@@ -1,0 +1,258 @@
+//! Requests that the process image cannot answer and that are forwarded to the drive.
+
+use std::future::Future;
+use std::pin::Pin;
+use std::task::{Context, Poll};
+use std::time::Instant;
+
+use super::client::Client;
+use super::frame::Header;
+use crate::cache::{Reading, Unavailable};
+use crate::codec::n2::Object;
+use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
+use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
+use crate::plant::{DriveHandle, Placed};
+
+/// A request that is forwarded to a drive.
+#[derive(Debug)]
+pub(super) struct ForwardedRequest {
+    pub(super) header: Header,
+    pub(super) drive: DriveHandle,
+    pub(super) request: RequestPdu,
+    /// Whether the command includes a fault reset by 0x8100.
+    pub(super) resets: bool,
+    read: Option<PartialRead>,
+}
+
+/// What a forwarded request asks the bus for.
+#[derive(Debug)]
+pub(super) enum BusWork {
+    Order(Order),
+    /// Nothing, because it is refused; the refusal is audited.
+    Refused(Refusal),
+    /// A read that is split by object.
+    Parts(Vec<ReadPart>),
+}
+
+/// Part of a read.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum ReadPart {
+    /// Words from the process image.
+    Known(Vec<u16>),
+    /// A read of one object: the first `skip` of its items are dropped, the next `take` are used.
+    Object { pdu: RequestPdu, skip: usize, take: usize },
+}
+
+/// A read that is split by object.
+#[derive(Debug)]
+struct PartialRead {
+    words: Vec<u16>,
+    left: std::vec::IntoIter<ReadPart>,
+    /// Items of the object being read to skip, and to use.
+    asked: (usize, usize),
+}
+
+/// State of a forwarded request.
+#[derive(Debug)]
+pub(super) enum Progress {
+    /// A command of it is in the queue.
+    Pending(PendingRequest),
+    /// Its outcome is known.
+    Done(Box<ForwardedRequest>, Outcome),
+}
+
+/// A forwarded request whose command is in the queue; nothing is left to do but wait.
+#[derive(Debug)]
+pub(super) struct PendingRequest {
+    /// `None` once it is answered.
+    forwarded: Option<Box<ForwardedRequest>>,
+    placed: Placed,
+}
+
+/// A forwarded request of which the bus has answered a command.
+#[derive(Debug)]
+pub(super) struct AnsweredRequest {
+    forwarded: Box<ForwardedRequest>,
+    outcome: Outcome,
+}
+
+impl Future for PendingRequest {
+    type Output = AnsweredRequest;
+
+    fn poll(mut self: Pin<&mut Self>, cx: &mut Context<'_>) -> Poll<AnsweredRequest> {
+        match (self.placed.poll_answer(cx), self.forwarded.take()) {
+            (Poll::Ready(answer), Some(forwarded)) => Poll::Ready(AnsweredRequest {
+                forwarded,
+                outcome: answer.outcome,
+            }),
+            (_, forwarded) => {
+                self.forwarded = forwarded;
+                Poll::Pending
+            }
+        }
+    }
+}
+
+impl ForwardedRequest {
+    pub(super) fn new(header: Header, drive: &DriveHandle, request: RequestPdu) -> ForwardedRequest {
+        ForwardedRequest {
+            header,
+            drive: drive.clone(),
+            request,
+            resets: false,
+            read: None,
+        }
+    }
+
+    /// Queues its command, or the first one of several, before this returns.
+    pub(super) fn send(self, work: BusWork, client: &Client, now: Instant) -> Progress {
+        let mut forwarded = Box::new(self);
+        match work {
+            BusWork::Order(order) => forwarded.place(order, client, client.authority, now),
+            BusWork::Refused(refusal) => {
+                let what = describe::request(&forwarded.request);
+                let answer = forwarded.drive.refuse(&what, refusal, client.origin(), now);
+                Progress::Done(forwarded, answer.outcome)
+            }
+            BusWork::Parts(read_parts) => {
+                forwarded.read = Some(PartialRead {
+                    words: Vec::new(),
+                    left: read_parts.into_iter(),
+                    asked: (0, 0),
+                });
+                forwarded.read_on(client, now)
+            }
+        }
+    }
+
+    fn place(self: Box<Self>, order: Order, client: &Client, authority: Authority, now: Instant) -> Progress {
+        let placed = self.drive.place(order, client.origin(), authority, DEFAULT_EXPIRY, now);
+        Progress::Pending(PendingRequest {
+            forwarded: Some(self),
+            placed,
+        })
+    }
+
+    /// Requests the next object of a read, if any is left.
+    fn read_on(mut self: Box<Self>, client: &Client, now: Instant) -> Progress {
+        let Some(read) = &mut self.read else {
+            return Progress::Done(self, Outcome::Exception(Exception::DEVICE_FAILURE));
+        };
+        for part in read.left.by_ref() {
+            match part {
+                ReadPart::Known(known) => read.words.extend(known),
+                ReadPart::Object { pdu, skip, take } => {
+                    read.asked = (skip, take);
+                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now);
+                }
+            }
+        }
+        let words = std::mem::take(&mut read.words);
+        let reply = match &self.request {
+            RequestPdu::Read { table, .. } if table.is_bits() => {
+                Reply::Bits(words.iter().map(|word| *word != 0).collect())
+            }
+            _ => Reply::Registers(words),
+        };
+        Progress::Done(self, Outcome::Acknowledged(reply))
+    }
+}
+
+impl AnsweredRequest {
+    /// Continues a read with its next object, until one fails; any other request is done.
+    pub(super) fn go_on(mut self, client: &Client, now: Instant) -> Progress {
+        let Some(read) = &mut self.forwarded.read else {
+            return Progress::Done(self.forwarded, self.outcome);
+        };
+        let (skip, take) = read.asked;
+        match self.outcome {
+            Outcome::Acknowledged(Reply::Registers(got)) => read.words.extend(got.iter().skip(skip).take(take)),
+            Outcome::Acknowledged(Reply::Bits(got)) => {
+                read.words
+                    .extend(got.iter().skip(skip).take(take).map(|bit| u16::from(*bit)));
+            }
+            Outcome::Acknowledged(_) => {
+                return Progress::Done(self.forwarded, Outcome::Exception(Exception::DEVICE_FAILURE));
+            }
+            outcome => return Progress::Done(self.forwarded, outcome),
+        }
+        self.forwarded.read_on(client, now)
+    }
+}
+
+/// Splits a read that the process image cannot answer as a whole by object, for protocols that read one object per
+/// transaction (N2); `None` for protocols that read registers, where the request is forwarded unchanged.
+///
+/// # Errors
+/// The exception if part of the read is stale, was refused by the drive, or is not an object.
+pub(super) fn read_parts(
+    protocol: Protocol,
+    reading: &Reading<'_>,
+    table: Table,
+    start: u16,
+    count: u16,
+) -> Result<Option<Vec<ReadPart>>, Exception> {
+    if protocol != Protocol::N2 {
+        return Ok(None);
+    }
+    let mut read_parts = Vec::new();
+    let (mut at, mut left) = (start, count);
+    while left > 0 {
+        let (first, items) = object_around(table, at).ok_or(Exception::ADDRESS)?;
+        let skip = at - first;
+        let take = left.min(items - skip);
+        match reading.words(table, at, take) {
+            Ok(words) => read_parts.push(ReadPart::Known(words)),
+            Err(Unavailable::Refused(code)) => return Err(code),
+            Err(Unavailable::Stale) => return Err(Exception::GATEWAY_TARGET),
+            Err(Unavailable::NotPolled) => read_parts.push(ReadPart::Object {
+                pdu: RequestPdu::Read {
+                    table,
+                    start: first,
+                    count: items,
+                },
+                skip: skip.into(),
+                take: take.into(),
+            }),
+        }
+        left -= take;
+        at = at.saturating_add(take);
+    }
+    Ok(Some(read_parts))
+}
+
+/// First address and number of items of the object that contains the address.
+fn object_around(table: Table, address: u16) -> Option<(u16, u16)> {
+    let (first, object) = [address, address.saturating_sub(1)]
+        .into_iter()
+        .find_map(|first| Some((first, Object::at(table, first)?)))?;
+    let items = object.items();
+    (address < first.checked_add(items)?).then_some((first, items))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_object_around_an_address() {
+        let around = [
+            (Table::Input, 0, Some((0, 2))),
+            (Table::Input, 1, Some((0, 2))),
+            (Table::Holding, 7, Some((6, 2))),
+            (Table::Holding, 509, Some((508, 2))),
+            (Table::Holding, 510, None),
+            (Table::Input, 511, None),
+            (Table::Input, 0x3FFF, None),
+            (Table::Input, 0x4000, Some((0x4000, 1))),
+            (Table::Input, 0x4001, Some((0x4001, 1))),
+            (Table::Coil, 3, Some((3, 1))),
+            (Table::Coil, 254, Some((254, 1))),
+            (Table::Coil, 255, None),
+            (Table::DiscreteInput, u16::MAX, None),
+        ];
+        for (table, address, expected) in around {
+            assert_eq!(object_around(table, address), expected, "{table} {address}");
+        }
+    }
+}

@@ -1,0 +1,24 @@
+//! The real program from outside: its commands and the gateway as processes, commanded by mbpoll and mosquitto.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests may panic"
+)]
+
+mod support;
+
+mod gateway {
+    mod bad_commands;
+    mod cli;
+    mod commands;
+    mod demo;
+    mod drive_access;
+    mod local_socket;
+    mod operators;
+    mod restart;
+    mod slow_log;
+    mod trace;
+    mod user_profiles;
+}

@@ -1,0 +1,179 @@
+//! A bus with its thread on a real port, and simulated drives behind it.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use drivegate::bus::{BusOptions, BusTask};
+use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
+use drivegate::codec::wire::Silence;
+use drivegate::codec::{LineFormat, Protocol};
+use drivegate::command::{Authority, CommandQueue, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::drive::profile::{Profile, Profiles};
+use drivegate::drive::{ModelPoint, State, Value};
+use drivegate::event::Events;
+use drivegate::line::Rs485;
+use drivegate::plant::{BusHandle, DriveHandle, Plant};
+use drivegate::sim::drive::DriveOptions;
+use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+
+use crate::support::process::PATIENCE;
+
+/// A reply that comes late on a busy machine still comes in time.
+const RESPONSE_TIMEOUT: Duration = Duration::from_secs(2);
+
+/// A bus, its simulated line, and the plant around it.
+pub(crate) struct Rig {
+    pub(crate) plant: Plant,
+    pub(crate) events: Events,
+    // The bus ends before its line.
+    pub(crate) bus: BusTask,
+    pub(crate) line: SimulatedBus,
+    _link: tempfile::TempDir,
+}
+
+/// Name of the drive at an address.
+pub(crate) fn drive(address: u8) -> String {
+    format!("drive-{address}")
+}
+
+/// How a rig differs from the usual one: one pseudo-terminal at 38400 8N1, process data every 10 ms.
+pub(crate) struct Setup {
+    pub(crate) drives: u8,
+    pub(crate) protocol: Protocol,
+    pub(crate) profile: Arc<Profile>,
+    /// Where the simulated line is; the bus opens that, unless `port` says otherwise.
+    pub(crate) endpoint: Option<EndpointOptions>,
+    pub(crate) port: Option<String>,
+    pub(crate) rs485: Rs485,
+    pub(crate) response_timeout: Duration,
+}
+
+impl Default for Setup {
+    fn default() -> Setup {
+        Setup {
+            drives: 1,
+            protocol: Protocol::ModbusRtu,
+            profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
+            endpoint: None,
+            port: None,
+            rs485: Rs485::Off,
+            response_timeout: RESPONSE_TIMEOUT,
+        }
+    }
+}
+
+impl Rig {
+    pub(crate) fn new() -> Rig {
+        Rig::of(Setup::default())
+    }
+
+    pub(crate) fn of(setup: Setup) -> Rig {
+        let baud = if setup.protocol == Protocol::N2 { 9600 } else { 38_400 };
+        let format = LineFormat::new(baud, "8N1").unwrap();
+        let link = tempfile::tempdir().unwrap();
+        let pty = EndpointOptions::Pty {
+            link: Some(link.path().join("line1")),
+        };
+        let drives = (1..=setup.drives).map(DriveOptions::nx).collect();
+        let rules = LineRules::of(setup.protocol, format);
+        let line = SimulatedBus::start(SimulatedBusOptions {
+            endpoint: setup.endpoint.unwrap_or(pty),
+            ..SimulatedBusOptions::new("line1", rules, drives)
+        });
+        let line = line.unwrap();
+        let spec = BusSpec {
+            name: "line1".to_string(),
+            port: setup.port.unwrap_or_else(|| line.address()),
+            protocol: setup.protocol,
+            format,
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_millis(500),
+        };
+        let image = |address| {
+            let spec = DriveSpec {
+                access: Access::Control,
+                turnaround: Duration::from_micros(500),
+                ..DriveSpec::new(&drive(address), "line1", address, setup.profile.clone())
+            };
+            // Nothing is stale because this machine is busy.
+            Arc::new(DriveImage::new(spec, Duration::from_millis(500)).with_stale_floor(PATIENCE))
+        };
+        let handle = BusHandle {
+            image: Arc::new(BusImage::new(spec, (1..=setup.drives).map(image).collect())),
+            queue: Arc::new(CommandQueue::new().unwrap()),
+        };
+        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let options = BusOptions {
+            response_timeout: setup.response_timeout,
+            retries: 1,
+            silence: Silence::Spec,
+            rs485: setup.rs485,
+        };
+        let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
+        let plant = Plant {
+            gateway: "test".to_string(),
+            stale_after: PATIENCE,
+            buses: vec![handle],
+            events: events.clone(),
+            writes,
+        };
+        Rig {
+            plant,
+            events,
+            bus,
+            line,
+            _link: link,
+        }
+    }
+
+    /// Waits until something holds.
+    pub(crate) async fn until(&self, what: &str, holds: impl Fn(&Rig) -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        while !holds(self) {
+            assert!(Instant::now() < deadline, "never came: {what}");
+            tokio::time::sleep(Duration::from_millis(5)).await;
+        }
+    }
+
+    pub(crate) fn handle(&self, address: u8) -> DriveHandle {
+        self.plant.drive(&drive(address)).unwrap()
+    }
+
+    /// One that is not known yet counts as offline.
+    pub(crate) fn state(&self, address: u8) -> State {
+        let state = self.handle(address).reading(Instant::now()).state();
+        state.unwrap_or(State::Offline)
+    }
+
+    pub(crate) fn good(&self, address: u8, point: ModelPoint) -> Option<Value> {
+        self.handle(address).reading(Instant::now()).model(point).good()
+    }
+
+    pub(crate) fn bus_up(&self) -> bool {
+        self.bus.handle().image.health().up
+    }
+
+    /// Sets points as one command.
+    pub(crate) async fn set(&self, address: u8, points: &[(&str, f64)]) -> Outcome {
+        let handle = self.handle(address);
+        let index = |name| handle.image.spec.profile.point_index(name).unwrap();
+        let values = points
+            .iter()
+            .map(|(name, value)| (index(name), Value::Number(*value)))
+            .collect();
+        let origin = Origin::new(SourceKind::Mqtt, "test");
+        handle
+            .place(
+                Order::Points(values),
+                origin,
+                Authority::Write,
+                PATIENCE,
+                Instant::now(),
+            )
+            .answered()
+            .await
+            .outcome
+    }
+}

@@ -1,0 +1,9 @@
+//! The HTTP interface against a hand-made plant, with plain clients, promtool, a real Prometheus and a
+//! real browser.
+
+mod client;
+mod interface;
+mod metrics;
+mod page;
+mod plant;
+mod streams;

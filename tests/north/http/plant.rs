@@ -1,0 +1,244 @@
+//! A plant made by hand: no bus runs, the images are filled here.
+
+use std::fmt::Write as _;
+use std::net::SocketAddr;
+use std::sync::Arc;
+use std::sync::atomic::Ordering;
+use std::time::{Duration, Instant, SystemTime};
+
+use arc_swap::ArcSwap;
+use drivegate::cache::{DriveImage, Link, Outcome, PollCycle};
+use drivegate::codec::{Exception, Protocol, Table};
+use drivegate::command::{self, Origin, SourceKind, Ticket};
+use drivegate::drive::model::Kind;
+use drivegate::drive::profile::Profiles;
+use drivegate::drive::{ModelPoint, Profile};
+use drivegate::event::{Event, EventKind};
+use drivegate::north::NorthStats;
+use drivegate::north::http::{self, Http, Options};
+use drivegate::plant::{BusHandle, Plant, SharedPlant};
+use tokio_util::sync::CancellationToken;
+
+use crate::north::plant;
+pub(crate) use crate::north::plant::nx;
+
+pub(crate) const STALE_AFTER: Duration = Duration::from_secs(60);
+
+/// A family that has every point of the model, and one of its own.
+pub(crate) fn everything() -> Arc<Profile> {
+    let mut text = "name = \"everything\"\nprotocols = [\"modbus-rtu\"]\n\
+        [[range]]\ntable = \"holding\"\nfirst = 0\nlast = 99\nread = 50\n"
+        .to_string();
+    for (address, point) in ModelPoint::ALL.iter().enumerate() {
+        let name = point.name();
+        if *point == ModelPoint::FrequencyReference {
+            text += "[[point]]\nname = \"frequency_reference\"\nderive = \"band\"\nof = \"speed_reference\"\n\
+                minimum = \"minimum_frequency\"\nmaximum = \"maximum_frequency\"\n";
+            continue;
+        }
+        let bit = if point.kind() == Kind::Bool { ".0" } else { "" };
+        writeln!(
+            text,
+            "[[point]]\nname = \"{name}\"\nat = \"holding {address}{bit}\"\nclass = \"fast\""
+        )
+        .unwrap();
+    }
+    for (name, address) in [("minimum_frequency", 40), ("maximum_frequency", 41)] {
+        writeln!(
+            text,
+            "[[point]]\nname = \"{name}\"\nat = \"holding {address}\"\nunit = \"Hz\"\nclass = \"once\""
+        )
+        .unwrap();
+    }
+    text += "[faults]\n7 = \"saturation trip\"\n";
+    Arc::new(Profile::parse("everything.toml", &text, false).expect("a valid profile"))
+}
+
+/// The words of the NX family that run at 25 Hz, by PDU address.
+pub(crate) fn nx_running(address: u16) -> u16 {
+    match address {
+        2100 => 0b0010_0011,
+        2101 => 1 << 13,
+        2102 => 5000,
+        2103 => 2500,
+        2104 => 1450,
+        2105 => 42,
+        2106 => 318,
+        2107 => 155,
+        2108 => 2001,
+        2109 => 560,
+        2000 => 1,
+        2002 => 5000,
+        7 => 41,
+        8 => 37,
+        101 => 5000,
+        102 | 103 => 30,
+        _ => 0,
+    }
+}
+
+/// The same with fault 7.
+pub(crate) fn nx_faulted(address: u16) -> u16 {
+    match address {
+        2100 => 0b1001_1000,
+        2102..=2108 => 0,
+        2110 => 7,
+        other => nx_running(other),
+    }
+}
+
+pub(crate) fn drive(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
+    plant::image(plant::spec(bus, name, address, profile))
+}
+
+pub(crate) fn bus(name: &str, drives: Vec<Arc<DriveImage>>) -> BusHandle {
+    plant::bus(name, Protocol::ModbusRtu, drives)
+}
+
+/// The drive answers, and all its points were read at `at`.
+pub(crate) fn answer(image: &DriveImage, at: Instant, word: impl Fn(u16) -> u16) {
+    image.update(|snapshot| {
+        snapshot.link = Link::Online(SystemTime::now());
+        snapshot.fast_at = Some(at);
+        for read in &image.plan.reads {
+            let words: Vec<u16> = (0..read.count).map(|i| word(read.start + i)).collect();
+            snapshot.store(read.table, read.start, &words, at);
+        }
+    });
+    image.count(Outcome::Ok);
+    image.set_turnaround(Duration::from_micros(1900));
+}
+
+/// The drive does not answer any more.
+pub(crate) fn silence(image: &DriveImage) {
+    image.update(|snapshot| snapshot.link = Link::Offline(SystemTime::now()));
+    image.count(Outcome::Timeout);
+}
+
+/// The port of the bus is open, and rounds were run.
+pub(crate) fn open(bus: &BusHandle) {
+    bus.image.update_health(|health| {
+        health.up = true;
+        health.tried = true;
+        health.since = Some(SystemTime::now());
+        health.load = 0.4375;
+        health.opened += 1;
+        let cycle = |ms, rounds| PollCycle {
+            last: Some(Duration::from_micros(ms)),
+            rounds,
+        };
+        health.fast = cycle(12_500, 800);
+        health.slow = cycle(1_000_000, 10);
+    });
+    bus.image.transactions.observe(Duration::from_millis(9));
+    bus.image.fast_cycles.observe(Duration::from_micros(12_500));
+    bus.image.slow_cycles.observe(Duration::from_secs(1));
+}
+
+pub(crate) fn plant(buses: Vec<BusHandle>) -> Plant {
+    plant::plant("pump-house", STALE_AFTER, buses)
+}
+
+pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
+    Event {
+        id: 0,
+        time: SystemTime::now(),
+        kind,
+        bus: "line1".to_string(),
+        drive: Some(drive.to_string()),
+        fault_code: (kind == EventKind::Fault).then_some(7),
+        text: text.to_string(),
+    }
+}
+
+/// A plant in which everything occurs: `pump-1` runs, `fan-2` is offline with old values, `mixer-3` was
+/// never tried, `saw-4` has a fault on a bus of its own.
+pub(crate) fn mixed() -> Plant {
+    let nx = nx();
+    let drives = vec![
+        drive("line1", "pump-1", 1, &nx),
+        drive("line1", "fan-2", 2, &nx),
+        drive("line1", "mixer-3", 3, &nx),
+    ];
+    let now = Instant::now();
+    answer(&drives[0], now, nx_running);
+    answer(&drives[1], now, nx_running);
+    silence(&drives[1]);
+    let saw = drive("line2", "saw-4", 4, &nx);
+    answer(&saw, now, nx_faulted);
+    let buses = vec![bus("line1", drives), bus("line2", vec![saw])];
+    buses.iter().for_each(open);
+    plant(buses)
+}
+
+/// A drive that answers, ready and without a fault, and refuses to say whether it runs.
+pub(crate) fn secretive() -> Arc<DriveImage> {
+    let cx = Profiles::built_in().get("vacon-cx").expect("built in").clone();
+    let image = drive("line1", "fan-1", 1, &cx);
+    answer(&image, Instant::now(), |address| u16::from(address == 1));
+    image.update(|s| s.refuse(Table::DiscreteInput, 2, 1, Exception::ADDRESS));
+    image
+}
+
+/// One command that was answered.
+pub(crate) fn count_a_write(plant: &Plant) {
+    let origin = Origin::new(SourceKind::Mqtt, "t");
+    let (ticket, _answer) = Ticket::new(
+        origin,
+        "pump-1",
+        "run=true".to_string(),
+        true,
+        Instant::now(),
+        plant.writes.clone(),
+    );
+    ticket.answer(command::Outcome::TimedOut, Instant::now() + Duration::from_millis(20));
+}
+
+/// Figures of all north sides.
+pub(crate) fn stats() -> Arc<NorthStats> {
+    let stats = NorthStats::default();
+    stats.modbus_tcp.connected();
+    stats.modbus_tcp.answered(3, 0);
+    stats.modbus_tcp.answered(6, 1);
+    stats.mqtt.connected.store(true, Ordering::Relaxed);
+    stats.mqtt.published.store(17, Ordering::Relaxed);
+    stats.mqtt.buffered.store(2, Ordering::Relaxed);
+    Arc::new(stats)
+}
+
+/// A served plant.
+pub(crate) struct Server {
+    pub(crate) shared: SharedPlant,
+    pub(crate) cancel: CancellationToken,
+    pub(crate) address: SocketAddr,
+    pub(crate) http: Http,
+}
+
+impl Server {
+    pub(crate) async fn of(plant: Plant) -> Server {
+        let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+        let cancel = CancellationToken::new();
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        let http = http::start(Options { listen }, shared.clone(), stats(), cancel.clone())
+            .await
+            .expect("it starts");
+        Server {
+            shared,
+            cancel,
+            address: http.address(),
+            http,
+        }
+    }
+
+    pub(crate) fn plant(&self) -> Arc<Plant> {
+        self.shared.load_full()
+    }
+
+    /// The drive of that name; it must exist.
+    pub(crate) fn image(&self, name: &str) -> Arc<DriveImage> {
+        self.plant().drive(name).expect("a drive").image
+    }
+}
+
+/// The table of all words that the hand-made drives have.
+pub(crate) const HOLDING: Table = Table::Holding;

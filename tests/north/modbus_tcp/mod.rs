@@ -1,0 +1,15 @@
+//! The Modbus TCP server over real sockets, with simulated buses behind it: every answer and exception of the
+//! contract, bad input of all kinds, and independent clients.
+
+mod answers;
+mod bad_input;
+mod commands;
+mod connections;
+mod load;
+mod map;
+mod offline;
+mod peers;
+mod requests;
+mod rig;
+mod second_opinion;
+mod tls;

@@ -1,0 +1,118 @@
+//! The server without sockets: in virtual time, without a runtime.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use arc_swap::ArcSwap;
+use drivegate::codec::{RequestPdu, Table};
+use drivegate::command::{Authority, Command, Order};
+use drivegate::north::modbus_tcp::Offline;
+use drivegate::plant::{Plant, SharedPlant};
+
+use super::rig::{acknowledge, frame, n2_plant, options, plant, registers, words};
+use crate::north::plant::take_next;
+
+struct Bench {
+    plant: SharedPlant,
+    client: Offline,
+    now: Instant,
+}
+
+impl Bench {
+    fn of(plant: Plant) -> Bench {
+        let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
+        let peer = ([10, 0, 0, 9], 4711).into();
+        Bench {
+            client: Offline::new(options(), plant.clone(), Arc::default(), peer, Authority::Write),
+            plant,
+            // No clock of this machine is there yet.
+            now: Instant::now() + Duration::from_secs(600),
+        }
+    }
+
+    fn pop(&self) -> Option<Command> {
+        take_next(&self.plant.load().buses[0].queue, self.now)
+    }
+
+    /// The drive takes the next order, which this gives.
+    fn serve(&self) -> Order {
+        let command = self.pop().unwrap();
+        let (order, outcome) = (command.order.clone(), acknowledge(&command));
+        command.ticket.answer(outcome, self.now);
+        order
+    }
+
+    fn receive(&mut self, bytes: &[u8]) -> Vec<u8> {
+        self.client.receive(bytes, self.now)
+    }
+}
+
+#[test]
+fn orders_are_queued_when_the_call_returns_and_end_by_the_time_that_is_told() {
+    let mut bench = Bench::of(plant());
+    let mut batch = frame(1, 1, &words(6, &[0x8101, 1000]));
+    batch.extend(frame(2, 1, &words(6, &[0x8100, 1])));
+    batch.extend(frame(3, 1, &words(3, &[2102, 1])));
+    let read = frame(3, 1, &registers(3, &[5000]));
+    assert_eq!(bench.receive(&batch), read, "the cache answers at once");
+    assert_eq!(bench.plant.load().buses[0].queue.lock().len(), 2);
+    let first = bench.pop().unwrap();
+    assert_eq!(first.ticket.client(), "modbus_tcp 10.0.0.9");
+    assert_eq!(first.expires, bench.now + Duration::from_secs(2));
+    let outcome = acknowledge(&first);
+    first.ticket.answer(outcome, bench.now);
+    assert_eq!(bench.receive(&[]), frame(1, 1, &words(6, &[0x8101, 1000])));
+    bench.now += Duration::from_secs(2);
+    assert!(bench.pop().is_none());
+    assert_eq!(bench.receive(&[]), frame(2, 1, &[0x86, 0x0B]));
+    assert!(!bench.client.is_waiting());
+}
+
+#[test]
+fn the_next_piece_of_a_read_is_queued_when_the_last_one_is_finished() {
+    let mut bench = Bench::of(n2_plant());
+    assert!(bench.receive(&frame(7, 1, &words(2, &[5, 4]))).is_empty());
+    let piece = |start| {
+        Order::Read(RequestPdu::Read {
+            table: Table::DiscreteInput,
+            start,
+            count: 1,
+        })
+    };
+    assert_eq!(bench.serve(), piece(7));
+    assert!(bench.pop().is_none(), "one at a time");
+    bench.now += Duration::from_secs(1);
+    assert!(bench.receive(&[]).is_empty());
+    let second = bench.pop().unwrap();
+    assert_eq!(second.order, piece(8));
+    assert_eq!(
+        second.expires,
+        bench.now + Duration::from_secs(2),
+        "each has its own time"
+    );
+    let outcome = acknowledge(&second);
+    second.ticket.answer(outcome, bench.now);
+    assert_eq!(bench.receive(&[]), frame(7, 1, &[2, 1, 0b0011]));
+}
+
+#[test]
+fn clients_of_one_server_share_the_command_word() {
+    let mut bench = Bench::of(plant());
+    let mut other = bench
+        .client
+        .beside(([10, 0, 0, 10], 4711).into(), None, Authority::Write);
+    bench.receive(&frame(1, 1, &words(6, &[0x8100, 0])));
+    bench.serve();
+    let reset = frame(2, 1, &words(6, &[0x8100, 4]));
+    bench.receive(&reset);
+    let Order::Points(first) = bench.serve() else {
+        panic!("a command")
+    };
+    assert!(other.receive(&reset, bench.now).is_empty());
+    let second = bench.pop().unwrap();
+    assert_eq!(second.ticket.client(), "modbus_tcp 10.0.0.10");
+    let Order::Points(second) = second.order else {
+        panic!("a command")
+    };
+    assert_eq!(second.len() + 1, first.len(), "the reset was given by the first client");
+}

@@ -1,0 +1,340 @@
+//! The set topics.
+
+use std::time::Duration;
+
+use drivegate::drive::Value;
+use drivegate::event::EventKind;
+
+use super::bench::*;
+
+const SET: &str = "drivegate/hall/drive/p1/set";
+const RESULT: &str = "drivegate/hall/drive/p1/result";
+const EVENT: &str = "drivegate/hall/drive/p1/event";
+
+struct Bench {
+    broker: Broker,
+    gateway: Gateway,
+    watcher: Watcher,
+}
+
+/// Drives `p1`, which may be commanded, and `m1`, which may not; connected.
+fn bench() -> Bench {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "#");
+    let gateway = Gateway::start(options(broker.port), plant(&["p1", "m1"]));
+    watcher.wait_payload("drivegate/hall/status", "online");
+    Bench {
+        broker,
+        gateway,
+        watcher,
+    }
+}
+
+impl Bench {
+    /// The result of one message.
+    fn result(&self, topic: &str, payload: &str, more: &[&str]) -> serde_json::Value {
+        self.watcher.clear();
+        self.broker.publish(topic, payload, more);
+        let result = self.watcher.wait("the result", |m| m.topic.ends_with("/result"));
+        assert!(!result.retain && result.qos == 1);
+        result.json()
+    }
+}
+
+#[test]
+fn an_object_becomes_one_order() {
+    let bench = bench();
+    let result = bench.result(SET, r#"{"id": "a7", "run": true, "speed_reference": 50}"#, &[]);
+    assert_eq!((&result["id"], &result["ok"]), (&"a7".into(), &true.into()));
+    assert_eq!(result["result"], "acknowledged");
+    assert!(result["latency_ms"].as_f64().is_some_and(|ms| ms >= 0.0) && result.get("error").is_none());
+    let orders = bench.gateway.ordered();
+    assert_eq!(orders.len(), 1, "one command: {orders:?}");
+    let expected = [
+        ("run".to_string(), Value::Bool(true)),
+        ("speed_reference".to_string(), Value::Number(50.0)),
+    ];
+    assert_eq!((orders[0].0, orders[0].1.as_slice()), (0, expected.as_slice()));
+    assert!(orders[0].2 <= Duration::from_secs(2), "2 s unless told otherwise");
+    bench.gateway.stop();
+}
+
+#[test]
+fn bare_values_set_one_point() {
+    let bench = bench();
+    for (point, payload, value) in [
+        ("run", "true", Value::Bool(true)),
+        ("run", "0", Value::Bool(false)),
+        ("fault_reset", "1", Value::Bool(true)),
+        ("speed_reference", "33.3", Value::Number(33.3)),
+    ] {
+        let result = bench.result(&format!("{SET}/{point}"), payload, &[]);
+        assert_eq!((&result["ok"], &result["id"]), (&true.into(), &serde_json::Value::Null));
+        assert_eq!(bench.gateway.ordered().last().unwrap().1, [(point.to_string(), value)]);
+    }
+    bench.gateway.stop();
+}
+
+#[test]
+fn messages_of_a_topic_keep_their_order() {
+    let bench = bench();
+    let run = format!("{SET}/run");
+    let pairs = ["true", "false"].repeat(40);
+    bench.gateway.while_held(|| bench.broker.publish_all(&run, &pairs));
+    bench.watcher.wait_count(RESULT, 80);
+    let orders: Vec<bool> = bench
+        .gateway
+        .ordered()
+        .iter()
+        .map(|order| order.1[0].1.as_bool())
+        .collect();
+    assert_eq!(
+        orders.last(),
+        Some(&false),
+        "the last one published was a stop: {orders:?}"
+    );
+    assert!(
+        !orders.windows(2).any(|pair| pair == [true, true]),
+        "each run had its stop: {orders:?}"
+    );
+    bench.gateway.stop();
+}
+
+#[test]
+fn references_of_a_topic_keep_their_order() {
+    let bench = bench();
+    let values: Vec<String> = (1..=79).map(|percent| percent.to_string()).collect();
+    let payloads: Vec<&str> = values.iter().map(String::as_str).collect();
+    let topic = format!("{SET}/speed_reference");
+    bench.gateway.while_held(|| bench.broker.publish_all(&topic, &payloads));
+    bench.watcher.wait_count(RESULT, 79);
+    let written: Vec<f64> = bench
+        .gateway
+        .ordered()
+        .iter()
+        .filter_map(|order| match order.1[0].1 {
+            Value::Number(percent) => Some(percent),
+            _ => None,
+        })
+        .collect();
+    assert!(written.is_sorted(), "{written:?}");
+    assert_eq!(
+        written.last(),
+        Some(&79.0),
+        "the last one published is the last one written"
+    );
+    bench.gateway.stop();
+}
+
+#[test]
+fn a_response_topic_gets_the_result_with_its_correlation() {
+    let bench = bench();
+    let output = bench.broker.run(
+        "mosquitto_rr",
+        &[
+            "-t",
+            SET,
+            "-e",
+            "clients/7/answers",
+            "-m",
+            r#"{"id": 9, "run": true}"#,
+            "-D",
+            "PUBLISH",
+            "correlation-data",
+            "c-0815",
+            "-F",
+            "%t|%D|%p",
+            "-W",
+            "10",
+        ],
+    );
+    let text = String::from_utf8(output.stdout).unwrap();
+    let parts: Vec<&str> = text.trim().splitn(3, '|').collect();
+    assert_eq!(parts[..2], ["clients/7/answers", "c-0815"], "{text}");
+    let result: serde_json::Value = serde_json::from_str(parts[2]).unwrap();
+    assert_eq!((&result["id"], &result["ok"]), (&9.into(), &true.into()));
+    bench.watcher.wait("the answer", |m| m.topic == "clients/7/answers");
+    assert!(bench.watcher.payloads(RESULT).is_empty(), "it goes there, not here");
+    bench.gateway.stop();
+}
+
+#[test]
+fn expiry_by_field_and_by_message() {
+    let bench = bench();
+    bench.result(SET, r#"{"run": true, "expires_ms": 30000}"#, &[]);
+    let life = bench.gateway.ordered().last().unwrap().2;
+    assert!(life > Duration::from_secs(3), "{life:?}");
+    bench.result(
+        SET,
+        r#"{"run": true, "expires_ms": 30000}"#,
+        &["-D", "PUBLISH", "message-expiry-interval", "3"],
+    );
+    let life = bench.gateway.ordered().last().unwrap().2;
+    assert!(life <= Duration::from_secs(3), "{life:?}");
+    bench.gateway.stop();
+}
+
+#[test]
+fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
+    let bench = bench();
+    let long = format!(r#"{{"run": true, "id": "{}"}}"#, "x".repeat(70_000));
+    let file = bench.broker.dir.path().join("long");
+    std::fs::write(&file, long).unwrap();
+    for (topic, payload, code, text) in [
+        (SET, "run", "bad_value", "is not JSON"),
+        (SET, "", "bad_value", "is not JSON"),
+        (SET, "[true]", "bad_value", "is not a JSON object"),
+        (SET, "{}", "bad_value", "names no point"),
+        (
+            SET,
+            r#"{"sped_reference": 10}"#,
+            "not_writable",
+            "did you mean `speed_reference`?",
+        ),
+        (
+            SET,
+            r#"{"run": true, "ready": true}"#,
+            "not_writable",
+            "`ready` is read-only",
+        ),
+        (SET, r#"{"speed_reference": "10"}"#, "bad_value", "remove the quotes"),
+        (
+            SET,
+            r#"{"speed_reference": 80.1}"#,
+            "bad_value",
+            "outside the limits 0 to 80",
+        ),
+        (SET, r#"{"speed_reference": NaN}"#, "bad_value", "is not JSON"),
+        (
+            SET,
+            r#"{"run": true, "expires_ms": -1}"#,
+            "bad_value",
+            "`expires_ms` = -1",
+        ),
+        (
+            "drivegate/hall/drive/p1/set/speed_reference",
+            "nan",
+            "bad_value",
+            "not true, false or a number",
+        ),
+        (
+            "drivegate/hall/drive/p1/set/spedreference",
+            "1",
+            "not_writable",
+            "did you mean",
+        ),
+        (
+            "drivegate/hall/drive/m1/set",
+            r#"{"run": true}"#,
+            "not_allowed",
+            "only monitored",
+        ),
+    ] {
+        // Refusals are told at ten a second for each drive.
+        std::thread::sleep(Duration::from_millis(110));
+        let result = bench.result(topic, payload, &[]);
+        assert_eq!(result["ok"], false);
+        assert_eq!(result["error"]["code"], code, "{payload}: {result}");
+        let message = result["error"]["message"].as_str().unwrap();
+        assert!(message.contains(text), "{payload}: {message}");
+        let event = bench.watcher.wait("the event", |m| m.topic.ends_with("/event"));
+        assert_eq!(event.json()["event"], "refused_command");
+        assert!(event.json()["text"].as_str().unwrap().contains(topic));
+    }
+    let unknown = bench.result("drivegate/hall/drive/p2/set", r#"{"run": true}"#, &[]);
+    assert_eq!(
+        (&unknown["error"]["code"], &unknown["drive"]),
+        (&"unknown_drive".into(), &"p2".into())
+    );
+    bench.watcher.clear();
+    let output = bench
+        .broker
+        .run("mosquitto_pub", &["-q", "1", "-t", SET, "-f", file.to_str().unwrap()]);
+    assert!(output.status.success(), "{output:?}");
+    let result = bench.watcher.wait("the result", |m| m.topic == RESULT).json();
+    assert!(
+        result["error"]["message"]
+            .as_str()
+            .unwrap()
+            .contains("65536 are allowed"),
+        "{result}"
+    );
+    assert_eq!(bench.gateway.ordered(), []);
+    bench.gateway.stop();
+}
+
+#[test]
+fn retained_messages_are_never_commands() {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "#");
+    // Retained before the gateway is there.
+    broker.publish(SET, r#"{"id": 1, "run": true}"#, &["-r"]);
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    let event = watcher.wait("the first event", |m| m.topic == EVENT).json();
+    assert_eq!(event["event"], "refused_command");
+    assert!(event["text"].as_str().unwrap().contains("retained"), "{event}");
+    // Retained while it is connected.
+    watcher.clear();
+    broker.publish("drivegate/hall/drive/p1/set/run", "true", &["-r"]);
+    watcher.wait("the second event", |m| {
+        m.topic == EVENT && m.payload.contains("retained")
+    });
+    // Retained, when the gateway comes again.
+    watcher.clear();
+    gateway.stop();
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    wait_for("both to be refused again", || {
+        (watcher.payloads(EVENT).len() == 2).then_some(())
+    });
+    // Clearing them is no command either; and a real command still works.
+    watcher.clear();
+    let cleared = broker.run("mosquitto_pub", &["-q", "1", "-t", SET, "-r", "-n"]);
+    assert!(cleared.status.success());
+    broker.publish("drivegate/hall/drive/p1/set/run", "false", &[]);
+    watcher.wait("the result", |m| m.topic == RESULT && m.payload.contains("\"ok\":true"));
+    assert_eq!(watcher.payloads(EVENT).len(), 0);
+    let orders = gateway.ordered();
+    assert_eq!(orders.len(), 1);
+    assert_eq!(orders[0].1, [("run".to_string(), Value::Bool(false))]);
+    gateway.stop();
+}
+
+#[test]
+fn without_commands_nothing_is_listened_to() {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "#");
+    let mut options = options(broker.port);
+    options.commands = false;
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    watcher.wait_payload("drivegate/hall/status", "online");
+    broker.publish(SET, r#"{"run": true}"#, &[]);
+    broker.publish(&format!("{SET}/run"), "true", &[]);
+    // An event told afterwards arrives: had there been an answer to the commands, it would be here.
+    gateway.tell("p1", EventKind::Online, "afterwards");
+    watcher.wait("the event", |m| m.payload.contains("afterwards"));
+    assert_eq!((gateway.ordered().len(), watcher.payloads(RESULT).len()), (0, 0));
+    assert_eq!(watcher.payloads(EVENT).len(), 1);
+    gateway.stop();
+}
+
+#[test]
+fn many_commands_are_all_answered() {
+    let bench = bench();
+    let lines: String = (0..200).map(|n| format!("{{\"id\": {n}, \"run\": true}}\n")).collect();
+    let file = bench.broker.dir.path().join("lines");
+    std::fs::write(&file, lines).unwrap();
+    let port = bench.broker.port.to_string();
+    let mut child = std::process::Command::new("mosquitto_pub")
+        .args(["-V", "5", "-h", "127.0.0.1", "-p", &port, "-q", "1", "-t", SET, "-l"])
+        .stdin(std::fs::File::open(&file).unwrap())
+        .spawn()
+        .unwrap();
+    assert!(child.wait().unwrap().success());
+    let results = bench.watcher.wait_count(RESULT, 200);
+    let mut ids: Vec<u64> = results.iter().map(|r| r.json()["id"].as_u64().unwrap()).collect();
+    ids.sort_unstable();
+    assert_eq!(ids, (0..200).collect::<Vec<_>>());
+    let done = results.iter().filter(|r| r.json()["ok"] == true).count();
+    assert_eq!(bench.gateway.ordered().len(), done, "one order for each that was taken");
+    bench.gateway.stop();
+}

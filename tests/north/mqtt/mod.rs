@@ -1,0 +1,7 @@
+//! The MQTT client against Debian's Mosquitto and its clients.
+
+mod bench;
+mod commands;
+mod delivery;
+mod telemetry;
+mod tls;

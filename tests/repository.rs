@@ -1,0 +1,17 @@
+//! What ships: every configuration, the documents, the house of the sources, what is packaged around the program.
+#![allow(
+    clippy::unwrap_used,
+    clippy::expect_used,
+    clippy::panic,
+    clippy::indexing_slicing,
+    reason = "tests may panic"
+)]
+
+mod support;
+
+mod repository {
+    mod config;
+    mod documents;
+    mod layering;
+    mod packaging;
+}

@@ -1,0 +1,206 @@
+//! What the documents say is true: commands, links, and every configuration they show.
+
+mod drives;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+
+use crate::support::tools::{root, run_well};
+use tempfile::TempDir;
+
+const DRIVEGATE: &str = env!("CARGO_BIN_EXE_drivegate");
+
+fn read(path: &Path) -> String {
+    fs::read_to_string(path).unwrap_or_else(|error| panic!("{}: {error}", path.display()))
+}
+
+/// The documents for people.
+fn documents() -> Vec<PathBuf> {
+    let mut found = vec![root().join("README.md"), root().join("CHANGELOG.md")];
+    found.extend(files(&root().join("docs"), "md"));
+    found
+}
+
+/// All files below `dir` with that extension.
+fn files(dir: &Path, extension: &str) -> Vec<PathBuf> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            found.extend(files(&path, extension));
+        } else if path.extension().is_some_and(|e| e == extension) {
+            found.push(path);
+        }
+    }
+    found.sort();
+    found
+}
+
+/// The fenced blocks of that language.
+fn blocks(text: &str, language: &str) -> Vec<String> {
+    let opening = format!("\n```{language}\n");
+    let inside = text.split(&opening).skip(1);
+    inside
+        .map(|rest| rest.split("\n```").next().unwrap().to_string() + "\n")
+        .collect()
+}
+
+#[test]
+fn every_configuration_that_ships_is_valid() {
+    let mut configurations = files(&root().join("deploy"), "toml");
+    assert!(configurations.len() >= 2);
+    let dir = TempDir::new().unwrap();
+    // The certificates that the documentation makes beside its configuration.
+    let (script, tls) = (
+        root().join("docs/modbus-tls-ca.sh"),
+        dir.path().join("tls").display().to_string(),
+    );
+    run_well(&script, &[&tls, "ca"]);
+    run_well(
+        &script,
+        &[&tls, "server", "gateway", "pump-house.example", "192.168.1.5"],
+    );
+    for document in documents() {
+        for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
+            if is_profile(block) {
+                continue;
+            }
+            let name = document.file_stem().unwrap().to_string_lossy().into_owned();
+            let path = dir.path().join(format!("{name}-{i}.toml"));
+            // A block that shows one section stands in a file that has the others.
+            let head = if block.contains("[gateway]") {
+                ""
+            } else {
+                "[gateway]\nname = \"g\"\n\n"
+            };
+            // The directory of an installation is not there.
+            let profiles = dir.path().join("profiles");
+            fs::create_dir_all(&profiles).unwrap();
+            let block = block.replace("/etc/drivegate/profiles", &profiles.display().to_string());
+            fs::write(&path, format!("{head}{block}")).unwrap();
+            configurations.push(path);
+        }
+    }
+    for path in configurations {
+        run_well(
+            Path::new(DRIVEGATE),
+            &["check", "--config", &path.display().to_string()],
+        );
+    }
+}
+
+fn is_profile(block: &str) -> bool {
+    let named = block.contains("\nbase = ") || block.contains("\nprotocols = ");
+    named && !block.contains("[mqtt]") || block.starts_with("[n2]")
+}
+
+#[test]
+fn every_profile_that_is_shown_is_sound() {
+    let dir = TempDir::new().unwrap();
+    let all = documents().into_iter().flat_map(|page| blocks(&read(&page), "toml"));
+    let shown: Vec<String> = all.filter(|b| is_profile(b)).collect();
+    assert!(shown.len() >= 5);
+    for (i, mut block) in shown.into_iter().enumerate() {
+        // A block that shows one section stands in a profile.
+        if block.starts_with("[n2]") {
+            block = format!("name = \"n2-{i}\"\nbase = \"vacon-nx-n2\"\n{block}");
+        }
+        fs::write(dir.path().join(format!("{i}.toml")), block).unwrap();
+    }
+    let listed = run_well(
+        Path::new(DRIVEGATE),
+        &["profiles", "--profile-dir", &dir.path().display().to_string()],
+    );
+    for name in ["our-hvx", "our-cx", "our-nx", "energy-meter"] {
+        assert!(listed.contains(name), "{listed}");
+    }
+}
+
+/// Puts `text` between the comment `<!-- name -->` and the next `<!-- end -->` of a page, or fails where it is not
+/// there. `DRIVEGATE_WRITE_DOCS=1` writes the page instead.
+fn generated(page: &str, name: &str, text: &str) {
+    let path = root().join("docs").join(page);
+    let old = read(&path);
+    let start = format!("<!-- {name} -->\n");
+    let (head, rest) = old.split_once(&start).unwrap();
+    let (_, tail) = rest.split_once("<!-- end -->").unwrap();
+    let new = format!("{head}{start}{text}<!-- end -->{tail}");
+    if std::env::var_os("DRIVEGATE_WRITE_DOCS").is_some() {
+        fs::write(&path, new).unwrap();
+    } else {
+        assert!(
+            old == new,
+            "docs/{page} is not what the profiles say; run DRIVEGATE_WRITE_DOCS=1 cargo test --test repository documents"
+        );
+    }
+}
+
+#[test]
+fn the_page_of_profiles_quotes_the_energy_meter() {
+    let meter = read(&root().join("docs/energy-meter.toml"));
+    generated(
+        "profiles.md",
+        "energy-meter.toml",
+        &format!("\n```toml\n{meter}```\n\n"),
+    );
+}
+
+#[test]
+fn the_page_of_drives_says_what_the_profiles_deliver() {
+    generated("drives.md", "tables", &drives::tables());
+}
+
+#[test]
+fn the_readme_quotes_the_shipped_configuration() {
+    let quoted = blocks(&read(&root().join("README.md")), "toml");
+    assert_eq!(quoted, [read(&root().join("deploy/drivegate.toml"))]);
+}
+
+#[test]
+fn the_two_commands_of_the_readme_exist() {
+    let readme = read(&root().join("README.md"));
+    assert!(readme.contains("\ncargo run --release -- demo "));
+    assert!(readme.contains("\nmake test "));
+    let makefile = read(&root().join("Makefile"));
+    assert!(makefile.contains("\ntest: "));
+    let ci = read(&root().join(".ci/run"));
+    assert!(ci.contains("make test"), "CI runs the same command");
+}
+
+#[test]
+fn the_commands_of_the_readme_exist() {
+    let readme = read(&root().join("README.md"));
+    let rows = readme.lines().filter_map(|line| line.strip_prefix("| `drivegate "));
+    let commands: Vec<&str> = rows
+        .map(|row| row.split(|c: char| !c.is_ascii_alphanumeric()).next().unwrap())
+        .collect();
+    assert!(commands.len() >= 7, "{commands:?}");
+    for command in commands {
+        let help = run_well(Path::new(DRIVEGATE), &[command, "--help"]);
+        assert!(help.contains(&format!("Usage: drivegate {command}")), "{help}");
+    }
+}
+
+/// Somebody who looks for a page must find it.
+#[test]
+fn the_index_names_every_page() {
+    let index = read(&root().join("docs/README.md"));
+    for page in files(&root().join("docs"), "md") {
+        let name = page.file_name().unwrap().to_string_lossy().into_owned();
+        assert!(name == "README.md" || index.contains(&format!("]({name})")), "{name}");
+    }
+}
+
+#[test]
+fn links_lead_somewhere() {
+    for document in documents() {
+        let text = read(&document);
+        for link in text.split("](").skip(1).map(|rest| rest.split(')').next().unwrap()) {
+            if link.starts_with("http") {
+                continue;
+            }
+            let target = document.parent().unwrap().join(link.split('#').next().unwrap());
+            assert!(target.exists(), "{}: {link}", document.display());
+        }
+    }
+}

@@ -1,0 +1,289 @@
+//! What ships around the binary: service unit, image, compose file, dashboard, alert rules.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::net::TcpStream;
+
+use crate::support::process::{Running, until};
+use crate::support::site::Site;
+use crate::support::tools::{python, root, run_well, tool};
+use serde_json::Value;
+use tempfile::TempDir;
+
+/// The metrics of the public contract; dashboards and alerts of users hang on these names.
+const METRICS: [&str; 38] = [
+    "drivegate_drive_up",
+    "drivegate_drive_state",
+    "drivegate_drive_sample_age_seconds",
+    "drivegate_drive_output_frequency_hertz",
+    "drivegate_drive_motor_speed_rpm",
+    "drivegate_drive_motor_current_amperes",
+    "drivegate_drive_motor_torque_percent",
+    "drivegate_drive_motor_power_percent",
+    "drivegate_drive_motor_voltage_volts",
+    "drivegate_drive_dc_link_voltage_volts",
+    "drivegate_drive_heatsink_temperature_celsius",
+    "drivegate_drive_energy_kilowatthours",
+    "drivegate_drive_operating_hours",
+    "drivegate_drive_fault_code",
+    "drivegate_drive_ready",
+    "drivegate_drive_running",
+    "drivegate_drive_reversed",
+    "drivegate_drive_fault",
+    "drivegate_drive_warning",
+    "drivegate_drive_at_reference",
+    "drivegate_drive_speed_reference_percent",
+    "drivegate_drive_actual_speed_percent",
+    "drivegate_point_value",
+    "drivegate_drive_transactions_total",
+    "drivegate_drive_turnaround_seconds",
+    "drivegate_bus_up",
+    "drivegate_bus_load_ratio",
+    "drivegate_bus_queue_depth",
+    "drivegate_writes_total",
+    "drivegate_modbus_tcp_connections",
+    "drivegate_modbus_tcp_requests_total",
+    "drivegate_mqtt_connected",
+    "drivegate_mqtt_published_total",
+    "drivegate_mqtt_buffered_messages",
+    "drivegate_build_info",
+    "drivegate_bus_cycle_seconds_bucket",
+    "drivegate_bus_transaction_seconds_bucket",
+    "drivegate_write_seconds_bucket",
+];
+
+/// What the dashboard has to show.
+const SHOWN: [&str; 15] = [
+    "drivegate_drive_up",
+    "drivegate_drive_state",
+    "drivegate_drive_actual_speed_percent",
+    "drivegate_drive_motor_current_amperes",
+    "drivegate_drive_motor_torque_percent",
+    "drivegate_drive_motor_power_percent",
+    "drivegate_drive_dc_link_voltage_volts",
+    "drivegate_drive_heatsink_temperature_celsius",
+    "drivegate_bus_up",
+    "drivegate_bus_load_ratio",
+    "drivegate_bus_cycle_seconds_bucket",
+    "drivegate_drive_transactions_total",
+    "drivegate_writes_total",
+    "drivegate_modbus_tcp_requests_total",
+    "drivegate_mqtt_connected",
+];
+
+const DASHBOARD: &str = "deploy/compose/grafana/dashboards/drivegate.json";
+const ALERTS: &str = "deploy/compose/prometheus/alerts.yml";
+
+fn read(path: &str) -> String {
+    fs::read_to_string(root().join(path)).unwrap_or_else(|error| panic!("{path}: {error}"))
+}
+
+/// The shipped unit with the path of the binary under test.
+fn unit(dir: &TempDir) -> String {
+    let text = read("systemd/drivegate.service");
+    let start = "ExecStart=/usr/bin/drivegate run";
+    assert!(text.contains(start), "the unit starts something else");
+    let text = text.replace("/usr/bin/drivegate", env!("CARGO_BIN_EXE_drivegate"));
+    let path = dir.path().join("drivegate.service");
+    fs::write(&path, text).unwrap();
+    path.display().to_string()
+}
+
+#[test]
+fn the_unit_is_clean() {
+    let dir = TempDir::new().unwrap();
+    let analyze = tool("systemd-analyze");
+    let printed = run_well(&analyze, &["verify", "--man=no", "--recursive-errors=no", &unit(&dir)]);
+    let complaints: Vec<&str> = printed.lines().filter(|line| line.contains("drivegate")).collect();
+    assert!(complaints.is_empty(), "{complaints:#?}");
+}
+
+/// 0 is locked up entirely, 100 not at all; what is left is the network, the serial ports and their group.
+#[test]
+fn the_unit_is_sandboxed() {
+    // 1.6 without the real time of the line's thread, which costs two entries.
+    let dir = TempDir::new().unwrap();
+    let arguments = [
+        "security",
+        "--offline=true",
+        "--no-pager",
+        "--threshold=18",
+        &unit(&dir),
+    ];
+    run_well(&tool("systemd-analyze"), &arguments);
+}
+
+#[test]
+fn prometheus_takes_its_configuration_and_the_alerts_do_what_they_say() {
+    let promtool = tool("promtool");
+    run_well(
+        &promtool,
+        &["check", "config", "deploy/compose/prometheus/prometheus.yml"],
+    );
+    run_well(&promtool, &["check", "rules", ALERTS]);
+    run_well(
+        &promtool,
+        &["test", "rules", "deploy/compose/prometheus/alerts_test.yml"],
+    );
+}
+
+fn metrics_in(text: &str) -> BTreeSet<String> {
+    let word = |c: char| c.is_ascii_alphanumeric() || c == '_';
+    text.split(|c| !word(c))
+        .filter(|w| w.starts_with("drivegate_"))
+        .map(str::to_string)
+        .collect()
+}
+
+fn expressions(dashboard: &Value) -> Vec<String> {
+    let panels = dashboard["panels"].as_array().unwrap();
+    let targets = panels.iter().filter_map(|panel| panel["targets"].as_array()).flatten();
+    targets
+        .map(|target| target["expr"].as_str().unwrap().to_string())
+        .collect()
+}
+
+#[test]
+fn dashboard_and_alerts_use_metrics_that_exist() {
+    let known: BTreeSet<String> = METRICS.iter().map(ToString::to_string).collect();
+    let dashboard: Value = serde_json::from_str(&read(DASHBOARD)).unwrap();
+    let mut queries = expressions(&dashboard);
+    for variable in dashboard["templating"]["list"].as_array().unwrap() {
+        queries.push(variable["query"].to_string());
+    }
+    let shown = metrics_in(&queries.join("\n"));
+    let unknown: Vec<_> = shown.difference(&known).collect();
+    assert!(unknown.is_empty(), "{DASHBOARD}: {unknown:?}");
+    let missing: Vec<_> = SHOWN.iter().filter(|metric| !shown.contains(**metric)).collect();
+    assert!(missing.is_empty(), "{DASHBOARD} does not show {missing:?}");
+
+    // Label values such as a file name may begin like a metric; expressions are what counts.
+    let alerts = yaml(ALERTS);
+    let rules = alerts["groups"][0]["rules"].as_array().unwrap();
+    let expressions: Vec<&str> = rules.iter().map(|rule| rule["expr"].as_str().unwrap()).collect();
+    let unknown: Vec<_> = metrics_in(&expressions.join("\n"))
+        .into_iter()
+        .filter(|m| !known.contains(m))
+        .collect();
+    assert!(unknown.is_empty(), "{ALERTS}: {unknown:?}");
+}
+
+#[test]
+fn the_expressions_of_the_dashboard_are_sound() {
+    let dashboard: Value = serde_json::from_str(&read(DASHBOARD)).unwrap();
+    let panels = dashboard["panels"].as_array().unwrap();
+    let ids: BTreeSet<i64> = panels.iter().map(|panel| panel["id"].as_i64().unwrap()).collect();
+    assert_eq!(ids.len(), panels.len(), "two panels have the same id");
+    let expressions = expressions(&dashboard);
+    assert!(expressions.len() > 20, "only {} expressions", expressions.len());
+    let rules: Vec<Value> = expressions
+        .iter()
+        .enumerate()
+        .map(|(i, expression)| {
+            let plain = expression.replace("$__rate_interval", "1m");
+            serde_json::json!({ "record": format!("expression:{i}"), "expr": plain })
+        })
+        .collect();
+    let dir = TempDir::new().unwrap();
+    let file = dir.path().join("rules.yml");
+    // JSON is YAML.
+    let text = serde_json::json!({ "groups": [{ "name": "dashboard", "rules": rules }] }).to_string();
+    fs::write(&file, text).unwrap();
+    run_well(&tool("promtool"), &["check", "rules", &file.display().to_string()]);
+}
+
+fn yaml(path: &str) -> Value {
+    let script = "import json, sys, yaml; json.dump(yaml.safe_load(open(sys.argv[1])), sys.stdout)";
+    let printed = run_well(&python(), &["-c", script, path]);
+    serde_json::from_str(&printed).unwrap_or_else(|error| panic!("{path}: {error}: {printed}"))
+}
+
+#[test]
+fn what_compose_mounts_and_publishes_is_there() {
+    let compose = yaml("deploy/compose.yaml");
+    let image = read("deploy/Dockerfile");
+    let exposed = image.lines().find_map(|line| line.strip_prefix("EXPOSE ")).unwrap();
+    for (name, service) in compose["services"].as_object().unwrap() {
+        for volume in service["volumes"].as_array().unwrap() {
+            let source = volume.as_str().unwrap().split(':').next().unwrap();
+            if source.starts_with("./") {
+                let path = root().join("deploy").join(source);
+                assert!(
+                    path.is_dir(),
+                    "{name}: {source}: mount folders: an editor replaces a file"
+                );
+            } else if !source.starts_with('/') {
+                assert!(compose["volumes"].get(source).is_some(), "{name}: no volume {source}");
+            }
+        }
+        for port in service["ports"].as_array().unwrap() {
+            let port = port.as_str().unwrap();
+            assert!(port.starts_with("${BIND:-127.0.0.1}:"), "{name}: {port} is open to all");
+            let inside = port.rsplit(':').next().unwrap();
+            assert!(
+                name != "drivegate" || exposed.contains(inside),
+                "the image does not expose {inside}"
+            );
+        }
+    }
+    let config: toml::Table = read("deploy/compose/drivegate/drivegate.toml").parse().unwrap();
+    for listen in [&config["modbus_tcp"]["listen"][0], &config["http"]["listen"]] {
+        let port = listen.as_str().unwrap().rsplit(':').next().unwrap();
+        assert!(exposed.contains(port), "the image does not expose {port}");
+    }
+}
+
+#[test]
+fn grafana_finds_its_datasource_and_dashboard() {
+    let datasource = yaml("deploy/compose/grafana/provisioning/datasources/prometheus.yaml");
+    assert_eq!(datasource["datasources"][0]["url"], "http://prometheus:9090");
+    let provider = yaml("deploy/compose/grafana/provisioning/dashboards/drivegate.yaml");
+    let path = provider["providers"][0]["options"]["path"]
+        .as_str()
+        .unwrap()
+        .to_string();
+    let compose = yaml("deploy/compose.yaml");
+    let mounts = compose["services"]["grafana"]["volumes"].to_string();
+    assert!(mounts.contains(&format!("./compose/grafana/dashboards:{path}:ro")));
+}
+
+#[test]
+fn the_image_is_small_and_not_root() {
+    let text = read("deploy/Dockerfile");
+    let last = text.rsplit("\nFROM ").next().unwrap();
+    assert!(last.starts_with("scratch\n"), "the image ends in {last}");
+    let user = last.lines().find_map(|line| line.strip_prefix("USER ")).unwrap();
+    assert_ne!(user.split(':').next().unwrap().parse(), Ok(0), "a number, and not root");
+    assert!(last.contains("CMD [\"run\", \"--config\", \"/etc/drivegate/drivegate.toml\"]"));
+    // What the build needs is let in.
+    let ignored = read(".dockerignore");
+    for needed in ["Cargo.toml", "Cargo.lock", "src", "profiles"] {
+        assert!(ignored.lines().any(|line| line == format!("!{needed}")), "{needed}");
+    }
+}
+
+#[test]
+fn the_local_socket_has_its_directory() {
+    assert!(read("systemd/drivegate.service").contains("\nRuntimeDirectory=drivegate\n"));
+    let image = read("deploy/Dockerfile");
+    let owned = image.lines().find(|line| line.contains("chown 65532:65532")).unwrap();
+    assert!(owned.contains("/image/run/drivegate"), "{owned}");
+    let service = &yaml("deploy/compose.yaml")["services"]["drivegate"];
+    assert_eq!(service["read_only"], true);
+    let writable = service["tmpfs"][0].as_str().unwrap();
+    assert!(writable.starts_with("/run/drivegate:uid=65532,"), "{writable}");
+}
+
+#[test]
+fn mosquitto_takes_its_configuration() {
+    let site = Site::new();
+    let config = read("deploy/compose/mosquitto/mosquitto.conf")
+        .replace("listener 1883", &format!("listener {} 127.0.0.1", site.mqtt))
+        .replace("/mosquitto/data", &site.folder.path().display().to_string());
+    site.write("mosquitto.conf", &config);
+    let mut broker = Running::start(&tool("mosquitto"), &["-c", &site.path("mosquitto.conf")]);
+    until("the broker", || {
+        assert!(broker.runs(), "{}", broker.output());
+        TcpStream::connect(("127.0.0.1", site.mqtt)).ok()
+    });
+}

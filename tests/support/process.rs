@@ -1,0 +1,229 @@
+//! Processes that end with their test, and what is asked of them.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::path::Path;
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::{Arc, Mutex};
+use std::time::{Duration, Instant};
+
+use super::tools::tool;
+
+/// Longest wait for something that must come.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A running process; killed when dropped.
+pub(crate) struct Running {
+    child: Child,
+    output: Arc<Mutex<String>>,
+}
+
+impl Running {
+    /// Starts a program; its output is kept.
+    pub(crate) fn start(program: &Path, arguments: &[&str]) -> Running {
+        Running::spawn(Command::new(program).args(arguments))
+    }
+
+    /// Starts what is prepared; its output is kept.
+    pub(crate) fn spawn(command: &mut Command) -> Running {
+        let mut child = command
+            .stdin(Stdio::null())
+            .stdout(Stdio::piped())
+            .stderr(Stdio::piped())
+            .spawn()
+            .unwrap_or_else(|error| panic!("cannot start {command:?}: {error}"));
+        let output = Arc::new(Mutex::new(String::new()));
+        keep(child.stdout.take().unwrap(), &output);
+        keep(child.stderr.take().unwrap(), &output);
+        Running { child, output }
+    }
+
+    /// Starts drivegate.
+    pub(crate) fn drivegate(arguments: &[&str]) -> Running {
+        Running::spawn(&mut drivegate(arguments))
+    }
+
+    /// Whether it runs still.
+    pub(crate) fn runs(&mut self) -> bool {
+        self.child.try_wait().unwrap().is_none()
+    }
+
+    /// What it has printed.
+    pub(crate) fn output(&self) -> String {
+        self.output.lock().unwrap().clone()
+    }
+
+    /// Waits until it has printed `text`.
+    pub(crate) fn until_printed(&self, text: &str) -> String {
+        until(&format!("the output `{text}`"), || {
+            self.output().contains(text).then(|| self.output())
+        })
+    }
+
+    /// Its process id.
+    pub(crate) fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Sends a signal, such as `INT`.
+    pub(crate) fn signal(&self, name: &str) {
+        let pid = self.child.id().to_string();
+        assert!(
+            Command::new("kill")
+                .args([&format!("-{name}"), &pid])
+                .status()
+                .unwrap()
+                .success()
+        );
+    }
+
+    /// Waits for its end.
+    pub(crate) fn ended(&mut self) -> ExitStatus {
+        until("the end of the process", || self.child.try_wait().unwrap())
+    }
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+        if std::thread::panicking() {
+            eprintln!("--- output of process {}\n{}", self.child.id(), self.output());
+        }
+    }
+}
+
+/// The program, with runtime files away from those of gateways on this machine.
+pub(crate) fn drivegate(arguments: &[&str]) -> Command {
+    let mut command = Command::new(env!("CARGO_BIN_EXE_drivegate"));
+    command
+        .args(arguments)
+        .env_remove("RUNTIME_DIRECTORY")
+        .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"));
+    command
+}
+
+fn keep(stream: impl Read + Send + 'static, output: &Arc<Mutex<String>>) {
+    let output = output.clone();
+    std::thread::spawn(move || {
+        for line in BufReader::new(stream).lines().map_while(Result::ok) {
+            let mut output = output.lock().unwrap();
+            output.push_str(&line);
+            output.push('\n');
+        }
+    });
+}
+
+/// Waits until `ask` has an answer.
+pub(crate) fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
+    let deadline = Instant::now() + PATIENCE;
+    loop {
+        if let Some(answer) = ask() {
+            return answer;
+        }
+        assert!(Instant::now() < deadline, "never came: {what}");
+        std::thread::sleep(Duration::from_millis(20));
+    }
+}
+
+/// A TCP port that is free now, and that no other test of this process is given. It is none of those that the kernel
+/// gives to whoever asks for any, so that nobody has it by chance before it is bound.
+pub(crate) fn free_port() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = 10_000 + (std::process::id() % 200) as u16 * 100;
+    loop {
+        let port = first + NEXT.fetch_add(1, Ordering::Relaxed) % 2_000;
+        if TcpListener::bind(("127.0.0.1", port)).is_ok() {
+            return port;
+        }
+    }
+}
+
+/// Status and body of a GET.
+pub(crate) fn get(port: u16, path: &str) -> Option<(u16, String)> {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).ok()?;
+    stream.set_read_timeout(Some(PATIENCE)).ok()?;
+    write!(stream, "GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n\r\n").ok()?;
+    let mut text = String::new();
+    stream.read_to_string(&mut text).ok()?;
+    let status = text.get(9..12)?.parse().ok()?;
+    Some((status, text.split_once("\r\n\r\n")?.1.to_string()))
+}
+
+/// Waits until the gateway says that it is ready.
+pub(crate) fn until_ready(http: u16) {
+    until("200 from /readyz", || {
+        get(http, "/readyz").filter(|(status, _)| *status == 200)
+    });
+}
+
+/// A drive as `/api/v1/drives` tells it.
+pub(crate) fn api(http: u16, drive: &str) -> serde_json::Value {
+    let (status, body) = get(http, &format!("/api/v1/drives/{drive}")).expect("an answer");
+    assert_eq!(status, 200, "{body}");
+    serde_json::from_str(&body).unwrap()
+}
+
+/// The good value of a point.
+pub(crate) fn point(http: u16, drive: &str, name: &str) -> serde_json::Value {
+    let point = api(http, drive)["points"][name].clone();
+    if point["quality"] == "good" {
+        point["value"].clone()
+    } else {
+        serde_json::Value::Null
+    }
+}
+
+/// Reads `count` registers by mbpoll.
+pub(crate) fn mbpoll_read(port: u16, unit: u8, start: u16, count: u16) -> Result<Vec<u16>, String> {
+    let text = mbpoll(port, unit, start, &["-c", &count.to_string()], &[])?;
+    let value = |line: &str| {
+        let text = line
+            .trim_start()
+            .strip_prefix('[')?
+            .split_once("]:")?
+            .1
+            .trim()
+            .to_string();
+        let number: i32 = text.split_whitespace().next()?.parse().ok()?;
+        Some(number as u16)
+    };
+    Ok(text.lines().filter_map(value).collect())
+}
+
+/// Writes registers by mbpoll: one value by function 6, several by function 16.
+pub(crate) fn mbpoll_write(port: u16, unit: u8, start: u16, values: &[u16]) -> Result<(), String> {
+    let values: Vec<String> = values.iter().map(u16::to_string).collect();
+    let values: Vec<&str> = values.iter().map(String::as_str).collect();
+    let text = mbpoll(port, unit, start, &[], &values)?;
+    if text.contains("Written") { Ok(()) } else { Err(text) }
+}
+
+/// Reads registers, again until they are read: on a busy machine the time of a request may run out.
+pub(crate) fn read_registers(port: u16, unit: u8, start: u16, count: u16) -> Vec<u16> {
+    until("registers", || mbpoll_read(port, unit, start, count).ok())
+}
+
+/// Writes registers, again until that is acknowledged.
+pub(crate) fn write_registers(port: u16, unit: u8, start: u16, values: &[u16]) {
+    until("a write", || mbpoll_write(port, unit, start, values).ok());
+}
+
+fn mbpoll(port: u16, unit: u8, start: u16, options: &[&str], values: &[&str]) -> Result<String, String> {
+    let (port, unit, start) = (port.to_string(), unit.to_string(), start.to_string());
+    let mut arguments = vec![
+        "-m", "tcp", "-p", &port, "-a", &unit, "-0", "-r", &start, "-1", "-o", "10",
+    ];
+    arguments.extend(options);
+    arguments.push("127.0.0.1");
+    arguments.extend(values);
+    let output = Command::new(tool("mbpoll")).args(&arguments).output().unwrap();
+    let text = [output.stdout, output.stderr].concat();
+    let text = String::from_utf8_lossy(&text).into_owned();
+    if output.status.success() && !text.contains("failed") {
+        Ok(text)
+    } else {
+        Err(text)
+    }
+}

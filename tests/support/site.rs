@@ -1,0 +1,202 @@
+//! A gateway's site: its folder with the configuration, free ports for its servers, a simulated line, a broker.
+
+use std::net::TcpStream;
+use std::path::{Path, PathBuf};
+
+use drivegate::codec::LineFormat;
+use drivegate::sim::drive::DriveOptions;
+use drivegate::sim::endpoint::EndpointOptions;
+use drivegate::sim::half_duplex::LineRules;
+use drivegate::sim::statistics::Direction;
+use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
+use tempfile::TempDir;
+
+use super::process::{Running, api, free_port, get, until, until_ready};
+use super::tools::{run, run_well, tool};
+
+/// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
+pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
+     [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nsilence = \"chars\"\nresponse_timeout = \"2s\"\n";
+/// Nothing is stale because this machine is busy.
+pub(crate) const MODBUS_TCP: &str =
+    "[modbus_tcp]\nlisten = [\"127.0.0.1:{modbus}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n";
+pub(crate) const MQTT: &str = "[mqtt]\nurl = \"mqtt://127.0.0.1:{mqtt}\"\ncommands = true\n";
+pub(crate) const HTTP: &str = "[http]\nlisten = \"127.0.0.1:{http}\"\n";
+
+/// The section of a Vacon NX; `keys` are further lines of it.
+pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
+    format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{keys}\n")
+}
+
+/// One that takes commands.
+pub(crate) fn controlled(name: &str, address: u8, keys: &str) -> String {
+    drive(name, address, &format!("access = \"control\"\n{keys}"))
+}
+
+pub(crate) struct Site {
+    pub(crate) folder: TempDir,
+    pub(crate) modbus: u16,
+    pub(crate) mqtt: u16,
+    pub(crate) http: u16,
+}
+
+impl Site {
+    /// One without a configuration.
+    pub(crate) fn new() -> Site {
+        Site {
+            folder: tempfile::tempdir().unwrap(),
+            modbus: free_port(),
+            mqtt: free_port(),
+            http: free_port(),
+        }
+    }
+
+    /// One with the configuration that the parts make.
+    pub(crate) fn of(parts: &[&str]) -> Site {
+        let site = Site::new();
+        site.configure(parts);
+        site
+    }
+
+    pub(crate) fn file(&self, name: &str) -> PathBuf {
+        self.folder.path().join(name)
+    }
+
+    pub(crate) fn path(&self, name: &str) -> String {
+        self.file(name).display().to_string()
+    }
+
+    pub(crate) fn config(&self) -> String {
+        self.path("drivegate.conf")
+    }
+
+    pub(crate) fn write(&self, name: &str, text: &str) {
+        std::fs::write(self.file(name), text).unwrap();
+    }
+
+    /// Writes the configuration, with the ports of the site where `{modbus}`, `{mqtt}` and `{http}` stand.
+    pub(crate) fn configure(&self, parts: &[&str]) {
+        let ports = [("{modbus}", self.modbus), ("{mqtt}", self.mqtt), ("{http}", self.http)];
+        let text = ports.iter().fold(parts.concat(), |text, (place, port)| {
+            text.replace(place, &port.to_string())
+        });
+        self.write("drivegate.conf", &text);
+    }
+
+    /// Writes the configuration anew with something in another's place; what it was before.
+    pub(crate) fn change(&self, from: &str, to: &str) -> String {
+        let text = std::fs::read_to_string(self.config()).unwrap();
+        assert!(text.contains(from), "{from} does not stand in\n{text}");
+        self.write("drivegate.conf", &text.replace(from, to));
+        text
+    }
+
+    /// Simulated drives at the port of `line1`, at 38400; what is on their line is written down.
+    pub(crate) fn line(&self, addresses: &[u8]) -> SimulatedBus {
+        line_of(&self.file("line1"), addresses)
+    }
+
+    /// The same as a process of its own.
+    pub(crate) fn simulate(&self, arguments: &[&str]) -> Running {
+        let line = self.path("line1");
+        let running = Running::drivegate(&[&["simulate", "--link", &line], arguments].concat());
+        running.until_printed("Ctrl-C ends");
+        running
+    }
+
+    /// Starts the gateway.
+    pub(crate) fn run(&self) -> Running {
+        Running::drivegate(&["run", "--config", &self.config()])
+    }
+
+    /// Starts the gateway and waits until it is ready.
+    pub(crate) fn run_ready(&self) -> Running {
+        let gateway = self.run();
+        until_ready(self.http);
+        gateway
+    }
+
+    /// Starts Mosquitto.
+    pub(crate) fn broker(&self) -> Running {
+        let text = format!("listener {} 127.0.0.1\nallow_anonymous true\n", self.mqtt);
+        self.write("mosquitto.conf", &text);
+        let broker = Running::start(&tool("mosquitto"), &["-c", &self.path("mosquitto.conf")]);
+        until("mosquitto", || TcpStream::connect(("127.0.0.1", self.mqtt)).ok());
+        broker
+    }
+
+    pub(crate) fn until_connected(&self, connected: bool) {
+        self.until_metric(&format!("drivegate_mqtt_connected {}", u8::from(connected)));
+    }
+
+    pub(crate) fn until_metric(&self, line: &str) {
+        until(line, || get(self.http, "/metrics")?.1.contains(line).then_some(()));
+    }
+
+    pub(crate) fn until_state(&self, drive: &str, state: &str) {
+        until(&format!("{drive} is {state}"), || {
+            (api(self.http, drive)["state"] == state).then_some(())
+        });
+    }
+
+    pub(crate) fn until_point(&self, drive: &str, point: &str, wanted: impl Into<serde_json::Value>) {
+        let wanted = wanted.into();
+        until(&format!("{point} of {drive} is {wanted}"), || {
+            (self.point(drive, point) == wanted).then_some(())
+        });
+    }
+
+    /// The good value of a point, else null.
+    pub(crate) fn point(&self, drive: &str, point: &str) -> serde_json::Value {
+        super::process::point(self.http, drive, point)
+    }
+
+    pub(crate) fn audit(&self) -> Vec<serde_json::Value> {
+        serde_json::from_str(&get(self.http, "/api/v1/audit").unwrap().1).unwrap()
+    }
+
+    /// Runs `mosquitto_pub`; the message is with the broker when this returns.
+    pub(crate) fn publish(&self, arguments: &[&str]) {
+        let port = self.mqtt.to_string();
+        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1"];
+        run_well(&tool("mosquitto_pub"), &[&client, arguments].concat());
+    }
+
+    /// The response to a message to a set topic, by a client of its own.
+    pub(crate) fn ask(&self, topic: &str, payload: &str) -> serde_json::Value {
+        let (port, topic) = (self.mqtt.to_string(), format!("drivegate/test/drive/{topic}"));
+        let client = ["-h", "127.0.0.1", "-p", &port, "-V", "5", "-q", "1", "-W", "60"];
+        let request = ["-t", &topic, "-e", "answers/1", "-m", payload];
+        let output = run(&tool("mosquitto_rr"), &[&client[..], &request].concat());
+        serde_json::from_slice(&output.stdout).unwrap_or_else(|error| panic!("{topic} {payload}: {error}: {output:?}"))
+    }
+
+    /// Asks again until the command is carried out: on a busy machine its time may run out.
+    pub(crate) fn order(&self, topic: &str, payload: &str) -> serde_json::Value {
+        until(payload, || {
+            Some(self.ask(topic, payload)).filter(|result| result["ok"] == true)
+        })
+    }
+}
+
+/// Simulated drives behind a link, at 38400; what is on their line is written down.
+pub(crate) fn line_of(link: &Path, addresses: &[u8]) -> SimulatedBus {
+    let rules = LineRules::new(LineFormat::new(38_400, "8N1").unwrap());
+    let drives = addresses.iter().map(|address| DriveOptions::nx(*address)).collect();
+    let endpoint = EndpointOptions::Pty {
+        link: Some(link.to_path_buf()),
+    };
+    SimulatedBus::start(SimulatedBusOptions {
+        endpoint,
+        transcript: 100_000,
+        ..SimulatedBusOptions::new("line1", rules, drives)
+    })
+    .unwrap()
+}
+
+/// Function codes of the requests on the line.
+pub(crate) fn functions(line: &SimulatedBus) -> Vec<u8> {
+    let mut frames = line.transcript();
+    frames.retain(|frame| frame.direction == Direction::ToDrives);
+    frames.iter().filter_map(|frame| frame.bytes.get(1).copied()).collect()
+}

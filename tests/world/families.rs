@@ -1,0 +1,130 @@
+//! Every family of the reference, over every protocol it speaks, commanded through the same sequence and read by the
+//! same names: what differs is in the profiles, nobody who commands a drive has to know.
+
+use drivegate::codec::Protocol;
+use drivegate::drive::profile::Profiles;
+use drivegate::drive::{ModelPoint, State, Value};
+
+use super::rig::{PATIENCE, Rig, line};
+use super::scenario::Line;
+
+/// A family's profile, a fault as the drive's own registers show it, and the code and the text that everybody sees.
+const FAMILIES: [(&str, u16, i64, &str); 8] = [
+    ("vacon-nx", 53, 53, "fieldbus fault"),
+    ("vacon-nx-n2", 53, 53, "fieldbus fault"),
+    ("eaton-svx", 53, 53, "fieldbus fault"),
+    ("eaton-hvx", 53, 53, "fieldbus fault"),
+    ("eaton-hvx-n2", 53, 53, "fieldbus fault"),
+    ("vacon-cx", 1, 1, "overcurrent"),
+    // The lowest bit of the mask, counted from 1.
+    ("teco-7300pa", 0x0002, 2, "overvoltage"),
+    ("teco-7300pa-n2", 0x0002, 2, "overvoltage"),
+];
+
+/// Points that every family has.
+const EVERYWHERE: [ModelPoint; 12] = [
+    ModelPoint::Ready,
+    ModelPoint::Running,
+    ModelPoint::Reversed,
+    ModelPoint::Fault,
+    ModelPoint::AtReference,
+    ModelPoint::ZeroSpeed,
+    ModelPoint::OutputFrequency,
+    ModelPoint::MotorCurrent,
+    ModelPoint::MotorVoltage,
+    ModelPoint::DcLinkVoltage,
+    ModelPoint::FaultCode,
+    ModelPoint::SpeedReference,
+];
+
+/// The line that a family has by its works.
+fn works(family: &'static str, protocol: Protocol) -> Line {
+    let (baud, format) = match protocol {
+        Protocol::ModbusRtu => (19_200, "8N2"),
+        Protocol::ModbusAscii => (19_200, "7N2"),
+        Protocol::N2 => (9600, "8N1"),
+    };
+    Line {
+        format,
+        spec: |spec| {
+            // Families that do not tell their frequencies.
+            let told = spec.profile.point_index("maximum_frequency").is_some();
+            spec.frequency_range = (!told).then_some(0.0..=60.0);
+        },
+        ..line(family, protocol, baud, 1)
+    }
+}
+
+fn set(rig: &mut Rig, points: &[(&str, f64)]) {
+    let outcome = rig.set(1, points);
+    assert!(outcome.is_ok(), "{points:?}: {outcome}");
+}
+
+fn number(rig: &Rig, point: ModelPoint) -> Option<f64> {
+    rig.good(1, point).map(Value::as_f64)
+}
+
+/// Stop, run forward, 50 %, reverse, a provoked fault, reset, stop.
+fn operate(line: &Line, fault: u16, code: i64, text: &str) {
+    let (yes, no) = (Value::Bool(true), Value::Bool(false));
+    let mut rig = Rig::of(line);
+    rig.until("all common points", PATIENCE, |rig| {
+        EVERYWHERE.iter().all(|point| rig.good(1, *point).is_some())
+    });
+    set(&mut rig, &[("run", 0.0)]);
+    rig.until_state(1, State::Ready);
+    rig.until_good(1, ModelPoint::ZeroSpeed, yes);
+
+    set(&mut rig, &[("run", 1.0), ("reverse", 0.0), ("speed_reference", 50.0)]);
+    rig.until_state(1, State::Running);
+    rig.until_good(1, ModelPoint::AtReference, yes);
+    rig.until("the reference read back", PATIENCE, |rig| {
+        number(rig, ModelPoint::SpeedReference) == Some(50.0)
+    });
+    // At reference may be told from some hertz before it on.
+    rig.until("half of 50 or 60 Hz", PATIENCE, |rig| {
+        number(rig, ModelPoint::OutputFrequency).is_some_and(|output| [25.0, 30.0].contains(&output))
+    });
+    rig.until_good(1, ModelPoint::Reversed, no);
+    rig.until_good(1, ModelPoint::ZeroSpeed, no);
+    rig.until("a current", PATIENCE, |rig| {
+        number(rig, ModelPoint::MotorCurrent).is_some_and(|current| current > 0.0)
+    });
+
+    set(&mut rig, &[("reverse", 1.0)]);
+    rig.until_good(1, ModelPoint::Reversed, yes);
+    assert_ne!(
+        rig.good(1, ModelPoint::Running),
+        Some(no),
+        "turning it round does not stop it"
+    );
+
+    rig.with_drive(1, |drive, _| drive.trip(fault));
+    rig.until_state(1, State::Fault);
+    rig.until_good(1, ModelPoint::FaultCode, Value::Integer(code));
+    assert_eq!(rig.drive(1).reading(rig.now).fault_text(), text);
+
+    set(&mut rig, &[("fault_reset", 1.0)]);
+    rig.until_state(1, State::Ready);
+    rig.until_good(1, ModelPoint::FaultCode, Value::Integer(0));
+    rig.until_good(1, ModelPoint::ZeroSpeed, yes);
+    assert_ne!(rig.good(1, ModelPoint::Running), Some(yes), "a reset starts nothing");
+
+    set(&mut rig, &[("run", 1.0), ("reverse", 0.0)]);
+    rig.until_state(1, State::Running);
+    set(&mut rig, &[("run", 0.0)]);
+    rig.until_state(1, State::Ready);
+}
+
+#[test]
+fn every_family_is_operated_alike_over_each_protocol_it_speaks() {
+    let built_in = Profiles::built_in();
+    let here = |name: &str| FAMILIES.iter().any(|(family, ..)| *family == name);
+    assert!(built_in.names().all(here), "no family is left out");
+    for (family, fault, code, text) in FAMILIES {
+        for protocol in &built_in.get(family).unwrap().protocols {
+            println!("{family} over {}", protocol.name());
+            operate(&works(family, *protocol), fault, code, text);
+        }
+    }
+}

@@ -1,0 +1,303 @@
+//! One bus and what its clients see of it: frames, commands, faults, leases, parameters, a port that comes and goes.
+
+use std::time::Duration;
+
+use drivegate::cache::{Access, LeaseAction, Supervision};
+use drivegate::codec::{Exception, Protocol};
+use drivegate::command::{Outcome, Refusal};
+use drivegate::drive::{ModelPoint, Quality, State, Value};
+use drivegate::event::EventKind;
+use drivegate::sim::drive::ModelOptions;
+use drivegate::sim::faults::{Fault, FaultPlan};
+use drivegate::sim::nx::NxOptions;
+use drivegate::sim::statistics::Recorded;
+
+use super::bus::Parts;
+use super::rig::{PATIENCE, Rig, line};
+use super::scenario::Line;
+
+fn nx(baud: u32, drives: u8) -> Line {
+    line("vacon-nx", Protocol::ModbusRtu, baud, drives)
+}
+
+fn ready(line: &Line) -> Rig {
+    let mut rig = Rig::of(line);
+    for address in 1..=line.drives {
+        rig.until_state(address, State::Ready);
+    }
+    rig
+}
+
+fn hex(frame: &Recorded) -> String {
+    let text: Vec<String> = frame.bytes.iter().map(|byte| format!("{byte:02X}")).collect();
+    text.join(" ")
+}
+
+fn supervised(action: LeaseAction, timeout: Duration) -> Option<Supervision> {
+    let adopt = false;
+    Some(Supervision { timeout, action, adopt })
+}
+
+#[test]
+fn the_frames_on_the_line_are_those_of_the_reference() {
+    let mut rig = ready(&nx(38_400, 1));
+    assert!(rig.set(1, &[("speed_reference", 50.0)]).is_ok());
+    assert!(rig.set(1, &[("run", 1.0)]).is_ok());
+    rig.until_good(1, ModelPoint::AtReference, Value::Bool(true));
+    assert_eq!(rig.good(1, ModelPoint::OutputFrequency), Some(Value::Number(25.0)));
+    assert_eq!(rig.good(1, ModelPoint::ActualSpeed), Some(Value::Number(50.0)));
+    assert!(rig.set(1, &[("run", 1.0), ("reverse", 1.0)]).is_ok());
+    assert!(rig.set(1, &[("speed_reference", -50.0)]).is_ok());
+    assert!(rig.set(1, &[("run", 0.0), ("reverse", 0.0)]).is_ok());
+    rig.until_state(1, State::Ready);
+    assert!(rig.set(1, &[("fault_reset", 1.0)]).is_ok());
+    let requests = rig.requests();
+    let last = |frame: &str| requests.iter().rev().find(|request| hex(request) == frame);
+    // drives.md 7.1 and 7.4, misprints corrected.
+    for (meaning, frame) in [
+        ("read 2101..2111", "01 03 08 34 00 0B 47 A3"),
+        ("read 42001..42003", "01 03 07 D0 00 03 05 46"),
+        ("reference 50 %", "01 06 07 D2 13 88 25 D1"),
+        ("run", "01 06 07 D0 00 01 48 87"),
+        ("run reverse", "01 06 07 D0 00 03 C9 46"),
+        ("reference -50 %", "01 06 07 D2 EC 78 64 65"),
+        ("stop", "01 06 07 D0 00 00 89 47"),
+        ("fault reset", "01 06 07 D0 00 04 88 84"),
+    ] {
+        assert!(last(frame).is_some(), "{meaning}: {frame} was not on the line");
+    }
+    let (high, low) = (last("01 06 07 D0 00 04 88 84"), last("01 06 07 D0 00 00 89 47"));
+    let held = low.unwrap().start - high.unwrap().end;
+    assert!(held >= Duration::from_millis(20), "two update periods: {held:?}");
+    let s = rig.bus.wire.statistics();
+    assert_eq!((s.silence_violations, s.collisions, s.bad_crc), (0, 0, 0));
+}
+
+#[test]
+fn a_fault_is_told_and_reset() {
+    // With a lease, so that nothing is told of a missing one.
+    let mut rig = ready(&Line {
+        supervision: supervised(LeaseAction::Hold, PATIENCE),
+        ..nx(115_200, 1)
+    });
+    let mut events = rig.plant.events.subscribe();
+    rig.with_drive(1, |drive, _| drive.trip(1));
+    rig.until_state(1, State::Fault);
+    assert_eq!(rig.good(1, ModelPoint::FaultCode), Some(Value::Integer(1)));
+    let event = events.try_recv().unwrap();
+    assert_eq!((event.kind, event.fault_code), (EventKind::Fault, Some(1)));
+    assert!(event.text.contains("overcurrent"), "{}", event.text);
+    assert!(rig.set(1, &[("fault_reset", 1.0)]).is_ok());
+    rig.until_state(1, State::Ready);
+    assert_eq!(events.try_recv().unwrap().kind, EventKind::FaultEnd);
+}
+
+#[test]
+fn a_motor_that_was_stopped_elsewhere_is_not_started_by_a_command_that_does_not_name_run() {
+    let mut rig = ready(&nx(38_400, 1));
+    let address = 2000;
+    for (points, left) in [(("reverse", 1.0), 2), (("fault_reset", 1.0), 0), (("reverse", 1.0), 2)] {
+        assert!(rig.set(1, &[("run", 1.0), ("reverse", 0.0)]).is_ok());
+        rig.until_state(1, State::Running);
+        // The gateway cannot have read it by the time of the command.
+        rig.at_the_drive(1, address, 0);
+        rig.bus.wire.record(1_000);
+        assert!(rig.set(1, &[points]).is_ok());
+        assert_eq!(rig.word(1, address), left, "{points:?}");
+        let written: Vec<String> = rig.requests().iter().map(hex).collect();
+        let runs = |frame: &&String| frame.starts_with("01 06 07 D0 00 0") && "1357".contains(&frame[16..17]);
+        assert_eq!(written.iter().find(runs), None, "{points:?}");
+    }
+}
+
+#[test]
+fn a_dead_drive_is_stale_at_once_and_comes_back() {
+    let mut rig = ready(&nx(115_200, 2));
+    rig.set_alive(2, false);
+    rig.until_state(2, State::Offline);
+    assert_eq!(rig.sample(2, ModelPoint::OutputFrequency).quality, Quality::Stale);
+    assert_eq!(rig.state(1), State::Ready);
+    assert_eq!(rig.set(2, &[("run", 1.0)]), Outcome::Offline);
+    rig.set_alive(2, true);
+    rig.until_state(2, State::Ready);
+}
+
+#[test]
+fn after_a_replug_everything_is_read_and_nothing_written() {
+    let mut rig = Rig::of(&nx(115_200, 2));
+    let all_read = |rig: &Rig| {
+        [1, 2]
+            .iter()
+            .all(|drive| rig.good(*drive, ModelPoint::FrequencyReference).is_some())
+    };
+    rig.until("both drives are read", PATIENCE, all_read);
+    assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());
+    rig.until_state(1, State::Running);
+    // The last time the first exchange meets a fault, too.
+    for lost in [false, false, true] {
+        rig.bus.set_open(false, rig.now);
+        for address in [1, 2] {
+            assert_eq!(rig.sample(address, ModelPoint::OutputFrequency).quality, Quality::Stale);
+            assert_eq!(rig.state(address), State::Offline);
+        }
+        assert_eq!(rig.set(1, &[("run", 1.0)]), Outcome::BusDown);
+        rig.bus.wire.record(10_000);
+        if lost {
+            rig.set_faults(FaultPlan::default().at(1, Fault::Drop));
+        }
+        rig.bus.set_open(true, rig.now);
+        rig.until("all is good again", PATIENCE, all_read);
+        rig.until_state(1, State::Running);
+        let mut once = [0, 0];
+        for request in rig.requests() {
+            assert_eq!(request.bytes[1], 3, "nothing is written: {request}");
+            // Parameters 101..=104 are read once.
+            if request.bytes[2..4] == [0, 100] {
+                once[usize::from(request.bytes[0]) - 1] += 1;
+            }
+        }
+        assert_eq!(once, [1, 1], "what is read once is read once more");
+    }
+    assert_eq!(rig.good(1, ModelPoint::SpeedReference), Some(Value::Number(20.0)));
+}
+
+#[test]
+fn a_stop_overtakes_and_purges() {
+    let mut rig = ready(&nx(9_600, 4));
+    let mut placed: Vec<_> = [("speed_reference", 10.0), ("run", 1.0)]
+        .iter()
+        .cycle()
+        .take(20)
+        .map(|point| {
+            let order = rig.points(1, &[*point]);
+            rig.place(1, order)
+        })
+        .collect();
+    assert!(rig.set(1, &[("run", 0.0)]).is_ok());
+    for order in &mut placed {
+        let outcome = rig.answered(order);
+        assert!(matches!(outcome, Outcome::Purged | Outcome::Replaced), "{outcome:?}");
+    }
+    rig.run(PATIENCE);
+    assert_eq!(rig.good(1, ModelPoint::Running), Some(Value::Bool(false)));
+}
+
+#[test]
+fn a_lease_that_runs_out_stops_the_drive_once() {
+    let mut rig = ready(&Line {
+        supervision: supervised(LeaseAction::Stop, Duration::from_millis(300)),
+        ..nx(115_200, 1)
+    });
+    let mut events = rig.plant.events.subscribe();
+    assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());
+    rig.until_state(1, State::Running);
+    rig.until_state(1, State::Ready);
+    rig.run(PATIENCE);
+    let events = std::iter::from_fn(|| events.try_recv().ok());
+    assert_eq!(events.filter(|event| event.kind == EventKind::Supervision).count(), 1);
+}
+
+#[test]
+fn commands_are_checked_against_the_drive() {
+    let mut rig = Rig::of(&nx(115_200, 1));
+    let known = |rig: &Rig| rig.good(1, ModelPoint::FrequencyReference).is_some();
+    rig.until("the frequency range", PATIENCE, known);
+    let outcome = rig.set(1, &[("speed_reference", 101.0)]);
+    assert!(matches!(outcome, Outcome::Refused(_)), "{outcome:?}");
+    assert!(rig.set(1, &[("frequency_reference", 30.0)]).is_ok());
+    rig.until_good(1, ModelPoint::SpeedReference, Value::Number(60.0));
+    assert_eq!(rig.good(1, ModelPoint::FrequencyReference), Some(Value::Number(30.0)));
+    let unknown = rig.read(1, 6000, 5);
+    assert_eq!(unknown, Outcome::Exception(Exception::ADDRESS));
+}
+
+/// 50 Hz are all of 50 Hz and half of 100 Hz.
+#[test]
+fn a_maximum_frequency_changed_at_the_panel_is_followed() {
+    /// Maximum frequency, ID 102, 0.01 Hz; PDU address.
+    const MAXIMUM_FREQUENCY: u16 = 101;
+    let mut rig = ready(&Line {
+        spec: |spec| {
+            spec.limits.insert("frequency_reference".to_string(), 0.0..=50.0);
+        },
+        ..nx(38_400, 1)
+    });
+    let until = |rig: &mut Rig, maximum| {
+        let known = |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(maximum));
+        rig.until("the maximum frequency", PATIENCE, known);
+    };
+    until(&mut rig, 50.0);
+    assert!(rig.set(1, &[("frequency_reference", 50.0)]).is_ok());
+    rig.until_good(1, ModelPoint::SpeedReference, Value::Number(100.0));
+    rig.at_the_drive(1, MAXIMUM_FREQUENCY, 10_000);
+    until(&mut rig, 100.0);
+    for beyond in [("frequency_reference", 50.5), ("speed_reference", 50.5)] {
+        let outcome = rig.set(1, &[beyond]);
+        let refused = matches!(outcome, Outcome::Refused(Refusal::BadValue(_)));
+        assert!(refused, "{beyond:?}: {outcome:?}");
+    }
+    assert!(rig.set(1, &[("frequency_reference", 50.0)]).is_ok());
+    rig.until_good(1, ModelPoint::SpeedReference, Value::Number(50.0));
+}
+
+#[test]
+fn a_garbled_answer_is_told_apart_from_silence() {
+    let mut rig = ready(&nx(38_400, 1));
+    for (fault, outcome, code) in [
+        ("corrupt=1", Outcome::Garbled, Exception::DEVICE_FAILURE),
+        ("truncate=1", Outcome::Garbled, Exception::DEVICE_FAILURE),
+        ("deaf=1", Outcome::TimedOut, Exception::GATEWAY_TARGET),
+    ] {
+        rig.until_state(1, State::Ready);
+        rig.set_faults(FaultPlan::new(fault.parse().unwrap(), 1));
+        let told = rig.set(1, &[("speed_reference", 20.0)]);
+        assert_eq!((told.exception(), &told), (Some(code), &outcome), "{fault}");
+        rig.set_faults(FaultPlan::default());
+    }
+}
+
+#[test]
+fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
+    /// Parameter P2.7.22 of the drive.
+    const FIELDBUS_FAULT_RESPONSE: u16 = 733;
+    for (access, lease, response, wanted) in [
+        (Access::Control, false, 0, 1),
+        (Access::Control, true, 0, 0),
+        (Access::Control, false, 2, 0),
+        (Access::Monitor, false, 0, 0),
+    ] {
+        let line = Line {
+            supervision: supervised(LeaseAction::Stop, PATIENCE).filter(|_| lease),
+            spec: match access {
+                Access::Control => |_| {},
+                Access::Monitor => |spec| spec.access = Access::Monitor,
+            },
+            ..nx(115_200, 1)
+        };
+        let mut parts = Parts::of(0, &line, 5);
+        parts.drives[0].model = ModelOptions::Nx(NxOptions {
+            parameters: vec![(FIELDBUS_FAULT_RESPONSE, response)],
+            ..NxOptions::default()
+        });
+        let mut rig = Rig::recorded(&line, parts);
+        let known = |rig: &Rig| rig.value(1, "fieldbus_fault_response").is_some();
+        rig.until("the parameter is read", PATIENCE, known);
+        // It goes and comes: told again, once.
+        rig.set_alive(1, false);
+        rig.until_state(1, State::Offline);
+        rig.set_alive(1, true);
+        rig.until("the parameter is read again", PATIENCE, known);
+        rig.run(PATIENCE);
+        let mut told = rig.plant.events.recent();
+        told.retain(|event| event.kind == EventKind::Unsupervised);
+        assert_eq!(told.len(), 2 * wanted, "{told:?}");
+        for event in told {
+            let text = &event.text;
+            let says = |part| text.contains(part);
+            assert!(
+                says("nothing stops drive d0-1") && says("fieldbus_fault_response = 0"),
+                "{text}"
+            );
+        }
+    }
+}

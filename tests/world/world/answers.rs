@@ -1,0 +1,286 @@
+//! The answers that clients get: one each, and each is true.
+
+use super::*;
+
+impl World {
+    pub(super) fn collect(&mut self) {
+        for client in 0..self.clients.len() {
+            self.collect_client(client);
+        }
+    }
+
+    /// Answers of orders that a newer one replaced come before the newer one is taken note of: it takes their place.
+    pub(super) fn replaced(&mut self) {
+        self.collect();
+        let Some((newest, before)) = self.records.split_last_mut() else {
+            return;
+        };
+        let now = self.now;
+        let of_drive = |record: &&mut Record| (record.bus, record.drive) == (newest.bus, newest.drive);
+        let just_replaced = |record: &&mut Record| {
+            let answer = record.answer.as_ref();
+            !record.succeeded
+                && record.wish == Wish::Reference
+                && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
+        };
+        let recent = before.iter_mut().rev().take(1_000);
+        let mut replaced = recent.filter(of_drive).filter(just_replaced);
+        if newest.wish == Wish::Reference
+            && let Some(older) = replaced.next()
+        {
+            older.succeeded = true;
+            newest.place = older.place;
+        }
+    }
+
+    pub(super) fn collect_client(&mut self, client: usize) {
+        let now = self.now;
+        match &mut self.clients[client].way {
+            Way::Plain(waiting) => {
+                let mut answered = Vec::new();
+                waiting.retain_mut(|(id, placed)| match placed.answer() {
+                    Some(answer) => {
+                        answered.push((*id, answer));
+                        false
+                    }
+                    None => true,
+                });
+                for (id, answer) in answered {
+                    if self.records[id].answer.is_none() {
+                        self.answered(id, answer.outcome.code(), Some(&answer.outcome));
+                        self.clients[client].open = self.clients[client].open.saturating_sub(1);
+                    }
+                }
+            }
+            Way::Mqtt(offline, _) => {
+                for message in offline.poll(now) {
+                    let json: serde_json::Value = serde_json::from_slice(&message.payload).unwrap();
+                    let id = json["id"].as_u64().expect("the id of an order") as usize;
+                    let code = json["result"].as_str().unwrap().to_string();
+                    if self.is_of_repetition(id, &code) {
+                        continue;
+                    }
+                    self.answered(id, &code, None);
+                    self.clients[client].open = self.clients[client].open.saturating_sub(1);
+                }
+            }
+            Way::ModbusTcp(offline, ..) => {
+                let bytes = offline.receive(&[], now);
+                self.take_answers(client, &bytes);
+            }
+        }
+    }
+
+    /// Whether a result is that of a message that the broker delivered once more: as the first time, or a refusal.
+    fn is_of_repetition(&mut self, id: usize, code: &str) -> bool {
+        let record = &self.records[id];
+        let (Some((first, _)), Some(left)) = (&record.answer, self.repeats.get_mut(&id).filter(|left| **left > 0))
+        else {
+            return false;
+        };
+        *left -= 1;
+        assert!(
+            record.wish.is_stop() || first == code || code == "not_allowed",
+            "order {id} was answered {first}, and its repetition {code}"
+        );
+        true
+    }
+
+    pub(super) fn take_answers(&mut self, client: usize, bytes: &[u8]) {
+        for (transaction, exception) in answers(bytes) {
+            let Way::ModbusTcp(_, open, _) = &mut self.clients[client].way else {
+                return;
+            };
+            let id = open.remove(&transaction).expect("an answer to a request");
+            let code = match exception {
+                None => "acknowledged".to_string(),
+                Some(code) => format!("exception {code:02X}"),
+            };
+            self.answered(id, &code, None);
+            self.clients[client].open = self.clients[client].open.saturating_sub(1);
+        }
+    }
+
+    /// An order has its answer: is it true?
+    pub(super) fn answered(&mut self, id: usize, code: &str, outcome: Option<&Outcome>) {
+        let now = self.now;
+        let text = code.to_string();
+        self.note(move || format!("order {id} is answered {text}"));
+        assert!(self.records[id].answer.is_none(), "order {id} was answered twice");
+        self.records[id].answer = Some((code.to_string(), now));
+        let record = self.records[id].clone();
+        if let Some(open) = self.open.get_mut(&(record.bus, record.drive)) {
+            open.retain(|open| *open != id);
+            if open.is_empty() {
+                self.open.remove(&(record.bus, record.drive));
+            }
+        }
+        let truth = &mut self.truths[record.bus][record.drive];
+        let begun = [
+            "acknowledged",
+            "confirmed",
+            "timeout",
+            "garbled",
+            "refused_by_drive",
+            "interrupted",
+        ];
+        // By MQTT the answer comes with the confirmation, long after the order ended.
+        let writes = record.wish != Wish::RawRead && self.clients[record.client].habit != Habit::Mqtt;
+        if writes && (begun.contains(&code) || code.starts_with("exception")) {
+            truth.maybe_heard(now);
+        }
+        if record.wish.is_stop() || record.wish == Wish::Reset {
+            truth.last_stop_over = Some(now);
+        }
+        let unsent = [
+            "expired",
+            "replaced",
+            "purged",
+            "queue_full",
+            "offline",
+            "bus_down",
+            "shutting_down",
+            "withdrawn",
+        ];
+        if unsent.contains(&code) {
+            assert!(record.sent.is_none(), "order {id} was sent, and its answer is {code}");
+        }
+        let truth = &self.truths[record.bus][record.drive];
+        assert!(
+            code != "purged" || self.stopping || now >= record.expires || truth.last_stop.is_some_and(|stop| stop > id),
+            "order {id} was removed for a stop, and no client gave one"
+        );
+        assert!(
+            !(code == "queue_full" && record.wish.is_stop()),
+            "a stop was refused for want of room"
+        );
+        let bare_stop = matches!(record.wish, Wish::Stop | Wish::RawStop);
+        assert!(
+            !(code == "offline" && bare_stop),
+            "a stop was refused because the drive was away: it is the probe"
+        );
+        match code {
+            "acknowledged" | "confirmed" => self.check_done(id, &record, code, outcome),
+            "expired" => self.check_expired(id, &record),
+            _ => {}
+        }
+        if code == "confirmed" && record.wish == Wish::Stop {
+            self.check_stands(id, &record);
+        }
+        self.figures.confirmed += u64::from(code == "confirmed");
+    }
+
+    /// A confirmed stop: the motor stands, or is near zero speed.
+    pub(super) fn check_stands(&mut self, id: usize, record: &Record) {
+        let (sim, troubled) = (
+            self.now - self.began,
+            self.truths[record.bus][record.drive].is_troubled(record.accepted),
+        );
+        let bus = &mut self.buses[record.bus];
+        let late = bus.line.is_late();
+        let Some(drive) = bus.wire.slaves().drive(record.drive as u8 + 1) else {
+            return;
+        };
+        drive.advance(sim);
+        let state = drive.state();
+        assert!(
+            troubled || late || !state.running || state.output.abs() < 2.0,
+            "order {id}: the stop is confirmed, and the motor turns with {:.1} Hz",
+            state.output
+        );
+    }
+
+    /// What was acknowledged was done.
+    pub(super) fn check_done(&self, id: usize, record: &Record, code: &str, outcome: Option<&Outcome>) {
+        let bus = &self.buses[record.bus];
+        let (profile, truth) = (&bus.profile, &self.truths[record.bus][record.drive]);
+        let since = record.accepted;
+        if let Some((pdu, _)) = &record.read {
+            let Some(Outcome::Acknowledged(reply)) = outcome else {
+                return;
+            };
+            let words = reply.words();
+            let read = |did: &RequestPdu, answered: Option<&Vec<u16>>| did == pdu && answered == words.as_ref();
+            assert!(
+                truth.did(since, read),
+                "order {id} read what the drive did not say: {reply:?}"
+            );
+            return;
+        }
+        let run = |on: bool| move |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(on);
+        let n2 = profile.name.ends_with("n2");
+        if record.wish.is_stop() {
+            assert!(
+                truth.did(since, run(false)) || !truth.run,
+                "order {id}: {code}, but the drive was not told to stop"
+            );
+        } else if record.wish.is_run() && !n2 {
+            assert!(
+                truth.did(since, run(true)),
+                "order {id}: {code}, but the drive was not told to run"
+            );
+        }
+        if record.wish == Wish::Converted && profile.name != "vacon-cx" {
+            self.check_converted(id, record);
+        }
+        if let Some(unique) = record.unique.as_ref().filter(|_| !n2 && profile.name != "vacon-cx") {
+            let wrote = |did: &RequestPdu, _: Option<&Vec<u16>>| sets(did, unique);
+            let has = |did: &RequestPdu, words: Option<&Vec<u16>>| has_already(did, words, unique);
+            let done = truth.did(since, wrote) || truth.did(since, has);
+            assert!(done, "order {id}: {code}, but the drive did not take it");
+        }
+    }
+
+    /// What was converted rests on a maximum frequency that the drive had not long ago.
+    fn check_converted(&self, id: usize, record: &Record) {
+        let (bus, truth) = (&self.buses[record.bus], &self.truths[record.bus][record.drive]);
+        let image = &bus.handle.image.drives[record.drive];
+        let age = image.reading(self.now, Duration::ZERO).parameter_age() + Duration::from_millis(500);
+        let until = truth.maxima.iter().skip(1).map(|(since, _)| Some(*since)).chain([None]);
+        let recent = truth.maxima.iter().zip(until).filter(|((since, _), until)| {
+            *since <= record.accepted && until.is_none_or(|until| until + age >= record.accepted)
+        });
+        let mut words = recent.filter_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
+        let done = words.any(|words| {
+            let wrote =
+                |did: &RequestPdu, answered: Option<&Vec<u16>>| sets(did, &words) || has_already(did, answered, &words);
+            truth.did(record.accepted, wrote)
+        });
+        assert!(
+            done || truth.maxima.is_empty(),
+            "order {id} rests on an old frequency range; the drive had {:?}",
+            truth
+                .maxima
+                .iter()
+                .map(|(since, hz)| (*since - self.began, *hz))
+                .collect::<Vec<_>>()
+        );
+    }
+
+    /// A steady client on a calm line is always served.
+    pub(super) fn check_expired(&self, id: usize, record: &Record) {
+        let truth = &self.truths[record.bus][record.drive];
+        let calm = self.scenario.incidents.is_none() && !self.buses[record.bus].line.is_noisy();
+        if self.clients[record.client].habit == Habit::Steady && calm && !self.stopping {
+            assert!(
+                record.before > 4 || truth.is_troubled(record.accepted) || !self.is_alive(record.bus, record.drive),
+                "order {id} of a steady client expired behind {} others",
+                record.before
+            );
+        }
+    }
+
+    pub(super) fn is_alive(&self, bus: usize, drive: usize) -> bool {
+        !self.buses[bus].line.dead.contains(&(drive as u8 + 1))
+    }
+}
+
+fn has_already(did: &RequestPdu, words: Option<&Vec<u16>>, (table, address, wanted): &Unique) -> bool {
+    let (RequestPdu::Read { table: of, start, .. }, Some(words)) = (did, words) else {
+        return false;
+    };
+    let Some(offset) = address.checked_sub(*start).filter(|_| of == table) else {
+        return false;
+    };
+    words.get(usize::from(offset)..usize::from(offset) + wanted.len()) == Some(wanted.as_slice())
+}

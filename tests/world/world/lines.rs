@@ -1,0 +1,271 @@
+//! What goes over the lines: each request and each reply is checked.
+
+use super::*;
+
+impl World {
+    pub(super) fn step_bus(&mut self, index: usize) {
+        let mut seen = Vec::new();
+        self.buses[index].step(self.now, &mut seen);
+        for one in seen {
+            match one {
+                Seen::Sent(asked) => self.sent(index, &asked),
+                Seen::Acted(asked) => self.acted(index, &asked),
+                Seen::Over(asked) => self.over(index, &asked),
+                Seen::Heard(bytes) if self.history.is_long() => {
+                    self.note(move || format!("line{index} -> {bytes:02X?}"))
+                }
+                Seen::Heard(_) => {}
+            }
+        }
+        let line = &self.buses[index].wire;
+        let statistics = line.statistics();
+        assert_eq!(
+            statistics.silence_violations, 0,
+            "a request came before the line was silent"
+        );
+        // Behind a late reply that stood for the present one, that is still to come: nobody can know.
+        if !self.buses[index].line.is_late() {
+            assert_eq!(statistics.collisions, 0, "a request met a reply");
+            assert_eq!(statistics.provoked_overlaps, 0, "a request met noise");
+        }
+    }
+
+    /// A request is on the wire.
+    pub(super) fn sent(&mut self, bus: usize, asked: &Asked) {
+        let (drive, pdu, now) = (asked.drive, &asked.pdu, self.now);
+        assert!(
+            !asked.is_poll || !self.buses[bus].ending,
+            "a poll goes out while the gateway stops"
+        );
+        if !asked.is_poll || self.history.is_long() {
+            let text = pdu.clone();
+            self.note(move || format!("line{bus} drive {} <- {text:?}", drive + 1));
+        }
+        self.truths[bus][drive].asked = Some(now);
+        if !pdu.is_write() {
+            return;
+        }
+        let profile = self.buses[bus].profile.clone();
+        let open = self.open.get(&(bus, drive)).cloned().unwrap_or_default();
+        let client_waits = !open.is_empty();
+        let truth = &mut self.truths[bus][drive];
+        if let Some(run) = run_command(&profile, pdu) {
+            // What was read just before the drive lost its supply is not known to be lost.
+            let lost = truth.lost_word.is_some_and(|at| now - at < Duration::from_secs(1));
+            if run && !truth.run && !lost {
+                let until = truth
+                    .may_run
+                    .unwrap_or_else(|| panic!("a run went out behind a stop, drive {}", drive + 1));
+                assert!(now < until, "an expired run went out");
+            }
+            if !run {
+                truth.stop_sent = Some(now);
+            }
+            if run {
+                self.no_stop_is_overtaken(bus, drive);
+            }
+            let truth = &self.truths[bus][drive];
+            if !run && truth.run {
+                let ours = |id: &usize| {
+                    let wish = self.records[*id].wish;
+                    // Where the word cannot be read, a motor that was last seen standing is left standing.
+                    wish.is_stop() || matches!(wish, Wish::Reset | Wish::Reverse)
+                };
+                let repeated = truth.repeated_until.is_some_and(|until| now < until);
+                let recently = repeated || truth.last_stop_over.is_some_and(|at| now - at < LAST_STEPS);
+                if !open.iter().any(ours) && !recently && !self.stopping {
+                    self.supervision_acts(bus, drive, pdu);
+                }
+            }
+        }
+        if self.is_reference_of_supervision(bus, drive, pdu) {
+            self.supervision_acts(bus, drive, pdu);
+        }
+        let truth = &mut self.truths[bus][drive];
+        let repeated = truth.repeated_until.is_some_and(|until| now < until);
+        if client_waits || repeated {
+            truth.maybe_heard(now);
+            let certain = open.iter().any(|id| {
+                let unique = self.records[*id].unique.as_ref();
+                unique.is_some_and(|unique| sets(pdu, unique))
+            });
+            if certain {
+                truth.heard_for_certain(now);
+            }
+        }
+        self.check_unique(bus, drive, pdu);
+    }
+
+    /// A run goes out: no stop that was accepted before it is still to be answered.
+    pub(super) fn no_stop_is_overtaken(&mut self, bus: usize, drive: usize) {
+        self.collect();
+        let now = self.now;
+        let open: Vec<&Record> = self
+            .open
+            .get(&(bus, drive))
+            .into_iter()
+            .flatten()
+            .map(|id| &self.records[*id])
+            .collect();
+        let Some(run) = open
+            .iter()
+            .filter(|record| record.wish.is_run())
+            .map(|record| record.place)
+            .max()
+        else {
+            return;
+        };
+        for stop in open.iter().filter(|record| record.wish.is_stop() && record.place < run) {
+            // By MQTT the answer of an order that is done waits for its confirmation.
+            let by_mqtt = self.clients[stop.client].habit == Habit::Mqtt;
+            assert!(
+                by_mqtt || stop.accepted == now,
+                "a run goes out before an older stop: {stop:?}"
+            );
+        }
+    }
+
+    /// Whether a write sets the reference that supervision sets when a lease runs out.
+    pub(super) fn is_reference_of_supervision(&self, bus: usize, drive: usize, pdu: &RequestPdu) -> bool {
+        let bus = &self.buses[bus];
+        let Some(LeaseAction::SpeedReference(percent)) = bus.line.supervision.as_ref().map(|s| &s.action) else {
+            return false;
+        };
+        let maxima = self.truths[bus.index][drive].maxima.iter().map(|(_, maximum)| *maximum);
+        let mut words = maxima.filter_map(|maximum| percent_reference(&bus.profile, *percent, maximum));
+        words.any(|words| sets(pdu, &words))
+    }
+
+    /// A write goes out that no client asked for: the lease must have run out, and no client be back.
+    pub(super) fn supervision_acts(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
+        let now = self.now;
+        // An order that ended in this step waits no more.
+        self.collect();
+        let supervision = self.buses[bus].line.supervision.clone();
+        let supervision = supervision.unwrap_or_else(|| panic!("a stop that nobody ordered, drive {}", drive + 1));
+        assert!(
+            supervision.action == LeaseAction::Stop || run_command(&self.buses[bus].profile, pdu).is_none(),
+            "a stop went out where the action is {:?}",
+            supervision.action
+        );
+        let truth = &self.truths[bus][drive];
+        if let Some(heard) = truth.heard.0 {
+            assert!(
+                now - heard >= supervision.timeout,
+                "the action came {:?} after the client",
+                now - heard
+            );
+        } else {
+            assert!(
+                supervision.adopt || truth.heard.1.is_some(),
+                "the action came though nobody was ever heard of"
+            );
+        }
+        for id in self.open.get(&(bus, drive)).into_iter().flatten() {
+            let record = &self.records[*id];
+            // By MQTT the answer of an order that is done waits for its confirmation.
+            let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
+            let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt;
+            assert!(
+                !waits || now - record.accepted < Duration::from_millis(2),
+                "the action overrides a client that is back: {record:?}"
+            );
+        }
+    }
+
+    /// Words that only one order writes: what may go out of it, and in which order.
+    pub(super) fn check_unique(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
+        let now = self.now;
+        let repeated = self.truths[bus][drive].repeated_until.is_some_and(|until| now < until);
+        let again = |record: &Record| repeated && record.wish.is_stop();
+        let waiting = self.open.get(&(bus, drive)).into_iter().flatten();
+        let profile = &self.buses[bus].profile;
+        let is_converted = |id: &usize| {
+            let maxima = self.truths[bus][drive].maxima.iter();
+            let mut words = maxima.filter_map(|(_, maximum)| converted(profile, *id, *maximum));
+            self.records[*id].wish == Wish::Converted && words.any(|words| sets(pdu, &words))
+        };
+        if waiting.into_iter().any(is_converted) {
+            return;
+        }
+        let mine = |record: &Record| {
+            record.bus == bus && record.drive == drive && record.unique.as_ref().is_some_and(|unique| sets(pdu, unique))
+        };
+        // The last order with these words: they come again after some thousands.
+        let Some(id) = self.records.iter().rposition(mine) else {
+            return;
+        };
+        let record = &mut self.records[id];
+        if again(record) {
+            return;
+        }
+        if let Some((code, at)) = &record.answer {
+            panic!(
+                "order {id} was answered {code} {:?} ago, and goes out: {record:?}",
+                now - *at
+            );
+        }
+        assert!(now < record.expires, "an expired order goes out: {record:?}");
+        let first = record.sent.is_none();
+        record.sent.get_or_insert(now);
+        if first && !record.wish.is_stop() {
+            let (place, truth) = (record.place, &mut self.truths[bus][drive]);
+            assert!(
+                place > truth.last_place,
+                "order {id} of place {place} goes out behind place {}",
+                truth.last_place
+            );
+            truth.last_place = place;
+        }
+    }
+
+    /// A drive acted upon a request.
+    pub(super) fn acted(&mut self, bus: usize, asked: &Asked) {
+        let profile = self.buses[bus].profile.clone();
+        let refused = matches!(asked.reply, Some(Reply::Exception(_)));
+        let words = asked.reply.as_ref().and_then(Reply::words);
+        let truth = &mut self.truths[bus][asked.drive];
+        if refused {
+            return;
+        }
+        if let Some(run) = run_command(&profile, &asked.pdu) {
+            truth.run = run;
+        }
+        truth.act(self.now, asked.pdu.clone(), words);
+    }
+
+    /// An exchange is over: what the image has of it now is what the drive answered to it.
+    pub(super) fn over(&mut self, bus: usize, asked: &Asked) {
+        let (Some(RequestPdu::Read { table, start, count }), true) = (Some(asked.pdu.clone()), asked.is_poll) else {
+            return;
+        };
+        let image = &self.buses[bus].handle.image.drives[asked.drive];
+        let snapshot = image.snapshot();
+        let Some(at) = snapshot.read_at(table, start) else {
+            return;
+        };
+        let untouched = asked.last_read == Some(at);
+        if untouched {
+            return;
+        }
+        let stored: Vec<u16> = (0..count)
+            .map(|i| snapshot.word(table, start + i).unwrap_or(0))
+            .collect();
+        // Simulated late replies may overtake each other, which those of a drive do not.
+        let slack = if self.buses[bus].line.is_late() {
+            Duration::from_secs(1)
+        } else {
+            Duration::ZERO
+        };
+        let from = at.min(asked.at).checked_sub(slack).unwrap_or(at);
+        let truth = &self.truths[bus][asked.drive];
+        // The drive may have said it in answer to an earlier try; the image dates it back then.
+        let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words == Some(&stored);
+        assert!(
+            truth.did(from, said),
+            "drive {} at {table} {start}: it did not say {stored:?} in the last {:?}",
+            asked.drive + 1,
+            self.now - at
+        );
+    }
+}
