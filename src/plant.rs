@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use tokio::sync::oneshot;
 
-use crate::cache::{BusImage, DriveImage, Reading};
 use crate::codec::{Table, describe};
 use crate::command::{
     self, Answer, Authority, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
@@ -16,6 +15,7 @@ use crate::command::{
 };
 use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
+use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::placed::Placed;
 

@@ -7,10 +7,10 @@ use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
-use crate::cache::{DriveImage, Reading};
 use crate::codec::Reply;
 use crate::command::{Interruption, Outcome, Urgency};
 use crate::drive::ModelPoint;
+use crate::process_image::{DriveImage, Reading};
 
 /// A status older than this, or than three rounds of the line, does not tell whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);

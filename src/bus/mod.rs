@@ -40,7 +40,7 @@ use std::time::Duration;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
 
-/// How a bus treats its line, beside what [`crate::cache::BusSpec`] says.
+/// How a bus treats its line, beside what [`crate::process_image::BusSpec`] says.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusOptions {
     /// Time for the first byte of a reply; wire time is added.

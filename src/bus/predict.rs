@@ -8,12 +8,12 @@ use std::fmt;
 use std::time::Duration;
 
 use super::schedule::{SLOW_SHARE, slow_share};
-use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
 use crate::document::{Finding, format_duration};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::process_image::{BusSpec, DriveSpec};
 
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];

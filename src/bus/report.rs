@@ -8,10 +8,10 @@ use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::Ended;
-use crate::cache::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
 use crate::codec::{Exception, Reply, Request};
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
+use crate::process_image::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
 
 /// The load of the line is reckoned over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);

@@ -13,10 +13,10 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
-use crate::cache::{LeaseAction, Reading, Unavailable};
 use crate::command::{Answer, Refusal};
 use crate::drive::profile::Form;
 use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value};
+use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);

@@ -7,9 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::transaction::Ended;
-use crate::cache::{BusImage, Direction, FrameRecord};
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
+use crate::process_image::{BusImage, Direction, FrameRecord};
 
 /// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
 const KEPT: usize = 2048;

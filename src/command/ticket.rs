@@ -8,7 +8,7 @@ use tokio::sync::oneshot;
 
 use super::audit::{Audit, AuditRecord, Change};
 use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind};
-use crate::cache::{Histogram, HistogramSnapshot};
+use crate::process_image::{Histogram, HistogramSnapshot};
 
 /// Counters of commands, for the metrics, and the audit.
 #[derive(Debug, Default)]

@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{Access, LeaseAction, Supervision};
 use drivegate::codec::{Exception, Protocol};
 use drivegate::command::{Outcome, Refusal};
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
+use drivegate::process_image::{Access, LeaseAction, Supervision};
 use drivegate::sim::drive::ModelOptions;
 use drivegate::sim::faults::{Fault, FaultPlan};
 use drivegate::sim::nx::NxOptions;

@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::codec::Protocol;
+use drivegate::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::sim::random::Random;
 
 /// One world.

@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use drivegate::cache::{LeaseAction, Supervision};
 use drivegate::codec::{Protocol, Reply, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::drive::{ModelPoint, Value};
 use drivegate::plant::Placed;
+use drivegate::process_image::{LeaseAction, Supervision};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::random::Random;
 

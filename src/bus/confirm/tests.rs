@@ -3,10 +3,10 @@ use std::sync::Arc;
 use proptest::prelude::*;
 
 use super::*;
-use crate::cache::{Access, DriveImage, DriveSpec, Link};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::{Origin, Outcome, SourceKind, Ticket, WriteStats};
 use crate::drive::profile::Profiles;
+use crate::process_image::{Access, DriveImage, DriveSpec, Link};
 
 struct Bench {
     drive: DriveImage,

@@ -6,7 +6,6 @@ use crate::bus::command_run::{CommandRun, Next, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::master::supervise;
 use crate::bus::n2_late_replies::N2LateReplies;
-use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
 use crate::command::{
@@ -16,6 +15,7 @@ use crate::command::{
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 use crate::plant::BusHandle;
+use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 
 mod begins;
 mod chance;

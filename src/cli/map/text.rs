@@ -6,10 +6,10 @@ use comfy_table::{Table as TextTable, presets};
 
 use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
-use crate::cache::{Access, DriveSpec};
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::north::register_map::GATEWAY_UNIT;
+use crate::process_image::{Access, DriveSpec};
 
 /// The whole map as tables.
 pub(super) fn render(map: &Map<'_>) -> String {

@@ -2,9 +2,9 @@
 
 use std::time::{Duration, UNIX_EPOCH};
 
-use drivegate::cache::{Direction, FrameRecord};
 use drivegate::event::EventKind;
 use drivegate::north::http::MAX_LISTENERS;
+use drivegate::process_image::{Direction, FrameRecord};
 use serde_json::json;
 use tokio::time::timeout;
 

@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use drivegate::cache::Link;
 use drivegate::event::EventKind;
+use drivegate::process_image::Link;
 
 use super::bench::*;
 

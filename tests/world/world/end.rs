@@ -36,7 +36,7 @@ impl World {
             });
         }
         for (index, bus) in self.buses.iter_mut().enumerate() {
-            let on_shutdown = bus.line.on_shutdown == drivegate::cache::OnShutdown::Stop;
+            let on_shutdown = bus.line.on_shutdown == drivegate::process_image::OnShutdown::Stop;
             let Some(missing) = missing.get(&index).filter(|_| on_shutdown) else {
                 continue;
             };
