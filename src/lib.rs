@@ -22,7 +22,7 @@
 //!   ([`codec::n2`], whose objects lie in the tables of Modbus). Pure.
 //! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); points made of others
 //!   ([`drive::derive`]); which requests read them ([`drive::plan`]); how a family is known ([`drive::identify`]). Pure.
-//! - [`event`]: what happened, told once.
+//! - [`event`]: what happened, published once.
 //! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`plant`]: all images and queues, as the north sides see them.

@@ -12,7 +12,7 @@
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
-//! `tap`, which feeds the trace, add the time of day to what they tell.
+//! `tap`, which feeds the trace, add the time of day to what they report.
 
 pub mod command_run;
 pub mod confirm;

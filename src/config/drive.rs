@@ -288,7 +288,7 @@ fn shows_whether_it_runs(profile: &Profile) -> bool {
     let plan = Plan::of(profile);
     let is_read = |point| {
         let index = profile.model_index(point);
-        index.is_some_and(|index| plan.tells(profile, index))
+        index.is_some_and(|index| plan.shows(profile, index))
     };
     is_read(ModelPoint::Running) || is_read(ModelPoint::Run)
 }

@@ -267,7 +267,7 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     }
 }
 
-/// Every family that ships tells that it runs, and whether it is there.
+/// Every family that ships reports whether it runs, and whether it is there.
 #[test]
 fn every_family_can_be_supervised() {
     for profile in Profiles::built_in().iter() {

@@ -72,7 +72,7 @@ pub struct WorldBus {
     asked: Option<Asked>,
 }
 
-/// What a line has that its description does not tell.
+/// What a line has that is not in its description.
 pub struct Parts {
     pub profile: Arc<Profile>,
     pub drives: Vec<DriveOptions>,

@@ -43,7 +43,7 @@ pub struct Line {
     pub on_shutdown: OnShutdown,
     /// Addresses where nobody answers.
     pub dead: Vec<u8>,
-    /// A register that the first drive refuses to tell.
+    /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
     /// What else is different about its drives.
     pub spec: fn(&mut DriveSpec),

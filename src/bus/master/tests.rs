@@ -1,4 +1,4 @@
-//! The master with drives of one family that do as they are told, in virtual time.
+//! The master with drives of one family that do as commanded, in virtual time.
 
 use std::collections::BTreeMap;
 use std::time::SystemTime;
@@ -169,7 +169,7 @@ impl Rig {
         self.news.append(&mut news);
     }
 
-    /// What the process image is told.
+    /// What is stored in the process image.
     fn apply(&self, news: &News) {
         let image = |drive: usize| self.bus.image.drives[drive].clone();
         match news {

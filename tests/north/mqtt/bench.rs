@@ -438,9 +438,9 @@ impl Gateway {
         fill(&self.plant.load(), drive, frequency);
     }
 
-    pub(crate) fn tell(&self, drive: &str, kind: EventKind, text: &str) -> SystemTime {
+    pub(crate) fn publish_event(&self, drive: &str, kind: EventKind, text: &str) -> SystemTime {
         let time = SystemTime::now();
-        self.plant.load().events.tell(Event {
+        self.plant.load().events.publish(Event {
             id: 0,
             time,
             kind,

@@ -150,11 +150,11 @@ fn family(profile: &Profile) -> String {
     let mut sure: Vec<String> = Vec::new();
     let mut unsure: Vec<String> = Vec::new();
     for (code, fault) in &profile.faults {
-        let told = format!("{code} {}", fault.text);
+        let reported = format!("{code} {}", fault.text);
         if fault.verified {
-            sure.push(told)
+            sure.push(reported)
         } else {
-            unsure.push(told)
+            unsure.push(reported)
         }
     }
     if doubtful > 0 {

@@ -63,10 +63,10 @@ impl World {
         self.collect();
         let open: Vec<usize> = self.open.values().flatten().copied().collect();
         assert!(open.is_empty(), "orders without an answer at the end: {open:?}");
-        let told: u64 = self.writes.results().values().sum();
+        let reported: u64 = self.writes.results().values().sum();
         let reads = self.records.iter().filter(|record| record.read.is_some()).count();
         assert!(
-            told >= (self.records.len() - reads) as u64,
+            reported >= (self.records.len() - reads) as u64,
             "each order is counted once"
         );
     }
