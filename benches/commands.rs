@@ -10,9 +10,9 @@ use std::error::Error;
 use std::process::ExitCode;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::cache::Direction;
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, SourceKind};
 use drivegate::drive::Value;
+use drivegate::process_image::Direction;
 
 use common::gateway::{Bus, Gateway, line, settings};
 use common::{option, quantile};

@@ -12,12 +12,12 @@ use self::server::{ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
-use crate::cache::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
+use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);

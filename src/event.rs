@@ -1,4 +1,4 @@
-//! What happened: state changes that people and the cloud want to hear of, each told once.
+//! What happened: state changes that people and the cloud want to know of, each published once.
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, PoisonError};
@@ -11,7 +11,7 @@ use tokio::sync::broadcast;
 pub const BURST: usize = 16_384;
 /// Events kept for late readers.
 const KEPT: usize = 4096;
-/// Refused commands told of one drive within [`REFUSALS_IN`]: a client without authority can send them at any rate.
+/// Refused commands of one drive that are published within [`REFUSALS_IN`]: a client without authority can send them at any rate.
 const REFUSALS: u32 = 10;
 /// The time for which refused commands are counted.
 const REFUSALS_IN: Duration = Duration::from_secs(1);
@@ -112,7 +112,7 @@ pub fn rfc3339<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result
     serializer.collect_str(&humantime::format_rfc3339_millis(*time))
 }
 
-/// Where events are told and heard.
+/// Where events are published and received.
 #[derive(Debug, Clone)]
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,
@@ -125,23 +125,23 @@ pub struct Events {
 #[derive(Debug)]
 struct Refusals {
     since: Instant,
-    told: u32,
-    untold: u64,
+    published: u32,
+    omitted: u64,
 }
 
 impl Refusals {
-    /// Whether one may be told now, and how many were not told before it.
+    /// Whether one may be published now, and how many were left out before it.
     fn admit(&mut self, now: Instant) -> Option<u64> {
         if now.saturating_duration_since(self.since) >= REFUSALS_IN {
             self.since = now;
-            self.told = 0;
+            self.published = 0;
         }
-        if self.told == REFUSALS {
-            self.untold += 1;
+        if self.published == REFUSALS {
+            self.omitted += 1;
             return None;
         }
-        self.told += 1;
-        Some(std::mem::take(&mut self.untold))
+        self.published += 1;
+        Some(std::mem::take(&mut self.omitted))
     }
 }
 
@@ -156,8 +156,8 @@ impl Default for Events {
 }
 
 impl Events {
-    /// Tells an event; its id is set here.
-    pub fn tell(&self, mut event: Event) {
+    /// Publishes an event; its id is set here.
+    pub fn publish(&self, mut event: Event) {
         let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         kept.0 += 1;
         event.id = kept.0;
@@ -176,23 +176,23 @@ impl Events {
         let _ = self.sender.send(event);
     }
 
-    /// Tells that a command to `drive` was refused: ten a second at most, the next one tells how many were left out.
+    /// Publishes that a command to `drive` was refused: ten a second at most, the next one says how many were left out.
     /// The audit has them all.
-    pub fn tell_refusal(&self, bus: &str, drive: &str, mut text: String, now: Instant) {
-        let untold = {
+    pub fn publish_refusal(&self, bus: &str, drive: &str, mut text: String, now: Instant) {
+        let omitted = {
             let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
             let of_drive = refusals.entry(drive.to_string()).or_insert(Refusals {
                 since: now,
-                told: 0,
-                untold: 0,
+                published: 0,
+                omitted: 0,
             });
             of_drive.admit(now)
         };
-        let Some(untold) = untold else { return };
-        if untold > 0 {
-            text = format!("{text} ({untold} more refused before are in the audit log)");
+        let Some(omitted) = omitted else { return };
+        if omitted > 0 {
+            text = format!("{text} ({omitted} more refused before are in the audit log)");
         }
-        self.tell(Event {
+        self.publish(Event {
             id: 0,
             time: SystemTime::now(),
             kind: EventKind::RefusedCommand,
@@ -240,7 +240,7 @@ mod tests {
     fn a_burst_of_all_drives_reaches_who_is_busy_and_who_comes_late() {
         let events = Events::default();
         let mut busy = events.subscribe();
-        (0..BURST).for_each(|n| events.tell(event(n.to_string())));
+        (0..BURST).for_each(|n| events.publish(event(n.to_string())));
         let heard = std::iter::from_fn(|| busy.try_recv().ok());
         assert!(heard.map(|e| e.id).eq(1..=BURST as u64));
         let kept = events.recent();
@@ -253,15 +253,15 @@ mod tests {
         let events = Events::default();
         let now = Instant::now();
         for _ in 0..1000 {
-            events.tell_refusal("line1", "pump-1", "refused".to_string(), now);
+            events.publish_refusal("line1", "pump-1", "refused".to_string(), now);
         }
-        events.tell_refusal("line1", "pump-2", "refused".to_string(), now);
+        events.publish_refusal("line1", "pump-2", "refused".to_string(), now);
         assert_eq!(
             events.recent().len(),
             11,
             "ten of one drive, none of them at the cost of another drive"
         );
-        events.tell_refusal("line1", "pump-1", "refused".to_string(), now + REFUSALS_IN);
+        events.publish_refusal("line1", "pump-1", "refused".to_string(), now + REFUSALS_IN);
         let last = events.recent().last().map(|e| e.text.clone()).unwrap();
         assert_eq!(last, "refused (990 more refused before are in the audit log)");
     }

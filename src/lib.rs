@@ -3,12 +3,12 @@
 //! # The one flow
 //!
 //! ```text
-//!  drives ──line──▶ codec ──▶ bus (transaction, schedule) ──▶ cache ──▶ north (Modbus TCP, MQTT, HTTP)
+//!  drives ──line──▶ codec ──▶ bus (transaction, schedule) ──▶ process image ──▶ north (Modbus TCP, MQTT, HTTP)
 //!  drives ◀─line─── codec ◀── bus ◀────── command queue ◀────────────── north
 //! ```
 //!
 //! Values go up: the thread of a bus ([`bus`]) owns its [`mod@line`], asks one drive after the other and puts each reply
-//! into the process image ([`cache`]) as a whole. The servers ([`north`]) look at the image whenever they like; no
+//! into the process image ([`process_image`]) as a whole. The servers ([`north`]) look at the image whenever they like; no
 //! reader costs the line anything. Orders go down: a server gives an order to the drive's handle ([`plant`]), which
 //! checks authority, limits and presence ([`mod@command`]) and queues it for the bus; whoever ordered gets exactly one
 //! answer. North and bus never name each other.
@@ -22,8 +22,8 @@
 //!   ([`codec::n2`], whose objects lie in the tables of Modbus). Pure.
 //! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); points made of others
 //!   ([`drive::derive`]); which requests read them ([`drive::plan`]); how a family is known ([`drive::identify`]). Pure.
-//! - [`event`]: what happened, told once.
-//! - [`cache`]: the process image; many readers, one writer a bus.
+//! - [`event`]: what happened, published once.
+//! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
@@ -47,7 +47,6 @@
 //! Why things are as they are, and which file a change belongs to, stands in `docs/architecture.md`.
 
 pub mod bus;
-pub mod cache;
 pub mod cli;
 pub mod codec;
 pub mod command;
@@ -59,4 +58,5 @@ pub mod event;
 pub mod line;
 pub mod north;
 pub mod plant;
+pub mod process_image;
 pub mod sim;

@@ -8,7 +8,6 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use tokio::sync::oneshot;
 
-use crate::cache::{BusImage, DriveImage, Reading};
 use crate::codec::{Table, describe};
 use crate::command::{
     self, Answer, Authority, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
@@ -16,6 +15,7 @@ use crate::command::{
 };
 use crate::drive::{ModelPoint, Value};
 use crate::event::Events;
+use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::placed::Placed;
 
@@ -200,7 +200,7 @@ impl DriveHandle {
     /// before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
     ///
     /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused writes
-    /// are audited and told as an event.
+    /// are audited and published as an event.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
         let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
@@ -213,7 +213,7 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
             Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, now),
             Err(refusal) => {
-                self.tell_refusal(&what, &refusal.to_string(), ticket.origin(), now);
+                self.publish_refusal(&what, &refusal.to_string(), ticket.origin(), now);
                 ticket.answer(Outcome::Refused(refusal), now);
             }
             Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
@@ -229,19 +229,19 @@ impl DriveHandle {
         placed
     }
 
-    /// Refuses a command before it became an order; audited, counted and told like any other refusal.
+    /// Refuses a command before it became an order; audited, counted and published like any other refusal.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
-        self.tell_refusal(what, &refusal.to_string(), &origin, now);
+        self.publish_refusal(what, &refusal.to_string(), &origin, now);
         let name = &self.image.spec.name;
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
     }
 
-    /// Tells that a command was refused; a flood of them is counted, not told.
-    fn tell_refusal(&self, what: &str, why: &str, origin: &Origin, now: Instant) {
+    /// Publishes that a command was refused; a flood of them is counted.
+    fn publish_refusal(&self, what: &str, why: &str, origin: &Origin, now: Instant) {
         let what = if what.is_empty() { "an empty command" } else { what };
         let text = format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who);
         let spec = &self.image.spec;
-        self.events.tell_refusal(&spec.bus, &spec.name, text, now);
+        self.events.publish_refusal(&spec.bus, &spec.name, text, now);
     }
 
     fn describe(&self, order: &Order) -> String {

@@ -4,11 +4,11 @@ use std::error::Error;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::cache::BusImage;
 use drivegate::codec::LineFormat;
 use drivegate::config::Settings;
 use drivegate::daemon::Daemon;
 use drivegate::plant::Plant;
+use drivegate::process_image::BusImage;
 use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};

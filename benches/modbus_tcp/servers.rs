@@ -9,12 +9,12 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{BusImage, DriveImage, Link};
 use drivegate::codec::Table;
 use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
 use drivegate::north::modbus_tcp;
 use drivegate::plant::{BusHandle, Plant};
+use drivegate::process_image::{BusImage, DriveImage, Link};
 use drivegate::sim::statistics::Direction;
 use tokio_modbus::prelude::*;
 use tokio_modbus::server::tcp::{Server, accept_tcp_connection};

@@ -10,7 +10,7 @@ use std::sync::{Arc, LazyLock};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{BusImage, DriveImage, Link};
+use drivegate::process_image::{BusImage, DriveImage, Link};
 use drivegate::codec::{Exception, Reply, RequestPdu, Table};
 use drivegate::command::{Authority, Command, CommandQueue, Order, Outcome, Urgency};
 use drivegate::config::Settings;

@@ -54,7 +54,7 @@ struct Tries {
 #[derive(Debug)]
 pub struct CommandRun {
     urgency: Urgency,
-    /// With which it competes for the line; a stop that tells its drive nothing new has that of a command.
+    /// With which it competes for the line; a redundant stop has that of a command.
     pub rank: Urgency,
     scope: Scope,
     actions: VecDeque<Action>,
@@ -76,7 +76,7 @@ pub struct CommandRun {
     /// What the drive last said of its motor.
     running: bool,
     check: Check,
-    /// The drive does not tell its own word: bits that the command does not set are written as 0.
+    /// The drive's own word cannot be read: bits that the command does not set are written as 0.
     blind: bool,
     /// It waited for a late reply since its last step was chosen.
     held_up: bool,
@@ -303,7 +303,7 @@ impl CommandRun {
         if !self.tries.in_doubt || step.purpose != StepPurpose::ReadWord {
             self.tries.failures = 0;
         }
-        // An exception tells nothing of an earlier try that was not answered.
+        // An exception shows nothing about an earlier try that was not answered.
         if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
             self.tries.in_doubt = false;
         }
@@ -393,10 +393,10 @@ impl CommandRun {
     }
 
     /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
-    /// tells it (`untold`), and at the end of a pulse, which no read stands in the way of.
-    fn goes_on(&mut self, untold: bool) -> bool {
+    /// reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
+    fn goes_on(&mut self, unreadable: bool) -> bool {
         let ends = matches!(self.actions.front(), Some(Action::PulseEnd { .. }));
-        let goes_on = self.check == Check::NotYet && (untold || ends);
+        let goes_on = self.check == Check::NotYet && (unreadable || ends);
         if goes_on {
             self.check = Check::InVain;
             self.tries.failures = 0;
@@ -404,7 +404,7 @@ impl CommandRun {
         goes_on
     }
 
-    /// The drive does not tell its own word. A stop goes out all the same: no read stands in its way. So does a
+    /// The drive's own word cannot be read. A stop goes out all the same: no read stands in its way. So does a
     /// command to a motor that stands, and one that sets every bit; another one could stop or turn a motor that runs,
     /// and ends with `outcome`.
     fn without_word(&mut self, outcome: Outcome) -> Option<Outcome> {

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use crate::cache::Reading;
 use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, PollClass, Profile, Value};
+use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;

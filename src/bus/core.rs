@@ -97,7 +97,7 @@ impl BusCore {
         (self.chosen, self.asked, self.tap) = (None, None, None);
         let news = self.master.lost(now);
         self.report.bus_down(why);
-        self.tell(&news, now);
+        self.report_all(&news, now);
     }
 
     /// The bus ends: everybody who waits is answered. What the bus that comes after has to know.
@@ -136,7 +136,7 @@ impl BusCore {
     fn choose(&mut self, now: Instant) -> Option<Instant> {
         let mut news = Vec::new();
         let next = self.master.next(now, &mut news);
-        self.tell(&news, now);
+        self.report_all(&news, now);
         self.report.tick(now);
         let turn = match next {
             Ok(turn) => turn,
@@ -239,10 +239,10 @@ impl BusCore {
             mangled,
         };
         let news = self.master.done(turn, end, now);
-        self.tell(&news, now);
+        self.report_all(&news, now);
     }
 
-    fn tell(&mut self, news: &[News], now: Instant) {
+    fn report_all(&mut self, news: &[News], now: Instant) {
         for one in news {
             self.report.apply(one, now);
         }

@@ -7,18 +7,18 @@ use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
-use crate::cache::{DriveImage, Reading};
 use crate::codec::Reply;
 use crate::command::{Interruption, Outcome, Urgency};
 use crate::drive::ModelPoint;
+use crate::process_image::{DriveImage, Reading};
 
-/// A status older than this, or than three rounds of the line, does not tell whether the motor runs.
+/// A status older than this, or than three rounds of the line, does not show whether the motor runs.
 pub(super) const FRESH: Duration = Duration::from_secs(2);
 
 /// One drive.
 #[derive(Debug)]
 pub(super) struct DriveState {
-    /// A status older than that does not tell whether the motor runs.
+    /// A status older than that does not show whether the motor runs.
     pub(super) fresh: Duration,
     /// Its own command words.
     pub(super) words: KnownWords,
@@ -204,7 +204,7 @@ impl DriveState {
         self.stopped.is_some()
     }
 
-    /// Whether a stop tells the drive nothing new: it acknowledged one, a later sample shows the motor standing, and
+    /// Whether a stop is redundant: the drive acknowledged one, a later sample shows the motor standing, and
     /// nothing that is begun may start it.
     pub(super) fn stands_by_stop(&self, reading: &Reading<'_>) -> bool {
         let begun = self.runs.get(slot(Urgency::Command)).and_then(Option::as_ref);

@@ -2,7 +2,7 @@
 //! later request. Pure: time is an argument.
 //!
 //! A Modbus reply names neither register nor request. After an exchange without a believable answer, the reply may come
-//! during a later exchange. It is told apart by address, function and length; only a request to the same drive whose
+//! during a later exchange. It is recognised by address, function and length; only a request to the same drive whose
 //! reply would look the same could be answered wrongly. Such a request waits until no late reply can come any more. The
 //! same request may be sent again at once: whichever reply comes, it is true of the same registers.
 //!
@@ -91,7 +91,7 @@ impl LateReplies {
             Some(late) => {
                 late.until = until;
                 late.since.get_or_insert(began);
-                // Reads tell the truth in any order.
+                // Reads are true in any order.
                 if pdu.is_write() {
                     late.count = (late.count + 1).min(KEPT);
                 }
@@ -119,7 +119,7 @@ impl LateReplies {
         self.overtake(pdu);
     }
 
-    /// The drive may have taken `pdu`: an acknowledgement of another write from before does not tell how it is now.
+    /// The drive may have taken `pdu`: an acknowledgement of an earlier write does not show how it is now.
     fn overtake(&mut self, pdu: &RequestPdu) {
         let others = self.expected.iter_mut().filter(|late| late.pdu != *pdu);
         for late in others.filter(|late| pdu.is_write() && late.pdu.is_write()) {

@@ -24,13 +24,13 @@ use super::news::News;
 use super::schedule::{Cadence, Poll, Schedule};
 use super::supervision::{Demand, Lease, Orders};
 use super::transaction::Ended;
-use crate::cache::DriveImage;
 use crate::codec::n2::Session;
 use crate::codec::{Protocol, RequestPdu};
 use crate::command::{DEFAULT_EXPIRY, Interruption, Origin, Outcome, SourceKind, Urgency, WriteStats};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
 use crate::plant::{BusHandle, turn_away};
+use crate::process_image::DriveImage;
 
 /// The bus looks around at least this often.
 const LOOK_ROUND: Duration = Duration::from_millis(100);

@@ -12,7 +12,7 @@
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
-//! `tap`, which feeds the trace, add the time of day to what they tell.
+//! `tap`, which feeds the trace, add the time of day to what they report.
 
 pub mod command_run;
 pub mod confirm;
@@ -40,7 +40,7 @@ use std::time::Duration;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
 
-/// How a bus treats its line, beside what [`crate::cache::BusSpec`] says.
+/// How a bus treats its line, beside what [`crate::process_image::BusSpec`] says.
 #[derive(Debug, Clone, PartialEq)]
 pub struct BusOptions {
     /// Time for the first byte of a reply; wire time is added.

@@ -140,7 +140,7 @@ impl Late {
 }
 
 impl Form {
-    /// Whether a late reply of this form could pass for one of that. A late identity is told from a state by its value.
+    /// Whether a late reply of this form could pass for one of that. A late identity is distinguished from a state by its value.
     fn is_like(self, wanted: Form) -> bool {
         use Form::{Acknowledgement, Changes, Float, Identity, Integer, State};
         matches!(

@@ -4,7 +4,7 @@
 //! drive is identified first, its report is taken (and thrown away: the layout is not known, values are read), then it
 //! is read. `N00` at any time means that it has started anew: the same again.
 //!
-//! What tells late replies apart is not here but in `n2_late_replies`.
+//! Late replies are recognised in `n2_late_replies`.
 
 use std::time::Instant;
 
@@ -13,7 +13,7 @@ use crate::codec::n2::{N2Options, Session};
 use crate::codec::{Exception, Reply};
 use crate::command::Urgency;
 
-/// Polls in which a drive has to tell all its changes.
+/// Polls in which a drive has to report all its changes.
 pub const MOST_POLLS: u8 = 16;
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -35,7 +35,7 @@ struct Drive {
     polled: Option<Instant>,
     /// It answered something since it was identified.
     proved: bool,
-    /// The device type that was told last.
+    /// The device type that was reported last.
     device: Option<u8>,
 }
 
@@ -44,7 +44,7 @@ struct Drive {
 pub enum Progress {
     /// What is due next is decided anew.
     Going,
-    /// The drive is of another type than its profile says; told once.
+    /// The drive is of another type than its profile says; reported once.
     Unlike(u8),
     /// Something has changed: the drive is to be read.
     Changed,
@@ -221,7 +221,7 @@ impl Drive {
         }
         self.phase = Phase::Ready;
         self.polled = Some(now);
-        // The last poll of a series tells of all of it.
+        // The last poll of a series stands for all of it.
         if left + 1 < MOST_POLLS {
             Progress::Changed
         } else {

@@ -8,17 +8,17 @@ use std::fmt;
 use std::time::Duration;
 
 use super::schedule::{SLOW_SHARE, slow_share};
-use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::LineFormat;
 use crate::codec::wire::Silence;
 use crate::document::{Finding, format_duration};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::process_image::{BusSpec, DriveSpec};
 
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
-/// Part of a cadence by which it may be missed before it is told.
+/// Part of a cadence by which it may be missed before it is reported.
 const TOLERANCE: f64 = 0.001;
 
 /// A request of the plan of a bus.

@@ -8,14 +8,14 @@ use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::Ended;
-use crate::cache::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
 use crate::codec::{Exception, Reply, Request};
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
+use crate::process_image::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
 
 /// The load of the line is reckoned over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
-/// What was read longer ago does not tell of faults and parameters.
+/// What was read longer ago shows neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
 
 /// Reports what a bus does.
@@ -60,13 +60,13 @@ impl Report {
             News::Unlike(drive, device) => self.unlike(*drive, *device),
             News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception),
             News::NotConfirmed(drive, text) => {
-                self.tell(*drive, EventKind::NotConfirmed, None, |name| {
+                self.drive_event(*drive, EventKind::NotConfirmed, None, |name| {
                     format!("drive {name} {text}")
                 });
             }
             News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
             News::ActionRefused { drive, what, refusal } => {
-                self.tell(*drive, EventKind::Supervision, None, |name| {
+                self.drive_event(*drive, EventKind::Supervision, None, |name| {
                     format!(
                         "the lease of {name} ran out, and {what} cannot be written: {refusal}; it is tried again every \
                          second, until a client commands the drive"
@@ -74,7 +74,7 @@ impl Report {
                 });
             }
             News::RunningUnknown(drive) => {
-                self.tell(*drive, EventKind::Supervision, None, |name| {
+                self.drive_event(*drive, EventKind::Supervision, None, |name| {
                     format!(
                         "drive {name} does not say whether it runs; its supervision goes by the run command, and takes a \
                          motor whose run command is not known to run"
@@ -94,7 +94,7 @@ impl Report {
     }
 
     /// Reports an event of a drive; `text` makes the words from its name.
-    fn tell(&self, index: usize, kind: EventKind, fault_code: Option<i64>, text: impl FnOnce(&str) -> String) {
+    fn drive_event(&self, index: usize, kind: EventKind, fault_code: Option<i64>, text: impl FnOnce(&str) -> String) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -104,7 +104,7 @@ impl Report {
     }
 
     fn event(&self, kind: EventKind, drive: Option<String>, fault_code: Option<i64>, text: String) {
-        self.events.tell(Event {
+        self.events.publish(Event {
             id: 0,
             time: SystemTime::now(),
             kind,
@@ -139,7 +139,7 @@ impl Report {
             LeaseAction::SpeedReference(percent) => format!("the speed reference is set to {percent} %"),
         };
         let timeout = supervision.timeout;
-        self.tell(index, EventKind::Supervision, None, |name| {
+        self.drive_event(index, EventKind::Supervision, None, |name| {
             format!("no commanding client of {name} for {timeout:?}: {action}")
         });
     }
@@ -152,7 +152,7 @@ impl Report {
                  with the gateway"
             }
         };
-        self.tell(index, EventKind::Unsupervised, None, |name| {
+        self.drive_event(index, EventKind::Unsupervised, None, |name| {
             format!("drive {name} runs, and nobody has commanded it since the gateway started; {then}")
         });
     }
@@ -173,7 +173,7 @@ impl Report {
         self.event(EventKind::BusUp, None, None, text);
     }
 
-    /// Told once a reason, not at every try.
+    /// Reported once for each reason, not at every try.
     pub(super) fn bus_down(&mut self, why: &str) {
         let news = self.up || self.reason != why;
         self.image.update_health(|h| {
@@ -204,7 +204,7 @@ impl Report {
         if let Some(looked_at) = self.looked_at.get_mut(index) {
             *looked_at = false;
         }
-        self.tell(index, EventKind::Online, None, |name| format!("drive {name} answers"));
+        self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} answers"));
     }
 
     /// Also while the bus is down, when nothing was heard of the drive before.
@@ -222,7 +222,7 @@ impl Report {
         } else {
             "its bus is down"
         };
-        self.tell(index, EventKind::Offline, None, |name| {
+        self.drive_event(index, EventKind::Offline, None, |name| {
             format!("drive {name} is offline: {why}; it is asked again with pauses up to 10 s")
         });
     }
@@ -230,7 +230,7 @@ impl Report {
     fn restarted(&self, index: usize) {
         let Some(drive) = self.drive(index) else { return };
         drive.update(Snapshot::outlive);
-        self.tell(index, EventKind::Restarted, None, |name| {
+        self.drive_event(index, EventKind::Restarted, None, |name| {
             format!("drive {name} has started anew; it is read again, and takes only commands that come from now on")
         });
     }
@@ -239,7 +239,7 @@ impl Report {
     fn unlike(&self, index: usize, device: u8) {
         let Some(drive) = self.drive(index) else { return };
         let profile = &drive.spec.profile;
-        self.tell(index, EventKind::UnlikeProfile, None, |name| {
+        self.drive_event(index, EventKind::UnlikeProfile, None, |name| {
             format!(
                 "drive {name} says that it is a device of type {device:02X}h, its profile `{}` expects {:02X}h; check \
                  address and profile, or set device_type in [n2] of the profile",
@@ -279,7 +279,7 @@ impl Report {
             );
             return;
         }
-        self.tell(index, EventKind::Unsupervised, None, |name| {
+        self.drive_event(index, EventKind::Unsupervised, None, |name| {
             format!(
                 "nothing stops drive {name} when whoever commands it falls silent: it has no lease, and its own response \
                  to a silent master is off ({point} = 0); configure supervision, and set the parameter if the process \
@@ -311,10 +311,10 @@ impl Report {
             _ => return,
         }
         match active {
-            Some(code) => self.tell(index, EventKind::Fault, Some(code), |name| {
+            Some(code) => self.drive_event(index, EventKind::Fault, Some(code), |name| {
                 format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code))
             }),
-            None => self.tell(index, EventKind::FaultEnd, None, |name| {
+            None => self.drive_event(index, EventKind::FaultEnd, None, |name| {
                 format!("the fault of drive {name} is gone")
             }),
         }

@@ -229,12 +229,12 @@ impl Schedule {
         }
     }
 
-    /// A fast round that was started by the last [`Schedule::next`], told once.
+    /// A fast round that was started by the last [`Schedule::next`], reported once.
     pub fn take_round(&mut self) -> Option<RoundStart> {
         self.new_round.take()
     }
 
-    /// A slow round (the first slow poll after all were done), told once.
+    /// A slow round (the first slow poll after all were done), reported once.
     pub fn take_slow_round(&mut self) -> Option<RoundStart> {
         self.new_slow.take()
     }
@@ -249,7 +249,7 @@ impl Schedule {
     pub fn poll_done(&mut self, poll: &Poll, polled: Polled, took: Duration, now: Instant) -> Change {
         let item = self.drives.get_mut(poll.drive);
         if let Some(item) = item.and_then(|d| d.items.iter_mut().find(|i| i.read == poll.read)) {
-            // One that tells nothing is made up for among the slow polls.
+            // One without a result is made up for among the slow polls.
             item.wanted |= item.asked.take().is_some();
         }
         let turn = std::mem::replace(&mut self.turn, Turn::Due);
@@ -304,7 +304,7 @@ impl Schedule {
         }
     }
 
-    /// A drive that is online did not answer a command: its process data is read next in the round, which tells whether it is
+    /// A drive that is online did not answer a command: its process data is read next in the round, which shows whether it is
     /// there at all, before more is said to it in vain.
     pub fn doubted(&mut self, index: usize) {
         let online = |drive: &&mut DriveSchedule| drive.presence == Presence::Online;

@@ -13,10 +13,10 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
-use crate::cache::{LeaseAction, Reading, Unavailable};
 use crate::command::{Answer, Refusal};
 use crate::drive::profile::Form;
 use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value};
+use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);
@@ -282,7 +282,7 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
 }
 
 /// Whether a motor that stands may start without another command: the run command is set in the drive's word, or is not
-/// read yet. Of a drive that does not tell it, it is taken to be unset.
+/// read yet. Where a drive does not report it, it counts as unset.
 fn may_start(reading: &Reading<'_>, since: Instant) -> bool {
     let sample = reading.model(ModelPoint::Run);
     if let Some(run) = sample.good() {
@@ -300,7 +300,7 @@ pub(super) enum OwnResponse {
     Unknown,
     /// It has none: the point that says so.
     Off(&'static str),
-    /// It responds, if what no register tells is set too (such as the timeout of an option board).
+    /// It responds, if what no register shows is set too (such as the timeout of an option board).
     On,
 }
 

@@ -7,9 +7,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::transaction::Ended;
-use crate::cache::{BusImage, Direction, FrameRecord};
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
+use crate::process_image::{BusImage, Direction, FrameRecord};
 
 /// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
 const KEPT: usize = 2048;
@@ -38,9 +38,9 @@ impl Tap {
         }
     }
 
-    /// Tells the request.
+    /// Publishes the request.
     pub(super) fn sent(&self, quiet_since: Instant, began: Instant) {
-        self.image.trace.tell(|| FrameRecord {
+        self.image.trace.publish(|| FrameRecord {
             time: time_of_day(began),
             gap: Some(began.saturating_duration_since(quiet_since)),
             direction: Direction::Request,
@@ -56,7 +56,7 @@ impl Tap {
         self.hearing.add(bytes, now);
     }
 
-    /// Tells what came back, a record for each frame.
+    /// Publishes what came back, a record for each frame.
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
@@ -82,7 +82,7 @@ impl Tap {
     }
 
     fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {
-        self.image.trace.tell(|| FrameRecord {
+        self.image.trace.publish(|| FrameRecord {
             time: time_of_day(at),
             gap,
             direction: Direction::Reply,
@@ -94,9 +94,9 @@ impl Tap {
     }
 }
 
-/// Tells bytes that came between two exchanges.
+/// Publishes bytes that came between two exchanges.
 pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
-    image.trace.tell(|| {
+    image.trace.publish(|| {
         let mut hearing = Hearing::new(image.spec.format, quiet_since);
         hearing.add(bytes, now);
         let part = Part {

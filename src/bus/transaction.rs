@@ -262,10 +262,10 @@ impl Transaction {
     /// An adapter that hears itself sends the request back before the reply. A read cannot be answered by its own
     /// frame, so it shows the echo; the reply to a write of one register can, so there the echo must be known already.
     fn strip_echo(&mut self) -> bool {
-        let tells = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
+        let could_be_echo = !self.echo_seen && (self.echo || is_unlike_its_reply(&self.request.pdu));
         let noise = self.protocol.noise(&self.received);
         let from_frame = self.received.get(noise..).unwrap_or_default();
-        if !tells || !from_frame.starts_with(&self.frame) {
+        if !could_be_echo || !from_frame.starts_with(&self.frame) {
             return false;
         }
         self.received.drain(..noise + self.frame.len());
@@ -274,8 +274,8 @@ impl Transaction {
         true
     }
 
-    /// Whether the adapter sends back what it is given, as far as this exchange, which ended so, tells. Only an
-    /// answered request whose reply looks otherwise tells: a reply without an echo before it means that an earlier echo
+    /// Whether the adapter sends back what it is given, as far as this exchange, which ended so, shows it. Only an
+    /// answered request whose reply looks otherwise shows it: a reply without an echo before it means that an earlier echo
     /// was a freak, and believing in it would swallow the acknowledgements of all writes.
     pub fn echoes(&self, ended: &Ended) -> Option<bool> {
         let answered = matches!(ended, Ended::Reply(_));

@@ -11,10 +11,10 @@ use std::process::ExitCode;
 
 use self::direct::Direct;
 use super::{EXIT_CONFIG, EXIT_USAGE, report};
-use crate::cache::DriveSpec;
 use crate::config::{BusSettings, LogFormat, LogSettings, Settings, environment};
 use crate::document::nearest;
 use crate::north::local::protocol::{Expected, Outcome, Request};
+use crate::process_image::DriveSpec;
 
 /// The drive that a command is about.
 #[derive(Debug)]

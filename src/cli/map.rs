@@ -12,11 +12,11 @@ use std::sync::Arc;
 
 use self::rows::{Row, gateway_rows};
 use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
-use crate::cache::{BusImage, DriveImage, DriveSpec};
 use crate::command::CommandQueue;
 use crate::config::{BusSettings, Settings, environment};
 use crate::north::modbus_tcp::Role;
 use crate::plant::{BusHandle, DriveHandle, Plant};
+use crate::process_image::{BusImage, DriveImage, DriveSpec};
 
 /// Prints the Modbus TCP register map of a configuration, for the SCADA engineer.
 #[derive(Debug, clap::Args)]

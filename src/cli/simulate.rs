@@ -4,11 +4,11 @@ mod watch;
 
 use super::addresses::{Addresses, parse_addresses};
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
-use crate::cache::DriveSpec;
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{self, BusSettings, Settings, default_format};
 use crate::document::nearest;
 use crate::drive::profile::{Profile, Profiles};
+use crate::process_image::DriveSpec;
 use crate::sim::cx::AddressOffset;
 use crate::sim::drive::{DriveOptions, ModelOptions};
 use crate::sim::endpoint::EndpointOptions;

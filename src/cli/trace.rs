@@ -15,7 +15,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use self::pcap::Capture;
 use super::client::{EventStream, Url};
 use super::{EXIT_FAILED, report};
-use crate::cache::Direction;
+use crate::process_image::Direction;
 
 /// Interval at which the capture is flushed.
 const FLUSH: Duration = Duration::from_secs(1);

@@ -4,10 +4,10 @@ use std::process::ExitCode;
 
 use super::drive_access::{Target, Way, target};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
-use crate::cache::value_or_null;
 use crate::drive::model::Kind;
 use crate::drive::{Point, Value};
 use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
+use crate::process_image::value_or_null;
 
 /// Commands a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]

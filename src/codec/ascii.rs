@@ -1,6 +1,6 @@
 //! Modbus ASCII frames: colon, hexadecimal digits, LRC, CR LF (drives.md 5.1, worked frames section 7.3).
 //!
-//! A frame has a definite begin and end, so what is none of it is told at once: characters before a colon are noise,
+//! A frame has a definite beginning and end, so anything outside it is recognised at once: characters before a colon are noise,
 //! and a colon in the middle begins the frame anew. Digits are sent in upper case and taken in either. Of the pause of
 //! 1 s between two characters that ends a frame only a slave needs to know: a master has its deadline.
 

@@ -131,7 +131,7 @@ impl Protocol {
         }
     }
 
-    /// Characters at the beginning of `bytes` that cannot be part of a frame. Modbus RTU and N2 cannot tell.
+    /// Characters at the beginning of `bytes` that cannot be part of a frame. With Modbus RTU and N2 that cannot be known.
     pub fn noise(self, bytes: &[u8]) -> usize {
         match self {
             Protocol::ModbusAscii => ascii::noise(bytes),

@@ -71,7 +71,7 @@ fn foreign_or(bytes: &[u8], why: &'static str) -> Decoded {
     }
 }
 
-/// Length of the frame that starts `bytes`, once its first bytes tell it; more than [`LONGEST`] when it cannot be one.
+/// Length of the frame that starts `bytes`, once its first bytes show it; more than [`LONGEST`] when it cannot be one.
 fn frame_len(request: &Request, bytes: &[u8]) -> Option<usize> {
     let function = *bytes.get(1)?;
     let own = function == request.pdu.function();

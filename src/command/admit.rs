@@ -1,11 +1,11 @@
 //! Which commands are let through: authority first, then address, then value. Pure.
 
 use super::{Authority, Order, Refusal, Urgency};
-use crate::cache::{Access, Reading};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::model::Kind;
 use crate::drive::{ModelPoint, Point, Source, Value};
+use crate::process_image::{Access, Reading};
 
 /// An order that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]

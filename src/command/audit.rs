@@ -58,11 +58,11 @@ pub struct AuditRecord {
 }
 
 fn bare<S: Serializer>(value: &Value, serializer: S) -> Result<S::Ok, S::Error> {
-    crate::cache::value_or_null(Some(*value)).serialize(serializer)
+    crate::process_image::value_or_null(Some(*value)).serialize(serializer)
 }
 
 fn bare_or_null<S: Serializer>(value: &Option<Value>, serializer: S) -> Result<S::Ok, S::Error> {
-    crate::cache::value_or_null(*value).serialize(serializer)
+    crate::process_image::value_or_null(*value).serialize(serializer)
 }
 
 fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {

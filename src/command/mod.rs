@@ -82,7 +82,7 @@ pub enum Authority {
 pub struct Origin {
     /// Kind of the source.
     pub kind: SourceKind,
-    /// Address, topic or certificate name, as the audit tells it.
+    /// Address, topic or certificate name, as the audit shows it.
     pub who: String,
     client: Arc<str>,
 }
@@ -251,7 +251,7 @@ impl Outcome {
         matches!(self, Outcome::Acknowledged(_))
     }
 
-    /// The exception that tells a Modbus TCP client (`docs/modbus-tcp.md`); `None` for success.
+    /// The exception for a Modbus TCP client (`docs/modbus-tcp.md`); `None` for success.
     pub fn exception(&self) -> Option<Exception> {
         match self {
             Outcome::Acknowledged(_) => None,
@@ -307,7 +307,7 @@ pub enum Refusal {
     /// The point or address cannot be written, or does not exist.
     #[error("{0}")]
     NotWritable(String),
-    /// It rests on something that the drive tells and has not told so far. Of a drive that does not answer it says
+    /// It rests on something that the drive reports and has not reported so far. Of a drive that does not answer it says
     /// nothing: that is why.
     #[error("{0}")]
     NotKnown(String),

@@ -62,7 +62,7 @@ impl Stopping {
 /// The command that has its turn.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct Chosen {
-    /// Rank with which it competes for the line: a stop that tells the drive nothing new has that of a command.
+    /// Rank with which it competes for the line: a redundant stop has that of a command.
     pub rank: Urgency,
     number: u64,
 }
@@ -162,7 +162,7 @@ impl Pending {
 
     /// The command of that rank that has its turn at `now`, expired ones answered and removed. `may` says whether a
     /// command can be begun now: while the oldest of a drive cannot, the later ones to that drive wait behind it.
-    /// `redundant` says whether a stop tells its drive nothing new, which gives it the rank of a command.
+    /// `redundant` says whether a stop changes nothing at its drive, which gives it the rank of a command.
     pub fn next(
         &mut self,
         rank: Urgency,
@@ -208,7 +208,7 @@ impl Pending {
         }
         let of = (command.ticket.client().to_string(), command.drive);
         self.served.retain(|served| *served != of);
-        // Only clients that wait are told apart; more of them than commands can wait there are not.
+        // Only clients that wait are counted: there are never more of them than waiting commands.
         if self.served.len() >= SERVED_KEPT {
             self.served.pop_front();
         }

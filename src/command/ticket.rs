@@ -8,7 +8,7 @@ use tokio::sync::oneshot;
 
 use super::audit::{Audit, AuditRecord, Change};
 use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind};
-use crate::cache::{Histogram, HistogramSnapshot};
+use crate::process_image::{Histogram, HistogramSnapshot};
 
 /// Counters of commands, for the metrics, and the audit.
 #[derive(Debug, Default)]
@@ -42,7 +42,7 @@ impl WriteStats {
 }
 
 /// Answers a command exactly once: by [`Ticket::answer`] or [`Ticket::acknowledge`], or as "shutting down" when it
-/// is dropped. The audit follows when nothing more is to be told of the command.
+/// is dropped. The audit line follows when everything about the command is known.
 #[derive(Debug)]
 pub struct Ticket {
     origin: Origin,
@@ -110,12 +110,12 @@ impl Ticket {
         self.origin.client()
     }
 
-    /// Answers the command; nothing more is to be told of it.
+    /// Answers the command; nothing more will be known of it.
     pub fn answer(mut self, outcome: Outcome, now: Instant) {
         self.settle(outcome, now);
     }
 
-    /// Answers the command; whether it shows its effect is told later.
+    /// Answers the command; whether it shows its effect follows later.
     pub fn acknowledge(mut self, outcome: Outcome, now: Instant) -> Receipt {
         self.settle(outcome, now);
         Receipt(self)
@@ -223,7 +223,7 @@ pub(super) mod tests {
         let mut confirmation = ticket.confirmation();
         let receipt = ticket.acknowledge(acknowledged.clone(), now + Duration::from_millis(5));
         assert_eq!(answer.try_recv().unwrap().outcome, acknowledged);
-        assert!(stats.audit().recent().is_empty(), "one line tells both");
+        assert!(stats.audit().recent().is_empty(), "one line has both");
         receipt.confirm(now + Duration::from_millis(9));
         assert_eq!(confirmation.try_recv(), Ok(Duration::from_millis(9)));
         let record = &stats.audit().recent()[0];

@@ -7,12 +7,12 @@ use super::drive::{self, Surroundings};
 use super::keys::BUS;
 use super::{BusSettings, values};
 use crate::bus::BusOptions;
-use crate::cache::{BusSpec, DriveSpec};
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
 use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
 use crate::line::Rs485;
+use crate::process_image::{BusSpec, DriveSpec};
 
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);

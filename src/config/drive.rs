@@ -6,12 +6,12 @@ use std::sync::Arc;
 
 use super::key::{Key, Number};
 use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION};
-use crate::cache::{Access, DriveSpec, LeaseAction, OnShutdown, Supervision};
 use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
+use crate::process_image::{Access, DriveSpec, LeaseAction, OnShutdown, Supervision};
 
 /// Points that a message names.
 const MOST_NAMED: usize = 4;
@@ -288,7 +288,7 @@ fn shows_whether_it_runs(profile: &Profile) -> bool {
     let plan = Plan::of(profile);
     let is_read = |point| {
         let index = profile.model_index(point);
-        index.is_some_and(|index| plan.tells(profile, index))
+        index.is_some_and(|index| plan.shows(profile, index))
     };
     is_read(ModelPoint::Running) || is_read(ModelPoint::Run)
 }

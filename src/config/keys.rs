@@ -13,11 +13,11 @@ use super::key::{
 };
 use super::log::{self, LogFormat};
 use super::{bus, modbus_tcp, mqtt, values};
-use crate::cache::{Access, LeaseAction, OnShutdown};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
 use crate::north::modbus_tcp::{Role, Uncached};
+use crate::process_image::{Access, LeaseAction, OnShutdown};
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
 macro_rules! keys {

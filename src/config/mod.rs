@@ -27,11 +27,11 @@ use std::time::Duration;
 
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
-use crate::cache::{Access, BusSpec, DriveSpec};
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::north::local::SocketPath;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
+use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.

@@ -3,10 +3,10 @@
 use std::time::Duration;
 
 use super::BusSettings;
-use crate::cache::{Access, DriveSpec, OnShutdown};
 use crate::codec::{RequestPdu, Table};
 use crate::document::Finding;
 use crate::drive::plan::WireTime;
+use crate::process_image::{Access, DriveSpec, OnShutdown};
 
 /// Time the service manager allows for shutdown: `TimeoutStopSec` of `systemd/drivegate.service`.
 pub(crate) const UNIT_STOP_TIME: Duration = Duration::from_secs(90);

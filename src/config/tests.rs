@@ -118,9 +118,9 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
     assert_eq!(drive.limits["speed_reference"], 0.0..=80.5);
     assert_eq!(drive.turnaround, Duration::from_micros(500));
     assert_eq!(drive.frequency_range, Some(10.0..=50.0));
-    let lease = crate::cache::Supervision {
+    let lease = crate::process_image::Supervision {
         timeout: Duration::from_secs(5),
-        action: crate::cache::LeaseAction::Hold,
+        action: crate::process_image::LeaseAction::Hold,
         adopt: true,
     };
     assert_eq!(drive.supervision, Some(lease));
@@ -267,7 +267,7 @@ fn the_environment_overrides_and_problems_name_the_variable() {
     }
 }
 
-/// Every family that ships tells that it runs, and whether it is there.
+/// Every family that ships reports whether it runs, and whether it is there.
 #[test]
 fn every_family_can_be_supervised() {
     for profile in Profiles::built_in().iter() {

@@ -70,13 +70,13 @@ impl Plan {
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.
-    pub(crate) fn tells(&self, profile: &Profile, point: usize) -> bool {
+    pub(crate) fn shows(&self, profile: &Profile, point: usize) -> bool {
         match profile.points.get(point).map(|point| &point.source) {
             Some(Source::Raw(raw)) => {
                 let is_read = |address| self.reads.iter().any(|read| read.covers(raw.table, address));
                 raw.addresses().all(is_read)
             }
-            Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(|of| self.tells(profile, of)),
+            Some(Source::Derived(derived)) => derived.rests_on().into_iter().all(|of| self.shows(profile, of)),
             None => false,
         }
     }

@@ -79,7 +79,7 @@ pub struct Lost(pub String);
 /// What ended a wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Woken {
-    /// Bytes can be read (or the port is gone, which reading tells).
+    /// Bytes can be read (or the port is gone, which reading shows).
     Readable,
     /// A command came in.
     Command,

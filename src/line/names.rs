@@ -23,7 +23,7 @@ pub struct Names {
     known: Vec<SocketAddr>,
     /// The answer of a thread that still asks.
     asked: Option<Receiver<Found>>,
-    /// What the system said last instead of an address: told again while it says nothing, so that the reason why a bus
+    /// What the system said last instead of an address: repeated while it says nothing, so that the reason why a bus
     /// is down changes only when there is news.
     failure: Option<String>,
     /// The last answer was none.

@@ -10,10 +10,10 @@ mod gateway;
 pub(crate) use command::{CommandContext, CommandWrite, command, without_reset};
 pub(crate) use gateway::{BUS_BLOCK, BUS_REGISTERS, BusFigures, gateway};
 
-use crate::cache::Reading;
 use crate::codec::Exception;
 use crate::drive::tidy;
 use crate::drive::{ModelPoint, State, Value};
+use crate::process_image::Reading;
 
 /// First address that does not belong to the drive.
 pub(crate) const FIRST: u16 = 0x8000;

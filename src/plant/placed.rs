@@ -14,8 +14,8 @@ use crate::command::{Answer, Outcome};
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
-    answer: Told<Answer>,
-    confirmation: Told<Duration>,
+    answer: Arriving<Answer>,
+    confirmation: Arriving<Duration>,
 }
 
 impl Placed {
@@ -26,8 +26,8 @@ impl Placed {
     ) -> Placed {
         Placed {
             accepted,
-            answer: Told::Awaited(answer),
-            confirmation: Told::Awaited(confirmation),
+            answer: Arriving::Awaited(answer),
+            confirmation: Arriving::Awaited(confirmation),
         }
     }
 
@@ -77,25 +77,25 @@ impl Placed {
     }
 }
 
-/// What is told once, as often as it is asked for.
+/// What arrives once, for whoever asks, as often as they ask.
 #[derive(Debug)]
-enum Told<T> {
+enum Arriving<T> {
     Awaited(oneshot::Receiver<T>),
-    /// `None`: it will never be told.
+    /// `None`: it will never arrive.
     Known(Option<T>),
 }
 
-impl<T: Clone> Told<T> {
+impl<T: Clone> Arriving<T> {
     fn poll(&mut self, cx: &mut Context<'_>) -> Poll<Option<T>> {
-        if let Told::Awaited(receiver) = self {
+        if let Arriving::Awaited(receiver) = self {
             match Pin::new(receiver).poll(cx) {
                 Poll::Pending => return Poll::Pending,
-                Poll::Ready(told) => *self = Told::Known(told.ok()),
+                Poll::Ready(value) => *self = Arriving::Known(value.ok()),
             }
         }
         match self {
-            Told::Known(told) => Poll::Ready(told.clone()),
-            Told::Awaited(_) => Poll::Pending,
+            Arriving::Known(value) => Poll::Ready(value.clone()),
+            Arriving::Awaited(_) => Poll::Pending,
         }
     }
 }
@@ -115,7 +115,7 @@ mod tests {
 
     #[test]
     fn asked_without_a_runtime_and_as_often_as_one_likes() {
-        let (tell, answer) = oneshot::channel();
+        let (sender, answer) = oneshot::channel();
         let (confirm, confirmation) = oneshot::channel();
         let mut placed = Placed::new(Instant::now(), answer, confirmation);
         assert_eq!((placed.answer(), placed.confirmation()), (None, None));
@@ -123,7 +123,7 @@ mod tests {
             outcome: Outcome::Acknowledged(Reply::Written),
             latency: Duration::from_millis(3),
         };
-        tell.send(acknowledged.clone()).unwrap();
+        sender.send(acknowledged.clone()).unwrap();
         assert_eq!(placed.answer().as_ref(), Some(&acknowledged));
         assert_eq!(placed.answer(), Some(acknowledged));
         assert_eq!(placed.confirmation(), None);

@@ -224,7 +224,7 @@ impl HalfDuplex {
         self.provoked_end = None;
     }
 
-    /// Silence that ends a frame, and that a request has to wait for; zero where characters tell frames apart.
+    /// Silence that ends a frame, and that a request has to wait for; zero where characters delimit frames.
     fn silence(&self) -> Duration {
         match self.rules.wire {
             Wire::Instant => Duration::ZERO,

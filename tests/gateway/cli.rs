@@ -102,10 +102,10 @@ fn exit_codes() {
 fn errors_and_warnings_go_to_stderr_in_the_form_of_the_contract() {
     let bad = run(&["check", "--config", "tests/bad/twice.toml"]);
     let expected = fs::read_to_string(Path::new(ROOT).join("tests/bad/twice.expected")).unwrap();
-    let (mut told, mut wanted): (Vec<_>, Vec<_>) = (bad.err.lines().collect(), expected.lines().collect());
-    told.sort_unstable();
+    let (mut reported, mut wanted): (Vec<_>, Vec<_>) = (bad.err.lines().collect(), expected.lines().collect());
+    reported.sort_unstable();
     wanted.sort_unstable();
-    assert_eq!(told, wanted);
+    assert_eq!(reported, wanted);
     let nothing = run(&["check", "--config", "tests/bad/no-such.toml"]);
     assert_eq!(
         nothing.err,
@@ -412,7 +412,7 @@ fn a_closed_pipe_ends_the_output_quietly() {
         let Output { status, stderr, .. } = drivegate(&args).stdout(writer).output().unwrap();
         assert_eq!((status.code(), stderr.as_slice()), (Some(0), &b""[..]), "{args:?}");
     }
-    // Nowhere to tell errors either: the exit code still does.
+    // Errors cannot be printed either: only the exit code shows them.
     let (reader, writer) = io::pipe().unwrap();
     drop(reader);
     let bad = drivegate(&["check", "--config", "tests/bad/twice.toml"])
@@ -444,9 +444,9 @@ fn a_bad_log_level_of_the_demo_is_a_wrong_command_line() {
         }
         let _ = child.kill();
         let Output { status, stderr, .. } = child.wait_with_output().unwrap();
-        let told = String::from_utf8(stderr).unwrap();
-        assert_eq!(status.code(), Some(2), "{level}: {told}");
-        assert!(told.contains(wanted), "{level}: {told}");
+        let reported = String::from_utf8(stderr).unwrap();
+        assert_eq!(status.code(), Some(2), "{level}: {reported}");
+        assert!(reported.contains(wanted), "{level}: {reported}");
     }
 }
 

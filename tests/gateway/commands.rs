@@ -70,9 +70,12 @@ fn a_stop_under_a_full_queue_comes_first() {
     flood.write_all(&frames).unwrap();
     // It gets a place and goes out; that it is the very next on the line is proved in `tests/world`.
     until("the stop", || {
-        let told = mbpoll_write(site.modbus, 1, 33_024, &[0]);
-        assert!(!told.as_ref().is_err_and(|why| why.contains("busy")), "{told:?}");
-        told.ok()
+        let reported = mbpoll_write(site.modbus, 1, 33_024, &[0]);
+        assert!(
+            !reported.as_ref().is_err_and(|why| why.contains("busy")),
+            "{reported:?}"
+        );
+        reported.ok()
     });
     site.until_state("pump-1", "ready");
     // Each of the flood has its one answer: written, or refused because the queue was full or its time ran out.

@@ -356,9 +356,9 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
     });
     line.set_alive(1, false);
     for (drive, wanted) in [("pump-1", "stale"), ("pump-2", "bad")] {
-        let told = until("a drive that is away", || {
-            let told = api(http, drive);
-            (told["online"] == false).then_some(told)
+        let reported = until("a drive that is away", || {
+            let reported = api(http, drive);
+            (reported["online"] == false).then_some(reported)
         });
         let ran = drivegate(&["read", "--json", "--config", &config, drive]);
         assert_eq!(ran.code, 1, "{}", ran.err);
@@ -368,14 +368,14 @@ fn a_drive_that_is_away_has_the_quality_that_http_tells() {
         let mut others = Vec::new();
         for row in rows {
             let point = row["point"].as_str().unwrap();
-            let over_http = &told["points"][point]["quality"];
+            let over_http = &reported["points"][point]["quality"];
             if row["quality"] != wanted || over_http != wanted || !row["value"].is_null() {
                 others.push(format!("{drive}: {over_http} over HTTP: {row}"));
             }
         }
         assert!(others.is_empty(), "{others:#?}");
     }
-    // One reason for all of its points is told once.
+    // One reason for all of its points is reported once.
     let ran = drivegate(&["read", "--config", &config, "pump-2"]);
     let wanted = "error: no point of `pump-2` has a value: the drive does not answer\n";
     assert_eq!((ran.code, ran.out.as_str(), ran.err.as_str()), (1, "", wanted));

@@ -207,7 +207,7 @@ fn silence_of_a_drive_is_shown() {
     assert_eq!(fields[1..], ["-", "line1", "<", "pump-2", "timeout"]);
 }
 
-/// What goes wrong on the line is told as such, and what follows is right again.
+/// What goes wrong on the line is shown as such, and what follows is right again.
 #[test]
 fn faults_are_told_apart() {
     let plant = Plant::with("200ms");
@@ -286,22 +286,25 @@ fn it_ends_as_it_is_told_and_says_why() {
     let mut stdout = BufReader::new(child.stdout.take().unwrap());
     stdout.read_line(&mut String::new()).unwrap();
     drop(stdout);
-    let mut told = String::new();
-    child.stderr.take().unwrap().read_to_string(&mut told).unwrap();
+    let mut reported = String::new();
+    child.stderr.take().unwrap().read_to_string(&mut reported).unwrap();
     assert!(child.wait().unwrap().success());
-    assert_eq!(told, "");
+    assert_eq!(reported, "");
 
     // A bus that is not there.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--bus", "hall 1"]);
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8(output.stderr).unwrap();
-    assert_eq!(told, format!("error: there is no bus `hall 1`; {url}; known: line1\n"));
+    let reported = String::from_utf8(output.stderr).unwrap();
+    assert_eq!(
+        reported,
+        format!("error: there is no bus `hall 1`; {url}; known: line1\n")
+    );
 
     // A capture that cannot be written.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url, "--pcap", "/dev/null/x"]);
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8(output.stderr).unwrap();
-    assert!(told.starts_with("error: cannot write the capture: "), "{told}");
+    let reported = String::from_utf8(output.stderr).unwrap();
+    assert!(reported.starts_with("error: cannot write the capture: "), "{reported}");
 
     // A gateway that stops.
     let mut trace = Running::drivegate(&["trace", "--url", &url]);
@@ -314,12 +317,12 @@ fn it_ends_as_it_is_told_and_says_why() {
     // None there any more.
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url]);
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8(output.stderr).unwrap();
+    let reported = String::from_utf8(output.stderr).unwrap();
     assert!(
-        told.starts_with("error: cannot reach the gateway: Connection refused"),
-        "{told}"
+        reported.starts_with("error: cannot reach the gateway: Connection refused"),
+        "{reported}"
     );
-    assert!(told.contains(&url) && told.contains("--url"), "{told}");
+    assert!(reported.contains(&url) && reported.contains("--url"), "{reported}");
 
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", "127.0.0.1:9488"]);
     assert_eq!(output.status.code(), Some(2));
@@ -337,8 +340,8 @@ fn one_that_is_no_gateway_is_told_from_one() {
     });
     let output = run(Path::new(DRIVEGATE), &["trace", "--url", &url]);
     assert_eq!(output.status.code(), Some(1));
-    let told = String::from_utf8(output.stderr).unwrap();
-    assert!(told.starts_with("error: not an HTTP reply"), "{told}");
+    let reported = String::from_utf8(output.stderr).unwrap();
+    assert!(reported.starts_with("error: not an HTTP reply"), "{reported}");
     answer.join().unwrap();
 
     let plant = Plant::start();

@@ -28,7 +28,7 @@ fn loopback() -> EndpointOptions {
     }
 }
 
-/// A rig whose bus is told to open something else than its line.
+/// A rig whose bus is to open something else than its line.
 fn with_port(port: &str) -> Rig {
     Rig::of(Setup {
         port: Some(port.to_string()),
@@ -175,7 +175,7 @@ async fn a_server_that_hangs_up_is_tried_again() {
     let rig = with_port(&port);
     rig.until("it is tried again", |_| tries.load(Ordering::Relaxed) > 3)
         .await;
-    rig.until("it is told", |r| reason(r).contains("lost")).await;
+    rig.until("the reason", |r| reason(r).contains("lost")).await;
 }
 
 #[tokio::test]
@@ -190,7 +190,7 @@ async fn a_port_that_comes_is_opened() {
     assert_eq!(rig.bus.handle().image.health().opened, 1);
 }
 
-/// Passes bytes between the bus and a device server, until told to cut.
+/// Passes bytes between the bus and a device server, until it is to cut.
 fn proxy(to: String) -> (String, Arc<AtomicBool>) {
     let listener = TcpListener::bind("127.0.0.1:0").unwrap();
     let address = format!("tcp://{}", listener.local_addr().unwrap());

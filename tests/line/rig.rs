@@ -4,7 +4,6 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate::bus::{BusOptions, BusTask};
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{LineFormat, Protocol};
 use drivegate::command::{Authority, CommandQueue, Order, Origin, Outcome, SourceKind, WriteStats};
@@ -13,6 +12,7 @@ use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::Events;
 use drivegate::line::Rs485;
 use drivegate::plant::{BusHandle, DriveHandle, Plant};
+use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::drive::DriveOptions;
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::half_duplex::LineRules;

@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use drivegate::cache::{BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::{LineFormat, Protocol};
 use drivegate::command::{Command, CommandQueue, Urgency};
 use drivegate::drive::Profile;
 use drivegate::drive::profile::Profiles;
 use drivegate::event::Events;
 use drivegate::plant::{BusHandle, Plant};
+use drivegate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec};
 
 const SLOW_CYCLE: Duration = Duration::from_secs(1);
 

@@ -13,7 +13,7 @@ fn load(path: &Path) -> Loaded {
 }
 
 /// Errors and warnings as the program prints them, without the directory of the project.
-fn told(loaded: &Loaded) -> String {
+fn reported(loaded: &Loaded) -> String {
     let errors = loaded.errors.iter().map(|problem| format!("error: {problem}\n"));
     let warnings = loaded.warnings.iter().map(|problem| format!("warning: {problem}\n"));
     let all: String = errors.chain(warnings).collect();
@@ -32,7 +32,7 @@ fn files(directory: &str, extension: &str) -> Vec<PathBuf> {
     files
 }
 
-/// Holds each file of `directory` against `NAME.expected`. `BLESS=1` writes what is told now.
+/// Holds each file of `directory` against `NAME.expected`. `BLESS=1` writes the present messages.
 fn golden(directory: &str, sound: bool) {
     let mut wrong = Vec::new();
     for path in files(directory, "toml") {
@@ -40,13 +40,16 @@ fn golden(directory: &str, sound: bool) {
         assert_eq!(loaded.settings.is_some(), sound, "{}", path.display());
         assert_eq!(loaded.errors.is_empty(), sound, "{}", path.display());
         let expected = path.with_extension("expected");
-        let told = told(&loaded);
+        let reported = reported(&loaded);
         if std::env::var_os("BLESS").is_some() {
-            fs::write(&expected, &told).unwrap();
+            fs::write(&expected, &reported).unwrap();
         }
         let wanted = fs::read_to_string(&expected).unwrap_or_default();
-        if told != wanted {
-            wrong.push(format!("{}\n-- told\n{told}-- expected\n{wanted}", path.display()));
+        if reported != wanted {
+            wrong.push(format!(
+                "{}\n-- reported\n{reported}-- expected\n{wanted}",
+                path.display()
+            ));
         }
     }
     assert!(wrong.is_empty(), "{}", wrong.join("\n"));
@@ -90,10 +93,13 @@ fn one_device_under_two_names_is_one_port() {
             std::iter::empty(),
         )
     };
-    assert_eq!(told(&parse()), "", "a link that leads nowhere yet is no fault");
+    assert_eq!(reported(&parse()), "", "a link that leads nowhere yet is no fault");
     fs::write(&device, "").unwrap();
-    let told = told(&parse());
-    assert!(told.contains("usb-adapter already belongs to bus `a`, as"), "{told}");
+    let reported = reported(&parse());
+    assert!(
+        reported.contains("usb-adapter already belongs to bus `a`, as"),
+        "{reported}"
+    );
 }
 
 #[test]
@@ -115,10 +121,10 @@ fn the_password_file_gives_its_line() {
         "the environment overrides the file"
     );
     for bad in ["", "\n", "two\nlines\n"] {
-        let told = told(&parse(bad, &[]));
+        let reported = reported(&parse(bad, &[]));
         assert!(
-            told.starts_with("error: ") && told.contains("t.toml:5, mqtt.password_file"),
-            "{bad:?}: {told}"
+            reported.starts_with("error: ") && reported.contains("t.toml:5, mqtt.password_file"),
+            "{bad:?}: {reported}"
         );
     }
 }

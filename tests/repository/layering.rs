@@ -10,11 +10,24 @@ use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
 const ROOMS: [&str; 15] = [
-    "document", "codec", "drive", "event", "cache", "command", "plant", "line", "bus", "north", "sim", "config",
-    "daemon", "cli", "main",
+    "document",
+    "codec",
+    "drive",
+    "event",
+    "process_image",
+    "command",
+    "plant",
+    "line",
+    "bus",
+    "north",
+    "sim",
+    "config",
+    "daemon",
+    "cli",
+    "main",
 ];
 
-/// Rooms that meet at `cache` and `command` only, whatever their order.
+/// Rooms that meet at `process_image` and `command` only, whatever their order.
 const STRANGERS: [(&str, &str); 2] = [("north", "bus"), ("bus", "north")];
 
 #[test]
@@ -50,26 +63,44 @@ fn no_file_imports_from_a_room_below_it() {
 #[test]
 fn an_upward_import_is_caught() {
     let upward = [
-        ("cache/mod.rs", "use crate::bus::Task;"),
-        ("cache/mod.rs", "use crate::{codec::Request, bus::{self, Task}};"),
-        ("cache/mod.rs", "fn f() { let x = crate::north::http::serve(); }"),
-        ("cache/mod.rs", "use super::bus::Task;"),
-        ("cache/health.rs", "use super::super::bus::Task;"),
-        ("cache/health.rs", "mod tests { use super::super::super::bus::Task; }"),
+        ("process_image/mod.rs", "use crate::bus::Task;"),
         (
-            "cache/mod.rs",
+            "process_image/mod.rs",
+            "use crate::{codec::Request, bus::{self, Task}};",
+        ),
+        (
+            "process_image/mod.rs",
+            "fn f() { let x = crate::north::http::serve(); }",
+        ),
+        ("process_image/mod.rs", "use super::bus::Task;"),
+        ("process_image/health.rs", "use super::super::bus::Task;"),
+        (
+            "process_image/health.rs",
+            "mod tests { use super::super::super::bus::Task; }",
+        ),
+        (
+            "process_image/mod.rs",
             "#[cfg(test)]\nmod tests {\n    use crate::sim::Wire;\n}",
         ),
-        ("cache/mod.rs", "macro_rules! m { () => { $crate::plant::Plant }; }"),
+        (
+            "process_image/mod.rs",
+            "macro_rules! m { () => { $crate::plant::Plant }; }",
+        ),
         ("plant.rs", "use super::daemon;"),
-        ("cache/mod.rs", "const A: char = '\"'; use crate::bus::Task; // \""),
-        ("cache/mod.rs", "fn f<'a>(s: &'a str) {} use crate::bus::Task;"),
-        ("cache/mod.rs", "const A: &str = r#\"\"\"#; use crate::bus::Task;"),
+        (
+            "process_image/mod.rs",
+            "const A: char = '\"'; use crate::bus::Task; // \"",
+        ),
+        ("process_image/mod.rs", "fn f<'a>(s: &'a str) {} use crate::bus::Task;"),
+        (
+            "process_image/mod.rs",
+            "const A: &str = r#\"\"\"#; use crate::bus::Task;",
+        ),
         ("north/mqtt.rs", "use crate::bus::Task;"),
         ("bus/mod.rs", "use crate::north::http;"),
-        ("cache/mod.rs", "use crate::*;"),
-        ("cache/mod.rs", "use crate as house;"),
-        ("cache/mod.rs", "use crate::unheard_of::Thing;"),
+        ("process_image/mod.rs", "use crate::*;"),
+        ("process_image/mod.rs", "use crate as house;"),
+        ("process_image/mod.rs", "use crate::unheard_of::Thing;"),
         ("unheard_of.rs", "use crate::codec::Request;"),
         ("daemon.rs", "use crate::main::parse;"),
         ("daemon.rs", "use crate::cli::run;"),
@@ -83,26 +114,29 @@ fn an_upward_import_is_caught() {
 fn a_downward_import_is_fine() {
     let downward = [
         (
-            "cache/mod.rs",
+            "process_image/mod.rs",
             "use crate::codec::Request;\nuse crate::{drive::Value, event::Event};",
         ),
         (
-            "cache/mod.rs",
-            "use crate::cache::health::BusHealth;\nuse self::health::Other;",
+            "process_image/mod.rs",
+            "use crate::process_image::health::BusHealth;\nuse self::health::Other;",
         ),
         (
-            "cache/health.rs",
+            "process_image/health.rs",
             "use super::Snapshot;\nmod tests { use super::super::Snapshot; use super::*; }",
         ),
         (
-            "cache/mod.rs",
+            "process_image/mod.rs",
             "//! See [`crate::bus::Task`].\n/* use crate::north; /* crate::bus::x */ */",
         ),
         (
-            "cache/mod.rs",
+            "process_image/mod.rs",
             "const A: &str = \"crate::bus::Task\"; const B: &str = r#\"\" crate::bus::x \"#;",
         ),
-        ("cache/mod.rs", "pub(crate) fn f() {}\npub(in crate::cache) fn g() {}"),
+        (
+            "process_image/mod.rs",
+            "pub(crate) fn f() {}\npub(in crate::process_image) fn g() {}",
+        ),
         ("cli/run.rs", "use crate::daemon::Daemon;"),
         ("main.rs", "use drivegate::cli;\nfn main() { drivegate::daemon::run() }"),
         ("lib.rs", "pub mod bus;\npub use crate::north::NorthStats;"),
@@ -176,7 +210,7 @@ fn rust_files(dir: &Path) -> Vec<PathBuf> {
     files
 }
 
-/// The module path of a file below `src`: `cache/mod.rs` is `cache`, `cache/health.rs` is `cache`, `health`.
+/// The module path of a file below `src`: `process_image/mod.rs` is `process_image`, `process_image/health.rs` is `process_image`, `health`.
 fn modules_of(file: &Path) -> Vec<String> {
     let mut modules: Vec<String> = file
         .with_extension("")

@@ -158,7 +158,7 @@ pub(crate) fn until_ready(http: u16) {
     });
 }
 
-/// A drive as `/api/v1/drives` tells it.
+/// A drive as `/api/v1/drives` shows it.
 pub(crate) fn api(http: u16, drive: &str) -> serde_json::Value {
     let (status, body) = get(http, &format!("/api/v1/drives/{drive}")).expect("an answer");
     assert_eq!(status, 200, "{body}");

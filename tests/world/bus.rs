@@ -7,7 +7,6 @@ use drivegate::bus::BusOptions;
 use drivegate::bus::core::{Action, BusCore};
 use drivegate::bus::master::{Handover, Purpose};
 use drivegate::bus::predict::predict;
-use drivegate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu};
 use drivegate::command::{CommandQueue, WriteStats};
@@ -16,6 +15,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::event::Events;
 use drivegate::line::Rs485;
 use drivegate::plant::BusHandle;
+use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::{Delivery, HalfDuplex, LineRules};
@@ -72,7 +72,7 @@ pub struct WorldBus {
     asked: Option<Asked>,
 }
 
-/// What a line has that its description does not tell.
+/// What a line has that is not in its description.
 pub struct Parts {
     pub profile: Arc<Profile>,
     pub drives: Vec<DriveOptions>,

@@ -3,11 +3,11 @@
 use std::time::Duration;
 
 use drivegate::bus::predict::predict;
-use drivegate::cache::DriveSpec;
 use drivegate::codec::wire::Silence;
 use drivegate::codec::{Protocol, RequestPdu};
 use drivegate::command::{Order, Urgency};
 use drivegate::drive::{ModelPoint, PollClass, Value};
+use drivegate::process_image::DriveSpec;
 
 use super::bus::{Parts, Seen};
 use super::rig::{Rig, line};

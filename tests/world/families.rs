@@ -47,9 +47,9 @@ fn works(family: &'static str, protocol: Protocol) -> Line {
     Line {
         format,
         spec: |spec| {
-            // Families that do not tell their frequencies.
-            let told = spec.profile.point_index("maximum_frequency").is_some();
-            spec.frequency_range = (!told).then_some(0.0..=60.0);
+            // Families that do not report their frequencies.
+            let reported = spec.profile.point_index("maximum_frequency").is_some();
+            spec.frequency_range = (!reported).then_some(0.0..=60.0);
         },
         ..line(family, protocol, baud, 1)
     }
@@ -81,7 +81,7 @@ fn operate(line: &Line, fault: u16, code: i64, text: &str) {
     rig.until("the reference read back", PATIENCE, |rig| {
         number(rig, ModelPoint::SpeedReference) == Some(50.0)
     });
-    // At reference may be told from some hertz before it on.
+    // At reference may be reported from some hertz before it on.
     rig.until("half of 50 or 60 Hz", PATIENCE, |rig| {
         number(rig, ModelPoint::OutputFrequency).is_some_and(|output| [25.0, 30.0].contains(&output))
     });

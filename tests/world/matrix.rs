@@ -83,9 +83,9 @@ fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
     rig
 }
 
-/// What the counters must tell of a fault.
+/// What the counters must show of a fault.
 #[derive(Debug, Clone, Copy, PartialEq)]
-enum Tells {
+enum Shows {
     /// Nothing: the exchange goes well.
     Nothing,
     /// No reply is believed; drives are now and then taken for dead.
@@ -98,19 +98,19 @@ enum Tells {
     All,
 }
 
-impl Tells {
+impl Shows {
     fn fits(self, c: &Counts) -> bool {
         let quiet = c.timeout == 0 && c.corrupt == 0;
         match self {
-            // The first write behind a change of the echo may have to tell the echo by its time.
-            Tells::Nothing => quiet && c.exception == 0 && c.foreign <= 1,
-            Tells::Timeouts => c.timeout > 0 && c.exception == 0,
+            // The first write behind a change of the echo may have to recognise the echo by its time.
+            Shows::Nothing => quiet && c.exception == 0 && c.foreign <= 1,
+            Shows::Timeouts => c.timeout > 0 && c.exception == 0,
             // A bit error may lengthen the reply, a cut one may be as short as nothing.
-            Tells::Corrupt => c.corrupt > 0 && c.timeout == 0 && c.exception == 0,
-            Tells::Foreign => c.foreign > 0 && c.timeout == 0 && c.exception == 0,
-            Tells::ForeignAndTimeouts => c.foreign > 0 && c.timeout > 0 && c.exception == 0,
-            Tells::Exceptions => c.exception > 0 && quiet,
-            Tells::All => true,
+            Shows::Corrupt => c.corrupt > 0 && c.timeout == 0 && c.exception == 0,
+            Shows::Foreign => c.foreign > 0 && c.timeout == 0 && c.exception == 0,
+            Shows::ForeignAndTimeouts => c.foreign > 0 && c.timeout > 0 && c.exception == 0,
+            Shows::Exceptions => c.exception > 0 && quiet,
+            Shows::All => true,
         }
     }
 }
@@ -120,7 +120,7 @@ impl Tells {
 struct Row {
     fault: String,
     rates: String,
-    tells: Tells,
+    shows: Shows,
     /// Good exchanges, of those of the sound line, at least.
     share: f64,
     /// Whether drives are now and then taken for dead.
@@ -344,13 +344,13 @@ fn meet(row: &Row, protocol: Protocol, sound: u64) -> Met {
         }
     };
     must(
-        row.tells.fits(&counts),
-        format!("the counters do not tell {:?}", row.tells),
+        row.shows.fits(&counts),
+        format!("the counters do not show {:?}", row.shows),
     );
     must(counts.faults >= 50, "hardly a fault was met".to_string());
     // A refused register stays refused for a minute; the drives are there.
     let back = (0..usize::from(DRIVES)).all(|drive| rig.is_online(drive));
-    let refused = matches!(row.tells, Tells::Exceptions | Tells::All);
+    let refused = matches!(row.shows, Shows::Exceptions | Shows::All);
     must(
         back && (refused || rig.is_whole()),
         "drives are away behind it".to_string(),
@@ -410,21 +410,21 @@ fn matrix(protocol: Protocol, rows: impl IntoIterator<Item = Row>) {
     assert!(!failed, "{table}");
 }
 
-fn row(fault: &str, tells: Tells, share: f64) -> Row {
+fn row(fault: &str, shows: Shows, share: f64) -> Row {
     Row {
         fault: fault.to_string(),
         rates: format!("{fault}=0.3"),
-        tells,
+        shows,
         share,
-        vanish: matches!(tells, Tells::Timeouts | Tells::ForeignAndTimeouts),
+        vanish: matches!(shows, Shows::Timeouts | Shows::ForeignAndTimeouts),
         delivery: Delivery::Whole,
     }
 }
 
-fn named(fault: &str, rates: &str, tells: Tells, share: f64) -> Row {
+fn named(fault: &str, rates: &str, shows: Shows, share: f64) -> Row {
     Row {
         rates: rates.to_string(),
-        ..row(fault, tells, share)
+        ..row(fault, shows, share)
     }
 }
 
@@ -442,13 +442,13 @@ const ALL: &str = "deaf=0.03,drop=0.04,truncate=0.04,corrupt=0.05,double=0.05,la
 fn storm_of_all(name: &str) -> Row {
     Row {
         vanish: true,
-        ..named(name, ALL, Tells::All, 0.05)
+        ..named(name, ALL, Shows::All, 0.05)
     }
 }
 
 #[test]
 fn modbus_rtu() {
-    use Tells::*;
+    use Shows::*;
     let rows = [
         row("deaf", Timeouts, 0.05),
         row("drop", Timeouts, 0.05),
@@ -497,7 +497,7 @@ fn modbus_rtu() {
 
 #[test]
 fn modbus_ascii() {
-    use Tells::*;
+    use Shows::*;
     let rows = [
         row("deaf", Timeouts, 0.05),
         row("drop", Timeouts, 0.05),
@@ -533,7 +533,7 @@ fn modbus_ascii() {
 
 #[test]
 fn n2() {
-    use Tells::*;
+    use Shows::*;
     let rows = [
         row("deaf", Timeouts, 0.15),
         row("drop", Timeouts, 0.15),
@@ -545,7 +545,7 @@ fn n2() {
         row("late:255ms", Timeouts, 0.15),
         row("late:275ms", Timeouts, 0.15),
         row("late:400ms", Timeouts, 0.15),
-        // No reply of N2 names anything, so that a foreign one cannot be told: here it is none.
+        // No reply of N2 names anything, so that a foreign one cannot be recognised: here it is none.
         row("foreign-address", Timeouts, 0.15),
         row("foreign-function", Timeouts, 0.15),
         row("foreign-length", Timeouts, 0.15),

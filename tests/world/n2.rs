@@ -13,7 +13,7 @@ use super::scenario::Line;
 
 fn nx(drives: u8) -> Line {
     Line {
-        // The drive tells its frequencies.
+        // The drive reports its frequencies.
         spec: |spec| spec.frequency_range = None,
         ..line("vacon-nx-n2", Protocol::N2, 9600, drives)
     }
@@ -159,10 +159,10 @@ class = "once"
     parts.profile = Arc::new(Profile::parse("once.toml", text, false).unwrap());
     let mut rig = Rig::recorded(&line, parts);
     rig.until_good(1, ModelPoint::OutputFrequency, Value::Number(0.0));
-    let mut told = rig.plant.events.recent();
-    told.retain(|event| event.kind == EventKind::UnlikeProfile);
-    assert_eq!(told.len(), 1);
-    assert!(told[0].text.contains("type 10h") && told[0].text.contains("expects 12h"));
+    let mut reported = rig.plant.events.recent();
+    reported.retain(|event| event.kind == EventKind::UnlikeProfile);
+    assert_eq!(reported.len(), 1);
+    assert!(reported[0].text.contains("type 10h") && reported[0].text.contains("expects 12h"));
     let before = count(&rig, ">0104");
     let polled = |rig: &Rig| count(rig, ">0104") > before + 2;
     rig.until("it is polled though nothing is read", PATIENCE, polled);

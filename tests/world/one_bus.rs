@@ -2,11 +2,11 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{Access, LeaseAction, Supervision};
 use drivegate::codec::{Exception, Protocol};
 use drivegate::command::{Outcome, Refusal};
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
+use drivegate::process_image::{Access, LeaseAction, Supervision};
 use drivegate::sim::drive::ModelOptions;
 use drivegate::sim::faults::{Fault, FaultPlan};
 use drivegate::sim::nx::NxOptions;
@@ -75,7 +75,7 @@ fn the_frames_on_the_line_are_those_of_the_reference() {
 
 #[test]
 fn a_fault_is_told_and_reset() {
-    // With a lease, so that nothing is told of a missing one.
+    // With a lease, so that no missing one is reported.
     let mut rig = ready(&Line {
         supervision: supervised(LeaseAction::Hold, PATIENCE),
         ..nx(115_200, 1)
@@ -250,8 +250,8 @@ fn a_garbled_answer_is_told_apart_from_silence() {
     ] {
         rig.until_state(1, State::Ready);
         rig.set_faults(FaultPlan::new(fault.parse().unwrap(), 1));
-        let told = rig.set(1, &[("speed_reference", 20.0)]);
-        assert_eq!((told.exception(), &told), (Some(code), &outcome), "{fault}");
+        let reported = rig.set(1, &[("speed_reference", 20.0)]);
+        assert_eq!((reported.exception(), &reported), (Some(code), &outcome), "{fault}");
         rig.set_faults(FaultPlan::default());
     }
 }
@@ -282,16 +282,16 @@ fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
         let mut rig = Rig::recorded(&line, parts);
         let known = |rig: &Rig| rig.value(1, "fieldbus_fault_response").is_some();
         rig.until("the parameter is read", PATIENCE, known);
-        // It goes and comes: told again, once.
+        // It goes and comes: reported again, once.
         rig.set_alive(1, false);
         rig.until_state(1, State::Offline);
         rig.set_alive(1, true);
         rig.until("the parameter is read again", PATIENCE, known);
         rig.run(PATIENCE);
-        let mut told = rig.plant.events.recent();
-        told.retain(|event| event.kind == EventKind::Unsupervised);
-        assert_eq!(told.len(), 2 * wanted, "{told:?}");
-        for event in told {
+        let mut reported = rig.plant.events.recent();
+        reported.retain(|event| event.kind == EventKind::Unsupervised);
+        assert_eq!(reported.len(), 2 * wanted, "{reported:?}");
+        for event in reported {
             let text = &event.text;
             let says = |part| text.contains(part);
             assert!(

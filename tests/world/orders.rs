@@ -127,7 +127,7 @@ pub fn converted(profile: &Profile, number: usize, maximum: f64) -> Option<Uniqu
 }
 
 /// What a speed reference in percent of a drive with that maximum frequency is in its own register; none where it is not
-/// told in a register of one word.
+/// shown in a register of one word.
 pub fn percent_reference(profile: &Profile, percent: f64, maximum: f64) -> Option<Unique> {
     let (_, point) = reference_point(profile);
     let raw = point.raw()?;

@@ -3,9 +3,9 @@
 use std::time::Duration;
 
 use drivegate::bus::predict::predict;
-use drivegate::cache::DriveSpec;
 use drivegate::codec::Protocol;
 use drivegate::codec::wire::Silence;
+use drivegate::process_image::DriveSpec;
 use drivegate::sim::statistics::{Direction, Recorded};
 
 use super::bus::Parts;

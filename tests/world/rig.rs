@@ -4,12 +4,12 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{OnShutdown, Outcome as Counted};
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate::drive::{ModelPoint, PollClass, Sample, State, Value};
 use drivegate::event::Events;
 use drivegate::plant::{DriveHandle, Placed, Plant, SharedPlant};
+use drivegate::process_image::{OnShutdown, Outcome as Counted};
 use drivegate::sim::SimTime;
 use drivegate::sim::drive::SimulatedDrive;
 use drivegate::sim::faults::FaultPlan;

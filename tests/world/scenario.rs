@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use drivegate::cache::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::codec::Protocol;
+use drivegate::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::sim::random::Random;
 
 /// One world.
@@ -43,7 +43,7 @@ pub struct Line {
     pub on_shutdown: OnShutdown,
     /// Addresses where nobody answers.
     pub dead: Vec<u8>,
-    /// A register that the first drive refuses to tell.
+    /// A register that the first drive refuses to report.
     pub refuses: Option<&'static str>,
     /// What else is different about its drives.
     pub spec: fn(&mut DriveSpec),

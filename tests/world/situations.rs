@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use drivegate::cache::{LeaseAction, Supervision};
 use drivegate::codec::{Protocol, Reply, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::drive::{ModelPoint, Value};
 use drivegate::plant::Placed;
+use drivegate::process_image::{LeaseAction, Supervision};
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::random::Random;
 
@@ -187,8 +187,8 @@ struct Duel {
     rig: Rig,
     /// Orders without an answer: to run or to stop, and when they were accepted.
     open: Vec<(bool, Instant, Placed)>,
-    /// What the drive was told and took.
-    told: Vec<(Instant, bool)>,
+    /// What the drive was sent and accepted.
+    reported: Vec<(Instant, bool)>,
 }
 
 impl Duel {
@@ -196,7 +196,7 @@ impl Duel {
         let mut duel = Duel {
             rig: rig(line),
             open: Vec::new(),
-            told: Vec::new(),
+            reported: Vec::new(),
         };
         duel.rig.set_faults(faults(rates, seed));
         let (end, mut dice, mut on, mut stops) = (duel.rig.now + time, Random::new(seed), false, 0);
@@ -215,14 +215,14 @@ impl Duel {
 
     /// An acknowledged stop was heard by the drive.
     fn collect(&mut self) -> u32 {
-        let (told, mut stops) = (&self.told, 0);
+        let (reported, mut stops) = (&self.reported, 0);
         self.open.retain_mut(|(on, accepted, placed)| {
             let Some(answer) = placed.answer() else { return true };
             if !*on && answer.outcome.is_ok() {
                 let since = |(at, on): &(Instant, bool)| at >= accepted && !on;
-                let stands = told.last().is_none_or(|(_, on)| !on);
+                let stands = reported.last().is_none_or(|(_, on)| !on);
                 assert!(
-                    stands || told.iter().any(since),
+                    stands || reported.iter().any(since),
                     "a stop is acknowledged that the drive did not hear"
                 );
                 stops += 1;
@@ -237,7 +237,7 @@ impl Duel {
         match seen {
             Seen::Acted(asked) if !matches!(asked.reply, Some(Reply::Exception(_))) && asked.drive == 0 => {
                 let now = self.rig.now;
-                self.told
+                self.reported
                     .extend(run_command(&self.rig.bus.profile, &asked.pdu).map(|on| (now, on)));
             }
             Seen::Sent(asked) if asked.drive == 0 && run_command(&self.rig.bus.profile, &asked.pdu) == Some(true) => {

@@ -69,7 +69,7 @@ impl Step {
 pub(super) enum Check {
     NotYet,
     Read,
-    /// It does not tell.
+    /// It does not report it.
     InVain,
 }
 
@@ -282,7 +282,7 @@ fn bits(
         return None;
     }
     // A run bit that the command does not name may have been taken away elsewhere since the word was read, and to write
-    // it would start the motor: the drive is asked, and where it does not tell, a motor that stands goes on standing.
+    // it would start the motor: the drive is asked, and if it does not report it, a motor that stands keeps standing.
     let stands = standing_run_bit(profile, raw).map_or(value, |run| set(value, run));
     let value = match known.check {
         _ if known.names_run || value == stands => value,

@@ -63,7 +63,7 @@ impl Bench {
         (CommandRun::new(command, &self.profile), receiver)
     }
 
-    /// Runs the command against a drive that does as it is told; the writes as (ms, address, value).
+    /// Runs the command against a drive that does as commanded; the writes as (ms, address, value).
     fn run(&mut self, run: &mut CommandRun) -> Vec<(u128, u16, u16)> {
         let start = self.now;
         let mut writes = Vec::new();
@@ -216,8 +216,8 @@ fn a_command_that_was_held_up_asks_again_for_the_word() {
     bench.running = true;
     let (mut reverse, _a) = bench.begin(&[("reverse", 1.0)], Urgency::Command);
     let read = sends(&bench, &mut reverse);
-    let told = Reply::Registers(vec![1]);
-    assert_eq!(reverse.answered(&read, told, &mut bench.words), None);
+    let reported = Reply::Registers(vec![1]);
+    assert_eq!(reverse.answered(&read, reported, &mut bench.words), None);
     assert_eq!(sends(&bench, &mut reverse), word(3));
     reverse.hold_up();
     assert!(reverse.asks_again(), "the motor may have been stopped meanwhile");
@@ -250,7 +250,7 @@ fn exceptions_and_silence_end_it() {
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), Some(Outcome::TimedOut));
-    // The last try tells; the time that runs out in between ends it as the try before did.
+    // The last try decides; the time that runs out in between ends it as the try before did.
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
     assert_eq!(command.failed(&sent, Outcome::Garbled, 1), Some(Outcome::Garbled));

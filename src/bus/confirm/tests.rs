@@ -3,10 +3,10 @@ use std::sync::Arc;
 use proptest::prelude::*;
 
 use super::*;
-use crate::cache::{Access, DriveImage, DriveSpec, Link};
 use crate::codec::{Reply, RequestPdu, Table};
 use crate::command::{Origin, Outcome, SourceKind, Ticket, WriteStats};
 use crate::drive::profile::Profiles;
+use crate::process_image::{Access, DriveImage, DriveSpec, Link};
 
 struct Bench {
     drive: DriveImage,
@@ -124,14 +124,14 @@ fn a_ripple_of_the_speed_does_not_confirm_a_stop_that_the_drive_ignores() {
     let mut bench = Bench::new();
     bench.speed(50.0);
     bench.set("run", Value::Bool(false));
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for round in 0..400 {
         bench.speed(if round % 2 == 0 { 49.4 } else { 50.6 });
-        told.append(&mut bench.expired());
+        reported.append(&mut bench.expired());
         assert!(!bench.results().contains(&"confirmed"));
     }
-    assert_eq!(told.len(), 1, "{told:?}");
-    assert!(told[0].ends_with("the motor does not stop"), "{told:?}");
+    assert_eq!(reported.len(), 1, "{reported:?}");
+    assert!(reported[0].ends_with("the motor does not stop"), "{reported:?}");
     assert_eq!(bench.results(), ["acknowledged"]);
     assert!(bench.confirmations.is_empty());
 }
@@ -191,18 +191,18 @@ fn a_fall_that_ceases_above_near_zero_is_told() {
     bench.speed(90.0);
     bench.set("run", Value::Bool(false));
     let since = bench.now;
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     let mut at = None;
     while bench.now < since + Duration::from_secs(12) {
         let passed = (bench.now - since).as_secs_f64();
         // It falls to 40 % within 5 s and stays there.
         bench.speed((90.0 - 10.0 * passed).max(40.0));
-        told.append(&mut bench.expired());
-        if told.len() == 1 {
+        reported.append(&mut bench.expired());
+        if reported.len() == 1 {
             at.get_or_insert(bench.now - since);
         }
     }
-    assert_eq!(told.len(), 1, "{told:?}");
+    assert_eq!(reported.len(), 1, "{reported:?}");
     let at = at.unwrap().as_secs_f64();
     assert!(
         (6.9..7.1).contains(&at),
@@ -275,10 +275,10 @@ fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
     bench.read(2100, &[8]);
     assert_eq!(bench.results(), ["acknowledged", "confirmed"], "it stands");
     bench.now += Duration::from_secs(2);
-    let told = bench.expired();
-    assert_eq!(told.len(), 1);
+    let reported = bench.expired();
+    assert_eq!(reported.len(), 1);
     assert_eq!(
-        told[0],
+        reported[0],
         "acknowledged it but did not show it within 2s: the fault is still active"
     );
     assert_eq!(bench.results(), ["acknowledged", "confirmed", "acknowledged"]);
@@ -287,7 +287,7 @@ fn what_does_not_show_is_told_once_and_what_was_overtaken_is_not() {
 
 proptest! {
     /// Whatever a drive shows after a stop: it is confirmed only by a read that showed it standing or near zero, and by any
-    /// such read in time; else it stays acknowledged, told at most once; and nothing is waited for without an end.
+    /// such read in time; else it stays acknowledged, reported at most once; and nothing is waited for without an end.
     #[test]
     fn a_stop_is_confirmed_or_told_or_neither(
         reads in proptest::collection::vec((1u64..900, any::<bool>(), 0u16..10_000), 1..60),
@@ -296,26 +296,26 @@ proptest! {
         bench.speed(100.0);
         bench.set("run", Value::Bool(false));
         let since = bench.now;
-        let (mut stood, mut stood_in_time, mut told) = (false, false, Vec::new());
+        let (mut stood, mut stood_in_time, mut reported) = (false, false, Vec::new());
         for (pause, runs, speed) in reads {
             bench.now += Duration::from_millis(pause);
             bench.read(2100, &[if runs { 2 } else { 0 }, 0, speed]);
             let shows = !runs || speed < 100;
             stood |= shows;
             stood_in_time |= shows && bench.now - since < Duration::from_secs(2);
-            told.append(&mut bench.expired());
+            reported.append(&mut bench.expired());
             if shows {
                 prop_assert!(bench.confirmations.is_empty());
             }
             let confirmed = bench.results() == ["confirmed"];
             prop_assert!(confirmed || !stood_in_time);
             prop_assert!(stood || !confirmed);
-            prop_assert!(told.is_empty() || (told.len() == 1 && !confirmed));
+            prop_assert!(reported.is_empty() || (reported.len() == 1 && !confirmed));
         }
         // A fall ends some day.
         bench.now += Duration::from_secs(3);
-        told.append(&mut bench.expired());
-        prop_assert!(bench.confirmations.is_empty() && told.len() <= 1);
+        reported.append(&mut bench.expired());
+        prop_assert!(bench.confirmations.is_empty() && reported.len() <= 1);
         prop_assert_eq!(bench.results().len(), 1);
     }
 }

@@ -8,10 +8,10 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
 use crate::bus::drive_state::FRESH;
-use crate::cache::{Access, OnShutdown};
 use crate::command::{Answer, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{ModelPoint, Value};
 use crate::plant::BusHandle;
+use crate::process_image::{Access, OnShutdown};
 
 /// Wait before a stop that was not acknowledged is ordered again.
 const AGAIN: Duration = Duration::from_millis(20);

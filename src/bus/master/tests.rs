@@ -1,4 +1,4 @@
-//! The master with drives of one family that do as they are told, in virtual time.
+//! The master with drives of one family that do as commanded, in virtual time.
 
 use std::collections::BTreeMap;
 use std::time::SystemTime;
@@ -7,13 +7,15 @@ use tokio::sync::oneshot::Receiver;
 
 use super::*;
 use crate::bus::transaction::MAY_BE_LATE;
-use crate::cache::{Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings};
 use crate::codec::wire::Silence;
 use crate::codec::{Exception, LineFormat, Reply, Table};
 use crate::command::{Answer, Authority, Command, CommandQueue, Order, Ticket, admit};
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, PollClass, Value};
 use crate::line::Rs485;
+use crate::process_image::{
+    Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
+};
 
 /// What an exchange takes.
 const COST: Duration = Duration::from_millis(20);
@@ -167,7 +169,7 @@ impl Rig {
         self.news.append(&mut news);
     }
 
-    /// What the process image is told.
+    /// What is stored in the process image.
     fn apply(&self, news: &News) {
         let image = |drive: usize| self.bus.image.drives[drive].clone();
         match news {

@@ -47,7 +47,7 @@ pub(super) enum Presence {
 pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
     pub(super) tried: bool,
-    /// It did not answer a command: a fast poll tells whether it is there, before anything else is read.
+    /// It did not answer a command: a fast poll shows whether it is there, before anything else is read.
     pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,

@@ -6,7 +6,6 @@ use crate::bus::command_run::{CommandRun, Next, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::master::supervise;
 use crate::bus::n2_late_replies::N2LateReplies;
-use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, LineFormat, Protocol, Reply, RequestPdu, Table};
 use crate::command::{
@@ -16,6 +15,7 @@ use crate::command::{
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
 use crate::plant::BusHandle;
+use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link, Supervision as Settings};
 
 mod begins;
 mod chance;
@@ -108,7 +108,7 @@ impl Bench {
     /// `ms` later the drive says whether it runs, and its lease is looked at.
     fn look(&mut self, ms: u64, runs: bool) {
         self.now += Duration::from_millis(ms);
-        self.tells(ModelPoint::Running, Value::Bool(runs));
+        self.shows(ModelPoint::Running, Value::Bool(runs));
         self.supervise();
     }
 
@@ -127,7 +127,7 @@ impl Bench {
     }
 
     /// The drive has that value now.
-    fn tells(&self, point: ModelPoint, value: Value) {
+    fn shows(&self, point: ModelPoint, value: Value) {
         self.knows(point.name(), value);
     }
 
@@ -154,7 +154,7 @@ impl Bench {
     }
 
     /// Leases that ran out while the drive ran.
-    fn told(&self) -> usize {
+    fn reported(&self) -> usize {
         let ran_out = |news: &&News| matches!(news, News::LeaseRanOut(0));
         self.news.iter().filter(ran_out).count()
     }
@@ -234,7 +234,7 @@ fn the_action_is_written_once_and_again_until_it_is_acknowledged() {
         for _ in 0..20 {
             assert!(bench.after(1_000, true).is_none(), "once");
         }
-        assert_eq!(bench.told(), 1);
+        assert_eq!(bench.reported(), 1);
     }
 }
 
@@ -243,11 +243,11 @@ fn a_drive_that_stands_and_one_that_is_held_are_left_alone() {
     let mut bench = Bench::new(LeaseAction::Stop);
     bench.heartbeat();
     assert!(bench.after(10_000, false).is_none());
-    assert_eq!(bench.told(), 0);
+    assert_eq!(bench.reported(), 0);
     let mut bench = Bench::new(LeaseAction::Hold);
     bench.heartbeat();
     assert!(bench.after(10_000, true).is_none());
-    assert_eq!(bench.told(), 1);
+    assert_eq!(bench.reported(), 1);
 }
 
 /// What a command writes to a drive that has the run command: the point that takes it, and its value there.
@@ -337,7 +337,7 @@ fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     assert!(refusal.to_string().contains("frequency_range"), "{refusal}");
     assert_eq!(bench.own_results(), ["not_writable"]);
     bench.knows("maximum_frequency", Value::Number(50.0));
-    let command = bench.after(1_000, true).expect("the drive tells its range now");
+    let command = bench.after(1_000, true).expect("the drive reports its range now");
     command.answer(&acknowledged(), bench.now);
     assert!(bench.after(1_000, true).is_none());
     // A client that is back has its own reference.
@@ -370,7 +370,7 @@ fn an_action_that_is_due_outlives_the_bus() {
         bench.after(5_000, true).is_none(),
         "what was acknowledged last is not due again"
     );
-    assert_eq!(bench.told(), 1);
+    assert_eq!(bench.reported(), 1);
     // Nothing is due to a drive that is only monitored from now on, nor where nothing is to be written.
     for change in [
         (|spec: &mut DriveSpec| spec.access = Access::Monitor) as fn(&mut DriveSpec),
@@ -418,20 +418,20 @@ fn a_motor_that_may_start_by_itself_keeps_its_lease() {
     bench.heartbeat();
     // A fault, with the run command left in the drive's word.
     for _ in 0..10 {
-        bench.tells(ModelPoint::Run, Value::Bool(true));
+        bench.shows(ModelPoint::Run, Value::Bool(true));
         assert!(bench.after(1_000, false).is_none());
     }
-    assert_eq!(bench.told(), 0);
+    assert_eq!(bench.reported(), 0);
     assert!(bench.after(10, true).is_some(), "it started by it");
     // The run command was taken away.
     let mut bench = Bench::new(LeaseAction::Stop);
     bench.heartbeat();
-    bench.tells(ModelPoint::Run, Value::Bool(true));
+    bench.shows(ModelPoint::Run, Value::Bool(true));
     assert!(bench.after(6_000, false).is_none());
-    bench.tells(ModelPoint::Run, Value::Bool(false));
+    bench.shows(ModelPoint::Run, Value::Bool(false));
     assert!(bench.after(10, false).is_none());
     assert!(bench.after(10, true).is_none(), "started by someone else");
-    assert_eq!(bench.told(), 0);
+    assert_eq!(bench.reported(), 0);
 }
 
 #[test]
@@ -447,7 +447,7 @@ fn a_drive_that_runs_without_a_lease_is_told_once_and_adopted_where_that_is_want
     bench.reload(bench.spec());
     assert!(bench.after(1_000, true).is_none());
     assert!(bench.image().is_unsupervised(), "after a reload too");
-    assert_eq!(bench.news.len(), 1, "told once");
+    assert_eq!(bench.news.len(), 1, "reported once");
     bench.heartbeat();
     assert!(bench.after(4_900, true).is_none());
     assert!(!bench.image().is_unsupervised());

@@ -4,7 +4,6 @@ use std::time::{Duration, Instant};
 
 use super::Target;
 use super::gateway::NotFound;
-use crate::cache::{OnShutdown, Reading};
 use crate::command::{Origin, SourceKind};
 use crate::config::{BusSettings, Settings};
 use crate::daemon::Daemon;
@@ -12,6 +11,7 @@ use crate::drive::{Point, PollClass, Profile, Quality, Source};
 use crate::north::local::protocol::{Outcome, Request};
 use crate::north::local::{SocketPath, answer};
 use crate::plant::DriveHandle;
+use crate::process_image::{OnShutdown, Reading};
 
 /// Time to open the port.
 const OPEN: Duration = Duration::from_millis(1500);
@@ -156,7 +156,7 @@ fn is_settled(reading: &Reading<'_>, index: usize) -> bool {
         reading.sample(source).quality == Quality::Good
             || raw.is_none_or(|raw| {
                 let words = reading.words(raw.table, raw.address, raw.form.items());
-                matches!(words, Ok(_) | Err(crate::cache::Unavailable::Refused(_)))
+                matches!(words, Ok(_) | Err(crate::process_image::Unavailable::Refused(_)))
             })
     })
 }

@@ -6,8 +6,8 @@ use serde_json::{Map as Object, Value, json};
 
 use super::Map;
 use super::rows::{COLUMNS, Row, drive_rows};
-use crate::cache::Access;
 use crate::north::register_map::GATEWAY_UNIT;
+use crate::process_image::Access;
 
 /// Rows of all units, with unit and drive.
 fn rows(map: &Map<'_>) -> Vec<(u8, String, Row)> {

@@ -1,11 +1,11 @@
 //! The rows of the map: the content of each address.
 
-use crate::cache::Access;
 use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
 use crate::drive::{ModelPoint, Plan, Point, Profile};
 use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
 use crate::plant::{BusHandle, Plant};
+use crate::process_image::Access;
 
 /// One line of the map.
 #[derive(Debug, Clone, PartialEq)]

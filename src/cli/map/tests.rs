@@ -2,9 +2,9 @@ use std::time::Duration;
 
 use super::export::quoted;
 use super::*;
-use crate::cache::{Access, BusSpec};
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::profile::Profiles;
+use crate::process_image::{Access, BusSpec};
 
 fn plant() -> Plant {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();

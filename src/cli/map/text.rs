@@ -6,10 +6,10 @@ use comfy_table::{Table as TextTable, presets};
 
 use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
-use crate::cache::{Access, DriveSpec};
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::north::register_map::GATEWAY_UNIT;
+use crate::process_image::{Access, DriveSpec};
 
 /// The whole map as tables.
 pub(super) fn render(map: &Map<'_>) -> String {
@@ -41,7 +41,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             profile.title,
             units.join(", ")
         );
-        // What a unit of this profile can have; the table above tells which units can be written.
+        // What a unit of this profile can have; the table above shows which units can be written.
         out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
         out += &ranges(profile);

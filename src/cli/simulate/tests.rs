@@ -94,15 +94,15 @@ fn bad_command_lines() {
     assert!(error.contains("did you mean `vacon-nx`"), "{error}");
     assert!(parse("--format 9N1").unwrap().line().unwrap_err().contains("--format"));
     assert!(parse("--format 8N1").unwrap().line().is_ok());
-    let told = |words: &str| parse(words).unwrap().line().unwrap_err();
-    let error = told("--protocol n2");
+    let error_of = |words: &str| parse(words).unwrap().line().unwrap_err();
+    let error = error_of("--protocol n2");
     assert!(
         error.contains("speak modbus-rtu") && error.contains("`vacon-nx-n2`"),
         "{error}"
     );
-    let error = told("--profile teco-7300pa --addresses 30-32");
+    let error = error_of("--profile teco-7300pa --addresses 30-32");
     assert!(error.contains("no address 32") && error.contains("1 to 31"), "{error}");
-    assert!(told("--addresses 250").contains("its drives have 1 to 247"));
+    assert!(error_of("--addresses 250").contains("its drives have 1 to 247"));
     assert!(
         parse("--profile teco-7300pa-n2 --addresses 250-255")
             .unwrap()

@@ -9,7 +9,7 @@ use std::io::{self, BufWriter, Write};
 use std::path::Path;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use crate::cache::Direction;
+use crate::process_image::Direction;
 
 /// LINKTYPE_RTAC_SERIAL.
 const LINK_TYPE: u32 = 250;

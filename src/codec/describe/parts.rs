@@ -28,7 +28,7 @@ pub struct Part {
 }
 
 /// Splits what came after `request`, whose frame was `frame`, into its parts, in the order of arrival. `answered`: the
-/// exchange ended with a reply, which tells the reply to a write from an echo of it.
+/// exchange ended with a reply, which distinguishes the reply to a write from its echo.
 pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], answered: bool) -> Vec<Part> {
     let mut parts = Vec::new();
     let mut at = 0;
@@ -63,7 +63,7 @@ pub fn parts(protocol: Protocol, request: &Request, frame: &[u8], bytes: &[u8], 
 }
 
 /// Most requests cannot be answered by their own frame; the write of one register is, so there only a second frame, or
-/// the lack of an answer, tells.
+/// the lack of an answer, shows.
 fn is_echo(protocol: Protocol, request: &Request, frame: &[u8], rest: &[u8], answered: bool) -> bool {
     let Some(more) = rest.strip_prefix(frame).filter(|_| !frame.is_empty()) else {
         return false;

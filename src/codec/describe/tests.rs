@@ -335,9 +335,9 @@ fn n2_in_the_words_of_its_objects() {
             "nothing new",
         ),
     ];
-    for (pdu, bytes, asked, told) in cases {
+    for (pdu, bytes, asked, reported) in cases {
         assert_eq!(request_on(Protocol::N2, &pdu), asked);
-        assert_eq!(reply(Protocol::N2, &Request::new(1, pdu), bytes.as_bytes()), told);
+        assert_eq!(reply(Protocol::N2, &Request::new(1, pdu), bytes.as_bytes()), reported);
     }
     assert_eq!(stray(Protocol::N2, b">01FA7\r"), "foreign: a request to address 1");
     assert_eq!(

@@ -125,7 +125,7 @@ impl RequestPdu {
         }
     }
 
-    /// Bytes of the regular reply's PDU; for 43/14, whose length the reply itself tells, its shortest.
+    /// Bytes of the regular reply's PDU; for 43/14, whose length only the reply shows, its shortest.
     pub fn reply_len(&self) -> usize {
         match self {
             RequestPdu::Read { table, count, .. } => {

@@ -36,7 +36,7 @@ pub struct N2Options {
     pub region_width: RegionWidth,
     /// Drives are identified before they are asked anything else, and after an exchange that failed.
     pub identify: bool,
-    /// Device type that a drive is expected to tell.
+    /// Device type that a drive is expected to report.
     pub device_type: u8,
     /// An overridden analog output is released afterwards.
     pub release: bool,
@@ -65,7 +65,7 @@ impl Default for N2Options {
 
 /// Bit of a configuration byte that switches the report of changes on; simulator only.
 pub const CONFIG_REPORT_BIT: u8 = 0;
-/// Bit of a status byte that tells an override; simulator only.
+/// Bit of a status byte that shows an override; simulator only.
 pub const STATUS_OVERRIDE_BIT: u8 = 5;
 /// What the simulator sends for a limit that is switched off.
 pub const INVALID_FLOAT: u32 = 0x7FC0_0000;

@@ -188,7 +188,7 @@ fn write(region: u8, rest: &[u8]) -> Result<Command, u8> {
     })
 }
 
-/// The object of 7/2 and 7/3 and what stands behind it. A region never begins with 0, so a 0 tells the form of two
+/// The object of 7/2 and 7/3 and what stands behind it. A region never begins with 0, so a 0 shows the form of two
 /// characters.
 fn commanded(rest: &[u8]) -> Result<(Object, Vec<u8>), u8> {
     let rest = rest.strip_prefix(b"0").unwrap_or(rest);

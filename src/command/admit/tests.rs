@@ -3,9 +3,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
-use crate::cache::{DriveImage, DriveSpec, Link};
 use crate::codec::Exception;
 use crate::drive::profile::Profiles;
+use crate::process_image::{DriveImage, DriveSpec, Link};
 
 fn drive(access: Access) -> DriveImage {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();

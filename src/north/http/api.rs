@@ -5,9 +5,9 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
-use crate::cache::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 use crate::drive::{self, Quality, State};
 use crate::plant::{BusHandle, DriveHandle};
+use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 
 /// An error reply.
 #[derive(Debug, Serialize)]

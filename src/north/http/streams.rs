@@ -22,9 +22,9 @@ use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
 use super::routes::{AppState, not_found};
 use super::{MAX_LISTENERS, api};
-use crate::cache::{Direction, FrameRecord};
 use crate::codec::{Protocol, describe};
 use crate::event::Event;
+use crate::process_image::{Direction, FrameRecord};
 
 /// Time after which a browser reconnects.
 const RETRY: Duration = Duration::from_secs(2);

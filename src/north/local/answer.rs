@@ -9,13 +9,13 @@ use super::protocol::{
     Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, Request, Setting, WriteOutcome,
     WriteRequest, port_of,
 };
-use crate::cache::{Link, Reading, Unavailable, public_points};
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
 use crate::document::nearest;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::mqtt::point_value;
 use crate::plant::{DriveHandle, Plant};
+use crate::process_image::{Link, Reading, Unavailable, public_points};
 
 /// Most points of one request; a profile has some hundred.
 const MAX_POINTS: usize = 1024;

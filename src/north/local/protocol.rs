@@ -13,9 +13,9 @@ use std::time::Duration;
 use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
-use crate::cache::{BusSpec, DriveSpec, value_or_null};
 use crate::command::{Answer, CONFIRMED};
 use crate::drive::{Point, Sample};
+use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
 pub const VERSION: u64 = 1;

@@ -5,10 +5,10 @@ use std::time::Instant;
 
 use super::model::MODEL;
 use super::process;
-use crate::cache::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
 use crate::drive::{PollClass, State};
 use crate::north::NorthStats;
 use crate::plant::{BusHandle, Plant};
+use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
 
 /// Commit of the build, set for releases.
 const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");

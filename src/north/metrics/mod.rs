@@ -156,12 +156,12 @@ mod tests {
     use std::time::Duration;
 
     use super::*;
-    use crate::cache::{BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Supervision};
     use crate::codec::{LineFormat, Protocol};
     use crate::command::{CommandQueue, WriteStats};
     use crate::drive::profile::Profiles;
     use crate::event::Events;
     use crate::plant::BusHandle;
+    use crate::process_image::{BusImage, BusSpec, DriveImage, DriveSpec, LeaseAction, Supervision};
 
     fn drive(name: &str, supervision: Option<Supervision>) -> Arc<DriveImage> {
         let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();

@@ -7,11 +7,11 @@ use std::time::Instant;
 
 use super::client::Client;
 use super::frame::Header;
-use crate::cache::{Reading, Unavailable};
 use crate::codec::n2::Object;
 use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table, describe};
 use crate::command::{Authority, DEFAULT_EXPIRY, Order, Outcome, Refusal};
 use crate::plant::{DriveHandle, Placed};
+use crate::process_image::{Reading, Unavailable};
 
 /// A request that is forwarded to a drive.
 #[derive(Debug)]

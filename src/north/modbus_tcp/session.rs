@@ -11,7 +11,6 @@ use super::frame::{self, Frame, Header};
 use super::identify::Identity;
 use super::routes::{PlantView, Routes};
 use super::{ServerState, Uncached};
-use crate::cache::{Access, Unavailable};
 use crate::codec::modbus::encode_exception;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Authority, Order, Outcome};
@@ -20,6 +19,7 @@ use crate::north::ModbusTcpStats;
 use crate::north::log_throttle::LogThrottle;
 use crate::north::register_map::{self, BusFigures, BusState, CommandWrite, DriveView, FIRST, GATEWAY_UNIT};
 use crate::plant::{BusHandle, DriveHandle};
+use crate::process_image::{Access, Unavailable};
 
 /// Function codes that write.
 const WRITES: [u8; 6] = [5, 6, 15, 16, 22, 23];

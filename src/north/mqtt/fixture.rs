@@ -3,11 +3,11 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use crate::cache::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 use crate::codec::{LineFormat, Protocol, Table};
 use crate::command::CommandQueue;
 use crate::drive::profile::Profiles;
 use crate::plant::{BusHandle, Plant};
+use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 
 /// A bus `line1` with NX drives of these names; all may be commanded.
 pub(super) fn plant(drives: &[&str]) -> Plant {

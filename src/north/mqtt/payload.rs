@@ -4,10 +4,10 @@ use std::time::{Duration, SystemTime};
 
 use serde::ser::{Serialize, SerializeMap, Serializer};
 
-use crate::cache::{BusHealth, Reading, value_or_null};
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
 use crate::plant::BusHandle;
+use crate::process_image::{BusHealth, Reading, value_or_null};
 
 /// Keys of the state object that are not points; a profile point of that name is omitted.
 const STATE_KEYS: [&str; 6] = ["state", "quality", "time", "age_ms", "fault_text", "point_quality"];
@@ -67,7 +67,7 @@ impl Topics {
 
 /// The points of a drive that are published: index in the profile and name.
 pub(super) fn published_points(profile: &Profile) -> Vec<(usize, &str)> {
-    let mut points = crate::cache::public_points(profile);
+    let mut points = crate::process_image::public_points(profile);
     points.retain(|(_, name)| !STATE_KEYS.contains(name));
     points
 }
@@ -289,8 +289,8 @@ mod tests {
     use std::time::Instant;
 
     use super::*;
-    use crate::cache::{DriveImage, DriveSpec, Link};
     use crate::codec::Table;
+    use crate::process_image::{DriveImage, DriveSpec, Link};
 
     #[test]
     fn set_topics_are_recognised() {

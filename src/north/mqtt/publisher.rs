@@ -253,8 +253,8 @@ mod tests {
 
     use super::super::fixture;
     use super::*;
-    use crate::cache::Link;
     use crate::codec::{Exception, Table};
+    use crate::process_image::Link;
 
     struct Bench {
         plant: Plant,

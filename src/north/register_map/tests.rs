@@ -1,10 +1,10 @@
 use std::time::{Duration, Instant, SystemTime};
 
 use super::*;
-use crate::cache::{Access, DriveImage, DriveSpec, Link, Snapshot};
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::drive::profile::Profiles;
+use crate::process_image::{Access, DriveImage, DriveSpec, Link, Snapshot};
 
 const STALE_AFTER: Duration = Duration::from_secs(1);
 

@@ -69,7 +69,7 @@ pub struct Board {
     /// Records that are not acknowledged yet, a reply each.
     reports: VecDeque<Vec<u8>>,
     /// The first of them was sent.
-    told: bool,
+    has_sent_reports: bool,
     polled: SimTime,
     /// Power cycles of the drive that the board has gone through with it.
     power_cycles: u32,
@@ -86,7 +86,7 @@ impl Board {
             overridden: BTreeMap::new(),
             reported: BTreeMap::new(),
             reports: VecDeque::new(),
-            told: false,
+            has_sent_reports: false,
             polled: now,
             power_cycles: 0,
         }
@@ -153,11 +153,11 @@ impl Board {
             }
             Command::Poll { again } => {
                 self.polled = now;
-                if *again && std::mem::take(&mut self.told) {
+                if *again && std::mem::take(&mut self.has_sent_reports) {
                     self.reports.pop_front();
                 }
                 self.note_changes(model);
-                self.told = !self.reports.is_empty();
+                self.has_sent_reports = !self.reports.is_empty();
                 Ok(Some(self.reports.front().cloned().map_or(Answer::Ack, Answer::Data)))
             }
             Command::WarmReset if self.map.warm_reset => {
@@ -323,7 +323,7 @@ impl Board {
     /// All AI, AO, BI and BO, as after each Identify, whatever of it was reported before.
     fn full_report(&mut self, model: Model<'_>) {
         self.reports.clear();
-        self.told = false;
+        self.has_sent_reports = false;
         self.reported.clear();
         self.collect(true, model);
     }

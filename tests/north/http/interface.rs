@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::Link;
 use drivegate::codec::Exception;
 use drivegate::north::http::{self, MAX_CONNECTIONS, Options};
+use drivegate::process_image::Link;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::TcpStream;
@@ -162,10 +162,10 @@ async fn a_good_drive() {
         })
     );
     let names: Vec<&String> = points.as_object().unwrap().keys().collect();
-    assert_eq!(names.len(), drivegate::cache::public_points(&plant::nx()).len());
+    assert_eq!(names.len(), drivegate::process_image::public_points(&plant::nx()).len());
     assert!(
         !names.contains(&&"process_data_in_1".to_string()),
-        "what is never read is not told"
+        "what is never read is left out"
     );
     for (name, value, unit) in [
         ("output_frequency", json!(25.0), "Hz"),
@@ -207,7 +207,7 @@ async fn values_that_are_not_good_say_so() {
     let refused = get(server.address, "/api/v1/drives/pump-1").await.json();
     assert_eq!(
         refused["points"]["output_frequency"], nothing,
-        "the last value is not told"
+        "the last value is not shown"
     );
     assert_eq!(refused["points"]["motor_speed"]["quality"], json!("good"));
 

@@ -373,8 +373,8 @@ async fn open_metrics_for_those_that_ask() {
 
 fn promtool(text: &str) -> (bool, String) {
     let output = feed(&tool("promtool"), &["check", "metrics"], text);
-    let told = [output.stdout, output.stderr].concat();
-    (output.status.success(), String::from_utf8(told).expect("text"))
+    let reported = [output.stdout, output.stderr].concat();
+    (output.status.success(), String::from_utf8(reported).expect("text"))
 }
 
 #[tokio::test]
@@ -384,9 +384,9 @@ async fn promtool_has_no_complaint() {
     let server = Server::of(plant).await;
     assert_eq!(promtool(&scrape(&server).await), (true, String::new()));
     // The one name of the contract that the linter would have otherwise, from families that count hours.
-    let (_, told) = promtool(&scrape(&everything().await).await);
+    let (_, reported) = promtool(&scrape(&everything().await).await);
     assert_eq!(
-        told,
+        reported,
         "drivegate_drive_operating_hours use base unit \"seconds\" instead of \"hours\"\n"
     );
 }

@@ -49,7 +49,7 @@ async fn the_page_shows_the_plant() {
     let plant = plant::mixed();
     plant
         .events
-        .tell(event(EventKind::Fault, "saw-4", "fault 7: <saturation> trip"));
+        .publish(event(EventKind::Fault, "saw-4", "fault 7: <saturation> trip"));
     plant.buses[1].image.update_health(|health| {
         health.up = false;
         health.reason = Some("the adapter is gone".to_string());

@@ -7,7 +7,6 @@ use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{DriveImage, Link, Outcome, PollCycle};
 use drivegate::codec::{Exception, Protocol, Table};
 use drivegate::command::{self, Origin, SourceKind, Ticket};
 use drivegate::drive::model::Kind;
@@ -17,6 +16,7 @@ use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
 use drivegate::north::http::{self, Http, Options};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
+use drivegate::process_image::{DriveImage, Link, Outcome, PollCycle};
 use tokio_util::sync::CancellationToken;
 
 use crate::north::plant;

@@ -2,22 +2,24 @@
 
 use std::time::{Duration, UNIX_EPOCH};
 
-use drivegate::cache::{Direction, FrameRecord};
 use drivegate::event::EventKind;
 use drivegate::north::http::MAX_LISTENERS;
+use drivegate::process_image::{Direction, FrameRecord};
 use serde_json::json;
 use tokio::time::timeout;
 
 use super::client::{EventStream, Message, PATIENCE, get, request};
 use super::plant::{self, Server, event};
 
-/// A server that told two events already.
+/// A server with two events.
 async fn served() -> Server {
     let plant = plant::mixed();
-    plant.events.tell(event(EventKind::Online, "pump-1", "pump-1 answers"));
     plant
         .events
-        .tell(event(EventKind::Fault, "saw-4", "fault 7: saturation trip"));
+        .publish(event(EventKind::Online, "pump-1", "pump-1 answers"));
+    plant
+        .events
+        .publish(event(EventKind::Fault, "saw-4", "fault 7: saturation trip"));
     Server::of(plant).await
 }
 
@@ -46,7 +48,7 @@ async fn events_kept_and_new() {
     server
         .plant()
         .events
-        .tell(event(EventKind::FaultEnd, "saw-4", "the fault is gone"));
+        .publish(event(EventKind::FaultEnd, "saw-4", "the fault is gone"));
     let live = next(&mut stream).await.json();
     assert_eq!((&live["id"], &live["event"]), (&json!(3), &json!("fault_end")));
 }
@@ -58,12 +60,12 @@ async fn a_burst_of_all_drives_is_not_lost() {
         .await
         .opened()
         .await;
-    // Nothing of it is sent before all are told: the server has one thread, this one.
+    // Nothing of it is sent before all are published: the server has one thread, this one.
     for _ in 0..1000 {
         server
             .plant()
             .events
-            .tell(event(EventKind::Offline, "pump-1", "pump-1 does not answer"));
+            .publish(event(EventKind::Offline, "pump-1", "pump-1 does not answer"));
     }
     for id in 1..=1002 {
         let heard = next(&mut stream).await;
@@ -111,7 +113,7 @@ async fn events_as_json_for_those_that_ask_now_and_then() {
     server
         .plant()
         .events
-        .tell(event(EventKind::FaultEnd, "saw-4", "the fault is gone"));
+        .publish(event(EventKind::FaultEnd, "saw-4", "the fault is gone"));
     assert_eq!(ask(last).await["events"][0]["id"], json!(3));
 }
 
@@ -137,9 +139,9 @@ async fn frames_of_one_bus() {
         .opened()
         .await;
     assert!(plant.buses[0].image.trace.wanted() && !plant.buses[1].image.trace.wanted());
-    plant.buses[0].image.trace.tell(|| frame(Direction::Request, 0xAB));
-    plant.buses[1].image.trace.tell(|| frame(Direction::Request, 0xCD));
-    plant.buses[0].image.trace.tell(|| frame(Direction::Reply, 0xEF));
+    plant.buses[0].image.trace.publish(|| frame(Direction::Request, 0xAB));
+    plant.buses[1].image.trace.publish(|| frame(Direction::Request, 0xCD));
+    plant.buses[0].image.trace.publish(|| frame(Direction::Reply, 0xEF));
     assert_eq!(
         next(&mut stream).await.json(),
         json!({"bus": "line1", "time": "2023-11-14T22:13:20.123456Z", "gap_us": null, "direction": "request",
@@ -151,7 +153,7 @@ async fn frames_of_one_bus() {
     drop(stream);
     let unwanted = async {
         while plant.buses[0].image.trace.wanted() {
-            plant.buses[0].image.trace.tell(|| frame(Direction::Request, 0));
+            plant.buses[0].image.trace.publish(|| frame(Direction::Request, 0));
             tokio::task::yield_now().await;
         }
     };
@@ -167,7 +169,7 @@ async fn frames_of_all_buses() {
         .opened()
         .await;
     for bus in &plant.buses {
-        bus.image.trace.tell(|| frame(Direction::Request, 1));
+        bus.image.trace.publish(|| frame(Direction::Request, 1));
     }
     let mut buses = vec![
         next(&mut stream).await.json()["bus"].clone(),
@@ -207,7 +209,7 @@ async fn a_slow_listener_is_told_what_it_lost() {
         plant.buses[0]
             .image
             .trace
-            .tell(|| frame(Direction::Request, (count % 256) as u8));
+            .publish(|| frame(Direction::Request, (count % 256) as u8));
     }
     let lagged = next(&mut stream).await;
     assert_eq!(
@@ -248,7 +250,7 @@ async fn listeners_are_bounded_and_places_come_back() {
             server.plant().buses[0]
                 .image
                 .trace
-                .tell(|| frame(Direction::Request, 0));
+                .publish(|| frame(Direction::Request, 0));
         }
     };
     timeout(PATIENCE, again).await.expect("a place");

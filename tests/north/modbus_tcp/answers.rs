@@ -4,10 +4,10 @@
 use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
 
-use drivegate::cache::{Access, Link};
 use drivegate::codec::Exception;
 use drivegate::command::Outcome;
 use drivegate::north::modbus_tcp::Uncached;
+use drivegate::process_image::{Access, Link};
 
 use super::rig::{Client, Rig, frame, options, plant, plant_where, registers, until, words, write};
 use crate::support::tools;

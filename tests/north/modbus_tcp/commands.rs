@@ -246,14 +246,14 @@ async fn refusals_are_counted_and_told() {
             "{code} in {results:?}"
         );
     }
-    let told = plant.events.recent();
-    assert_eq!(told.len(), 3);
-    assert!(told.iter().all(|e| e.kind == EventKind::RefusedCommand));
+    let reported = plant.events.recent();
+    assert_eq!(reported.len(), 3);
+    assert!(reported.iter().all(|e| e.kind == EventKind::RefusedCommand));
     let peer = client.stream.local_addr().unwrap().to_string();
     assert!(
-        told[0].text.contains(&peer) && told[0].text.contains("bits 3 to 15"),
+        reported[0].text.contains(&peer) && reported[0].text.contains("bits 3 to 15"),
         "{}",
-        told[0].text
+        reported[0].text
     );
     rig.end().await;
 }

@@ -180,7 +180,7 @@ async fn nothing_is_torn() {
         let (image, end, polls) = (rig.drive("pump-1"), end.clone(), polls.clone());
         std::thread::spawn(move || {
             while !end.load(Ordering::Relaxed) {
-                // All eleven words, and so both halves of every 32-bit value made of them, tell the poll.
+                // All eleven words, and so both halves of every 32-bit value made of them, show the poll.
                 let n = (polls.fetch_add(1, Ordering::Relaxed) % 10_000) as u16;
                 let now = Instant::now();
                 image.update(|s| {
@@ -229,7 +229,7 @@ async fn disorder_leaves_nothing_behind() {
     for _ in 0..500 {
         assert_eq!(worker.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
         let answer = worker.ask(1, &words(6, &[2003, 1])).await;
-        // The others may have filled the queue, which is told.
+        // The others may have filled the queue, which is reported.
         assert!(answer == words(6, &[2003, 1]) || answer == [0x86, 6], "{answer:?}");
     }
     for vandal in vandals {

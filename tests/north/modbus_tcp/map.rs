@@ -5,11 +5,11 @@ use std::fmt::Write as _;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use drivegate::cache::{BusImage, DriveImage, Link};
 use drivegate::command::CommandQueue;
 use drivegate::config::Settings;
 use drivegate::drive::profile::Profiles;
 use drivegate::plant::{BusHandle, Plant};
+use drivegate::process_image::{BusImage, DriveImage, Link};
 use serde_json::Value;
 
 use super::rig::{Rig, options, words};

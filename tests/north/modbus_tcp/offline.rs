@@ -54,7 +54,7 @@ fn orders_are_queued_when_the_call_returns_and_end_by_the_time_that_is_told() {
     batch.extend(frame(2, 1, &words(6, &[0x8100, 1])));
     batch.extend(frame(3, 1, &words(3, &[2102, 1])));
     let read = frame(3, 1, &registers(3, &[5000]));
-    assert_eq!(bench.receive(&batch), read, "the cache answers at once");
+    assert_eq!(bench.receive(&batch), read, "the process image answers at once");
     assert_eq!(bench.plant.load().buses[0].queue.lock().len(), 2);
     let first = bench.pop().unwrap();
     assert_eq!(first.ticket.client(), "modbus_tcp 10.0.0.9");

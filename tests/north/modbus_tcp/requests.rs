@@ -2,10 +2,10 @@
 
 use std::time::SystemTime;
 
-use drivegate::cache::Link;
 use drivegate::codec::{Exception, RequestPdu, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::north::modbus_tcp::Uncached;
+use drivegate::process_image::Link;
 
 use super::rig::{Client, Rig, n2_plant, options, registers, words, write};
 
@@ -203,7 +203,7 @@ async fn an_n2_drive_is_asked_object_by_object_for_what_is_not_polled() {
     assert_eq!(client.ask(1, &words(2, &[5, 5])).await, [2, 1, 0b1_0011]);
     let asked: Vec<Order> = (7..10).map(|at| read(Table::DiscreteInput, at, 1)).collect();
     assert_eq!(rig.buses[0].orders(), asked);
-    // Half of AI 1, AI 2 from the cache, half of AI 11.
+    // Half of AI 1, AI 2 from the process image, half of AI 11.
     assert_eq!(client.ask(1, &words(4, &[2, 2])).await, registers(4, &[0x41C8, 0]));
     assert_eq!(rig.buses[0].orders(), []);
     assert_eq!(client.ask(1, &words(4, &[21, 1])).await, registers(4, &[21]));

@@ -7,13 +7,13 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Command, CommandQueue, Order, Outcome};
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::north::NorthStats;
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
+use drivegate::process_image::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
 use rustix::event::{PollFd, PollFlags, poll};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};

@@ -211,13 +211,13 @@ async fn roles_decide_who_writes() {
         plant.writes.results().get(&(SourceKind::ModbusTcp, "acknowledged")),
         Some(&2)
     );
-    let told = plant.events.recent();
-    assert_eq!(told.len(), 6);
-    // Who it was is told by the name in the certificate, and from where.
+    let reported = plant.events.recent();
+    assert_eq!(reported.len(), 6);
+    // The event names the certificate and the address.
     assert!(
-        told[0].text.contains("from modbus_tcp screen at 127.0.0.1:"),
+        reported[0].text.contains("from modbus_tcp screen at 127.0.0.1:"),
         "{}",
-        told[0].text
+        reported[0].text
     );
     // The other listener does not care about certificates.
     let mut plain = rig.client().await;

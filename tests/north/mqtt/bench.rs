@@ -10,7 +10,6 @@ use std::sync::{Arc, Condvar, Mutex};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
-use drivegate::cache::{Access, DriveSpec, Link};
 use drivegate::codec::{Protocol, Reply, Table};
 use drivegate::command::{Order, Outcome};
 use drivegate::drive::Value;
@@ -18,6 +17,7 @@ use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
 use drivegate::north::mqtt::{self, Mqtt, Options};
 use drivegate::plant::{Plant, SharedPlant};
+use drivegate::process_image::{Access, DriveSpec, Link};
 use tempfile::TempDir;
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Runtime;
@@ -438,9 +438,9 @@ impl Gateway {
         fill(&self.plant.load(), drive, frequency);
     }
 
-    pub(crate) fn tell(&self, drive: &str, kind: EventKind, text: &str) -> SystemTime {
+    pub(crate) fn publish_event(&self, drive: &str, kind: EventKind, text: &str) -> SystemTime {
         let time = SystemTime::now();
-        self.plant.load().events.tell(Event {
+        self.plant.load().events.publish(Event {
             id: 0,
             time,
             kind,

@@ -55,7 +55,7 @@ fn an_object_becomes_one_order() {
         ("speed_reference".to_string(), Value::Number(50.0)),
     ];
     assert_eq!((orders[0].0, orders[0].1.as_slice()), (0, expected.as_slice()));
-    assert!(orders[0].2 <= Duration::from_secs(2), "2 s unless told otherwise");
+    assert!(orders[0].2 <= Duration::from_secs(2), "2 s by default");
     bench.gateway.stop();
 }
 
@@ -230,7 +230,7 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
             "only monitored",
         ),
     ] {
-        // Refusals are told at ten a second for each drive.
+        // At most ten refusals a second are published for each drive.
         std::thread::sleep(Duration::from_millis(110));
         let result = bench.result(topic, payload, &[]);
         assert_eq!(result["ok"], false);
@@ -309,8 +309,8 @@ fn without_commands_nothing_is_listened_to() {
     watcher.wait_payload("drivegate/hall/status", "online");
     broker.publish(SET, r#"{"run": true}"#, &[]);
     broker.publish(&format!("{SET}/run"), "true", &[]);
-    // An event told afterwards arrives: had there been an answer to the commands, it would be here.
-    gateway.tell("p1", EventKind::Online, "afterwards");
+    // An event published afterwards arrives: had there been an answer to the commands, it would be here.
+    gateway.publish_event("p1", EventKind::Online, "afterwards");
     watcher.wait("the event", |m| m.payload.contains("afterwards"));
     assert_eq!((gateway.ordered().len(), watcher.payloads(RESULT).len()), (0, 0));
     assert_eq!(watcher.payloads(EVENT).len(), 1);

@@ -27,7 +27,7 @@ fn rfc3339(time: SystemTime) -> String {
 fn a_broker_that_comes_later_is_found() {
     let mut broker = Broker::prepared(TempDir::new().unwrap(), "allow_anonymous true\n");
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
-    let time_told = gateway.tell("p1", EventKind::Fault, "before there was a broker");
+    let time_told = gateway.publish_event("p1", EventKind::Fault, "before there was a broker");
     wait_for("the event to be buffered", || (gateway.buffered() == 1).then_some(()));
     assert!(!gateway.connected());
     broker.up();
@@ -100,10 +100,14 @@ fn events_wait_in_order_and_telemetry_does_not() {
     gateway.wait_connected(false);
     watcher.wait_payload("drivegate/hall/status", "offline");
     watcher.clear();
-    let mut told = Vec::new();
+    let mut reported = Vec::new();
     for n in 0u16..100 {
         gateway.read("p1", 3000 + n);
-        told.push(rfc3339(gateway.tell("p1", EventKind::Fault, &format!("event {n}"))));
+        reported.push(rfc3339(gateway.publish_event(
+            "p1",
+            EventKind::Fault,
+            &format!("event {n}"),
+        )));
     }
     wait_for("the events to be buffered", || {
         (gateway.buffered() == 100).then_some(())
@@ -116,7 +120,7 @@ fn events_wait_in_order_and_telemetry_does_not() {
     );
     assert_eq!(
         events.iter().map(time).collect::<Vec<_>>(),
-        told,
+        reported,
         "with their original times"
     );
     let point = "drivegate/hall/drive/p1/point/output_frequency";
@@ -139,24 +143,24 @@ fn buffered_events_survive_a_killed_gateway() {
     });
     let gateway = Gateway::start(options.clone(), plant(&["p1"]));
     watcher.wait_payload("drivegate/hall/status", "online");
-    gateway.tell("p1", EventKind::Online, "delivered");
+    gateway.publish_event("p1", EventKind::Online, "delivered");
     watcher.wait("the event", |m| m.payload.contains("delivered"));
     wait_for("its acknowledgement", || (gateway.buffered() == 0).then_some(()));
     line.cut();
     gateway.wait_connected(false);
     watcher.clear();
-    let tell = |gateway: &Gateway, range: std::ops::Range<usize>| -> Vec<String> {
-        let one = |n| rfc3339(gateway.tell("p1", EventKind::Fault, &format!("event {n}")));
+    let publish = |gateway: &Gateway, range: std::ops::Range<usize>| -> Vec<String> {
+        let one = |n| rfc3339(gateway.publish_event("p1", EventKind::Fault, &format!("event {n}")));
         range.map(one).collect()
     };
-    let mut told = tell(&gateway, 0..1000);
+    let mut reported = publish(&gateway, 0..1000);
     wait_for("the events to be buffered", || {
         (gateway.buffered() == 1000).then_some(())
     });
     gateway.kill();
     let gateway = Gateway::start(options, plant(&["p1"]));
     wait_for("the old events", || (gateway.buffered() == 1000).then_some(()));
-    told.extend(tell(&gateway, 1000..1010));
+    reported.extend(publish(&gateway, 1000..1010));
     wait_for("the new events", || (gateway.buffered() == 1010).then_some(()));
     line.mend();
     let events = watcher.wait_count(EVENT, 1010);
@@ -164,7 +168,7 @@ fn buffered_events_survive_a_killed_gateway() {
         texts(&events),
         (0..1010).map(|n| format!("event {n}")).collect::<Vec<_>>()
     );
-    assert_eq!(events.iter().map(time).collect::<Vec<_>>(), told);
+    assert_eq!(events.iter().map(time).collect::<Vec<_>>(), reported);
     wait_for("the buffer to be empty", || (gateway.buffered() == 0).then_some(()));
     gateway.stop();
     let bytes = |entry: std::io::Result<std::fs::DirEntry>| entry.unwrap().metadata().unwrap().len();
@@ -179,7 +183,7 @@ fn a_burst_of_all_drives_is_delivered() {
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     gateway.wait_connected(true);
     for n in 0..1000 {
-        gateway.tell("p1", EventKind::Offline, &format!("event {n}"));
+        gateway.publish_event("p1", EventKind::Offline, &format!("event {n}"));
     }
     let events = watcher.wait_count(EVENT, 1000);
     assert_eq!(
@@ -199,7 +203,7 @@ fn a_directory_that_cannot_be_used_does_not_stop_the_events() {
         max_bytes: 1 << 20,
     });
     let gateway = Gateway::start(options, plant(&["p1"]));
-    gateway.tell("p1", EventKind::Fault, "from memory");
+    gateway.publish_event("p1", EventKind::Fault, "from memory");
     watcher.wait("the event", |m| m.payload.contains("from memory"));
     gateway.stop();
 }
@@ -210,7 +214,7 @@ fn a_broker_that_takes_one_message_at_a_time() {
     let watcher = Watcher::new(&broker, "drivegate/#");
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     for n in 0..20 {
-        gateway.tell("p1", EventKind::Fault, &format!("event {n}"));
+        gateway.publish_event("p1", EventKind::Fault, &format!("event {n}"));
     }
     let events = watcher.wait_count(EVENT, 20);
     assert_eq!(
@@ -252,7 +256,7 @@ fn a_broker_that_hangs_does_not_hold_up_the_stop() {
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     watcher.wait_payload("drivegate/hall/status", "online");
     broker.signal("STOP");
-    gateway.tell("p1", EventKind::Fault, "nobody listens");
+    gateway.publish_event("p1", EventKind::Fault, "nobody listens");
     gateway.stop();
     broker.signal("CONT");
     watcher.wait_payload("drivegate/hall/status", "offline");

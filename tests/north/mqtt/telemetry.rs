@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::SystemTime;
 
-use drivegate::cache::Link;
 use drivegate::event::EventKind;
+use drivegate::process_image::Link;
 
 use super::bench::*;
 
@@ -91,7 +91,7 @@ fn events_pass_through_and_are_not_retained() {
     let topic = "drivegate/hall/drive/p1/event";
     let watcher = Watcher::with(&broker, topic, &["--retain-as-published"]);
     gateway.wait_connected(true);
-    let time = gateway.tell("p1", EventKind::Fault, "fault 53: fieldbus fault");
+    let time = gateway.publish_event("p1", EventKind::Fault, "fault 53: fieldbus fault");
     let event = watcher.wait("the event", |m| m.topic == topic);
     assert!(!event.retain && event.qos == 1);
     let event = event.json();
@@ -123,7 +123,7 @@ fn a_clean_stop_says_offline_once_and_soon() {
     let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
     let watcher = Watcher::new(&broker, "drivegate/hall/#");
     watcher.wait_payload("drivegate/hall/status", "online");
-    gateway.tell("p1", EventKind::Restarted, "the last word");
+    gateway.publish_event("p1", EventKind::Restarted, "the last word");
     gateway.stop();
     watcher.wait_payload("drivegate/hall/status", "offline");
     watcher.wait("the event", |m| m.payload.contains("the last word"));
@@ -147,14 +147,14 @@ fn a_reload_clears_what_vanished_and_keeps_the_events() {
     let watcher = Watcher::new(&broker, "drivegate/#");
     watcher.wait("p2", |m| m.topic == "drivegate/hall/drive/p2/state");
     watcher.clear();
-    gateway.tell("p1", EventKind::Online, "told to the old plant");
+    gateway.publish_event("p1", EventKind::Online, "of the old plant");
     gateway.plant.store(Arc::new(plant(&["p1", "p3"])));
     watcher.wait_payload("drivegate/hall/drive/p2/state", "");
     watcher.wait_payload("drivegate/hall/drive/p2/point/running", "");
     watcher.wait("p3", |m| m.topic == "drivegate/hall/drive/p3/state");
-    watcher.wait("the old event", |m| m.payload.contains("told to the old plant"));
-    gateway.tell("p3", EventKind::Online, "told to the new plant");
-    watcher.wait("the new event", |m| m.payload.contains("told to the new plant"));
+    watcher.wait("the old event", |m| m.payload.contains("of the old plant"));
+    gateway.publish_event("p3", EventKind::Online, "of the new plant");
+    watcher.wait("the new event", |m| m.payload.contains("of the new plant"));
     assert_eq!(broker.retained("drivegate/hall/drive/p2/state"), None);
     gateway.stop();
 }

@@ -67,7 +67,7 @@ fn mutual_tls() {
         (system_roots, "UnknownIssuer"),
     ] {
         let gateway = Gateway::start(bad, plant(&["p1"]));
-        gateway.tell("p1", EventKind::Fault, "not delivered");
+        gateway.publish_event("p1", EventKind::Fault, "not delivered");
         wait_log(broker.port, why);
         assert!(!gateway.connected());
         gateway.stop();
@@ -108,7 +108,7 @@ fn users_passwords_and_rights() {
     wrong.username = Some("hall".to_string());
     wrong.password = Some(Secret("guess".to_string()));
     let gateway = Gateway::start(wrong.clone(), plant(&["p1"]));
-    gateway.tell("p1", EventKind::Fault, "kept");
+    gateway.publish_event("p1", EventKind::Fault, "kept");
     wait_log(broker.port, "(NotAuthorized); check mqtt.username");
     wait_for("the event to be buffered", || (gateway.buffered() == 1).then_some(()));
     assert!(!gateway.connected());
@@ -119,7 +119,7 @@ fn users_passwords_and_rights() {
     watcher.wait_payload("drivegate/hall/status", "online");
     watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
     // What the broker refuses for good is dropped; the rest goes on.
-    gateway.tell("p1", EventKind::Fault, "not allowed");
+    gateway.publish_event("p1", EventKind::Fault, "not allowed");
     broker.publish("drivegate/hall/drive/p1/set", r#"{"run": true}"#, &login);
     watcher.wait("the result", |m| m.topic == "drivegate/hall/drive/p1/result");
     wait_for("nothing to wait", || (gateway.buffered() == 0).then_some(()));

@@ -212,12 +212,12 @@ impl World {
         if record.wish.is_stop() {
             assert!(
                 truth.did(since, run(false)) || !truth.run,
-                "order {id}: {code}, but the drive was not told to stop"
+                "order {id}: {code}, but no stop reached the drive"
             );
         } else if record.wish.is_run() && !n2 {
             assert!(
                 truth.did(since, run(true)),
-                "order {id}: {code}, but the drive was not told to run"
+                "order {id}: {code}, but no run reached the drive"
             );
         }
         if record.wish == Wish::Converted && profile.name != "vacon-cx" {

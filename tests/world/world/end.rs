@@ -36,7 +36,7 @@ impl World {
             });
         }
         for (index, bus) in self.buses.iter_mut().enumerate() {
-            let on_shutdown = bus.line.on_shutdown == drivegate::cache::OnShutdown::Stop;
+            let on_shutdown = bus.line.on_shutdown == drivegate::process_image::OnShutdown::Stop;
             let Some(missing) = missing.get(&index).filter(|_| on_shutdown) else {
                 continue;
             };
@@ -63,10 +63,10 @@ impl World {
         self.collect();
         let open: Vec<usize> = self.open.values().flatten().copied().collect();
         assert!(open.is_empty(), "orders without an answer at the end: {open:?}");
-        let told: u64 = self.writes.results().values().sum();
+        let reported: u64 = self.writes.results().values().sum();
         let reads = self.records.iter().filter(|record| record.read.is_some()).count();
         assert!(
-            told >= (self.records.len() - reads) as u64,
+            reported >= (self.records.len() - reads) as u64,
             "each order is counted once"
         );
     }

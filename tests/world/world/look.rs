@@ -28,7 +28,7 @@ impl World {
                 drive.advance(sim);
                 let image = &bus.handle.image.drives[index];
                 let seen = image.reading(now, Duration::from_secs(5)).is_set(ModelPoint::Running);
-                // Where the drive refuses to tell whether it runs, its run command stands for it.
+                // Where the drive refuses to report whether it runs, its run command stands for it.
                 let blind = index == 0 && bus.line.refuses.is_some() && truth.run && image.snapshot().link.is_online();
                 let running = drive.state().running && drive.answers() && (seen || blind);
                 truth.running_since = running.then(|| truth.running_since.unwrap_or(now));

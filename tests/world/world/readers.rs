@@ -53,8 +53,11 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
             continue;
         }
         let own = name_of(point);
-        let told = &json["points"][own];
-        assert!(!told["value"].is_null(), "{name}: `{own}` is good, and has no value");
+        let reported = &json["points"][own];
+        assert!(
+            !reported["value"].is_null(),
+            "{name}: `{own}` is good, and has no value"
+        );
         match &point.source {
             Source::Raw(_) => {
                 let most = match point.class {
@@ -62,7 +65,7 @@ fn check_json(drive: &DriveHandle, plant: &Plant, json: &Json, now: Instant) {
                     PollClass::Slow => slow,
                     PollClass::Once | PollClass::Never => Duration::MAX,
                 };
-                let age = Duration::from_millis(told["age_ms"].as_u64().unwrap());
+                let age = Duration::from_millis(reported["age_ms"].as_u64().unwrap());
                 assert!(json["online"] == true, "{name}: `{own}` is good, and the drive is away");
                 assert!(age <= most, "{name}: `{own}` is good, and {age:?} old");
             }

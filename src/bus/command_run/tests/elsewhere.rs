@@ -84,16 +84,16 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
 fn each_try_of_the_write_has_a_read_of_its_own_and_there_are_no_more_of_them() {
     let mut bench = bench(1);
     let mut command = reverse(&bench);
-    let tell = |command: &mut CommandRun, bench: &mut Bench, has: u16| {
+    let report = |command: &mut CommandRun, bench: &mut Bench, has: u16| {
         let read = sends(bench, command);
         assert!(asks(&read));
-        let told = Reply::Registers(vec![has]);
-        assert_eq!(command.answered(&read, told, &mut bench.words), None);
+        let reported = Reply::Registers(vec![has]);
+        assert_eq!(command.answered(&read, reported, &mut bench.words), None);
     };
-    tell(&mut command, &mut bench, 1);
+    report(&mut command, &mut bench, 1);
     assert_eq!(sends(&bench, &mut command), word(3));
     assert_eq!(command.failed(&word(3), Outcome::TimedOut, 1), None);
-    tell(&mut command, &mut bench, 0);
+    report(&mut command, &mut bench, 0);
     assert_eq!(sends(&bench, &mut command), word(2));
     assert_eq!(command.failed(&word(2), Outcome::TimedOut, 1), Some(Outcome::TimedOut));
 }

@@ -38,7 +38,7 @@ fn dead_drives_cost_two_percent_each() {
     let total = |bench: &Bench| bench.polls(PollClass::Fast).values().sum::<usize>() as f64;
     let ratio = total(&some) / total(&all);
     assert!(ratio >= 0.94, "{ratio}");
-    assert_eq!(some.offline, [2, 5, 9], "told once each");
+    assert_eq!(some.offline, [2, 5, 9], "reported once each");
     // It comes back within ten seconds, and its once class is read again.
     some.dead.clear();
     some.log.clear();
@@ -94,11 +94,11 @@ fn refused_blocks_are_split_joined_and_retried_slowly() {
         asked.push((poll.read.start, poll.read.count));
         refused_if(poll.read.covers(Table::Holding, bad))
     });
-    let told = changes.into_iter().filter_map(|change| match change {
+    let reported = changes.into_iter().filter_map(|change| match change {
         Change::Unavailable(read, _) => Some(read.start),
         _ => None,
     });
-    let unavailable: Vec<u16> = told.collect();
+    let unavailable: Vec<u16> = reported.collect();
     assert_eq!(unavailable, [bad]);
     let tail: Vec<_> = asked
         .iter()

@@ -10,10 +10,10 @@ fn an_order_that_waits_holds_the_lease_no_longer_than_it_may_wait() {
     let mut order = bench.order();
     for _ in 0..19 {
         bench.look(100, true);
-        assert_eq!(bench.told(), 0);
+        assert_eq!(bench.reported(), 0);
     }
     bench.look(100, true);
-    assert_eq!(bench.told(), 1, "its time is over, and it never reached the wire");
+    assert_eq!(bench.reported(), 1, "its time is over, and it never reached the wire");
     assert!(is_action(&bench.take().expect("the stop")));
     assert_eq!(order.try_recv().unwrap().outcome, Outcome::Purged);
 }
@@ -50,9 +50,9 @@ fn a_lease_begins_anew_when_the_order_ends() {
         bench.look(1_500, true);
         end(&mut bench);
         bench.look(4_900, true);
-        assert_eq!(bench.told(), 0, "end {index}");
+        assert_eq!(bench.reported(), 0, "end {index}");
         bench.look(100, true);
-        assert_eq!(bench.told(), 1, "end {index}");
+        assert_eq!(bench.reported(), 1, "end {index}");
     }
 }
 
@@ -66,9 +66,9 @@ fn a_read_that_an_order_needs_first_has_reached_the_wire() {
     bench.look(1_500, true);
     bench.end(&Outcome::TimedOut);
     bench.look(4_900, true);
-    assert_eq!(bench.told(), 0);
+    assert_eq!(bench.reported(), 0);
     bench.look(100, true);
-    assert_eq!(bench.told(), 1);
+    assert_eq!(bench.reported(), 1);
 }
 
 #[test]
@@ -98,7 +98,7 @@ fn what_did_not_reach_the_wire_and_what_no_client_wanted_renews_nothing() {
     for _ in 0..20 {
         assert!(bench.after(1_000, true).is_none(), "once");
     }
-    assert_eq!(bench.told(), 1, "the action began no lease");
+    assert_eq!(bench.reported(), 1, "the action began no lease");
 }
 
 #[test]
@@ -126,5 +126,5 @@ fn a_read_renews_nothing_and_holds_nothing() {
     bench.begin();
     bench.send();
     bench.look(50, true);
-    assert_eq!(bench.told(), 1);
+    assert_eq!(bench.reported(), 1);
 }

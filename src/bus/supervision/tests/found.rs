@@ -35,7 +35,7 @@ fn an_answer_of_an_earlier_lease_does_not_stand_for_the_action_of_the_next() {
         bench.after(90, true).is_some(),
         "the lease ran out again, and the motor runs"
     );
-    assert_eq!(bench.told(), 2);
+    assert_eq!(bench.reported(), 2);
 }
 
 #[test]

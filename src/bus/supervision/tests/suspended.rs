@@ -9,7 +9,7 @@ fn ran_out(action: LeaseAction) -> Bench {
     let mut bench = Bench::new(action);
     bench.heartbeat();
     bench.look(5_000, true);
-    assert_eq!((bench.told(), bench.bus.queue.lock().len()), (1, 1));
+    assert_eq!((bench.reported(), bench.bus.queue.lock().len()), (1, 1));
     bench
 }
 
@@ -29,7 +29,7 @@ fn an_order_that_reaches_the_wire_takes_the_place_of_an_action_that_waits() {
         assert_eq!(order.try_recv().unwrap().outcome, acknowledged());
         assert!(bench.after(4_900, true).is_none(), "it commands the drive");
         assert!(bench.after(100, true).is_some(), "until it falls silent again");
-        assert_eq!(bench.told(), 2);
+        assert_eq!(bench.reported(), 2);
     }
 }
 
@@ -53,7 +53,7 @@ fn the_action_is_due_again_when_the_order_ends_without_reaching_the_wire() {
             bench.look(10, true);
             let again = bench.take().expect("the action");
             assert!(is_action(&again) && order.try_recv().is_ok());
-            assert_eq!(bench.told(), 1, "the lease ran out once");
+            assert_eq!(bench.reported(), 1, "the lease ran out once");
         }
     }
 }

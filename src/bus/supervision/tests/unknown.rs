@@ -35,12 +35,12 @@ fn where_the_drive_refuses_to_tell_its_run_command_stands_for_it() {
         bench.refuses_running();
         assert!(bench.later(4_900).is_none());
         if let Some(run) = run {
-            bench.tells(ModelPoint::Run, Value::Bool(run));
+            bench.shows(ModelPoint::Run, Value::Bool(run));
         }
         let action = bench.later(100);
         assert_eq!(action.map(|a| a.urgency), acts.then_some(Urgency::Stop), "{run:?}");
         let unknown = bench.news.iter().filter(|n| **n == News::RunningUnknown(0));
-        assert_eq!((unknown.count(), bench.told()), (1, usize::from(acts)), "{run:?}");
+        assert_eq!((unknown.count(), bench.reported()), (1, usize::from(acts)), "{run:?}");
     }
 }
 
@@ -85,7 +85,7 @@ fn drive(points: &str) -> DriveImage {
     image(spec)
 }
 
-fn told(drive: &DriveImage, words: &[(u16, u16)]) -> OwnResponse {
+fn reported(drive: &DriveImage, words: &[(u16, u16)]) -> OwnResponse {
     let now = Instant::now();
     for (address, word) in words {
         drive.update(|s| s.store(Table::Holding, *address, &[*word], now));
@@ -98,13 +98,13 @@ fn what_the_points_tell_together() {
     let response = "[[point]]\nname = \"fieldbus_fault_response\"\nat = \"holding 732\"\nclass = \"once\"\n";
     let timeout = "[[point]]\nname = \"communication_timeout\"\nat = \"holding 542\"\nscale = 0.1\nunit = \"s\"\nclass = \"once\"\n";
     let other = "[[point]]\nname = \"other\"\nat = \"holding 7\"\nclass = \"once\"\n";
-    assert_eq!(told(&drive(other), &[(7, 0)]), OwnResponse::Unknown);
+    assert_eq!(reported(&drive(other), &[(7, 0)]), OwnResponse::Unknown);
     let one = drive(response);
-    assert_eq!(told(&one, &[]), OwnResponse::Unknown, "not read yet");
-    assert_eq!(told(&one, &[(732, 0)]), OwnResponse::Off(FIELDBUS_FAULT_RESPONSE));
-    assert_eq!(told(&one, &[(732, 2)]), OwnResponse::On);
+    assert_eq!(reported(&one, &[]), OwnResponse::Unknown, "not read yet");
+    assert_eq!(reported(&one, &[(732, 0)]), OwnResponse::Off(FIELDBUS_FAULT_RESPONSE));
+    assert_eq!(reported(&one, &[(732, 2)]), OwnResponse::On);
     let both = drive(&format!("{response}{timeout}"));
-    assert_eq!(told(&both, &[(732, 2)]), OwnResponse::Unknown);
-    assert_eq!(told(&both, &[(542, 0)]), OwnResponse::Off(COMMUNICATION_TIMEOUT));
-    assert_eq!(told(&both, &[(542, 50)]), OwnResponse::On);
+    assert_eq!(reported(&both, &[(732, 2)]), OwnResponse::Unknown);
+    assert_eq!(reported(&both, &[(542, 0)]), OwnResponse::Off(COMMUNICATION_TIMEOUT));
+    assert_eq!(reported(&both, &[(542, 50)]), OwnResponse::On);
 }

@@ -1,4 +1,4 @@
-//! Stops: two of a drive wait at most, none is refused, and one that tells a drive nothing new has no precedence.
+//! Stops: two of a drive wait at most, none is refused, and a redundant one has no precedence.
 
 use super::*;
 use crate::codec::{Reply, RequestPdu};

@@ -6,9 +6,9 @@
 use std::fmt::{self, Write as _};
 use std::time::Instant;
 
-use crate::cache::Reading;
 use crate::drive::{ModelPoint, Quality, State};
 use crate::plant::Plant;
+use crate::process_image::Reading;
 
 const DOCUMENT: &str = include_str!("index.html");
 

@@ -31,7 +31,7 @@ async fn client(buffer: Option<Buffer>) -> Client {
 /// Raises events while the client is busy, then lets it receive them.
 async fn burst(client: &mut Client, count: usize) {
     for n in 0..count {
-        client.plant.load().events.tell(Event {
+        client.plant.load().events.publish(Event {
             id: 0,
             time: SystemTime::UNIX_EPOCH,
             kind: EventKind::Offline,

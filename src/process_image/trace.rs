@@ -55,8 +55,8 @@ impl Trace {
         self.0.receiver_count() > 0
     }
 
-    /// Tells a frame to the listeners; the record is only built when there are any.
-    pub fn tell(&self, record: impl FnOnce() -> FrameRecord) {
+    /// Publishes a frame to the listeners; the record is only built when there are any.
+    pub fn publish(&self, record: impl FnOnce() -> FrameRecord) {
         if self.wanted() {
             // The last listener may have gone meanwhile, which is no error.
             let _ = self.0.send(Arc::new(record()));

@@ -328,7 +328,7 @@ impl Reading<'_> {
         }
     }
 
-    /// The ends of a band as the drive told them last, and the worse quality of the two. No command is made of them.
+    /// The ends of a band as the drive reported them last, and the worse quality of the two. No command is made of them.
     fn last_band(&self, minimum: Bound, maximum: Bound) -> Option<((f64, f64), Quality)> {
         let end = |bound: Bound| match bound {
             Bound::Point(point) => {

@@ -1,6 +1,6 @@
 use super::*;
-use crate::cache::DriveImage;
 use crate::drive::profile::Profiles;
+use crate::process_image::DriveImage;
 
 /// What rests on the drive's frequency range is no worse than the figures that it rests on.
 #[test]
