@@ -18,10 +18,10 @@ pub const BABBLE: Duration = Duration::from_millis(500);
 const WITHOUT_WIRE_TIME: u32 = 64;
 /// Most that early replies weigh together: so many regular replies bring a line back to its protection.
 const MOST_WEIGHT: u32 = 256;
-/// An early reply that can hardly be another one's: two within some thirty replies are enough.
-const WEIGHT_OF_EARLY: u32 = 48;
-/// An early reply that was not believed, with no other behind it: three are enough.
-const WEIGHT_OF_DOUBTED: u32 = 24;
+/// An early reply that can hardly be another one's: it is enough, until the next regular reply.
+const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
+/// An early reply that was not believed, with no other behind it: two are enough.
+const WEIGHT_OF_DOUBTED: u32 = 40;
 /// An early reply that could be another one's and was believed: one in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 

@@ -52,7 +52,7 @@ fn a_reply_that_comes_twice_now_and_then_is_never_believed() {
     let mut bench = Bench::new();
     for _ in 0..100 {
         assert!(!bench.believes(EARLY), "it came once more");
-        for _ in 0..24 {
+        for _ in 0..40 {
             assert!(bench.believes(REGULAR), "which takes the weight back");
         }
     }
@@ -61,7 +61,7 @@ fn a_reply_that_comes_twice_now_and_then_is_never_believed() {
 #[test]
 fn early_replies_again_and_again_show_a_line_without_wire_time() {
     let mut bench = Bench::new();
-    for _ in 0..3 {
+    for _ in 0..2 {
         assert!(!bench.believes(EARLY));
     }
     for _ in 0..100 {
