@@ -41,6 +41,11 @@ impl Wish {
         )
     }
 
+    /// Whether it sets a reference and nothing else, so that a newer one takes its place.
+    pub fn is_reference(self) -> bool {
+        matches!(self, Wish::Reference | Wish::Converted)
+    }
+
     /// One that the dice choose.
     pub fn of(dice: &mut Random) -> Wish {
         match dice.within(0..=99) {

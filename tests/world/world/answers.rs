@@ -20,12 +20,12 @@ impl World {
         let just_replaced = |record: &&mut Record| {
             let answer = record.answer.as_ref();
             !record.succeeded
-                && record.wish == Wish::Reference
+                && record.wish.is_reference()
                 && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
         };
         let recent = before.iter_mut().rev().take(1_000);
         let mut replaced = recent.filter(of_drive).filter(just_replaced);
-        if newest.wish == Wish::Reference
+        if newest.wish.is_reference()
             && let Some(older) = replaced.next()
         {
             older.succeeded = true;
