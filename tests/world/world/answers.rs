@@ -240,7 +240,7 @@ impl World {
         let recent = truth.maxima.iter().zip(until).filter(|((since, _), until)| {
             *since <= record.accepted && until.is_none_or(|until| until + age >= record.accepted)
         });
-        let mut words = recent.filter_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
+        let mut words = recent.flat_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
         let done = words.any(|words| {
             let wrote =
                 |did: &RequestPdu, answered: Option<&Vec<u16>>| sets(did, &words) || has_already(did, answered, &words);

@@ -187,7 +187,7 @@ impl World {
         let profile = &self.buses[bus].profile;
         let is_converted = |id: &usize| {
             let maxima = self.truths[bus][drive].maxima.iter();
-            let mut words = maxima.filter_map(|(_, maximum)| converted(profile, *id, *maximum));
+            let mut words = maxima.flat_map(|(_, maximum)| converted(profile, *id, *maximum));
             self.records[*id].wish == Wish::Converted && words.any(|words| sets(pdu, &words))
         };
         if waiting.into_iter().any(is_converted) {
