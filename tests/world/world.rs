@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::cache::LeaseAction;
-use drivegate::codec::{Reply, RequestPdu};
+use drivegate::codec::{Protocol, Reply, RequestPdu};
 use drivegate::command::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate::drive::{ModelPoint, Quality, Value};
 use drivegate::event::{EventKind, Events};
