@@ -20,7 +20,8 @@ const WITHOUT_WIRE_TIME: u32 = 64;
 const MOST_WEIGHT: u32 = 256;
 /// An early reply that can hardly be another one's: it is enough, until the next regular reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
-/// An early reply that was not believed, with no other behind it: two are enough.
+/// An early reply that was not believed, with nothing behind it: two are enough. One with the regular reply behind it came
+/// twice or late, as on a wire: that takes all weight back.
 const WEIGHT_OF_DOUBTED: u32 = 40;
 /// An early reply that could be another one's and was believed: one in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
@@ -199,7 +200,7 @@ impl LineState {
         } = self.underway.take()?;
         self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
         let early = now < earliest;
-        self.weigh(&ended, early, doubtful || late, transaction.doubted());
+        self.weigh(&ended, early, doubtful || late, &transaction);
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
         Some(Exchanged {
@@ -213,13 +214,14 @@ impl LineState {
     }
 
     /// Weighs what the end of an exchange shows of the wire time. `early`: faster than the wire; `doubtful`: the reply could
-    /// be another one's; `doubted`: an early reply was not believed.
-    fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, doubted: bool) {
+    /// be another one's.
+    fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
         let believed = self.early_weight >= WITHOUT_WIRE_TIME;
         let weight = match ended {
             Ended::Reply(Reply::Exception(_)) => 0,
             Ended::Reply(_) if !early => {
-                self.early_weight = self.early_weight.saturating_sub(1);
+                let less = if transaction.doubted() { MOST_WEIGHT } else { 1 };
+                self.early_weight = self.early_weight.saturating_sub(less);
                 0
             }
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
@@ -227,7 +229,8 @@ impl LineState {
             // An N2 reply shows too little of its request to be certain.
             Ended::Reply(_) if self.protocol == Protocol::N2 => WEIGHT_OF_DOUBTED,
             Ended::Reply(_) => WEIGHT_OF_EARLY,
-            Ended::Silent | Ended::Corrupt(_) if doubted => WEIGHT_OF_DOUBTED,
+            // What else came may be what is left of the reply itself.
+            Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => WEIGHT_OF_DOUBTED,
             Ended::Silent | Ended::Corrupt(_) => 0,
         };
         self.early_weight = (self.early_weight + weight).min(MOST_WEIGHT);

@@ -60,6 +60,8 @@ pub struct Transaction {
     /// A reply that is whole before then was not made for this request.
     doubted_before: Option<Instant>,
     doubted: bool,
+    /// Something came behind such a reply.
+    behind_doubted: bool,
     /// What comes before then, and is no echo, came before the request was over.
     ignored_before: Option<Instant>,
     /// What may still come of earlier exchanges on an N2 line.
@@ -93,6 +95,7 @@ impl Transaction {
             echo_seen: false,
             doubted_before: None,
             doubted: false,
+            behind_doubted: false,
             ignored_before: None,
             late: N2LateReplies::default(),
         }
@@ -112,6 +115,11 @@ impl Transaction {
     /// Whether a reply came too early to be believed.
     pub fn doubted(&self) -> bool {
         self.doubted
+    }
+
+    /// Whether such a reply was all that came.
+    pub fn only_doubted(&self) -> bool {
+        self.doubted && !self.behind_doubted
     }
 
     /// What may still come of earlier exchanges on an N2 line.
@@ -143,6 +151,7 @@ impl Transaction {
     /// Bytes came in.
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
         self.first_byte.get_or_insert(now);
+        self.behind_doubted |= self.doubted && !bytes.is_empty();
         self.received.extend_from_slice(bytes);
         let room = MOST_BYTES.saturating_sub(self.seen.len());
         self.seen.extend(bytes.iter().take(room));
@@ -169,6 +178,7 @@ impl Transaction {
                 Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
+                    self.behind_doubted |= self.doubted && !self.received.is_empty();
                     self.first_byte = (!self.received.is_empty()).then_some(now);
                     self.garbage = None;
                     if self.received.is_empty() {

@@ -40,6 +40,8 @@ pub struct Truth {
     pub last_stop: Option<usize>,
     /// A write that takes its run command away was last on the wire.
     pub stop_sent: Option<Instant>,
+    /// The action of supervision that was last on the wire, while nothing else was written since.
+    pub action: Option<Tried>,
     /// A stop that the broker delivered once more may be under way until then.
     pub repeated_until: Option<Instant>,
     /// A request to it was last on the wire.
@@ -52,7 +54,33 @@ pub struct Truth {
     pub maxima: Vec<(Instant, f64)>,
 }
 
+/// A write that is tried until it is answered.
+#[derive(Debug)]
+pub struct Tried {
+    pub pdu: RequestPdu,
+    pub began: Instant,
+    pub last: Instant,
+    pub tries: u32,
+}
+
 impl Truth {
+    /// Since when an action is on the wire of which this write, at `now`, is a try. Given up, it comes again a second
+    /// later as a new one.
+    pub fn action_began(&mut self, pdu: &RequestPdu, retries: u32, now: Instant) -> Instant {
+        let new = Tried {
+            pdu: pdu.clone(),
+            began: now,
+            last: now,
+            tries: 0,
+        };
+        let goes_on =
+            |tried: &Tried| tried.pdu == *pdu && tried.tries <= retries && now - tried.last < Duration::from_secs(1);
+        let action = self.action.take().filter(goes_on).unwrap_or(new);
+        let action = self.action.insert(action);
+        (action.last, action.tries) = (now, action.tries + 1);
+        action.began
+    }
+
     pub fn new(maximum: Option<(Instant, f64)>) -> Truth {
         Truth {
             run: false,
@@ -70,6 +98,7 @@ impl Truth {
             lost_word: None,
             last_stop: None,
             stop_sent: None,
+            action: None,
             repeated_until: None,
             asked: None,
             offline_since: None,

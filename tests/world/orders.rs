@@ -41,6 +41,11 @@ impl Wish {
         )
     }
 
+    /// Whether it sets a reference and nothing else, so that a newer one takes its place.
+    pub fn is_reference(self) -> bool {
+        matches!(self, Wish::Reference | Wish::Converted)
+    }
+
     /// One that the dice choose.
     pub fn of(dice: &mut Random) -> Wish {
         match dice.within(0..=99) {
@@ -115,15 +120,20 @@ pub fn converts_hertz(profile: &Profile) -> bool {
     reference_point(profile).1.unit == "%"
 }
 
-/// What the order of that number that is converted writes to a drive with that maximum frequency.
-pub fn converted(profile: &Profile, number: usize, maximum: f64) -> Option<Unique> {
+/// What the order of that number that is converted writes to a drive with that maximum frequency: half a count may be
+/// rounded either way.
+pub fn converted(profile: &Profile, number: usize, maximum: f64) -> impl Iterator<Item = Unique> {
+    const ROUNDING: f64 = 1e-6;
     let (_, value, _) = unique_reference(profile, number);
     let percent = if converts_hertz(profile) {
         value.as_f64() * 100.0 / maximum
     } else {
         value.as_f64()
     };
-    percent_reference(profile, percent, maximum)
+    let either = [percent - ROUNDING, percent + ROUNDING];
+    either
+        .into_iter()
+        .filter_map(move |percent| percent_reference(profile, percent, maximum))
 }
 
 /// What a speed reference in percent of a drive with that maximum frequency is in its own register; none where it is not

@@ -15,12 +15,13 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
-use drivegate::codec::{Reply, RequestPdu};
+use drivegate::codec::{Protocol, Reply, RequestPdu};
 use drivegate::command::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats};
 use drivegate::drive::{ModelPoint, Quality, Value};
 use drivegate::event::{EventKind, Events};
 use drivegate::north::mqtt::Incoming;
 use drivegate::plant::{Plant, SharedPlant};
+use drivegate::process_image::LeaseAction;
 use drivegate::process_image::LeaseAction;
 use drivegate::sim::random::Random;
 use tokio::sync::broadcast;

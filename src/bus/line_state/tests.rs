@@ -20,15 +20,20 @@ impl Bench {
 
     /// Whether a reply is believed that is whole so long after its request.
     fn believes(&mut self, after: Duration) -> bool {
+        let reply = reply();
+        self.answers(&[(after, &reply)])
+    }
+
+    /// Whether a reply is believed where this comes so long after the request.
+    fn answers(&mut self, what: &[(Duration, &[u8])]) -> bool {
         let pdu = RequestPdu::Read {
             table: Table::Holding,
             start: 0,
             count: 1,
         };
         let request = Request::new(1, pdu);
-        let (mut frame, mut reply) = (Vec::new(), Vec::new());
+        let mut frame = Vec::new();
         rtu::encode_request(&request, &mut frame);
-        rtu::encode_frame(1, &[3, 2, 0, 7], &mut reply);
         let sending = Sending {
             response_timeout: Duration::from_millis(100),
             could_be_doubled: true,
@@ -38,10 +43,18 @@ impl Bench {
         self.line
             .send(request, frame, sending, N2LateReplies::default(), self.now);
         let sent = self.line.quiet_since();
-        let exchanged = self.line.heard(&reply, sent + after);
+        let exchanged = what
+            .iter()
+            .find_map(|(after, bytes)| self.line.heard(bytes, sent + *after));
         let over = exchanged.or_else(|| self.line.on_time(sent + Duration::from_secs(1)).ok());
         matches!(over.expect("it is over").ended, Ended::Reply(_))
     }
+}
+
+fn reply() -> Vec<u8> {
+    let mut reply = Vec::new();
+    rtu::encode_frame(1, &[3, 2, 0, 7], &mut reply);
+    reply
 }
 
 const EARLY: Duration = Duration::from_millis(1);
@@ -55,6 +68,30 @@ fn a_reply_that_comes_twice_now_and_then_is_never_believed() {
         for _ in 0..40 {
             assert!(bench.believes(REGULAR), "which takes the weight back");
         }
+    }
+}
+
+#[test]
+fn replies_that_come_twice_before_others_that_are_mangled_are_never_believed() {
+    let mut bench = Bench::new();
+    let (reply, foreign) = (reply(), reply().iter().map(|byte| byte ^ 4).collect::<Vec<_>>());
+    for _ in 0..100 {
+        assert!(
+            !bench.answers(&[(EARLY, &reply), (REGULAR, &foreign)]),
+            "it came once more"
+        );
+    }
+}
+
+#[test]
+fn the_reply_behind_an_early_one_shows_a_wire() {
+    let mut bench = Bench::new();
+    let reply = reply();
+    for _ in 0..100 {
+        for _ in 0..2 {
+            assert!(!bench.believes(EARLY), "the next one was lost");
+        }
+        assert!(bench.answers(&[(EARLY, &reply), (REGULAR, &reply)]));
     }
 }
 

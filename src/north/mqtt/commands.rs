@@ -144,8 +144,8 @@ impl Commands {
         let id = request.id.as_ref().map(Json::to_string);
         let identity = id.map(|id| self.hasher.hash_one((&incoming.topic, id)));
         if !stop && let Some(known) = self.repeated(&incoming, fingerprint, identity, now) {
-            if known.stops == drive.stops() {
-                return known.result.clone();
+            if known.stops == drive.stops() || known.result.is_none() {
+                return known.result.clone(); // none yet: it is still to come
             }
             // The motor was stopped since: the previous result is no longer true, and a repetition would start it
             // again.

@@ -20,12 +20,12 @@ impl World {
         let just_replaced = |record: &&mut Record| {
             let answer = record.answer.as_ref();
             !record.succeeded
-                && record.wish == Wish::Reference
+                && record.wish.is_reference()
                 && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
         };
         let recent = before.iter_mut().rev().take(1_000);
         let mut replaced = recent.filter(of_drive).filter(just_replaced);
-        if newest.wish == Wish::Reference
+        if newest.wish.is_reference()
             && let Some(older) = replaced.next()
         {
             older.succeeded = true;
@@ -240,7 +240,7 @@ impl World {
         let recent = truth.maxima.iter().zip(until).filter(|((since, _), until)| {
             *since <= record.accepted && until.is_none_or(|until| until + age >= record.accepted)
         });
-        let mut words = recent.filter_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
+        let mut words = recent.flat_map(|((_, maximum), _)| converted(&bus.profile, id, *maximum));
         let done = words.any(|words| {
             let wrote =
                 |did: &RequestPdu, answered: Option<&Vec<u16>>| sets(did, &words) || has_already(did, answered, &words);

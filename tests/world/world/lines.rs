@@ -49,6 +49,7 @@ impl World {
         let open = self.open.get(&(bus, drive)).cloned().unwrap_or_default();
         let client_waits = !open.is_empty();
         let truth = &mut self.truths[bus][drive];
+        truth.action.take_if(|action| action.pdu != *pdu);
         if let Some(run) = run_command(&profile, pdu) {
             // What was read just before the drive lost its supply is not known to be lost.
             let lost = truth.lost_word.is_some_and(|at| now - at < Duration::from_secs(1));
@@ -148,10 +149,13 @@ impl World {
             "a stop went out where the action is {:?}",
             supervision.action
         );
-        let truth = &self.truths[bus][drive];
+        let retries = self.buses[bus].line.retries;
+        let truth = &mut self.truths[bus][drive];
+        // What is on the wire when a client comes back stands, lost or not: its tries go on.
+        let began = truth.action_began(pdu, retries, now);
         if let Some(heard) = truth.heard.0 {
             assert!(
-                now - heard >= supervision.timeout,
+                now - heard >= supervision.timeout || heard > began,
                 "the action came {:?} after the client",
                 now - heard
             );
@@ -165,7 +169,8 @@ impl World {
             let record = &self.records[*id];
             // By MQTT the answer of an order that is done waits for its confirmation.
             let by_mqtt = self.clients[record.client].habit == Habit::Mqtt;
-            let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt;
+            let before = record.accepted <= began;
+            let waits = record.wish != Wish::RawRead && record.expires > now && !by_mqtt && before;
             assert!(
                 !waits || now - record.accepted < Duration::from_millis(2),
                 "the action overrides a client that is back: {record:?}"
@@ -182,7 +187,7 @@ impl World {
         let profile = &self.buses[bus].profile;
         let is_converted = |id: &usize| {
             let maxima = self.truths[bus][drive].maxima.iter();
-            let mut words = maxima.filter_map(|(_, maximum)| converted(profile, *id, *maximum));
+            let mut words = maxima.flat_map(|(_, maximum)| converted(profile, *id, *maximum));
             self.records[*id].wish == Wish::Converted && words.any(|words| sets(pdu, &words))
         };
         if waiting.into_iter().any(is_converted) {

@@ -346,6 +346,16 @@ fn a_refusal_of_the_queue_has_its_reason() {
 }
 
 #[test]
+fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
+    let mut bench = Bench::new();
+    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
+    assert_eq!(bench.take(run.clone()), None);
+    assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
+    let again = bench.take(Incoming { dup: true, ..run });
+    assert_eq!(again, None, "the first one's result is still to come");
+}
+
+#[test]
 fn a_repetition_after_a_stop_is_refused() {
     let mut bench = Bench::new();
     let run = set("p1/set", r#"{"id": 1, "run": true}"#);
