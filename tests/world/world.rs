@@ -22,7 +22,6 @@ use drivegate::event::{EventKind, Events};
 use drivegate::north::mqtt::Incoming;
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate::process_image::LeaseAction;
-use drivegate::process_image::LeaseAction;
 use drivegate::sim::random::Random;
 use tokio::sync::broadcast;
 use tokio::sync::oneshot;
