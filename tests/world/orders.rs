@@ -105,9 +105,12 @@ pub fn reference_point(profile: &Profile) -> (usize, &Point) {
 pub fn unique_reference(profile: &Profile, number: usize) -> (usize, Value, Unique) {
     let (index, point) = reference_point(profile);
     let raw = point.raw().unwrap();
-    // 0 to 40 in hundredths: within what every family takes, and never what supervision sets (20 %).
+    // 0 to 40 in hundredths: within what every family takes, and never what supervision sets (20 %, of any range).
     let hundredths = match number % 4_000 {
-        1_000 | 1_200 | 2_000 => 3_999,
+        1_000 => 4_001,
+        1_200 => 4_002,
+        1_600 => 4_003,
+        2_000 => 4_004,
         other => other,
     };
     let value = Value::Number(hundredths as f64 / 100.0);
