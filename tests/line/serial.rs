@@ -5,15 +5,19 @@ use std::path::{Path, PathBuf};
 
 use serde_json::Value;
 
-use crate::support::process::{Running, get, mbpoll_read, read_registers, until, write_registers};
+use crate::support::process::{self, Running, get, mbpoll_read, read_registers, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
-use crate::support::tools::{python, root, run, run_well, tool};
-
-const DRIVEGATE: &str = env!("CARGO_BIN_EXE_drivegate");
+use crate::support::tools::{python, root, tool};
 
 /// What `drivegate` printed on stdout and stderr.
 fn drivegate(arguments: &[&str]) -> String {
-    run_well(Path::new(DRIVEGATE), arguments)
+    let ran = process::drivegate(arguments).output().unwrap();
+    let (out, err) = (
+        String::from_utf8_lossy(&ran.stdout),
+        String::from_utf8_lossy(&ran.stderr),
+    );
+    assert!(ran.status.success(), "{arguments:?}: {err}{out}");
+    format!("{err}{out}")
 }
 
 /// Gives a command, again until it is acknowledged.
@@ -21,7 +25,9 @@ fn command(site: &Site, points: &[&str]) {
     let config = site.config();
     let arguments = [&["write", "--config", &config, "drive"], points].concat();
     until("a command that is acknowledged", || {
-        run(Path::new(DRIVEGATE), &arguments).status.success().then_some(())
+        let ran = process::drivegate(&arguments).output().unwrap();
+        eprint!("{}", String::from_utf8_lossy(&ran.stderr));
+        ran.status.success().then_some(())
     });
 }
 
@@ -89,7 +95,7 @@ fn reads_and_writes_pymodbus(protocol: &str, framer: &str, format: &str) {
     let read = |points: &[&str]| -> Value {
         let arguments = [&["read", "--config", &file, "drive", "--json"], points].concat();
         let output = until("values", || {
-            Some(run(Path::new(DRIVEGATE), &arguments)).filter(|output| output.status.success())
+            Some(process::drivegate(&arguments).output().unwrap()).filter(|output| output.status.success())
         });
         serde_json::from_slice(&output.stdout).unwrap()
     };
