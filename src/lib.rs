@@ -44,7 +44,8 @@
 //! - A database, a user interface that writes, and plug-ins: profiles are declarative.
 //! - The async runtime on the way of the line: 3.5 characters are shorter than its timer's step.
 //!
-//! Why things are as they are, and which file a change belongs to, stands in `docs/architecture.md`.
+//! `docs/architecture.md` follows one exchange, one command and one value through the files, says which file a change belongs
+//! to, and gives the reasons.
 
 pub mod bus;
 pub mod cli;
