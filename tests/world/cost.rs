@@ -7,6 +7,7 @@ use drivegate::codec::wire::Silence;
 use drivegate::codec::{Protocol, RequestPdu};
 use drivegate::command::{Order, Urgency};
 use drivegate::drive::{ModelPoint, PollClass, Value};
+use drivegate::plant::Placed;
 use drivegate::process_image::DriveSpec;
 
 use super::bus::{Parts, Seen};
@@ -188,4 +189,42 @@ fn a_flood_leaves_half_of_the_line_to_polls_and_its_turn_to_another_client() {
         polls.as_secs_f64() > 0.9 * commands.as_secs_f64(),
         "{polls:?} of polls, {commands:?} of commands"
     );
+}
+
+/// Two clients that stop a standing drive again and again, as a PLC does that writes 0 in a loop, and a third one.
+#[test]
+fn stops_in_a_loop_keep_no_other_client_waiting() {
+    let ms = Duration::from_millis;
+    let mut rig = rig(&line("vacon-nx", Protocol::ModbusRtu, 9600, 6));
+    rig.run(MINUTE / 4);
+    let end = rig.now + MINUTE;
+    let mut stops: [Option<Placed>; 2] = [None, None];
+    let (mut reference, mut next, mut begun) = (None::<Placed>, rig.now, rig.now);
+    let (mut stopped, mut longest) = (0, Duration::ZERO);
+    while rig.now < end {
+        for (index, place) in stops.iter_mut().enumerate() {
+            if place.as_mut().is_none_or(|placed| placed.answer().is_some()) {
+                let address = index as u8 + 1;
+                let order = rig.points(address, &[("run", 0.0)]);
+                *place = Some(rig.place_as(&format!("plc {index}"), address, order));
+                stopped += 1;
+            }
+        }
+        if let Some(placed) = &mut reference
+            && let Some(answer) = placed.answer()
+        {
+            assert!(answer.outcome.is_ok(), "{:?}", answer.outcome);
+            longest = longest.max(rig.now - begun);
+            reference = None;
+        }
+        if reference.is_none() && rig.now >= next {
+            let order = rig.points(3, &[("speed_reference", f64::from(stopped % 80))]);
+            reference = Some(rig.place_as("operator", 3, order));
+            (begun, next) = (rig.now, rig.now + ms(500));
+        }
+        let until = rig.now + ms(1);
+        while rig.step(until).is_some() {}
+    }
+    assert!(stopped > 500, "{stopped} stops");
+    assert!(longest < ms(1_000), "an order waited {longest:?}");
 }
