@@ -23,6 +23,8 @@ const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
 /// An early reply that was not believed, with nothing behind it: two are enough. One with the regular reply behind it came
 /// twice or late, as on a wire: that takes all weight back.
 const WEIGHT_OF_DOUBTED: u32 = 40;
+/// Either on an N2 line, whose replies show too little of their request to be certain: three are enough.
+const WEIGHT_ON_N2: u32 = 24;
 /// An early reply that could be another one's and was believed: one in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
@@ -213,6 +215,13 @@ impl LineState {
         })
     }
 
+    fn weight_of(&self, weight: u32) -> u32 {
+        match self.protocol {
+            Protocol::N2 => WEIGHT_ON_N2,
+            Protocol::ModbusRtu | Protocol::ModbusAscii => weight,
+        }
+    }
+
     /// Weighs what the end of an exchange shows of the wire time. `early`: faster than the wire; `doubtful`: the reply could
     /// be another one's.
     fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
@@ -226,11 +235,9 @@ impl LineState {
             }
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
             Ended::Reply(_) if doubtful => 0,
-            // An N2 reply shows too little of its request to be certain.
-            Ended::Reply(_) if self.protocol == Protocol::N2 => WEIGHT_OF_DOUBTED,
-            Ended::Reply(_) => WEIGHT_OF_EARLY,
+            Ended::Reply(_) => self.weight_of(WEIGHT_OF_EARLY),
             // What else came may be what is left of the reply itself.
-            Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => WEIGHT_OF_DOUBTED,
+            Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => self.weight_of(WEIGHT_OF_DOUBTED),
             Ended::Silent | Ended::Corrupt(_) => 0,
         };
         self.early_weight = (self.early_weight + weight).min(MOST_WEIGHT);
