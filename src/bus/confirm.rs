@@ -166,7 +166,9 @@ impl Watch {
         let Watch { what, within, .. } = self;
         if !self.was_read {
             let within = *within * UNREAD;
-            return format!("acknowledged {what} but was not read within {within:?}: whether it did it is not known");
+            return format!(
+                "acknowledged {what} but was not read within {within:?}; whether it took effect is unknown"
+            );
         }
         let missing: Vec<String> = self.effects.iter().map(|e| e.missing(profile)).collect();
         let missing = missing.join(", ");

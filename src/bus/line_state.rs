@@ -18,14 +18,14 @@ pub const BABBLE: Duration = Duration::from_millis(500);
 const WITHOUT_WIRE_TIME: u32 = 64;
 /// Most that early replies weigh together: so many regular replies bring a line back to its protection.
 const MOST_WEIGHT: u32 = 256;
-/// An early reply that can hardly be another one's: it is enough, until the next regular reply.
+/// An early reply that can hardly belong to another request. One is enough, until the next regular reply.
 const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
 /// An early reply that was not believed, with nothing behind it: two are enough. One with the regular reply behind it came
 /// twice or late, as on a wire: that takes all weight back.
 const WEIGHT_OF_DOUBTED: u32 = 40;
-/// Either on an N2 line, whose replies show too little of their request to be certain: three are enough.
+/// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
-/// An early reply that could be another one's and was believed: one in nine keeps the line as it is.
+/// An early reply that could belong to another request and was believed. One in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
 /// How a request is to be sent.
