@@ -25,6 +25,9 @@ const WEIGHT_OF_EARLY: u32 = WITHOUT_WIRE_TIME;
 const WEIGHT_OF_DOUBTED: u32 = 40;
 /// Weight of either on an N2 line, where a reply does not show which request it answers. Three are enough.
 const WEIGHT_ON_N2: u32 = 24;
+/// What a regular reply takes back on an N2 line, where a doubled reply whose successor was lost looks like an early one:
+/// while fewer than one reply in four is early, the line keeps its protection.
+const REGULAR_ON_N2: u32 = 8;
 /// An early reply that could belong to another request and was believed. One in nine keeps the line as it is.
 const WEIGHT_OF_BELIEVED: u32 = 8;
 
@@ -229,8 +232,12 @@ impl LineState {
         let weight = match ended {
             Ended::Reply(Reply::Exception(_)) => 0,
             Ended::Reply(_) if !early => {
-                let less = if transaction.doubted() { MOST_WEIGHT } else { 1 };
-                self.early_weight = self.early_weight.saturating_sub(less);
+                let taken_back = match self.protocol {
+                    _ if transaction.doubted() => MOST_WEIGHT,
+                    Protocol::N2 => REGULAR_ON_N2,
+                    Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
+                };
+                self.early_weight = self.early_weight.saturating_sub(taken_back);
                 0
             }
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,

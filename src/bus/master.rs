@@ -134,7 +134,7 @@ pub struct Master {
     /// What N2 says to drives beside reading them.
     sessions: N2Sessions,
     n2_late: N2LateReplies,
-    /// What was answered last on the line.
+    /// Whose reply came last on the line, sound or mangled: it may come once more.
     last_answered: Option<(usize, RequestPdu)>,
     turns: Turns,
     shutdown: Option<Shutdown>,

@@ -4,36 +4,49 @@ use crate::codec::{RequestPdu, Table, rtu};
 /// A line at 9600 baud on which every reply could be the last one once more.
 struct Bench {
     line: LineState,
+    protocol: Protocol,
     now: Instant,
 }
 
 impl Bench {
     fn new() -> Bench {
+        Bench::of(Protocol::ModbusRtu)
+    }
+
+    fn of(protocol: Protocol) -> Bench {
         let now = Instant::now();
         let format = LineFormat::new(9600, "8N1").unwrap();
         let silence = Duration::from_millis(4);
         Bench {
-            line: LineState::new(Protocol::ModbusRtu, format, silence, now),
+            line: LineState::new(protocol, format, silence, now),
+            protocol,
             now,
         }
     }
 
     /// Whether a reply is believed that is whole so long after its request.
     fn believes(&mut self, after: Duration) -> bool {
-        let reply = reply();
+        let reply = match self.protocol {
+            Protocol::N2 => b"A1061\r".to_vec(),
+            Protocol::ModbusRtu | Protocol::ModbusAscii => reply(),
+        };
         self.answers(&[(after, &reply)])
     }
 
     /// Whether a reply is believed where this comes so long after the request.
     fn answers(&mut self, what: &[(Duration, &[u8])]) -> bool {
+        let table = match self.protocol {
+            Protocol::N2 => Table::DiscreteInput,
+            Protocol::ModbusRtu | Protocol::ModbusAscii => Table::Holding,
+        };
         let pdu = RequestPdu::Read {
-            table: Table::Holding,
+            table,
             start: 0,
             count: 1,
         };
         let request = Request::new(1, pdu);
         let mut frame = Vec::new();
-        rtu::encode_request(&request, &mut frame);
+        self.protocol.encode(&request, &mut frame);
         let sending = Sending {
             response_timeout: Duration::from_millis(100),
             could_be_doubled: true,
@@ -132,4 +145,27 @@ fn a_request_waits_for_silence_but_not_for_ever() {
     }
     assert!(bench.line.clear_at(since) <= now + Duration::from_millis(4));
     assert!(now <= since + BABBLE + Duration::from_millis(4));
+}
+
+/// Every tenth reply comes twice and the one behind it is lost: its copy is alone in its exchange.
+#[test]
+fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
+    let mut bench = Bench::of(Protocol::N2);
+    for _ in 0..100 {
+        assert!(!bench.believes(EARLY), "it came once more");
+        for _ in 0..9 {
+            assert!(bench.believes(REGULAR));
+        }
+    }
+}
+
+#[test]
+fn an_n2_line_without_wire_time_is_believed_after_three_replies() {
+    let mut bench = Bench::of(Protocol::N2);
+    for _ in 0..3 {
+        assert!(!bench.believes(EARLY));
+    }
+    for _ in 0..100 {
+        assert!(bench.believes(EARLY), "no wire");
+    }
 }

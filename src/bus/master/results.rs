@@ -50,7 +50,10 @@ impl Master {
                 }
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
-            Ended::Corrupt(_) if end.mangled && !self.late_before => {}
+            Ended::Corrupt(_) if end.mangled && !self.late_before => {
+                // It may come once more, and sound.
+                self.last_answered = Some((turn.drive, turn.pdu.clone()));
+            }
             Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
                 drive.late.given_up(&turn.pdu, end.began, now);
             }

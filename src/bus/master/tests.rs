@@ -511,3 +511,35 @@ fn an_n2_stop_whose_answer_may_be_a_late_one_is_sent_again_when_none_can_come() 
     assert!(sent[1] >= sent[0] + rig.master.response_timeout * N2_LATE);
     assert!(outcome(&mut stop).is_some_and(|o| o.is_ok()));
 }
+
+/// What an adapter or a repeater sends twice may come mangled first and sound afterwards.
+#[test]
+fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
+    for (mangled, expected) in [(true, true), (false, false)] {
+        let mut rig = Rig::of(2, "vacon-nx-n2", Protocol::N2);
+        let read = |rig: &mut Rig| loop {
+            let next = rig.master.next(rig.now, &mut Vec::new());
+            match next {
+                Err(until) => rig.now = until,
+                Ok(turn) if matches!(turn.pdu(), RequestPdu::Read { .. }) => break turn,
+                Ok(turn) => panic!("{turn:?}"),
+            }
+        };
+        let end = |ended| TurnEnd {
+            ended,
+            began: rig.now,
+            took: COST,
+            mangled,
+        };
+        let garbled = end(Ended::Corrupt("checksum"));
+        let mut turn = read(&mut rig);
+        // The reply before has another form than this one's.
+        let written = RequestPdu::WriteCoil { address: 0, on: true };
+        rig.master.last_answered = Some((turn.drive, written));
+        assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
+        rig.now += COST;
+        rig.master.done(&turn, garbled, rig.now);
+        turn.drive = 1 - turn.drive;
+        assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
+    }
+}
