@@ -3,6 +3,9 @@
 //! The north sides build an [`Order`], [`admit`] checks it against authority, profile and limits, and the
 //! [`CommandQueue`] of the bus takes it. The [`Ticket`] inside a command answers when it is used or dropped,
 //! so a command can neither be answered twice nor be forgotten.
+//!
+//! [`Outcome`] has the code, the text and the Modbus exception of every result; the texts of refusals are where the
+//! refusal is decided, mostly in `admit`.
 
 mod admit;
 mod audit;

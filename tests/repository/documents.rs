@@ -16,7 +16,9 @@ fn read(path: &Path) -> String {
 
 /// The documents for people.
 fn documents() -> Vec<PathBuf> {
-    let mut found = vec![root().join("README.md"), root().join("CHANGELOG.md")];
+    let mut found = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+        .map(|name| root().join(name))
+        .to_vec();
     found.extend(files(&root().join("docs"), "md"));
     found
 }

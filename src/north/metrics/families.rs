@@ -1,4 +1,5 @@
-//! The families of series and their values.
+//! Every metric with its name, help, labels and values. Those of the common drive model are listed in `model`; counters
+//! of the servers come from `NorthStats`.
 
 use std::sync::atomic::Ordering;
 use std::time::Instant;

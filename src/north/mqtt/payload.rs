@@ -1,4 +1,5 @@
-//! The topics and payloads.
+//! Names of the topics and content of the payloads. `publisher` decides which topics a drive has and when they are
+//! published.
 
 use std::time::{Duration, SystemTime};
 
