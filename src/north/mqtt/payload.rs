@@ -421,6 +421,7 @@ mod tests {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: Some(53),
+            count: None,
             text: "gone".to_string(),
         };
         let (topic, payload) = event(&topics, &object).unwrap();

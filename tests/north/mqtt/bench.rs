@@ -447,6 +447,7 @@ impl Gateway {
             bus: "line1".to_string(),
             drive: Some(drive.to_string()),
             fault_code: None,
+            count: None,
             text: text.to_string(),
         });
         time

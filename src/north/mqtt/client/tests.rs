@@ -38,6 +38,7 @@ async fn burst(client: &mut Client, count: usize) {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: None,
+            count: None,
             text: format!("event {n}"),
         });
     }
