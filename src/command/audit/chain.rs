@@ -158,6 +158,20 @@ pub struct Tail {
 
 /// The end of a file whose last bytes are `window`; `None` if no entry is in them.
 pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
+    let of = |line: &[u8], head: &Head| Chain {
+        seq: head.seq,
+        last: Hash::of(line),
+    };
+    let after = window.iter().rposition(|byte| *byte == b'\n').map(|place| place + 1);
+    let last = window.get(after.or(is_whole.then_some(0))?..)?;
+    if let Some(head) = Head::read(last) {
+        // Only its line end is missing.
+        return Some(Tail {
+            chain: of(last, &head),
+            fragment: None,
+            ended: false,
+        });
+    }
     let mut end = window.len();
     // What precedes the first line end may be the end of a longer line.
     while let Some(line_end) = window.get(..end)?.iter().rposition(|byte| *byte == b'\n') {
@@ -165,10 +179,7 @@ pub fn tail(window: &[u8], is_whole: bool) -> Option<Tail> {
         let begin = before.iter().rposition(|byte| *byte == b'\n').map(|place| place + 1);
         let line = before.get(begin.or(is_whole.then_some(0))?..)?;
         if let Some(head) = Head::read(line) {
-            let chain = Chain {
-                seq: head.seq,
-                last: Hash::of(line),
-            };
+            let chain = of(line, &head);
             let (fragment, ended) = fragment(window.get(line_end + 1..)?);
             let ended = ended || fragment.is_none();
             return Some(Tail { chain, fragment, ended });
@@ -365,6 +376,10 @@ mod tests {
         for cut in joined.len() - third.len() - 1..joined.len() {
             let tail = tail(&joined[..cut], true).unwrap();
             let rest = &joined[joined.len() - third.len() - 1..cut];
+            if rest == third {
+                assert_eq!(tail, Tail { chain, fragment: None, ended: false }, "only its line end is missing");
+                continue;
+            }
             assert_eq!((tail.chain.seq, tail.ended), (2, rest.is_empty()));
             let Some((bytes, sha256)) = tail.fragment else {
                 assert!(rest.is_empty());

@@ -327,17 +327,17 @@ impl Writer {
             (None, None) => last_of(&self.numbered(1))?,
         };
         self.chain = Some(before.unwrap_or_default());
-        let rest = match found {
-            Some(tail) => tail.fragment.map(|fragment| (fragment, tail.ended)),
+        let (fragment, ended) = match found {
+            Some(tail) => (tail.fragment, tail.ended),
             None => only_fragment(&mut file, bytes)?,
         };
         let mut open = Open { file, bytes };
-        if let Some(((bytes, sha256), ended)) = rest {
+        if open.bytes > 0 && !ended {
+            open.file.write_all(b"\n")?;
+            open.bytes += 1;
+        }
+        if let Some((bytes, sha256)) = fragment {
             tracing::warn!("audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named", path.display());
-            if !ended {
-                open.file.write_all(b"\n")?;
-                open.bytes += 1;
-            }
             let time = SystemTime::now();
             self.open = Some(open);
             self.write(&Entry::Fragment { time, bytes, sha256 })?;
@@ -387,13 +387,12 @@ fn read_end(file: &mut File, bytes: u64, length: u64) -> io::Result<Vec<u8>> {
 }
 
 /// A file without any entry: the rest of its first line, or not an audit file.
-fn only_fragment(file: &mut File, bytes: u64) -> io::Result<Option<((u64, Hash), bool)>> {
+fn only_fragment(file: &mut File, bytes: u64) -> io::Result<(Option<(u64, Hash)>, bool)> {
     let window = read_end(file, bytes, LONGEST_TAIL)?;
-    let (fragment, ended) = chain::fragment(&window);
     if bytes > LONGEST_TAIL || window.iter().filter(|byte| **byte == b'\n').count() > 1 {
         return Err(io::Error::other("it is not an audit file; move it away or name another"));
     }
-    Ok(fragment.map(|fragment| (fragment, ended)))
+    Ok(chain::fragment(&window))
 }
 
 #[cfg(test)]

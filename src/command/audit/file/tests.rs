@@ -25,19 +25,23 @@ impl Writer {
     }
 }
 
-/// The lines of all files, oldest first.
-fn lines(dir: &Path) -> Vec<String> {
+/// All files, oldest first.
+fn text(dir: &Path) -> Vec<u8> {
     let numbered = |n| dir.join(format!("audit.jsonl.{n}"));
     let mut files: Vec<PathBuf> = (1..10).rev().map(numbered).filter(|path| path.exists()).collect();
     files.push(dir.join("audit.jsonl"));
-    let texts: Vec<Vec<u8>> = files.iter().map(|path| fs::read(path).unwrap()).collect();
-    String::from_utf8_lossy(&texts.concat()).lines().map(String::from).collect()
+    files.iter().flat_map(|path| fs::read(path).unwrap()).collect()
+}
+
+fn lines(dir: &Path) -> Vec<String> {
+    String::from_utf8_lossy(&text(dir)).lines().map(String::from).collect()
 }
 
 fn faults(dir: &Path) -> Vec<String> {
     let mut verifier = Verifier::new(None);
-    let lines = lines(dir);
-    let mut faults: Vec<String> = lines.iter().filter_map(|line| Some(verifier.line(line.as_bytes()).err()?.why)).collect();
+    let text = text(dir);
+    let lines = text.strip_suffix(b"\n").unwrap().split(|byte| *byte == b'\n');
+    let mut faults: Vec<String> = lines.filter_map(|line| Some(verifier.line(line).err()?.why)).collect();
     faults.extend(verifier.finish().err());
     faults
 }
@@ -110,7 +114,7 @@ fn a_crash_inside_a_line_is_named() {
         }
         assert!(fs::read(dir.path().join("audit.jsonl")).unwrap().starts_with(&bytes), "nothing is removed");
         assert_eq!(faults(dir.path()), Vec::<String>::new(), "{}", String::from_utf8_lossy(&bytes));
-        let whole_lines = bytes.ends_with(b"}\n");
+        let whole_lines = bytes.ends_with(b"}\n") || bytes.ends_with(b"\"count\":1}");
         assert_eq!(values(dir.path(), "entry").iter().any(|entry| entry == "fragment"), !whole_lines);
     }
 }
