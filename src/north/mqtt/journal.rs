@@ -136,6 +136,11 @@ impl Journal {
         Ok(())
     }
 
+    /// Whether half of the room is taken.
+    pub(super) fn is_busy(&self) -> bool {
+        self.bytes() >= self.max_bytes / 2
+    }
+
     fn begin_segment(&mut self) -> io::Result<()> {
         let number = self.next_number;
         let path = self.dir.join(format!("{PREFIX}{number:012}{SUFFIX}"));

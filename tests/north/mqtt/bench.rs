@@ -493,6 +493,7 @@ impl Gateway {
 async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
     loop {
         let now = Instant::now();
+        plant.load().report_refusals(now);
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
                 let drive = &bus.image.drives[command.drive];
