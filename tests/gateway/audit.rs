@@ -171,7 +171,7 @@ fn text_from_outside_forges_no_line_and_commands_no_terminal() {
         let gateway: Running = site.run_ready();
         site.until_connected(true);
         let forged = "\n<3>forged: nothing\u{1b}[2J\u{9b}31m\u{202e}";
-        let payload = format!("{{\"speed_reference{forged}\": 5}}");
+        let payload = serde_json::json!({format!("speed_reference{forged}"): 5}).to_string();
         site.publish(&["-t", "drivegate/test/drive/pump/set", "-m", &payload]);
         let topic = "drivegate/test/drive/nobody\u{202e}/set";
         site.publish(&["-t", topic, "-m", &payload]);

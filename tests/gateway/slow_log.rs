@@ -31,13 +31,14 @@ fn ask(client: &mut TcpStream, unit: u8, pdu: &[u8; 5]) -> Vec<u8> {
 fn a_log_that_nobody_reads_holds_nobody_up() {
     let modbus = MODBUS_TCP.replace("127.0.0.1/32", "127.0.0.9/32");
     let site = Site::of(&[LINE1, &controlled("pump", 1, ""), &modbus, HTTP]);
-    // A pipe holds 64 KiB; this one is full from the beginning.
-    let (log, mut full) = std::io::pipe().unwrap();
-    full.write_all(&[b'x'; 64 << 10]).unwrap();
+    let (log, writer) = std::io::pipe().unwrap();
+    let mut other = writer.try_clone().unwrap();
     let mut gateway = Command::new(env!("CARGO_BIN_EXE_drivegate"));
-    gateway.args(["run", "--config", &site.config()]).stderr(full);
+    gateway.args(["run", "--config", &site.config()]).stderr(writer);
     let mut gateway = Unread(gateway.spawn().unwrap());
     until("the metrics", || get(site.http, "/metrics"));
+    // A pipe holds 64 KiB: this blocks until nobody can read any more.
+    let filling = std::thread::spawn(move || other.write_all(&vec![b'x'; 1 << 20]));
     let mut client = TcpStream::connect(("127.0.0.1", site.modbus)).unwrap();
     client.set_read_timeout(Some(PATIENCE)).unwrap();
     // Each is refused, since the client is not in `write`.
@@ -54,4 +55,5 @@ fn a_log_that_nobody_reads_holds_nobody_up() {
     let status = until("the end", || gateway.0.try_wait().unwrap());
     assert!(status.success(), "{status}");
     drop(log);
+    assert!(filling.join().unwrap().is_err(), "the pipe was full");
 }
