@@ -210,14 +210,17 @@ impl Events {
         let passed = store
             .limit
             .admit(refused.client, refused.reason, Some(refused.drive), event, now);
-        passed.into_iter().for_each(|passed| self.publish_counted(&mut store, passed));
+        passed
+            .into_iter()
+            .for_each(|passed| self.publish_counted(&mut store, passed));
     }
 
     /// Publishes the refusals that waited long enough for their count.
     pub fn publish_due(&self, now: Instant) {
         let mut store = self.store();
         let due = store.limit.due(now);
-        due.into_iter().for_each(|passed| self.publish_counted(&mut store, passed));
+        due.into_iter()
+            .for_each(|passed| self.publish_counted(&mut store, passed));
     }
 
     fn publish_counted(&self, store: &mut Store, (mut event, count): (Event, u64)) {
@@ -295,9 +298,19 @@ mod tests {
             events.publish_refusal(refused, start + Duration::from_millis(n.into()));
         }
         events.publish_due(start + Duration::from_secs(200));
-        let refused: Vec<_> = events.recent().into_iter().filter(|e| e.kind == EventKind::RefusedCommand).collect();
+        let refused: Vec<_> = events
+            .recent()
+            .into_iter()
+            .filter(|e| e.kind == EventKind::RefusedCommand)
+            .collect();
         assert_eq!(refused.len(), REFUSALS_KEPT);
-        assert!(refused.last().unwrap().text.contains("commands of this client were refused)"));
+        assert!(
+            refused
+                .last()
+                .unwrap()
+                .text
+                .contains("commands of this client were refused)")
+        );
         (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Online)));
         (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Fault)));
         let kept = events.recent();

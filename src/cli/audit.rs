@@ -72,7 +72,8 @@ impl Verify {
                 match line {
                     Ok(line) => {
                         let found = verifier.line(&line).err();
-                        faults.extend(found.map(|found| fault(&found.why, if found.before { &before } else { &place })));
+                        faults
+                            .extend(found.map(|found| fault(&found.why, if found.before { &before } else { &place })));
                     }
                     Err(error) => {
                         faults.push(error);
@@ -90,7 +91,10 @@ impl Verify {
         }
         match verifier.chain() {
             _ if !faults.is_empty() => Err(faults),
-            Some(chain) => Ok(format!("{lines} lines are whole; the last is entry {} with the hash {}\n", chain.seq, chain.last)),
+            Some(chain) => Ok(format!(
+                "{lines} lines are whole; the last is entry {} with the hash {}\n",
+                chain.seq, chain.last
+            )),
             None => Ok("no lines\n".to_string()),
         }
     }
@@ -142,5 +146,8 @@ impl Lines {
 }
 
 fn unreadable(path: &Path, error: &io::Error) -> String {
-    format!("cannot read the audit: {error}; {}; name a file that can be read", path.display())
+    format!(
+        "cannot read the audit: {error}; {}; name a file that can be read",
+        path.display()
+    )
 }

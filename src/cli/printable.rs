@@ -56,7 +56,8 @@ mod tests {
     #[test]
     fn what_commands_a_terminal_or_forges_a_line_is_shown() {
         let bad = "a\nINFO forged\r\x1b[2J\u{9b}31m\x07\u{202e}txt.exe\u{2066}\u{200b}\u{feff}\u{e0041}\u{2028}z";
-        let shown = "a\\nINFO forged\\r\\u001b[2J\\u009b31m\\u0007\\u202etxt.exe\\u2066\\u200b\\ufeff\\udb40\\udc41\\u2028z";
+        let shown =
+            "a\\nINFO forged\\r\\u001b[2J\\u009b31m\\u0007\\u202etxt.exe\\u2066\\u200b\\ufeff\\udb40\\udc41\\u2028z";
         assert_eq!(line(bad), shown);
         assert_eq!(lines("a\n\t\x1b\nb\n"), "a\n\t\\u001b\nb\n");
         for fine in ["Müller 25 °C ␍␊ → 日本", "quotes \" \\ '", ""] {

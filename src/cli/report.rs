@@ -77,7 +77,8 @@ pub(super) struct TextTable(Table);
 impl TextTable {
     /// Adds a row.
     pub(super) fn add_row<T: AsRef<str>>(&mut self, cells: impl IntoIterator<Item = T>) {
-        self.0.add_row(cells.into_iter().map(|cell| printable::line(cell.as_ref())));
+        self.0
+            .add_row(cells.into_iter().map(|cell| printable::line(cell.as_ref())));
     }
 
     /// Aligns a column to the right, as figures are.

@@ -185,21 +185,25 @@ impl Audit {
         let drive = (record.result != super::Refusal::UNKNOWN_DRIVE).then(|| record.drive.clone());
         let (share, result) = (record.share.clone(), record.result);
         let passed = records.refusals.admit(&share, result, drive.as_deref(), record, now);
-        passed.into_iter().for_each(|passed| self.keep_counted(&mut records, passed));
+        passed
+            .into_iter()
+            .for_each(|passed| self.keep_counted(&mut records, passed));
     }
 
     /// Records the refusals that waited long enough for their count.
     pub fn record_due(&self, now: Instant) {
         let mut records = self.records();
         let due = records.refusals.due(now);
-        due.into_iter().for_each(|passed| self.keep_counted(&mut records, passed));
+        due.into_iter()
+            .for_each(|passed| self.keep_counted(&mut records, passed));
     }
 
     /// Records all refusals that wait for their count, at the end.
     pub fn record_rest(&self, now: Instant) {
         let mut records = self.records();
         let rest = records.refusals.rest(now);
-        rest.into_iter().for_each(|passed| self.keep_counted(&mut records, passed));
+        rest.into_iter()
+            .for_each(|passed| self.keep_counted(&mut records, passed));
     }
 
     fn keep_counted(&self, records: &mut Records, (mut record, count): (AuditRecord, u64)) {
@@ -263,7 +267,11 @@ mod tests {
             audit.record(record("operator", i), Reach::Sent, now);
         }
         for i in 0..50_000 {
-            audit.record(record("flood", i), Reach::Refused, now + Duration::from_millis(i as u64));
+            audit.record(
+                record("flood", i),
+                Reach::Refused,
+                now + Duration::from_millis(i as u64),
+            );
             audit.record(record("flood", i), Reach::Queued, now);
         }
         let kept = audit.recent();

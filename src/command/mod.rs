@@ -256,11 +256,9 @@ impl Outcome {
             | Outcome::TimedOut
             | Outcome::Garbled
             | Outcome::Interrupted(_) => Reach::Sent,
-            Outcome::Expired
-            | Outcome::Replaced
-            | Outcome::Purged
-            | Outcome::Withdrawn
-            | Outcome::ShuttingDown => Reach::Queued,
+            Outcome::Expired | Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::ShuttingDown => {
+                Reach::Queued
+            }
             Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
         }
     }

@@ -155,7 +155,9 @@ impl Ticket {
             confirmed: self.confirmed,
             count: 1,
         };
-        self.stats.audit.record(record, outcome.reach(), self.accepted + latency);
+        self.stats
+            .audit
+            .record(record, outcome.reach(), self.accepted + latency);
     }
 }
 

@@ -169,7 +169,14 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
     let mut gateway = gateway.unwrap_or_default();
     profile_errors.append(&mut gateway.errors);
-    let Gateway { name, socket, state_dir, profile_dirs, profiles, .. } = gateway;
+    let Gateway {
+        name,
+        socket,
+        state_dir,
+        profile_dirs,
+        profiles,
+        ..
+    } = gateway;
     let broken = !profile_errors.is_empty();
     let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
@@ -189,7 +196,10 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .map(|table| mqtt::read(&table, base, name.as_deref()));
     let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
     let http_listener = http_listener.flatten();
-    let audit = ROOT.audit.table(reader).map(|table| log::read_audit(&table, &state_dir));
+    let audit = ROOT
+        .audit
+        .table(reader)
+        .map(|table| log::read_audit(&table, &state_dir));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 

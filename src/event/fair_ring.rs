@@ -83,7 +83,10 @@ mod tests {
     #[test]
     fn sources_with_one_item_each_leave_in_their_order() {
         let mut ring = FairRing::new(3);
-        ["d", "a", "c", "b", "e"].iter().enumerate().for_each(|(n, source)| ring.push(*source, n as u64, ()));
+        ["d", "a", "c", "b", "e"]
+            .iter()
+            .enumerate()
+            .for_each(|(n, source)| ring.push(*source, n as u64, ()));
         let mut kept: Vec<u64> = ring.iter().map(|(number, ())| *number).collect();
         kept.sort_unstable();
         assert_eq!(kept, [2, 3, 4]);

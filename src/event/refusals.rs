@@ -43,7 +43,14 @@ impl<T> RefusalLimit<T> {
     /// `client` was refused something for `reason`, by `drive` unless there is none of that name. Returns what passes now,
     /// with the number of refusals that it stands for; what does not is returned by a later call, or by
     /// [`RefusalLimit::due`].
-    pub fn admit(&mut self, client: &Arc<str>, reason: &'static str, drive: Option<&str>, item: T, now: Instant) -> Option<(T, u64)> {
+    pub fn admit(
+        &mut self,
+        client: &Arc<str>,
+        reason: &'static str,
+        drive: Option<&str>,
+        item: T,
+        now: Instant,
+    ) -> Option<(T, u64)> {
         let client = self.client(client, now);
         client.refused = now;
         let is_new = client.kinds.len() < KINDS && client.kinds.insert((reason, drive.unwrap_or_default().to_string()));
@@ -58,7 +65,8 @@ impl<T> RefusalLimit<T> {
     fn client(&mut self, name: &Arc<str>, now: Instant) -> &mut Client<T> {
         if !self.clients.contains_key(name) && self.clients.len() >= CLIENTS {
             let idle = |client: &Client<T>| now.saturating_duration_since(client.refused) >= FORGOTTEN;
-            self.clients.retain(|_, client| client.waiting.is_some() || !idle(client));
+            self.clients
+                .retain(|_, client| client.waiting.is_some() || !idle(client));
         }
         let known = self.clients.contains_key(name) || self.clients.len() < CLIENTS;
         let name = if known { name.clone() } else { Arc::from("") };
@@ -77,7 +85,10 @@ impl<T> RefusalLimit<T> {
 
     /// All that waits, at the end.
     pub fn rest(&mut self, now: Instant) -> Vec<(T, u64)> {
-        self.clients.values_mut().filter_map(|client| client.pass(now)).collect()
+        self.clients
+            .values_mut()
+            .filter_map(|client| client.pass(now))
+            .collect()
     }
 }
 
@@ -100,7 +111,13 @@ mod tests {
 
     const SECOND: Duration = Duration::from_secs(1);
 
-    fn admit(limit: &mut RefusalLimit<u64>, client: &str, reason: &'static str, item: u64, now: Instant) -> Option<(u64, u64)> {
+    fn admit(
+        limit: &mut RefusalLimit<u64>,
+        client: &str,
+        reason: &'static str,
+        item: u64,
+        now: Instant,
+    ) -> Option<(u64, u64)> {
         limit.admit(&client.into(), reason, Some("pump-1"), item, now)
     }
 
@@ -114,13 +131,25 @@ mod tests {
             passed.extend(admit(&mut limit, "a", "not_allowed", n.into(), now));
         }
         assert_eq!(passed, [(2500, 2500), (5000, 2500), (7500, 2500), (10_000, 2500)]);
-        assert_eq!(admit(&mut limit, "a", "bad_value", 1, start + 4 * SECOND), Some((1, 1)), "another reason");
+        assert_eq!(
+            admit(&mut limit, "a", "bad_value", 1, start + 4 * SECOND),
+            Some((1, 1)),
+            "another reason"
+        );
         let drive = limit.admit(&"a".into(), "bad_value", Some("pump-2"), 2, start + 4 * SECOND);
         assert_eq!(drive, Some((2, 1)), "another drive");
-        assert_eq!(admit(&mut limit, "b", "bad_value", 3, start + 4 * SECOND), Some((3, 1)), "another client");
+        assert_eq!(
+            admit(&mut limit, "b", "bad_value", 3, start + 4 * SECOND),
+            Some((3, 1)),
+            "another client"
+        );
         assert_eq!(admit(&mut limit, "a", "bad_value", 4, start + 4 * SECOND), None);
         assert_eq!(limit.due(start + 4 * SECOND), []);
-        assert_eq!(limit.due(start + 5 * SECOND), [(4, 1)], "it is not lost when nothing follows");
+        assert_eq!(
+            limit.due(start + 5 * SECOND),
+            [(4, 1)],
+            "it is not lost when nothing follows"
+        );
         assert_eq!(limit.due(start + 6 * SECOND), []);
     }
 
@@ -130,11 +159,20 @@ mod tests {
         let mut counted = 0;
         let mut lines = 0;
         for n in 0..100_000u64 {
-            let passed = admit(&mut limit, &format!("10.0.{}.{}", n / 256, n % 256), "not_allowed", n, start);
+            let passed = admit(
+                &mut limit,
+                &format!("10.0.{}.{}", n / 256, n % 256),
+                "not_allowed",
+                n,
+                start,
+            );
             lines += passed.iter().count();
             counted += passed.map_or(0, |(_, count)| count);
         }
-        assert!(lines <= CLIENTS + 1 && limit.clients.len() <= CLIENTS + 1, "{lines} lines");
+        assert!(
+            lines <= CLIENTS + 1 && limit.clients.len() <= CLIENTS + 1,
+            "{lines} lines"
+        );
         let rest = limit.rest(start);
         assert_eq!(counted + rest.iter().map(|(_, count)| count).sum::<u64>(), 100_000);
         for n in 0..1000u64 {
@@ -144,7 +182,11 @@ mod tests {
         assert_eq!(kinds.max(), Some(KINDS));
         let later = start + FORGOTTEN;
         limit.rest(later);
-        assert_eq!(admit(&mut limit, "new", "not_allowed", 1, later), Some((1, 1)), "the others are forgotten");
+        assert_eq!(
+            admit(&mut limit, "new", "not_allowed", 1, later),
+            Some((1, 1)),
+            "the others are forgotten"
+        );
         assert!(limit.clients.contains_key("new"));
     }
 }

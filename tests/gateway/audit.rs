@@ -45,12 +45,17 @@ fn entries(site: &Site) -> Vec<Value> {
 
 fn verify(site: &Site, more: &[&str]) -> Output {
     let file = site.path("state/audit.jsonl");
-    drivegate(&[&["audit", "verify", &file], more].concat()).output().unwrap()
+    drivegate(&[&["audit", "verify", &file], more].concat())
+        .output()
+        .unwrap()
 }
 
 /// Their counts together.
 fn sum<'r>(records: impl IntoIterator<Item = &'r Value>) -> u64 {
-    records.into_iter().map(|record| record["count"].as_u64().unwrap()).sum()
+    records
+        .into_iter()
+        .map(|record| record["count"].as_u64().unwrap())
+        .sum()
 }
 
 #[test]
@@ -65,22 +70,36 @@ fn a_client_that_may_not_write_destroys_nothing() {
     });
     until("a flood", || (refused.load(Ordering::Relaxed) >= 5_000).then_some(()));
     let orders: Vec<u16> = (0..40).map(|n| 1000 + n).collect();
-    orders.iter().for_each(|value| write_registers(site.modbus, 1, SPEED_REFERENCE, &[*value]));
+    orders
+        .iter()
+        .for_each(|value| write_registers(site.modbus, 1, SPEED_REFERENCE, &[*value]));
     stop.store(true, Ordering::Relaxed);
     flooding.join().unwrap();
     let flooded = refused.load(Ordering::Relaxed);
 
-    let is_flood = |record: &&Value| record["client"].as_str().is_some_and(|client| client.starts_with("127.0.0.9"));
+    let is_flood = |record: &&Value| {
+        record["client"]
+            .as_str()
+            .is_some_and(|client| client.starts_with("127.0.0.9"))
+    };
     let has_all = |records: &[Value]| {
         let wanted = |value: &u16| {
             let command = format!("speed_reference={}", f64::from(*value) / 100.0);
-            records.iter().filter(|r| r["command"] == command.as_str() && !is_flood(r)).count() >= 1
+            records
+                .iter()
+                .filter(|r| r["command"] == command.as_str() && !is_flood(r))
+                .count()
+                >= 1
         };
         orders.iter().all(wanted) && sum(records.iter().filter(is_flood)) == flooded
     };
     until("all orders in the API", || has_all(&site.audit()).then_some(()));
     until("all orders in the file", || has_all(&entries(&site)).then_some(()));
-    let lines = |text: &str| -> Vec<Value> { text.lines().filter_map(|line| serde_json::from_str(line).ok()).collect() };
+    let lines = |text: &str| -> Vec<Value> {
+        text.lines()
+            .filter_map(|line| serde_json::from_str(line).ok())
+            .collect()
+    };
     let logged = until("all orders in the log", || {
         let mut audit = lines(&gateway.output());
         audit.retain(|line| line["target"] == "audit" && line.get("command").is_some());
@@ -91,18 +110,30 @@ fn a_client_that_may_not_write_destroys_nothing() {
         audit.iter_mut().for_each(count);
         has_all(&audit).then_some(audit)
     });
-    assert!(logged.len() < 200, "{} audit lines for {flooded} refusals", logged.len());
+    assert!(
+        logged.len() < 200,
+        "{} audit lines for {flooded} refusals",
+        logged.len()
+    );
     let metrics = get(site.http, "/metrics").unwrap().1;
-    assert!(metrics.contains("drivegate_audit_lost_total{kind=\"sent\"} 0"), "{metrics}");
+    assert!(
+        metrics.contains("drivegate_audit_lost_total{kind=\"sent\"} 0"),
+        "{metrics}"
+    );
 
     gateway.signal("TERM");
     assert!(gateway.ended().success());
     let whole = verify(&site, &[]);
     assert!(whole.status.success(), "{whole:?}");
-    let hash = gateway.output().lines().filter(|line| line.contains("last line of the audit file")).last().map(|line| {
-        let line: Value = serde_json::from_str(line).unwrap();
-        line["hash"].as_str().unwrap().to_string()
-    });
+    let hash = gateway
+        .output()
+        .lines()
+        .filter(|line| line.contains("last line of the audit file"))
+        .last()
+        .map(|line| {
+            let line: Value = serde_json::from_str(line).unwrap();
+            line["hash"].as_str().unwrap().to_string()
+        });
     let hash = hash.expect("the hash is logged at the end");
     assert!(String::from_utf8_lossy(&whole.stdout).contains(&hash), "{whole:?}");
     let path = site.file("state/audit.jsonl");
@@ -117,12 +148,23 @@ fn a_client_that_may_not_write_destroys_nothing() {
     let lines: Vec<&str> = text.split_inclusive('\n').collect();
     let forged = lines[4].replace("127.0.0", "127.9.9");
     assert_ne!(forged, lines[4]);
-    failing(&[&lines[..4], &[&forged], &lines[5..]].concat().concat(), &[], "audit.jsonl:5;");
-    failing(&[&lines[..4], &lines[7..]].concat().concat(), &[], "entries 5 to 7 before this line are missing");
+    failing(
+        &[&lines[..4], &[&forged], &lines[5..]].concat().concat(),
+        &[],
+        "audit.jsonl:5;",
+    );
+    failing(
+        &[&lines[..4], &lines[7..]].concat().concat(),
+        &[],
+        "entries 5 to 7 before this line are missing",
+    );
     let cut = lines[..lines.len() - 1].concat();
     failing(&cut, &["--last", &hash], "the end was cut");
     std::fs::write(&path, &cut).unwrap();
-    assert!(verify(&site, &[]).status.success(), "a cut end does not show without the hash");
+    assert!(
+        verify(&site, &[]).status.success(),
+        "a cut end does not show without the hash"
+    );
     failing(&cut[..cut.len() - 9], &[], "the line has no end");
     // A start names what a crash left, and the chain goes on.
     let mut again = site.run_ready();
@@ -193,7 +235,10 @@ fn text_from_outside_forges_no_line_and_commands_no_terminal() {
             let output = drivegate(arguments).output().unwrap();
             let printed = String::from_utf8_lossy(&[output.stdout, output.stderr].concat()).into_owned();
             assert!(!printed.is_empty() && is_plain(&printed), "{arguments:?}: {printed:?}");
-            assert!(!printed.lines().any(|line| line.starts_with("error: forged")), "{arguments:?}: {printed}");
+            assert!(
+                !printed.lines().any(|line| line.starts_with("error: forged")),
+                "{arguments:?}: {printed}"
+            );
         }
         let trace = drivegate(&["trace", "--url", &url, "--count", "3"]).output().unwrap();
         assert!(is_plain(&String::from_utf8_lossy(&trace.stdout)), "{trace:?}");

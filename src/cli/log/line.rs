@@ -90,7 +90,10 @@ impl LogLine {
         }
         let time = humantime::format_rfc3339_micros(SystemTime::now());
         match writer.has_ansi_escapes() {
-            true => write!(writer, "\x1b[2m{time}\x1b[0m \x1b[{colour}m{level:>5}\x1b[0m \x1b[2m{target}:\x1b[0m "),
+            true => write!(
+                writer,
+                "\x1b[2m{time}\x1b[0m \x1b[{colour}m{level:>5}\x1b[0m \x1b[2m{target}:\x1b[0m "
+            ),
             false => write!(writer, "{time} {level:>5} {target}: "),
         }
     }
@@ -165,7 +168,9 @@ mod tests {
 
     fn logged(format: LogFormat, events: impl FnOnce()) -> String {
         let written = Written::default();
-        let lines = tracing_subscriber::fmt::layer().with_writer(written.clone()).with_ansi(false);
+        let lines = tracing_subscriber::fmt::layer()
+            .with_writer(written.clone())
+            .with_ansi(false);
         match format {
             LogFormat::Json => {
                 let lines = lines.json().event_format(LogLine::new(format));
@@ -182,8 +187,15 @@ mod tests {
     #[test]
     fn no_field_makes_a_line_or_commands_a_terminal() {
         let bad = "x\n<3>forged: \x1b[2J\u{202e}y\u{9b}";
-        for (format, head) in [(LogFormat::Journal, "<4>drivegate"), (LogFormat::Text, "20"), (LogFormat::Json, "{\"")] {
-            let text = logged(format, || tracing::warn!(field = bad, debug = ?bad, shown = %bad, "{bad}"));
+        for (format, head) in [
+            (LogFormat::Journal, "<4>drivegate"),
+            (LogFormat::Text, "20"),
+            (LogFormat::Json, "{\""),
+        ] {
+            let text = logged(
+                format,
+                || tracing::warn!(field = bad, debug = ?bad, shown = %bad, "{bad}"),
+            );
             assert_eq!(text.lines().count(), 1, "{text}");
             let one = text.strip_suffix('\n').unwrap();
             assert!(one.starts_with(head) && one.matches("forged").count() == 4, "{one}");
@@ -215,7 +227,10 @@ mod tests {
         assert_eq!(text, "");
         tracing::subscriber::with_default(Registry::default(), || {
             let metadata = tracing::debug_span!(target: "rustls", "x").metadata();
-            assert!(metadata.is_some_and(|m| libraries.permit(m, start) == Some(0)), "only warnings are limited");
+            assert!(
+                metadata.is_some_and(|m| libraries.permit(m, start) == Some(0)),
+                "only warnings are limited"
+            );
             let span = tracing::warn_span!(target: "rustls", "x");
             let metadata = span.metadata().unwrap();
             assert_eq!(libraries.permit(metadata, start), Some(0));

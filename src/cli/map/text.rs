@@ -39,7 +39,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             out,
             "\nProfile {} ({}), units {}\n",
             profile.name,
-            profile.title,
+            printable::line(&profile.title),
             units.join(", ")
         );
         // What a unit of this profile can have; the table above shows which units can be written.

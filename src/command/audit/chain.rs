@@ -24,7 +24,10 @@ impl Hash {
 impl From<ring::digest::Digest> for Hash {
     fn from(digest: ring::digest::Digest) -> Hash {
         let mut hash = Hash::default();
-        hash.0.iter_mut().zip(digest.as_ref()).for_each(|(to, from)| *to = *from);
+        hash.0
+            .iter_mut()
+            .zip(digest.as_ref())
+            .for_each(|(to, from)| *to = *from);
         hash
     }
 }
@@ -59,7 +62,9 @@ impl Serialize for Hash {
 
 impl<'de> Deserialize<'de> for Hash {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Hash, D::Error> {
-        String::deserialize(deserializer)?.parse().map_err(serde::de::Error::custom)
+        String::deserialize(deserializer)?
+            .parse()
+            .map_err(serde::de::Error::custom)
     }
 }
 
@@ -219,7 +224,9 @@ pub struct Verifier {
 
 impl fmt::Debug for Verifier {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Verifier").field("chain", &self.chain).finish_non_exhaustive()
+        f.debug_struct("Verifier")
+            .field("chain", &self.chain)
+            .finish_non_exhaustive()
     }
 }
 
@@ -258,7 +265,10 @@ impl Verifier {
         };
         self.wanted = self.wanted.filter(|wanted| *wanted != now.last);
         let before = self.chain.replace(now);
-        let fragment = self.fragment.take().map(|(bytes, hash)| (bytes, Hash::from(hash.finish())));
+        let fragment = self
+            .fragment
+            .take()
+            .map(|(bytes, hash)| (bytes, Hash::from(hash.finish())));
         let named = head.bytes.zip(head.sha256).filter(|_| head.entry == "fragment");
         if fragment != named {
             let why = match fragment {
@@ -284,7 +294,9 @@ impl Verifier {
             return Err("the last line is no entry: a crash or somebody cut it".to_string());
         }
         match self.wanted {
-            Some(wanted) => Err(format!("no line has the hash {wanted}: the end was cut, or it is another file")),
+            Some(wanted) => Err(format!(
+                "no line has the hash {wanted}: the end was cut, or it is another file"
+            )),
             None => Ok(()),
         }
     }
@@ -299,7 +311,11 @@ fn follows(head: &Head, before: Chain) -> Result<(), Fault> {
     let why = match step {
         Some(1) => "the line was changed: the next one has the hash of another".to_string(),
         Some(0) | None => format!("entry {} follows entry {}: out of order", head.seq, before.seq),
-        Some(step) => format!("entries {} to {} before this line are missing", before.seq + 1, before.seq + step - 1),
+        Some(step) => format!(
+            "entries {} to {} before this line are missing",
+            before.seq + 1,
+            before.seq + step - 1
+        ),
     };
     Err(Fault {
         before: step == Some(1),
@@ -362,7 +378,10 @@ mod tests {
         forged[5] = whole[4].clone();
         assert!(faults(&forged, None)[0].1.contains("out of order"));
         let mut changed = whole.clone();
-        changed[2] = String::from_utf8(whole[2].clone()).unwrap().replace("\"a\"", "\"b\"").into_bytes();
+        changed[2] = String::from_utf8(whole[2].clone())
+            .unwrap()
+            .replace("\"a\"", "\"b\"")
+            .into_bytes();
         let expected = "the line was changed: the next one has the hash of another";
         assert_eq!(faults(&changed, None), [(3, expected.to_string())]);
     }
@@ -377,7 +396,15 @@ mod tests {
             let tail = tail(&joined[..cut], true).unwrap();
             let rest = &joined[joined.len() - third.len() - 1..cut];
             if rest == third {
-                assert_eq!(tail, Tail { chain, fragment: None, ended: false }, "only its line end is missing");
+                assert_eq!(
+                    tail,
+                    Tail {
+                        chain,
+                        fragment: None,
+                        ended: false
+                    },
+                    "only its line end is missing"
+                );
                 continue;
             }
             assert_eq!((tail.chain.seq, tail.ended), (2, rest.is_empty()));
@@ -395,11 +422,22 @@ mod tests {
             assert_eq!(faults(&edited, None).len(), 1);
             edited.remove(2);
             assert_eq!(faults(&edited, None).len(), 1, "it is not there");
-            assert_eq!(faults(&[&repaired[..3], &whole[2..]].concat(), None).len(), 1, "nobody names it");
+            assert_eq!(
+                faults(&[&repaired[..3], &whole[2..]].concat(), None).len(),
+                1,
+                "nobody names it"
+            );
         }
         assert_eq!(tail(b"garbage\n\0\0", true), None);
         let found = tail(&joined, true).unwrap();
-        assert_eq!(found, Tail { chain, fragment: None, ended: true });
+        assert_eq!(
+            found,
+            Tail {
+                chain,
+                fragment: None,
+                ended: true
+            }
+        );
         for window in 0..joined.len() {
             let part = tail(&joined[window..], false);
             assert!(part.is_none_or(|part| part == found));

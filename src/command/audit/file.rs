@@ -115,7 +115,12 @@ impl AuditFile {
     /// Takes a record; never waits for the disk.
     pub(super) fn push(&self, record: Arc<AuditRecord>, sent: bool) {
         let mut queues = self.shared.queues();
-        let Queues { sent: first, unsent, lost, .. } = &mut *queues;
+        let Queues {
+            sent: first,
+            unsent,
+            lost,
+            ..
+        } = &mut *queues;
         let (queue, room, lost) = match sent {
             true => (first, WAITING.0, &mut lost.0),
             false => (unsent, WAITING.1, &mut lost.1),
@@ -200,7 +205,11 @@ impl Writer {
             self.open = None;
         }
         while let Some((record, sent)) = self.shared.next() {
-            let entry = if sent { Entry::Sent(&record) } else { Entry::NotSent(&record) };
+            let entry = if sent {
+                Entry::Sent(&record)
+            } else {
+                Entry::NotSent(&record)
+            };
             if let Err(error) = self.write(&entry) {
                 self.shared.put_back(record, sent);
                 return Err(error);
@@ -249,7 +258,9 @@ impl Writer {
                 if end {
                     let queues = self.shared.queues();
                     let (sent, others) = (queues.sent.len(), queues.unsent.len());
-                    tracing::error!("audit file: {sent} records of commands that were sent and {others} others are not written");
+                    tracing::error!(
+                        "audit file: {sent} records of commands that were sent and {others} others are not written"
+                    );
                 }
             }
         }
@@ -316,7 +327,12 @@ impl Writer {
         if let Some(dir) = path.parent() {
             fs::create_dir_all(dir)?;
         }
-        let mut file = OpenOptions::new().read(true).append(true).create(true).mode(0o640).open(path)?;
+        let mut file = OpenOptions::new()
+            .read(true)
+            .append(true)
+            .create(true)
+            .mode(0o640)
+            .open(path)?;
         flock(&file, FlockOperation::NonBlockingLockExclusive)
             .map_err(|_| io::Error::other("another process writes it; give each gateway its own"))?;
         let bytes = file.metadata()?.len();
@@ -337,7 +353,10 @@ impl Writer {
             open.bytes += 1;
         }
         if let Some((bytes, sha256)) = fragment {
-            tracing::warn!("audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named", path.display());
+            tracing::warn!(
+                "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
+                path.display()
+            );
             let time = SystemTime::now();
             self.open = Some(open);
             self.write(&Entry::Fragment { time, bytes, sha256 })?;
@@ -390,7 +409,9 @@ fn read_end(file: &mut File, bytes: u64, length: u64) -> io::Result<Vec<u8>> {
 fn only_fragment(file: &mut File, bytes: u64) -> io::Result<(Option<(u64, Hash)>, bool)> {
     let window = read_end(file, bytes, LONGEST_TAIL)?;
     if bytes > LONGEST_TAIL || window.iter().filter(|byte| **byte == b'\n').count() > 1 {
-        return Err(io::Error::other("it is not an audit file; move it away or name another"));
+        return Err(io::Error::other(
+            "it is not an audit file; move it away or name another",
+        ));
     }
     Ok(chain::fragment(&window))
 }

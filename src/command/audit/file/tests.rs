@@ -48,7 +48,9 @@ fn faults(dir: &Path) -> Vec<String> {
 
 /// Values of a field, of the lines that have it.
 fn values(dir: &Path, field: &str) -> Vec<serde_json::Value> {
-    let json = lines(dir).into_iter().filter_map(|line| serde_json::from_str::<serde_json::Value>(&line).ok());
+    let json = lines(dir)
+        .into_iter()
+        .filter_map(|line| serde_json::from_str::<serde_json::Value>(&line).ok());
     json.filter_map(|json| json.get(field).cloned()).collect()
 }
 
@@ -64,7 +66,10 @@ fn records_become_a_chain_that_a_restart_continues() {
         assert_eq!(writer.chain.map(|chain| chain.seq), Some(4 * round + 4));
     }
     assert_eq!(faults(dir.path()), Vec::<String>::new());
-    let commands: Vec<String> = values(dir.path(), "command").iter().map(|v| v.as_str().unwrap().to_string()).collect();
+    let commands: Vec<String> = values(dir.path(), "command")
+        .iter()
+        .map(|v| v.as_str().unwrap().to_string())
+        .collect();
     assert_eq!(commands.concat(), "230123012301", "commands that were sent come first");
     assert_eq!(values(dir.path(), "entry")[1..3], ["sent", "not_sent"]);
 }
@@ -77,7 +82,10 @@ fn full_files_are_rotated_and_the_oldest_are_removed() {
         writer.push(n * 20..(n + 1) * 20, true);
         writer.work(false).unwrap();
     }
-    let sizes: Vec<u64> = fs::read_dir(dir.path()).unwrap().map(|e| e.unwrap().metadata().unwrap().len()).collect();
+    let sizes: Vec<u64> = fs::read_dir(dir.path())
+        .unwrap()
+        .map(|e| e.unwrap().metadata().unwrap().len())
+        .collect();
     assert_eq!(sizes.len() as u64, FILES);
     assert!(sizes.iter().sum::<u64>() <= 64 << 10);
     let kept = values(dir.path(), "seq");
@@ -90,7 +98,11 @@ fn full_files_are_rotated_and_the_oldest_are_removed() {
     let mut writer = self::writer(dir.path());
     writer.push(0..1, true);
     writer.work(true).unwrap();
-    assert_eq!(writer.chain.map(|chain| chain.seq), Some(801), "it goes on from the file before");
+    assert_eq!(
+        writer.chain.map(|chain| chain.seq),
+        Some(801),
+        "it goes on from the file before"
+    );
 }
 
 #[test]
@@ -112,10 +124,21 @@ fn a_crash_inside_a_line_is_named() {
             writer.push(0..1, true);
             writer.work(true).unwrap();
         }
-        assert!(fs::read(dir.path().join("audit.jsonl")).unwrap().starts_with(&bytes), "nothing is removed");
-        assert_eq!(faults(dir.path()), Vec::<String>::new(), "{}", String::from_utf8_lossy(&bytes));
+        assert!(
+            fs::read(dir.path().join("audit.jsonl")).unwrap().starts_with(&bytes),
+            "nothing is removed"
+        );
+        assert_eq!(
+            faults(dir.path()),
+            Vec::<String>::new(),
+            "{}",
+            String::from_utf8_lossy(&bytes)
+        );
         let whole_lines = bytes.ends_with(b"}\n") || bytes.ends_with(b"\"count\":1}");
-        assert_eq!(values(dir.path(), "entry").iter().any(|entry| entry == "fragment"), !whole_lines);
+        assert_eq!(
+            values(dir.path(), "entry").iter().any(|entry| entry == "fragment"),
+            !whole_lines
+        );
     }
 }
 
@@ -153,7 +176,10 @@ fn a_disk_that_comes_back_gets_what_waited_and_what_was_lost() {
     assert!(!writer.failing);
     let last = lines(&blocked).pop().unwrap();
     let last: serde_json::Value = serde_json::from_str(&last).unwrap();
-    assert_eq!((&last["entry"], &last["sent"], &last["not_sent"]), (&"lost".into(), &5.into(), &7.into()));
+    assert_eq!(
+        (&last["entry"], &last["sent"], &last["not_sent"]),
+        (&"lost".into(), &5.into(), &7.into())
+    );
     writer.work(true).unwrap();
     assert_eq!(values(&blocked, "not_sent"), [7], "once");
     assert_eq!(faults(&blocked), Vec::<String>::new());

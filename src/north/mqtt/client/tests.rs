@@ -98,7 +98,10 @@ async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) {
     assert!(client.dropped() > 0, "not all refusals are kept");
     client.publish_waiting();
     let (_, first) = client.outbox.next(1).unwrap();
-    assert!(first.payload.windows(8).any(|w| w == b"event 0\""), "the fault is there");
+    assert!(
+        first.payload.windows(8).any(|w| w == b"event 0\""),
+        "the fault is there"
+    );
 }
 
 #[tokio::test]
