@@ -234,7 +234,7 @@ impl Segment {
         let file = OpenOptions::new().read(true).write(true).open(&path)?;
         let bytes = fs::read(&path)?;
         let (mut end, mut waiting) = (0, 0);
-        while let Some(record) = bytes.get(end..).and_then(Record::decode) {
+        for record in records(&bytes) {
             waiting += u64::from(record.waits);
             end += record.length;
         }
@@ -279,6 +279,21 @@ impl Segment {
         }
         Ok(None)
     }
+}
+
+/// The whole records at the beginning of a segment.
+fn records(bytes: &[u8]) -> impl Iterator<Item = Record> {
+    let mut rest = bytes;
+    std::iter::from_fn(move || {
+        let record = Record::decode(rest)?;
+        rest = rest.get(record.length..)?;
+        Some(record)
+    })
+}
+
+/// Number and bytes of the whole records at the beginning of a segment, for the fuzzer.
+pub fn whole_records(segment: &[u8]) -> (usize, usize) {
+    records(segment).fold((0, 0), |(count, bytes), record| (count + 1, bytes + record.length))
 }
 
 struct Record {

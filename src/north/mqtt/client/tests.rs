@@ -108,7 +108,7 @@ async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) {
 async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
     let mut in_memory = client(None).await;
     a_fault_and_a_flood(&mut in_memory, BURST).await;
-    burst(&mut in_memory, BURST / 2 - 1).await;
+    burst(&mut in_memory, BURST / 2).await;
     let refused = in_memory.dropped();
     assert_eq!((in_memory.outbox.waiting(), refused), (BURST, BURST as u64 / 2 + 1));
     let dir = tempfile::tempdir().unwrap();
