@@ -12,7 +12,7 @@ use self::server::{ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
-use crate::command::{CommandQueue, WriteStats};
+use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
@@ -23,6 +23,11 @@ use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
+
+/// Time limit for the audit file to be written.
+const STOP_AUDIT: Duration = Duration::from_secs(1);
+/// Interval at which refusals are reported whose count is due.
+const REFUSALS_REPORTED: Duration = Duration::from_millis(250);
 
 /// Why the gateway cannot start or apply a new configuration.
 #[derive(Debug, thiserror::Error)]
@@ -51,6 +56,8 @@ pub struct Daemon {
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
+    /// Reports refusals whose count is due.
+    reporter: tokio::task::JoinHandle<()>,
     /// Beats of the bus threads at the last check, by bus.
     beats: BTreeMap<String, u64>,
 }
@@ -69,8 +76,9 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
         };
+        let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
-            plant: Arc::new(ArcSwap::from_pointee(plant)),
+            plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
             events,
@@ -80,8 +88,10 @@ impl Daemon {
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
             local: ServerSlot::default(),
+            reporter: report_refusals(shared),
             beats: BTreeMap::new(),
         };
+        daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
@@ -146,6 +156,7 @@ impl Daemon {
         self.replace_buses(&settings, prepared);
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
+        self.apply_audit(&settings).await;
         self.settings = settings;
         Ok(())
     }
@@ -255,6 +266,24 @@ impl Daemon {
         }
     }
 
+    /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.
+    async fn apply_audit(&self, settings: &Settings) {
+        let audit = self.writes.audit();
+        let before = audit.file();
+        if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
+            return;
+        }
+        // Its predecessor may have the same path.
+        audit.write_to(None);
+        if let Some(before) = before {
+            within(STOP_AUDIT, "the audit file", before.stop()).await;
+        }
+        match settings.audit.clone().map(AuditFile::start).transpose() {
+            Ok(file) => audit.write_to(file.map(Arc::new)),
+            Err(error) => tracing::error!("cannot start the thread of the audit file: {error}; free memory or threads"),
+        }
+    }
+
     /// Shuts down in order: no new commands of local and Modbus TCP clients, the configured stop commands, the buses,
     /// the last MQTT messages.
     pub async fn stop(mut self) {
@@ -272,8 +301,14 @@ impl Daemon {
             let _ = stopped.await;
         })
         .await;
+        self.reporter.abort();
+        self.writes.audit().record_rest(Instant::now());
         self.mqtt.stop().await;
         self.http.stop().await;
+        let audit = self.writes.audit();
+        if let Some(file) = audit.file() {
+            within(STOP_AUDIT, "the audit file", file.stop()).await;
+        }
     }
 
     /// Stops the drives with `on_shutdown = "stop"`; each bus has the time that this takes on its line.
@@ -306,4 +341,15 @@ impl Daemon {
             );
         }
     }
+}
+
+/// Reports refusals of the plant whose count is due.
+fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
+    tokio::spawn(async move {
+        let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
+        loop {
+            ticks.tick().await;
+            plant.load().report_refusals(Instant::now());
+        }
+    })
 }

@@ -10,6 +10,7 @@
 mod support;
 
 mod gateway {
+    mod audit;
     mod bad_commands;
     mod cli;
     mod commands;

@@ -111,6 +111,7 @@ impl Report {
             bus: self.image.spec.name.clone(),
             drive,
             fault_code,
+            count: None,
             text,
         });
     }

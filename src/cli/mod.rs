@@ -4,12 +4,14 @@
 //! line in `commands!` below.
 
 mod addresses;
+mod audit;
 mod check;
 mod client;
 mod demo;
 mod drive_access;
 mod log;
 mod map;
+mod printable;
 mod profiles;
 mod read;
 mod report;
@@ -77,6 +79,7 @@ commands! {
     Simulate => simulate,
     Profiles => profiles,
     Map => map,
+    Audit => audit,
     Schema => schema,
 }
 

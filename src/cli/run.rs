@@ -37,7 +37,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle) -> ExitCode {
     let daemon = match Daemon::start(settings).await {
         Ok(daemon) => daemon,
         Err(error) => {
-            eprintln!("error: {error}");
+            report::error(&error.to_string());
             return ExitCode::from(EXIT_FAILED);
         }
     };
@@ -51,7 +51,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle) -> ExitCode {
             ExitCode::SUCCESS
         }
         Err(error) => {
-            eprintln!("error: {error}");
+            report::error(&error.to_string());
             ExitCode::from(EXIT_FAILED)
         }
     }

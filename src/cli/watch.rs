@@ -8,7 +8,7 @@ use serde_json::Value;
 use tokio::signal::unix::{SignalKind, signal};
 
 use super::client::{Url, get_json};
-use super::{EXIT_FAILED, report};
+use super::{EXIT_FAILED, printable, report};
 
 /// Refresh interval.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -61,7 +61,7 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
         };
         let mut stdout = io::stdout().lock();
         // Redraws from the top, clearing the rest of each line and of the screen.
-        let text = text.replace('\n', "\x1b[K\r\n");
+        let text = printable::lines(&text).replace('\n', "\x1b[K\r\n");
         if write!(stdout, "\x1b[H{text}\x1b[J")
             .and_then(|()| stdout.flush())
             .is_err()

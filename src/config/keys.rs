@@ -130,6 +130,8 @@ keys! {
         mqtt: Present = Own { schema: Mqtt::schema, range: "[mqtt]" }, or "not started";
         /// HTTP server for metrics, health and the status page; not started without this section.
         http: Present = Own { schema: Http::schema, range: "[http]" }, or "not started";
+        /// File of all commands; not written without this section.
+        audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What is logged.
         log: Present = Own { schema: Log::schema, range: "[log]" }, or "the defaults";
     }
@@ -142,6 +144,8 @@ keys! {
         /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
+        /// Directory of what the gateway keeps.
+        state_dir: PathBuf = PATH, default "/var/lib/drivegate";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
         profile_dirs: Vec<PathBuf> = List { parse: values::path, empty: None, range: "directories" }, or "none";
@@ -378,6 +382,16 @@ keys! {
         listen: SocketAddr = Parsed {
             parse: values::socket, words: &[], pattern: "", range: "an address with a port",
         }, default "127.0.0.1:9488";
+    }
+
+    /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).
+    AUDIT: AuditTable {
+        /// The file; a relative path is relative to `state_dir` of `[gateway]`.
+        file: PathBuf = PATH, default "audit.jsonl";
+        /// Size of the file and the seven older ones beside it; the oldest is removed.
+        max_bytes: u64 = Parsed {
+            parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
+        }, default "64MiB";
     }
 
     /// What is logged.

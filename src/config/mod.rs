@@ -27,6 +27,7 @@ use std::time::Duration;
 
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
+use crate::command::AuditFileOptions;
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::north::local::SocketPath;
@@ -60,6 +61,8 @@ pub struct Settings {
     pub mqtt: Option<mqtt_client::Options>,
     /// Absent: not started.
     pub http: Option<http::Options>,
+    /// File of all commands; absent: not written.
+    pub audit: Option<AuditFileOptions>,
     /// What is logged.
     pub log: LogSettings,
 }
@@ -164,13 +167,16 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
 
 fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
     let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
-    let (name, socket, profile_dirs, profiles) = match gateway {
-        Some(gateway) => {
-            profile_errors.extend(gateway.errors);
-            (gateway.name, gateway.socket, gateway.profile_dirs, gateway.profiles)
-        }
-        None => (None, SocketPath::Default, Vec::new(), Profiles::built_in()),
-    };
+    let mut gateway = gateway.unwrap_or_default();
+    profile_errors.append(&mut gateway.errors);
+    let Gateway {
+        name,
+        socket,
+        state_dir,
+        profile_dirs,
+        profiles,
+        ..
+    } = gateway;
     let broken = !profile_errors.is_empty();
     let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
@@ -190,6 +196,10 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .map(|table| mqtt::read(&table, base, name.as_deref()));
     let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
     let http_listener = http_listener.flatten();
+    let audit = ROOT
+        .audit
+        .table(reader)
+        .map(|table| log::read_audit(&table, &state_dir));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
@@ -215,6 +225,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http)?,
+        audit,
         log: log?,
     })
 }
@@ -262,9 +273,23 @@ fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
 struct Gateway {
     name: Option<String>,
     socket: SocketPath,
+    state_dir: PathBuf,
     profile_dirs: Vec<PathBuf>,
     profiles: Profiles,
     errors: Vec<Problem>,
+}
+
+impl Default for Gateway {
+    fn default() -> Gateway {
+        Gateway {
+            name: None,
+            socket: SocketPath::Default,
+            state_dir: PathBuf::new(),
+            profile_dirs: Vec::new(),
+            profiles: Profiles::built_in(),
+            errors: Vec::new(),
+        }
+    }
 }
 
 fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
@@ -274,6 +299,7 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
         Some(path) => SocketPath::At(values::resolved(base, path)),
     };
+    let state_dir = values::resolved(base, GATEWAY.state_dir.get(reader));
     let mut profiles = Profiles::built_in();
     let mut errors = Vec::new();
     let dirs = GATEWAY.profile_dirs.get(reader);
@@ -292,6 +318,7 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     Gateway {
         name,
         socket,
+        state_dir,
         profile_dirs,
         profiles,
         errors,

@@ -39,6 +39,7 @@ roles = { operator = "control" }
 publish = {}
 buffer = {}
 [http]
+[audit]
 [log]
 "#;
 

@@ -16,6 +16,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.publish]", "Publish"),
         ("[mqtt.buffer]", "Buffer"),
         ("[http]", "Http"),
+        ("[audit]", "AuditTable"),
         ("[log]", "Log"),
     ];
     let mut page = page.to_string();

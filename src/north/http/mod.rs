@@ -4,6 +4,7 @@
 //! The cancellation ends everything, including open event streams.
 
 mod api;
+mod offline;
 mod page;
 mod routes;
 mod streams;
@@ -27,6 +28,8 @@ use super::listener::{AcceptLoop, ConnectionHandler, bind};
 use super::log_throttle::LogThrottle;
 use super::{NorthStats, ServerError};
 use crate::plant::{DriveHandle, SharedPlant};
+
+pub use self::offline::Offline;
 
 /// Maximum number of open connections; further clients get 503.
 pub const MAX_CONNECTIONS: usize = 128;

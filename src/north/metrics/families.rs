@@ -250,6 +250,18 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
         "Time from the acceptance of a command to its answer.",
         SeriesValue::Histogram(plant.writes.seconds()),
     ));
+    let mut lost = Family::new(
+        Kind::Counter,
+        "drivegate_audit_lost_total",
+        "Records that the audit file lacks because the disk did not take them.",
+    );
+    if let Some(file) = plant.writes.audit().file() {
+        let (sent, not_sent) = file.lost();
+        for (kind, count) in [("sent", sent), ("not_sent", not_sent)] {
+            lost.add(vec![("kind", kind.to_string())], SeriesValue::Count(count));
+        }
+    }
+    all.push(lost);
 }
 
 fn north(stats: &NorthStats, all: &mut Vec<Family>) {

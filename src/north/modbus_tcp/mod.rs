@@ -40,6 +40,13 @@ use crate::plant::SharedPlant;
 pub use self::offline::Offline;
 pub use self::tls::{Identity, IdentityFault, Role, Tls, TlsFile};
 
+/// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
+/// accepted.
+pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
+    let certificate = certificate::read(der).ok()?;
+    Some(certificate.role.map_err(|why| why.to_string()))
+}
+
 /// Name in messages.
 const PROTOCOL: &str = "Modbus TCP";
 /// Files that the gateway needs beside those of the connections: ports, queues, other servers and their clients.

@@ -20,7 +20,7 @@ use super::publisher::Publisher;
 use super::request::Incoming;
 use super::store::EventStore;
 use super::{Options, tls};
-use crate::event::Event;
+use crate::event::{Event, EventKind};
 use crate::north::NorthStats;
 use crate::plant::{Plant, SharedPlant};
 
@@ -183,7 +183,9 @@ impl Client {
         let Some((topic, payload)) = payload::event(&self.topics, event) else {
             return;
         };
-        self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
+        let is_refusal = event.kind == EventKind::RefusedCommand;
+        let message = Message::not_retained(topic, payload);
+        self.store.push(message, is_refusal, &mut self.outbox);
     }
 
     fn on_connection_event(&mut self, event: ConnectionEvent) {

@@ -136,6 +136,11 @@ impl Journal {
         Ok(())
     }
 
+    /// Whether half of the room is taken.
+    pub(super) fn is_busy(&self) -> bool {
+        self.bytes() >= self.max_bytes / 2
+    }
+
     fn begin_segment(&mut self) -> io::Result<()> {
         let number = self.next_number;
         let path = self.dir.join(format!("{PREFIX}{number:012}{SUFFIX}"));
@@ -229,7 +234,7 @@ impl Segment {
         let file = OpenOptions::new().read(true).write(true).open(&path)?;
         let bytes = fs::read(&path)?;
         let (mut end, mut waiting) = (0, 0);
-        while let Some(record) = bytes.get(end..).and_then(Record::decode) {
+        for record in records(&bytes) {
             waiting += u64::from(record.waits);
             end += record.length;
         }
@@ -274,6 +279,21 @@ impl Segment {
         }
         Ok(None)
     }
+}
+
+/// The whole records at the beginning of a segment.
+fn records(bytes: &[u8]) -> impl Iterator<Item = Record> {
+    let mut rest = bytes;
+    std::iter::from_fn(move || {
+        let record = Record::decode(rest)?;
+        rest = rest.get(record.length..)?;
+        Some(record)
+    })
+}
+
+/// Number and bytes of the whole records at the beginning of a segment, for the fuzzer.
+pub fn whole_records(segment: &[u8]) -> (usize, usize) {
+    records(segment).fold((0, 0), |(count, bytes), record| (count + 1, bytes + record.length))
 }
 
 struct Record {

@@ -38,6 +38,7 @@ use tokio_util::sync::CancellationToken;
 use super::NorthStats;
 use crate::plant::SharedPlant;
 
+pub use self::journal::whole_records;
 pub use self::offline::{Offline, Published};
 pub use self::request::Incoming;
 pub(super) use self::request::resolve as point_value;

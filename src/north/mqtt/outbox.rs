@@ -135,6 +135,11 @@ impl Outbox {
         self.dropped += push(&mut self.events, self.serial, message, record, full);
     }
 
+    /// Whether half of the room for events is taken.
+    pub(super) fn is_busy(&self) -> bool {
+        self.events.len() >= EVENTS / 2
+    }
+
     /// Number of events that may be loaded from disk now.
     pub(super) fn room(&self) -> usize {
         LOADED.saturating_sub(self.events.len())

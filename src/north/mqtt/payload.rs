@@ -422,6 +422,7 @@ mod tests {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: Some(53),
+            count: None,
             text: "gone".to_string(),
         };
         let (topic, payload) = event(&topics, &object).unwrap();

@@ -21,6 +21,7 @@ pub(super) struct EventStore {
     journal: Option<Journal>,
     /// Whether the last write failed; logged once.
     failing: bool,
+    refusals_dropped: u64,
     synced: Option<Instant>,
 }
 
@@ -60,8 +61,13 @@ impl EventStore {
         }
     }
 
-    /// Stores an event.
-    pub(super) fn push(&mut self, message: Message, outbox: &mut Outbox) {
+    /// Stores an event. Refusals have a part of the room only, so that they push out no other event; those beyond it are
+    /// dropped.
+    pub(super) fn push(&mut self, message: Message, is_refusal: bool, outbox: &mut Outbox) {
+        if is_refusal && self.journal.as_ref().map_or_else(|| outbox.is_busy(), Journal::is_busy) {
+            self.refusals_dropped += 1;
+            return;
+        }
         match self.journal.as_mut().map(|journal| journal.append(&message)) {
             Some(Ok(())) => self.failing = false,
             Some(Err(error)) => {
@@ -118,7 +124,7 @@ impl EventStore {
 
     /// Number of events dropped because the buffer was full or damaged.
     pub(super) fn dropped(&self) -> u64 {
-        self.journal.as_ref().map_or(0, Journal::dropped)
+        self.journal.as_ref().map_or(0, Journal::dropped) + self.refusals_dropped
     }
 }
 

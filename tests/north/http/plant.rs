@@ -147,6 +147,7 @@ pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
         bus: "line1".to_string(),
         drive: Some(drive.to_string()),
         fault_code: (kind == EventKind::Fault).then_some(7),
+        count: None,
         text: text.to_string(),
     }
 }

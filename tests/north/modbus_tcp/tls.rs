@@ -6,7 +6,7 @@ use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::process::{Command, Stdio};
 use std::sync::{Arc, LazyLock};
-use std::time::{Duration, SystemTime};
+use std::time::{Duration, Instant, SystemTime};
 
 use drivegate::command::SourceKind;
 use drivegate::north::ConnectionRefusal;
@@ -211,8 +211,9 @@ async fn roles_decide_who_writes() {
         plant.writes.results().get(&(SourceKind::ModbusTcp, "acknowledged")),
         Some(&2)
     );
+    plant.report_refusals(Instant::now() + Duration::from_secs(1));
     let reported = plant.events.recent();
-    assert_eq!(reported.len(), 6);
+    assert_eq!(reported.iter().filter_map(|event| event.count).sum::<u64>(), 6);
     // The event names the certificate and the address.
     assert!(
         reported[0].text.contains("from modbus_tcp screen at 127.0.0.1:"),

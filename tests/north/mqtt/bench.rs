@@ -447,6 +447,7 @@ impl Gateway {
             bus: "line1".to_string(),
             drive: Some(drive.to_string()),
             fault_code: None,
+            count: None,
             text: text.to_string(),
         });
         time
@@ -492,6 +493,7 @@ impl Gateway {
 async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
     loop {
         let now = Instant::now();
+        plant.load().report_refusals(now);
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
                 let drive = &bus.image.drives[command.drive];

@@ -38,6 +38,7 @@ async fn burst(client: &mut Client, count: usize) {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: None,
+            count: None,
             text: format!("event {n}"),
         });
     }
@@ -76,4 +77,44 @@ async fn lost_events_are_counted() {
     let mut client = client(None).await;
     burst(&mut client, BURST + 10).await;
     assert_eq!((client.outbox.waiting(), client.missed), (BURST, 10));
+}
+
+/// A fault, then refusals, more than there is room for.
+async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) {
+    burst(client, 1).await;
+    for n in 0..refusals {
+        let event = Event {
+            id: 0,
+            time: SystemTime::UNIX_EPOCH,
+            kind: EventKind::RefusedCommand,
+            bus: "line1".to_string(),
+            drive: Some("p1".to_string()),
+            fault_code: None,
+            count: Some(1),
+            text: format!("refused {n}"),
+        };
+        client.on_event(Ok(Arc::new(event)));
+    }
+    assert!(client.dropped() > 0, "not all refusals are kept");
+    client.publish_waiting();
+    let (_, first) = client.outbox.next(1).unwrap();
+    assert!(
+        first.payload.windows(8).any(|w| w == b"event 0\""),
+        "the fault is there"
+    );
+}
+
+#[tokio::test]
+async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
+    let mut in_memory = client(None).await;
+    a_fault_and_a_flood(&mut in_memory, BURST).await;
+    burst(&mut in_memory, BURST / 2).await;
+    let refused = in_memory.dropped();
+    assert_eq!((in_memory.outbox.waiting(), refused), (BURST, BURST as u64 / 2 + 1));
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 64 << 10,
+    };
+    a_fault_and_a_flood(&mut client(Some(buffer)).await, 1000).await;
 }
