@@ -12,6 +12,7 @@ mod log;
 mod map;
 mod profiles;
 mod read;
+mod reload;
 mod report;
 mod run;
 mod scan;
