@@ -1,5 +1,6 @@
 //! The gateway as a whole: start, reload and the order of shutdown.
 
+mod file_limit;
 mod server;
 
 use std::collections::BTreeMap;
@@ -8,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 
-use self::server::{ServerSlot, within};
+use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
@@ -38,9 +39,6 @@ pub enum StartError {
     /// The system does not provide a thread or a file descriptor for the bus of that name.
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
-    /// A server cannot start, and the previous servers cannot be started again.
-    #[error("{0}; the previous servers cannot be restarted: {1}")]
-    NotRestored(Box<ServerError>, Box<ServerError>),
 }
 
 /// A running gateway.
@@ -62,12 +60,15 @@ pub struct Daemon {
     beats: BTreeMap<String, u64>,
 }
 
+type PreparedServers = (Prepared<modbus_tcp::Server>, Prepared<http::Http>);
+
 impl Daemon {
     /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
     ///
     /// # Errors
     /// A server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
+        let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let plant = Plant {
             gateway: settings.gateway.clone(),
@@ -96,7 +97,8 @@ impl Daemon {
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.replace_buses(&settings, prepared);
-        daemon.apply_servers(&settings).await?;
+        let servers = daemon.prepare_servers(&settings).await?;
+        daemon.commit_servers(servers).await;
         daemon.apply_local(&settings).await;
         Ok(daemon)
     }
@@ -108,13 +110,13 @@ impl Daemon {
 
     /// The address that the HTTP server listens on.
     pub fn http_address(&self) -> Option<std::net::SocketAddr> {
-        self.http.server().map(http::Http::address)
+        self.http.server().and_then(http::Http::address)
     }
 
     /// The addresses that the Modbus TCP server listens on without TLS.
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
         let server = self.modbus_tcp.server();
-        server.map(|server| server.addresses().to_vec()).unwrap_or_default()
+        server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }
 
     /// Path of the local socket, if it is open.
@@ -141,18 +143,13 @@ impl Daemon {
     /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// A bus or a server cannot start. Everything runs as before, unless the error says that the previous servers
-    /// cannot be restarted.
+    /// A bus or a server cannot start. Everything runs as before.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
-        let before = self.settings.clone();
+        let settings = file_limit::fit(settings);
         // Everything that can fail comes before anything that runs is stopped for good.
         let prepared = self.prepare_buses(&settings)?;
-        if let Err(error) = self.apply_servers(&settings).await {
-            return Err(match self.apply_servers(&before).await {
-                Ok(()) => error.into(),
-                Err(restart) => StartError::NotRestored(error.into(), restart.into()),
-            });
-        }
+        let servers = self.prepare_servers(&settings).await?;
+        self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared);
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
@@ -237,12 +234,23 @@ impl Daemon {
         .map_err(failed)
     }
 
-    async fn apply_servers(&mut self, settings: &Settings) -> Result<(), ServerError> {
+    /// Prepares the servers that listen on the network: all of them or none.
+    async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let (plant, stats) = (&self.plant, &self.stats);
-        self.modbus_tcp
-            .apply(settings.modbus_tcp.as_ref(), plant, stats)
-            .await?;
-        self.http.apply(settings.http.as_ref(), plant, stats).await
+        let options = settings.modbus_tcp.as_ref();
+        let modbus_tcp = self.modbus_tcp.prepare(options, plant, stats).await?;
+        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
+            Ok(http) => Ok((modbus_tcp, http)),
+            Err(error) => {
+                self.modbus_tcp.abort(modbus_tcp).await;
+                Err(error)
+            }
+        }
+    }
+
+    async fn commit_servers(&mut self, (modbus_tcp, http): PreparedServers) {
+        self.modbus_tcp.commit(modbus_tcp).await;
+        self.http.commit(http).await;
     }
 
     async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {

@@ -14,6 +14,7 @@ mod map;
 mod printable;
 mod profiles;
 mod read;
+mod reload;
 mod report;
 mod run;
 mod scan;

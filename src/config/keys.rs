@@ -261,11 +261,11 @@ keys! {
         allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
         /// Who may write; no one by default. Modbus TCP has no passwords: keep it narrow, or use TLS.
         write: Vec<IpNet> = NETWORKS, default [];
-        /// Concurrent connections, over all listeners. The daemon raises its limit of open files as far as permitted,
-        /// and warns if that is not enough.
+        /// Concurrent connections, over all listeners; an eighth of them only for clients that may write. The daemon
+        /// raises its limit of open files; if the system does not permit enough, it serves fewer connections and warns.
         max_connections: usize = CONNECTIONS, default 64;
-        /// Concurrent connections from one address.
-        max_connections_per_address: usize = CONNECTIONS, or "none";
+        /// Concurrent connections from one address. Clients behind one NAT or proxy share an address.
+        max_connections_per_address: usize = CONNECTIONS, default 16;
         /// A connection without a request for this time is closed. A peer that disappeared is detected by TCP keepalive
         /// after 90 s in any case.
         idle_timeout: Option<Duration> = Parsed {

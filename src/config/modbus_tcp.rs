@@ -67,7 +67,10 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
             .as_ref()
             .is_some_and(|tls| tls.roles.values().any(|role| *role == Role::Control));
     let max_connections = MODBUS_TCP.max_connections.get(reader);
-    let max_connections_per_address = MODBUS_TCP.max_connections_per_address.read(reader);
+    let max_connections_per_address = MODBUS_TCP.max_connections_per_address.get(reader);
+    let tls_allow = tls.iter().flat_map(|tls| &tls.allow);
+    let allowed: Vec<&IpNet> = found.listeners.iter().flat_map(|l| &l.allow).chain(tls_allow).collect();
+    warn_of_shares(reader, &allowed, max_connections, max_connections_per_address);
     let idle_timeout = MODBUS_TCP.idle_timeout.get(reader);
     let uncached = MODBUS_TCP.uncached.get(reader);
     let stale_after = MODBUS_TCP.stale_after.get(reader);
@@ -265,6 +268,61 @@ fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
         );
     }
     roles
+}
+
+/// Networks whose addresses are those of hosts on the same site, not of a NAT in between.
+const PRIVATE: [&str; 8] = [
+    "10.0.0.0/8",
+    "172.16.0.0/12",
+    "192.168.0.0/16",
+    "169.254.0.0/16",
+    "127.0.0.0/8",
+    "::1/128",
+    "fc00::/7",
+    "fe80::/10",
+];
+
+/// Warns where the share of one address is probably too small: fewer connections are possible than are asked for, or
+/// clients come through a NAT and share an address.
+fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_address: usize) {
+    let hosts = |network: &IpNet| match network.network().is_loopback() {
+        true => 1,
+        false => 1_usize
+            .checked_shl(u32::from(network.max_prefix_len() - network.prefix_len()))
+            .unwrap_or(usize::MAX),
+    };
+    let hosts = allowed
+        .iter()
+        .map(|network| hosts(network))
+        .fold(0, usize::saturating_add);
+    let possible = hosts.saturating_mul(per_address);
+    if reader.has(MODBUS_TCP.max_connections.name) && hosts > 0 && possible < total {
+        reader.warning(
+            MODBUS_TCP.max_connections.name,
+            format!(
+                "at most {possible} connections are possible, {per_address} for each address in `allow`; clients behind \
+                 one NAT or proxy share an address"
+            ),
+            "raise max_connections_per_address, or lower max_connections",
+        );
+    }
+    let is_private = |network: &IpNet| {
+        let mut private = PRIVATE.iter().filter_map(|text| text.parse::<IpNet>().ok());
+        private.any(|private| private.contains(network))
+    };
+    let public = allowed
+        .iter()
+        .find(|network| !is_private(network) && network.prefix_len() < network.max_prefix_len());
+    if let (Some(public), false) = (public, reader.has(MODBUS_TCP.max_connections_per_address.name)) {
+        reader.warning(
+            MODBUS_TCP.allow.name,
+            format!(
+                "clients in {public} can come through a NAT or proxy; those behind one share its address and the \
+                 {per_address} connections that one address may have"
+            ),
+            "write max_connections_per_address, as many as the clients behind one address need",
+        );
+    }
 }
 
 /// Warns of who can reach a listener and who cannot, where that is probably a mistake.

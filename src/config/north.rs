@@ -13,7 +13,10 @@ pub(super) fn read_http(reader: &Reader<'_>) -> (Option<http::Options>, Option<L
     let listen = HTTP.listen.read(reader);
     reader.finish();
     (
-        listen.map(|listen| http::Options { listen }),
+        listen.map(|listen| http::Options {
+            listen,
+            max_connections: http::MAX_CONNECTIONS,
+        }),
         listen.map(|listen| (listen, HTTP.listen.place(reader))),
     )
 }

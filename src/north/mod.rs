@@ -10,13 +10,14 @@ pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 mod pem;
+mod refusals;
 pub(crate) mod register_map;
 mod stats;
 
 use std::io;
 use std::net::SocketAddr;
 
-pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
+pub use stats::{ConnectionRefusal, LostListeners, ModbusTcpStats, MqttStats, NorthStats, RefusalStats, ServerKind};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

@@ -83,7 +83,7 @@ impl Servers {
             listeners: Vec::new(),
             tls: None,
             max_connections: 64,
-            max_connections_per_address: None,
+            max_connections_per_address: 64,
             idle_timeout: None,
             uncached: Uncached::Forward,
         };

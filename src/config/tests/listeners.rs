@@ -199,11 +199,10 @@ fn new_certificates_in_the_same_files_are_seen() {
         settings(&source).modbus_tcp.unwrap()
     };
     let (one, two) = (renewed(), renewed());
-    assert!(two.differs_in_certificates_only(&one));
-    assert!(!one.differs_in_certificates_only(&one.clone()));
-    let mut other = two.clone();
-    other.max_connections += 1;
-    assert!(!other.differs_in_certificates_only(&one));
+    assert_ne!(one, two);
+    let mut with_old_certificates = two.clone();
+    with_old_certificates.tls = one.tls.clone();
+    assert_eq!(with_old_certificates, one, "nothing else differs");
     let debug = format!("{one:?}");
     let key = std::fs::read_to_string(dir.path().join("gateway.key")).unwrap();
     assert!(
@@ -217,4 +216,44 @@ fn new_certificates_in_the_same_files_are_seen() {
         "{:?}",
         loaded.warnings
     );
+}
+
+#[test]
+fn shares_that_are_probably_too_small() {
+    let warnings = |modbus_tcp: &str| {
+        let (loaded, _) = load(&format!("[gateway]\nname = \"g\"\n[modbus_tcp]\n{modbus_tcp}\n"));
+        let shares = loaded.warnings.iter().map(|warning| warning.finding.what.clone());
+        shares.filter(|what| what.contains("share")).collect::<Vec<_>>()
+    };
+    for quiet in [
+        "",
+        "allow = [\"10.0.0.5\"]",
+        "allow = [\"192.168.0.0/16\", \"fd00::/8\"]\nmax_connections = 1000",
+        "allow = [\"10.0.0.5\", \"10.0.0.6\"]\nmax_connections = 32",
+        "allow = [\"203.0.113.7\"]\nmax_connections = 16",
+        "allow = [\"0.0.0.0/0\"]\nmax_connections_per_address = 64",
+    ] {
+        assert_eq!(warnings(quiet), Vec::<String>::new(), "{quiet}");
+    }
+    for (modbus_tcp, wanted) in [
+        (
+            "max_connections = 100",
+            "at most 32 connections are possible, 16 for each address in `allow`",
+        ),
+        (
+            "allow = [\"10.0.0.5\"]\nmax_connections = 17",
+            "at most 16 connections are possible",
+        ),
+        (
+            "allow = [\"10.0.0.0/8\", \"0.0.0.0/0\"]",
+            "clients in 0.0.0.0/0 can come through a NAT",
+        ),
+        (
+            "allow = [\"2001:db8::/32\"]",
+            "share its address and the 16 connections",
+        ),
+    ] {
+        let found = warnings(modbus_tcp);
+        assert!(found.len() == 1 && found[0].contains(wanted), "{modbus_tcp}: {found:?}");
+    }
 }

@@ -1,6 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -12,10 +13,11 @@ use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, response};
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::{MAX_LISTENERS, api, page, streams};
+use super::{MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Scope, api, page, streams};
+use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
 
@@ -25,8 +27,25 @@ pub(super) struct AppState {
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthStats>,
     pub(super) cancel: CancellationToken,
-    /// Permits for event streams.
-    pub(super) listeners: Arc<Semaphore>,
+    /// Open event streams.
+    pub(super) listeners: Arc<ConnectionLimit>,
+    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
+    /// and `/healthz` does not wait for it.
+    rendering: Semaphore,
+}
+
+impl AppState {
+    /// A turn to render a large reply.
+    async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.rendering.acquire().await.ok()
+    }
+}
+
+/// Who asks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Client {
+    pub(super) address: IpAddr,
+    pub(super) scope: Scope,
 }
 
 /// All routes.
@@ -35,7 +54,8 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         plant,
         stats,
         cancel,
-        listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
+        listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
+        rendering: Semaphore::new(1),
     });
     Router::new()
         .route("/", get(status_page))
@@ -64,7 +84,12 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
 
 /// Refuses all methods that could change something and sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
-    let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
+    let scope = request.extensions().get::<Client>().map(|client| client.scope);
+    let is_health = ["/healthz", "/readyz"].contains(&request.uri().path());
+    let mut response = if scope == Some(Scope::Health) && !is_health {
+        let text = "too many connections are open; close some and try again\n";
+        (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
+    } else if matches!(*request.method(), Method::GET | Method::HEAD) {
         next.run(request).await
     } else {
         let text = "this interface is read only: use GET or HEAD\n";
@@ -83,6 +108,7 @@ async fn guard(request: Request, next: Next) -> Response {
 }
 
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
+    let _turn = app.turn().await;
     let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
     (policy, Html(page::render(&app.plant.load(), Instant::now())))
 }
@@ -92,6 +118,7 @@ async fn asset(content_type: &'static str, body: &'static str) -> impl IntoRespo
 }
 
 async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let _turn = app.turn().await;
     let accept: Vec<&str> = headers
         .get_all(header::ACCEPT)
         .iter()
@@ -111,7 +138,8 @@ async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Res
 }
 
 async fn ready(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = unready(&app.plant.load());
+    let mut reasons = unready(&app.plant.load());
+    reasons.extend(app.stats.lost_listeners.reasons());
     if reasons.is_empty() {
         return "ready\n".into_response();
     }
@@ -145,6 +173,7 @@ fn unready(plant: &Plant) -> Vec<String> {
 }
 
 async fn drives(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
@@ -174,6 +203,7 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
 
 /// The last commands, newest last.
 async fn audit(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
     let records = app.plant.load().writes.audit().recent();
     Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }

@@ -7,7 +7,7 @@ use std::time::Instant;
 use super::model::MODEL;
 use super::process;
 use crate::drive::{PollClass, State};
-use crate::north::NorthStats;
+use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
 
@@ -283,11 +283,17 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(requests);
     let mut refused = Family::new(
         Kind::Counter,
-        "drivegate_modbus_tcp_refused_total",
-        "Modbus TCP clients refused, by reason.",
+        "drivegate_connections_refused_total",
+        "Connections refused, or closed in favour of others, by server and reason.",
     );
-    for (reason, count) in stats.modbus_tcp.refused_connections().filter(|(_, count)| *count > 0) {
-        refused.add(vec![("reason", reason.name().to_string())], SeriesValue::Count(count));
+    for server in ServerKind::ALL {
+        for (reason, count) in stats.refused.of(server).filter(|(_, count)| *count > 0) {
+            let labels = vec![
+                ("server", server.name().to_string()),
+                ("reason", reason.name().to_string()),
+            ];
+            refused.add(labels, SeriesValue::Count(count));
+        }
     }
     all.push(refused);
     let mqtt = &stats.mqtt;

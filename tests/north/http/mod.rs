@@ -3,6 +3,7 @@
 
 mod client;
 mod interface;
+mod limits;
 mod metrics;
 mod page;
 mod plant;

@@ -14,7 +14,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
-use drivegate::north::http::{self, Http, Options};
+use drivegate::north::http::{self, Http, MAX_CONNECTIONS, Options};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, Link, Outcome, PollCycle};
 use tokio_util::sync::CancellationToken;
@@ -207,9 +207,18 @@ pub(crate) fn stats() -> Arc<NorthStats> {
     Arc::new(stats)
 }
 
+/// The server at this address.
+pub(crate) fn options(listen: SocketAddr) -> Options {
+    Options {
+        listen,
+        max_connections: MAX_CONNECTIONS,
+    }
+}
+
 /// A served plant.
 pub(crate) struct Server {
     pub(crate) shared: SharedPlant,
+    pub(crate) stats: Arc<NorthStats>,
     pub(crate) cancel: CancellationToken,
     pub(crate) address: SocketAddr,
     pub(crate) http: Http,
@@ -217,16 +226,27 @@ pub(crate) struct Server {
 
 impl Server {
     pub(crate) async fn of(plant: Plant) -> Server {
+        Server::with(plant, MAX_CONNECTIONS).await
+    }
+
+    /// One with fewer connections.
+    pub(crate) async fn with(plant: Plant, max_connections: usize) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let http = http::start(Options { listen }, shared.clone(), stats(), cancel.clone())
+        let stats = stats();
+        let options = Options {
+            max_connections,
+            ..options(listen)
+        };
+        let http = http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");
         Server {
             shared,
+            stats,
             cancel,
-            address: http.address(),
+            address: http.address().expect("an address"),
             http,
         }
     }

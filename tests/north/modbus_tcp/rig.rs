@@ -172,7 +172,7 @@ pub(crate) fn options() -> Options {
         listeners: vec![listener()],
         tls: None,
         max_connections: 64,
-        max_connections_per_address: None,
+        max_connections_per_address: 1000,
         idle_timeout: None,
         uncached: Uncached::Forward,
     }
