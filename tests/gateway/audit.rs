@@ -128,8 +128,7 @@ fn a_client_that_may_not_write_destroys_nothing() {
     let hash = gateway
         .output()
         .lines()
-        .filter(|line| line.contains("last line of the audit file"))
-        .last()
+        .rfind(|line| line.contains("last line of the audit file"))
         .map(|line| {
             let line: Value = serde_json::from_str(line).unwrap();
             line["hash"].as_str().unwrap().to_string()
