@@ -16,7 +16,7 @@ mod stats;
 use std::io;
 use std::net::SocketAddr;
 
-pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
+pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttLoss, MqttStats, NorthStats};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

@@ -1,6 +1,6 @@
 use arc_swap::ArcSwap;
 
-use super::super::{Buffer, fixture};
+use super::super::{Buffer, Qos, Telemetry, fixture};
 use super::*;
 use crate::event::{BURST, EventKind};
 
@@ -15,9 +15,19 @@ fn options(buffer: Option<Buffer>) -> Options {
         ca: None,
         identity: None,
         base: "drivegate".to_string(),
+        telemetry: Telemetry {
+            state: true,
+            points: true,
+            history: History::Off,
+        },
+        telemetry_qos: Qos::AtMostOnce,
+        event_qos: Qos::AtLeastOnce,
+        expiry: None,
         min_interval: Duration::from_millis(100),
         max_interval: Duration::from_secs(60),
         commands: true,
+        require_id: false,
+        response_topics: Vec::new(),
         buffer,
     }
 }
@@ -25,7 +35,7 @@ fn options(buffer: Option<Buffer>) -> Options {
 async fn client(buffer: Option<Buffer>) -> Client {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    Client::new(options(buffer), plant, Arc::default(), events).await
+    Client::new(options(buffer), plant, Arc::default(), events)
 }
 
 /// Raises events while the client is busy, then lets it receive them.
@@ -49,12 +59,12 @@ async fn burst(client: &mut Client, count: usize) {
 async fn a_busy_client_loses_no_event_of_a_burst() {
     let mut client = client(None).await;
     burst(&mut client, 1000).await;
-    assert_eq!((client.outbox.waiting(), client.missed, client.dropped()), (1000, 0, 0));
-    let (_, first) = client.outbox.next(1).unwrap();
+    assert_eq!((client.outbox.waiting(), client.missed, client.outbox.take_lost().events), (1000, 0, 0));
+    let (_, first) = client.outbox.next(1, true).unwrap();
     assert!(first.payload.windows(8).any(|w| w == b"event 0\""));
     burst(&mut client, BURST - 1000).await;
     assert_eq!(
-        (client.outbox.waiting(), client.missed, client.dropped()),
+        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
         (BURST, 0, 0)
     );
 }
