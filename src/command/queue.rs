@@ -147,7 +147,12 @@ impl Pending {
 
     /// The youngest of those with the most of one kind, if they are more than the `own` ones would be with one more.
     fn youngest_of_most<'p, K: PartialEq>(&'p self, kind: impl Fn(&'p Command) -> Option<K>, own: K) -> Option<usize> {
-        let others = || self.waiting.iter().enumerate().filter(|(_, c)| c.urgency != Urgency::Stop);
+        let others = || {
+            self.waiting
+                .iter()
+                .enumerate()
+                .filter(|(_, c)| c.urgency != Urgency::Stop)
+        };
         let held = |wanted: &K| others().filter(|(_, c)| kind(c).as_ref() == Some(wanted)).count();
         let counted = others().filter_map(|(index, c)| Some((held(&kind(c)?), index)));
         let (most, index) = counted.max()?;

@@ -270,7 +270,10 @@ fn read_response_topics(reader: &Reader<'_>, base: Option<&str>, gateway: Option
     let filters = MQTT.response_topics.get(reader);
     if let (Some(base), Some(gateway)) = (base, gateway) {
         let own = format!("{base}/{gateway}");
-        for filter in filters.iter().filter(|f| **f == own || f.starts_with(&format!("{own}/"))) {
+        for filter in filters
+            .iter()
+            .filter(|f| **f == own || f.starts_with(&format!("{own}/")))
+        {
             reader.problem(
                 MQTT.response_topics.name,
                 format!("`{filter}` is below the gateway's own topics"),

@@ -287,7 +287,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(Family::of(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages that the MQTT broker acknowledged.",
+        "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
         SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(

@@ -230,7 +230,11 @@ impl Client {
     /// Gives a message to the store, and to the outbox if its turn has come.
     fn keep(&mut self, kind: Kind, message: Message) {
         let room = self.outbox.room(kind) > 0;
-        let store = if kind == Kind::Event { &mut self.store } else { &mut self.history };
+        let store = if kind == Kind::Event {
+            &mut self.store
+        } else {
+            &mut self.history
+        };
         if let Some((number, message)) = store.push(message, room) {
             self.outbox.push(kind, message, number);
         }
@@ -238,7 +242,11 @@ impl Client {
 
     fn on_loaded(&mut self, kind: Kind, loaded: Loaded) {
         let opened = matches!(loaded, Loaded::Opened { .. });
-        let store = if kind == Kind::Event { &mut self.store } else { &mut self.history };
+        let store = if kind == Kind::Event {
+            &mut self.store
+        } else {
+            &mut self.history
+        };
         let (messages, topics) = store.take(loaded);
         for (number, message) in messages {
             self.outbox.push(kind, message, Some(number));
@@ -359,7 +367,11 @@ impl Client {
         if !limits.acknowledges || !limits.retains {
             tracing::warn!(
                 "the broker lacks {}: messages may be lost, or are not there for later subscribers",
-                if limits.acknowledges { "retained messages" } else { "QoS 1" }
+                if limits.acknowledges {
+                    "retained messages"
+                } else {
+                    "QoS 1"
+                }
             );
         }
         self.outages.end();
@@ -414,7 +426,9 @@ impl Client {
         let plant = self.plant.load();
         let crowded = |topic: &str| self.outbox.is_crowded(topic);
         if self.options.commands
-            && let Some(result) = self.commands.take(message, &plant, crowded, Instant::now(), SystemTime::now())
+            && let Some(result) = self
+                .commands
+                .take(message, &plant, crowded, Instant::now(), SystemTime::now())
         {
             self.outbox.push_result(result);
         }
@@ -545,7 +559,7 @@ impl Client {
 
     fn publish(&mut self, limits: BrokerLimits) {
         let now = Instant::now();
-        while let BrokerLink::Open(BrokerSession { connection, .. }) = &self.link
+        while let BrokerLink::Open(BrokerSession { connection, .. }) = &mut self.link
             && let Some((key, message)) = self.outbox.next(limits.window, now >= self.history_at)
         {
             if connection::packet_size(&message) > limits.max_packet {

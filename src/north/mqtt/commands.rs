@@ -109,7 +109,9 @@ impl Commands {
         let result = self.topics.drive(target.drive, "result");
         let reply = Reply::to(&incoming, result, target.drive, &self.rules.responses);
         let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
-        let who = who.as_deref().map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
         let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
         let what = || excerpt(&incoming.payload);
         let Some(drive) = plant.drive(target.drive) else {
@@ -120,7 +122,8 @@ impl Commands {
         };
         let profile = &drive.image.spec.profile;
         let request = request::read(&incoming, target.point, profile);
-        let refuse = |refusal, id, origin| Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), None, time));
+        let refuse =
+            |refusal, id, origin| Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), None, time));
         let (points, expiry) = match request.order {
             Err(refusal) => return refuse(refusal, request.id, origin),
             Ok(order) => order,

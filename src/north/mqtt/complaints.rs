@@ -20,7 +20,10 @@ pub(super) struct Complaints {
 impl Complaints {
     /// `None` if nothing is logged now, otherwise what to add about those left out.
     pub(super) fn permit(&mut self, now: Instant) -> Option<String> {
-        if self.last.is_some_and(|last| now.saturating_duration_since(last) < REFUSED) {
+        if self
+            .last
+            .is_some_and(|last| now.saturating_duration_since(last) < REFUSED)
+        {
             self.omitted += 1;
             return None;
         }
@@ -76,7 +79,10 @@ mod tests {
         assert!(outages.permit(&why(1), now));
         for second in 1..3600 {
             assert!(!outages.permit(&why(second), now + Duration::from_secs(second)));
-            assert_eq!(outages.permit("refused", now + Duration::from_secs(second)), second == 1);
+            assert_eq!(
+                outages.permit("refused", now + Duration::from_secs(second)),
+                second == 1
+            );
         }
         assert!(outages.permit(&why(2), now + SAME_REASON));
         outages.end();

@@ -4,6 +4,7 @@
 //! (messages in flight). The polling task never publishes, and publishing never waits: what finds no room stays in the
 //! outbox until [`ConnectionEvent::Room`].
 
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
@@ -80,6 +81,8 @@ pub(super) struct BrokerLimits {
     pub(super) acknowledges: bool,
     /// Whether it keeps retained messages.
     pub(super) retains: bool,
+    /// Number of topic aliases.
+    aliases: u16,
 }
 
 impl BrokerLimits {
@@ -92,6 +95,7 @@ impl BrokerLimits {
             max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
             acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
             retains: properties.and_then(|p| p.retain_available) != Some(0),
+            aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
         }
     }
 }
@@ -102,7 +106,41 @@ pub(super) struct Connection {
     client: AsyncClient,
     event: mpsc::Receiver<ConnectionEvent>,
     backlog: Arc<Backlog>,
+    aliases: Aliases,
     task: JoinHandle<()>,
+}
+
+/// Short names of topics, for telemetry that is published again and again: a topic gets one when it is published for the
+/// second time, as long as the broker has any.
+#[derive(Debug, Default)]
+struct Aliases {
+    /// With whether the broker knows it.
+    named: HashMap<Arc<str>, (u16, bool)>,
+    once: HashSet<Arc<str>>,
+}
+
+impl Aliases {
+    fn of(&mut self, topic: &Arc<str>, granted: u16) -> Option<(u16, bool)> {
+        if let Some(alias) = self.named.get(topic) {
+            return Some(*alias);
+        }
+        let next = u16::try_from(self.named.len() + 1).ok().filter(|next| *next <= granted);
+        let Some(next) = next else {
+            self.once = HashSet::new();
+            return None;
+        };
+        if self.once.insert(topic.clone()) {
+            return None;
+        }
+        self.named.insert(topic.clone(), (next, false));
+        Some((next, false))
+    }
+
+    fn announced(&mut self, topic: &str) {
+        if let Some((_, known)) = self.named.get_mut(topic) {
+            *known = true;
+        }
+    }
 }
 
 /// Messages that rumqttc has not written yet.
@@ -132,6 +170,7 @@ impl Connection {
             client,
             event,
             backlog,
+            aliases: Aliases::default(),
             task,
         }
     }
@@ -168,8 +207,13 @@ impl Connection {
     }
 
     /// Publishes a message; false if there is no room until [`ConnectionEvent::Room`].
-    pub(super) fn publish(&self, message: Message, limits: BrokerLimits) -> bool {
+    pub(super) fn publish(&mut self, message: Message, limits: BrokerLimits) -> bool {
+        let telemetry = message.retain && !message.payload.is_empty();
+        let alias = telemetry
+            .then(|| self.aliases.of(&message.topic, limits.aliases))
+            .flatten();
         let properties = PublishProperties {
+            topic_alias: alias.map(|(alias, _)| alias),
             correlation_data: message.correlation.map(Into::into),
             message_expiry_interval: message.expiry,
             ..PublishProperties::default()
@@ -179,13 +223,15 @@ impl Connection {
             false => QoS::AtMostOnce,
         };
         let retain = message.retain && limits.retains;
-        let (topic, payload) = (message.topic.as_ref(), message.payload);
+        let known = alias.is_some_and(|(_, known)| known);
+        let topic = if known { "" } else { message.topic.as_ref() };
         // Before the attempt: the event for the last message may come right after it.
         self.backlog.room_wanted.store(true, Ordering::SeqCst);
         let attempt = self
             .client
-            .try_publish_with_properties(topic, qos, retain, payload, properties);
+            .try_publish_with_properties(topic, qos, retain, message.payload, properties);
         if attempt.is_ok() {
+            self.aliases.announced(&message.topic);
             self.backlog.room_wanted.store(false, Ordering::SeqCst);
             self.backlog.messages.fetch_add(1, Ordering::SeqCst);
         }
@@ -216,7 +262,6 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
         .set_clean_start(true)
         .set_connect_timeout(CONNECT_TIMEOUT)
         .set_max_request_batch(BATCH)
-        .set_auto_topic_aliases(true)
         .set_outgoing_inflight_upper_limit(INFLIGHT)
         .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
     if let Some(user) = &options.username {

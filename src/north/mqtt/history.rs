@@ -55,7 +55,10 @@ impl Recorder {
             return None;
         }
         let since = self.last.as_ref().map(|(_, at)| now.saturating_duration_since(*at));
-        if let Some(early) = since.and_then(|since| min.checked_sub(since)).filter(|early| !early.is_zero()) {
+        if let Some(early) = since
+            .and_then(|since| min.checked_sub(since))
+            .filter(|early| !early.is_zero())
+        {
             return Some(early);
         }
         if let Some(entry) = render(&shown) {

@@ -125,7 +125,11 @@ impl Journal {
         }
         journal.marked = journal.acknowledged;
         // What is missing before the first message was lost or acknowledged in an earlier run.
-        let first = journal.segments.iter().find_map(|s| s.numbers).map_or(1, |(first, _)| first);
+        let first = journal
+            .segments
+            .iter()
+            .find_map(|s| s.numbers)
+            .map_or(1, |(first, _)| first);
         journal.passed = journal.acknowledged.max(first - 1).min(journal.last);
         journal.remove_acknowledged()?;
         Ok(journal)
@@ -152,7 +156,10 @@ impl Journal {
             self.lost += 1;
             file.set_len(end)?;
         }
-        self.last = self.last.max(numbers.map_or(0, |(_, last)| last)).max(self.acknowledged);
+        self.last = self
+            .last
+            .max(numbers.map_or(0, |(_, last)| last))
+            .max(self.acknowledged);
         self.segments.push_back(Segment {
             number,
             path,

@@ -259,7 +259,9 @@ impl Outbox {
 
     /// Whether so many results wait on that topic that commands answered there are refused.
     pub(super) fn is_crowded(&self, topic: &str) -> bool {
-        self.results_of.get(topic).is_some_and(|count| *count >= RESULTS_OF_TOPIC)
+        self.results_of
+            .get(topic)
+            .is_some_and(|count| *count >= RESULTS_OF_TOPIC)
     }
 
     /// Number of messages of that kind that may be loaded from disk now.

@@ -231,7 +231,10 @@ impl Publisher {
 
     /// What was recorded and not returned yet.
     pub(super) fn recorded(&mut self) -> Vec<Update> {
-        self.drives.iter_mut().filter_map(|drive| drive.recorder.take()).collect()
+        self.drives
+            .iter_mut()
+            .filter_map(|drive| drive.recorder.take())
+            .collect()
     }
 
     /// Looks at the drives that are due, a few in one call; whether none is left.

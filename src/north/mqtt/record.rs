@@ -38,7 +38,12 @@ pub(super) fn length(message: &Message) -> u64 {
 pub(super) fn message(number: u64, message: &Message, bytes: &mut Vec<u8>) {
     let topic = message.topic.as_bytes();
     let length = u16::try_from(topic.len()).unwrap_or(u16::MAX);
-    encode(MESSAGE, number, &[&length.to_le_bytes(), topic, &message.payload], bytes);
+    encode(
+        MESSAGE,
+        number,
+        &[&length.to_le_bytes(), topic, &message.payload],
+        bytes,
+    );
 }
 
 /// The record of an acknowledgement.
@@ -137,7 +142,11 @@ mod tests {
     fn three() -> Vec<u8> {
         let mut bytes = Vec::new();
         for number in 1..=3 {
-            message(number, &Message::not_retained("a/b", vec![number as u8; 40]), &mut bytes);
+            message(
+                number,
+                &Message::not_retained("a/b", vec![number as u8; 40]),
+                &mut bytes,
+            );
         }
         bytes.extend(mark(2));
         bytes
@@ -160,7 +169,10 @@ mod tests {
             first.entry,
             Entry::Message(1, Message::not_retained("a/b", vec![1; 40]))
         );
-        assert_eq!(first.range.len() as u64, length(&Message::not_retained("a/b", vec![1; 40])));
+        assert_eq!(
+            first.range.len() as u64,
+            length(&Message::not_retained("a/b", vec![1; 40]))
+        );
     }
 
     #[test]
@@ -179,7 +191,13 @@ mod tests {
     #[test]
     fn whatever_precedes_or_follows_records_are_found() {
         let whole = three();
-        for junk in [vec![], vec![0; 4096], b"X".repeat(100), MARK.to_vec(), whole[..30].to_vec()] {
+        for junk in [
+            vec![],
+            vec![0; 4096],
+            b"X".repeat(100),
+            MARK.to_vec(),
+            whole[..30].to_vec(),
+        ] {
             let bytes = [&junk[..], &whole, &junk].concat();
             assert_eq!(numbers(&bytes), [1, 2, 3, 102]);
         }

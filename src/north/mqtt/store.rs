@@ -250,7 +250,10 @@ impl Thread {
         };
         let waiting = journal.waiting();
         if waiting > 0 {
-            tracing::info!("{waiting} earlier {name} in {} are waiting for the broker", dir.display());
+            tracing::info!(
+                "{waiting} earlier {name} in {} are waiting for the broker",
+                dir.display()
+            );
         }
         let thread = Thread {
             base: journal.last(),
@@ -300,7 +303,12 @@ impl Thread {
 
     fn load(&mut self, most: usize) {
         let number = |number: u64| number as Number - self.base as Number;
-        let messages: Vec<_> = self.journal.take(most).into_iter().map(|(n, m)| (number(n), m)).collect();
+        let messages: Vec<_> = self
+            .journal
+            .take(most)
+            .into_iter()
+            .map(|(n, m)| (number(n), m))
+            .collect();
         let through = number(self.journal.through());
         self.tell(Loaded::Messages { messages, through });
     }

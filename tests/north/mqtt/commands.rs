@@ -358,7 +358,9 @@ fn a_flood_of_refused_commands_is_answered_to_the_last() {
 fn ids_and_commands_that_are_too_large_come_back() {
     let bench = bench();
     let big = "123456789012345678901234567890";
-    bench.broker.publish(SET, &format!("{{\"id\": {big}, \"sped\": 1}}"), &[]);
+    bench
+        .broker
+        .publish(SET, &format!("{{\"id\": {big}, \"sped\": 1}}"), &[]);
     let seen = bench.watcher.wait("the result", |m| m.topic == RESULT);
     assert!(seen.payload.contains(&format!("\"id\":{big},")), "{seen:?}");
     bench.watcher.clear();
@@ -367,6 +369,9 @@ fn ids_and_commands_that_are_too_large_come_back() {
     let arguments = ["-q", "1", "-t", SET, "-f", file.to_str().unwrap()];
     assert!(bench.broker.run("mosquitto_pub", &arguments).status.success());
     let result = bench.watcher.wait("the result", |m| m.topic == RESULT).json();
-    assert_eq!((&result["id"], &result["error"]["code"]), (&77.into(), &"bad_value".into()));
+    assert_eq!(
+        (&result["id"], &result["error"]["code"]),
+        (&77.into(), &"bad_value".into())
+    );
     bench.gateway.stop();
 }

@@ -201,7 +201,11 @@ impl Session {
         if qos == 0 {
             return Some(());
         }
-        let code = self.manners.refused.filter(|(below, _)| topic.starts_with(below)).map_or(0, |(_, code)| code);
+        let code = self
+            .manners
+            .refused
+            .filter(|(below, _)| topic.starts_with(below))
+            .map_or(0, |(_, code)| code);
         self.owed.push((packet, code));
         let in_flight = self.owed.len();
         let mut seen = self.seen.lock().unwrap();
@@ -238,35 +242,56 @@ fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
 fn odd_brokers_are_served() {
     let window = |n: u16| [&[0x21][..], &n.to_be_bytes()].concat();
     let cases: [(&str, Manners); 7] = [
-        ("receive maximum 1", Manners {
-            properties: window(1),
-            ..Manners::default()
-        }),
-        ("receive maximum 20, acknowledged backwards", Manners {
-            properties: window(20),
-            backwards: true,
-            ..Manners::default()
-        }),
-        ("QoS 0 only", Manners {
-            properties: vec![0x24, 0],
-            ..Manners::default()
-        }),
-        ("no retained messages", Manners {
-            properties: vec![0x25, 0],
-            ..Manners::default()
-        }),
-        ("topic aliases", Manners {
-            properties: vec![0x22, 0, 5],
-            ..Manners::default()
-        }),
-        ("packets in single bytes", Manners {
-            piecemeal: true,
-            ..Manners::default()
-        }),
-        ("the points refused", Manners {
-            refused: Some(("drivegate/hall/drive/p1/point", 0x87)),
-            ..Manners::default()
-        }),
+        (
+            "receive maximum 1",
+            Manners {
+                properties: window(1),
+                ..Manners::default()
+            },
+        ),
+        (
+            "receive maximum 20, acknowledged backwards",
+            Manners {
+                properties: window(20),
+                backwards: true,
+                ..Manners::default()
+            },
+        ),
+        (
+            "QoS 0 only",
+            Manners {
+                properties: vec![0x24, 0],
+                ..Manners::default()
+            },
+        ),
+        (
+            "no retained messages",
+            Manners {
+                properties: vec![0x25, 0],
+                ..Manners::default()
+            },
+        ),
+        (
+            "topic aliases",
+            Manners {
+                properties: vec![0x22, 0, 5],
+                ..Manners::default()
+            },
+        ),
+        (
+            "packets in single bytes",
+            Manners {
+                piecemeal: true,
+                ..Manners::default()
+            },
+        ),
+        (
+            "the points refused",
+            Manners {
+                refused: Some(("drivegate/hall/drive/p1/point", 0x87)),
+                ..Manners::default()
+            },
+        ),
     ];
     for (name, manners) in cases {
         let broker = Hostile::start(manners);
@@ -274,13 +299,11 @@ fn odd_brokers_are_served() {
         options.telemetry_qos = drivegate::north::mqtt::Qos::AtLeastOnce;
         let gateway = Gateway::start(options, plant(&["p1"]));
         serves(&broker, &gateway, 40);
-        for value in 0..5 {
+        for value in 0..10 {
             gateway.read("p1", 4000 + value);
             let text = format!("{}", f64::from(4000 + value) / 100.0);
             wait_for("the new value", || {
-                broker.has(|(topic, .., payload)| {
-                    topic == STATE && String::from_utf8_lossy(payload).contains(&text)
-                })
+                broker.has(|(topic, .., payload)| topic == STATE && String::from_utf8_lossy(payload).contains(&text))
             });
         }
         let seen = broker.seen.lock().unwrap();

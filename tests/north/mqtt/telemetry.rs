@@ -151,7 +151,9 @@ fn telemetry_expires_and_the_status_does_not() {
     options.telemetry_qos = Qos::AtLeastOnce;
     let gateway = Gateway::start(options, plant(&["p1"]));
     let late = Watcher::new(&broker, "drivegate/#");
-    late.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state" && m.qos == 1);
+    late.wait("the state", |m| {
+        m.topic == "drivegate/hall/drive/p1/state" && m.qos == 1
+    });
     let expiry = |topic: &str| {
         let arguments = ["-t", topic, "-F", "%E", "-W", "2", "-C", "1", "--retained-only"];
         let output = broker.run("mosquitto_sub", &arguments);

@@ -59,7 +59,10 @@ async fn burst(client: &mut Client, count: usize) {
 async fn a_busy_client_loses_no_event_of_a_burst() {
     let mut client = client(None).await;
     burst(&mut client, 1000).await;
-    assert_eq!((client.outbox.waiting(), client.missed, client.outbox.take_lost().events), (1000, 0, 0));
+    assert_eq!(
+        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
+        (1000, 0, 0)
+    );
     let (_, first) = client.outbox.next(1, true).unwrap();
     assert!(first.payload.windows(8).any(|w| w == b"event 0\""));
     burst(&mut client, BURST - 1000).await;

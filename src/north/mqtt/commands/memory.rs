@@ -103,10 +103,11 @@ impl Memory {
         now: Instant,
     ) -> Option<Repetition> {
         self.forget(now);
-        let marked = |known: &&Recent| {
-            incoming.dup && known.packet == incoming.packet && known.fingerprint == print.whole
-        };
-        let by_id = print.identity.and_then(|(_, content)| self.known.get(&content).copied());
+        let marked =
+            |known: &&Recent| incoming.dup && known.packet == incoming.packet && known.fingerprint == print.whole;
+        let by_id = print
+            .identity
+            .and_then(|(_, content)| self.known.get(&content).copied());
         let by_mark = || {
             let recent = self.recent.iter().rev().find(marked)?;
             Some(Known {

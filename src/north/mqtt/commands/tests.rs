@@ -197,7 +197,10 @@ fn a_repetition_gets_the_previous_result() {
         ..again.clone()
     };
     let to_other = bench.take(elsewhere).unwrap();
-    assert_eq!((to_other.topic.as_ref(), to_other.correlation.as_deref()), ("other", Some(&[1][..])));
+    assert_eq!(
+        (to_other.topic.as_ref(), to_other.correlation.as_deref()),
+        ("other", Some(&[1][..]))
+    );
     assert_eq!(json(&to_other), result);
     // Another payload with the same id is a new command; the first one is still not executed again.
     let other = set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#);
@@ -451,7 +454,12 @@ fn commands_whose_results_find_no_room_are_refused_and_stops_are_not() {
             .commands
             .take(incoming, &bench.plant, crowded, bench.now, SystemTime::UNIX_EPOCH)
     };
-    assert!(json(&crowded(r#"{"run": true}"#).unwrap())["error"]["message"].as_str().unwrap().contains("results"));
+    assert!(
+        json(&crowded(r#"{"run": true}"#).unwrap())["error"]["message"]
+            .as_str()
+            .unwrap()
+            .contains("results")
+    );
     assert_eq!(crowded(r#"{"run": false}"#), None);
 }
 

@@ -168,7 +168,11 @@ fn a_full_buffer_drops_its_oldest_segment() {
     let lost = journal.take_lost() as usize;
     let taken = take_all(&mut journal);
     assert_eq!((lost + taken.len(), journal.take_lost()), (5000, 0));
-    assert_eq!(numbers(&taken), (lost..5000).collect::<Vec<_>>(), "the newest, in order");
+    assert_eq!(
+        numbers(&taken),
+        (lost..5000).collect::<Vec<_>>(),
+        "the newest, in order"
+    );
     assert!(journal.bytes() > max * 9 / 10);
     journal.acknowledge(journal.last());
     journal.write().unwrap();

@@ -76,7 +76,9 @@ fn leader_first_then_results_events_and_telemetry_in_turn() {
     outbox.put_first(topic("status"), Vec::new());
     assert!(outbox.next(0, true).is_none());
     let sent = drain(&mut outbox, 100);
-    let order = ["status", "r1", "e1", "t1", "r2", "e2", "t2", "e3", "t3", "h1", "h2", "h3"];
+    let order = [
+        "status", "r1", "e1", "t1", "r2", "e2", "t2", "e3", "t3", "h1", "h2", "h3",
+    ];
     assert_eq!(names(&sent), order);
     outbox.push(Kind::History, event("h4"), None);
     assert!(outbox.next(100, false).is_none(), "the history has its pace");
@@ -165,7 +167,10 @@ fn telemetry_without_acknowledgement_passes_a_full_window() {
     assert_eq!(names(&sent), ["e1", "t"]);
     outbox.put(topic("t"), vec![2]);
     let (key, message) = outbox.next(1, true).unwrap();
-    assert_eq!((message.acknowledged, message.expiry, message.retain), (false, Some(300), true));
+    assert_eq!(
+        (message.acknowledged, message.expiry, message.retain),
+        (false, Some(300), true)
+    );
     assert!(outbox.mark_published(key, false).is_some());
     assert_eq!(outbox.oldest(Kind::Event), Some(7));
     outbox.numbered(1).unwrap();

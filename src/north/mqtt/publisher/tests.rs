@@ -276,7 +276,9 @@ fn many_drives_are_looked_at_a_few_at_a_time() {
     let mut states = 0;
     for calls in 1.. {
         let (updates, next) = bench.publisher.tick(bench.now, bench.wall);
-        let now = updates.iter().filter(|u| u.topic.ends_with("/state") && !u.topic.contains("/point/"));
+        let now = updates
+            .iter()
+            .filter(|u| u.topic.ends_with("/state") && !u.topic.contains("/point/"));
         let now = now.count();
         assert!(now <= DRIVES);
         states += now;
@@ -298,7 +300,11 @@ fn only_what_is_wanted_is_published() {
         assert_eq!(updates.iter().any(|u| u.topic.ends_with("p1/state")), state);
         assert_eq!(updates.iter().any(|u| u.topic.contains("/point/")), points);
         let vanished = bench.publisher.cleared();
-        assert_eq!(vanished.iter().any(|t| t.contains("/point/")), !points, "what was published before");
+        assert_eq!(
+            vanished.iter().any(|t| t.contains("/point/")),
+            !points,
+            "what was published before"
+        );
     }
 }
 
@@ -333,7 +339,9 @@ fn the_values_of_an_outage_are_recorded() {
         }
         assert!(arrays.is_empty());
         let recorded = bench.publisher.recorded();
-        let of_p1 = recorded.iter().find(|u| u.topic.as_ref() == "drivegate/hall/drive/p1/history");
+        let of_p1 = recorded
+            .iter()
+            .find(|u| u.topic.as_ref() == "drivegate/hall/drive/p1/history");
         let entries: Vec<Json> = of_p1.map_or(Vec::new(), |u| serde_json::from_slice(&u.payload).unwrap());
         assert_eq!(entries.len(), expected, "{mode:?}");
         assert!(entries.iter().all(|e| e["historical"] == true && e["time"].is_string()));

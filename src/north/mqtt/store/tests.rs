@@ -59,7 +59,10 @@ fn messages_wait_behind_those_on_disk() {
     store.load(100);
     store.load(100);
     let jobs: Vec<Job> = todo.try_iter().collect();
-    assert!(matches!(jobs[..], [Job::Append(_, false), Job::Append(_, false), Job::Load(100)]));
+    assert!(matches!(
+        jobs[..],
+        [Job::Append(_, false), Job::Append(_, false), Job::Load(100)]
+    ));
     let messages = (-1..=2).map(|n| (n, event(9))).collect();
     let (loaded, _) = store.take(Loaded::Messages { messages, through: 2 });
     assert_eq!((loaded.len(), store.waiting()), (4, 0));
