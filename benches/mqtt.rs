@@ -56,10 +56,12 @@ fn measure() -> Result<(), Box<dyn Error>> {
         println!("{columns} | {figures}");
     }
     let port = proxy(broker.port, far / 2)?;
-    let (rate, limit) = (events(&runtime, &broker, port)?, 20.0 / far.as_secs_f64());
+    let (rate, trip) = events(&runtime, &broker, port)?;
     println!(
-        "events: {rate:.0}/s, {:.2} of receive maximum / round trip",
-        rate / limit
+        "events: {rate:.0}/s; {:.2} of receive maximum / round trip, {:.2} with the round trip of a single event, {:.0} ms",
+        rate * far.as_secs_f64() / 20.0,
+        rate * trip / 20.0,
+        trip * 1e3
     );
     Ok(())
 }
@@ -67,6 +69,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
 /// The gateway with its plant.
 struct Gateway {
     plant: SharedPlant,
+    stats: Arc<NorthStats>,
     cancel: CancellationToken,
     mqtt: mqtt::Mqtt,
 }
@@ -111,7 +114,12 @@ impl Gateway {
             }
             std::thread::sleep(Duration::from_millis(5));
         }
-        Ok(Gateway { plant, cancel, mqtt })
+        Ok(Gateway {
+            plant,
+            stats,
+            cancel,
+            mqtt,
+        })
     }
 
     fn stop(self, runtime: &Runtime) {
@@ -214,11 +222,11 @@ fn states(
     ))
 }
 
-/// Events a second that arrive from a burst.
-fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<f64, Box<dyn Error>> {
+/// Events a second that arrive from a burst, and the time from a single event to its acknowledgement, s.
+fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<(f64, f64), Box<dyn Error>> {
     let arrived = broker.subscribe(runtime, "bench/hall/drive/+/event")?;
     let gateway = Gateway::start(runtime, port, 1, Duration::ZERO)?;
-    for n in 0..1000 {
+    let publish = |n: u32| {
         gateway.plant.load().events.publish(Event {
             id: 0,
             time: SystemTime::now(),
@@ -228,14 +236,25 @@ fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<f64, Box<dyn 
             fault_code: None,
             text: n.to_string(),
         });
+    };
+    let mut trips = Vec::new();
+    for n in 0..20 {
+        let begun = Instant::now();
+        publish(n);
+        arrived.recv_timeout(Duration::from_secs(20))?;
+        while gateway.stats.mqtt.buffered.load(Ordering::Relaxed) > 0 {
+            std::thread::sleep(Duration::from_millis(1));
+        }
+        trips.push(begun.elapsed().as_secs_f64());
     }
+    (0..1000).for_each(publish);
     let mut times = Vec::new();
     while times.len() < 1000 {
         let (.., at) = arrived.recv_timeout(Duration::from_secs(20))?;
         times.push(at.duration_since(SystemTime::UNIX_EPOCH)?.as_secs_f64());
     }
     gateway.stop(runtime);
-    Ok(common::rate(&times))
+    Ok((common::rate(&times), common::median(&trips)))
 }
 
 type Arrived = (String, Vec<u8>, SystemTime);

@@ -9,7 +9,7 @@ use super::key::Key;
 use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
 use super::values;
 use crate::document::{Finding, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
+use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry, identity_fault};
 
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
@@ -207,7 +207,11 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)>
             );
         }
     }
-    Some((certificate?, key?))
+    let identity = (certificate?, key?);
+    if let Some(fault) = identity_fault(&identity) {
+        reader.problem(names[1], fault, "write the certificate and its own key");
+    }
+    Some(identity)
 }
 
 pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
@@ -234,7 +238,7 @@ pub(super) fn parse_filter(text: &str) -> Result<String, Finding> {
     let levels: Vec<&str> = text.split('/').collect();
     let wild = |level: &&str| level.contains(['+', '#']) && level.len() > 1;
     let early = levels.iter().rev().skip(1).any(|level| *level == "#");
-    if text.is_empty() || text.contains('\0') || text.starts_with('$') || early || levels.iter().any(|l| wild(&l)) {
+    if text.is_empty() || text.contains('\0') || text.starts_with('$') || early || levels.iter().any(wild) {
         return Err(Finding::new(
             format!("`{text}` is not a topic filter"),
             "write levels joined by /, + for any level, # at the end for all below, not starting with $",

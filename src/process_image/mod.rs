@@ -180,6 +180,11 @@ impl DriveImage {
         }
     }
 
+    /// Whether the image was updated since `seen` was taken.
+    pub fn is_newer_than(&self, seen: &Arc<Snapshot>) -> bool {
+        !Arc::ptr_eq(&self.snapshot.load(), seen)
+    }
+
     /// Wakes `listener` at every update from now on, in place of an earlier one.
     pub fn notify(&self, listener: Arc<Notify>) {
         self.listener.store(Some(listener));

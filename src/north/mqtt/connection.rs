@@ -33,13 +33,13 @@ pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64)
 pub(super) const INFLIGHT: u16 = 1000;
 /// Number of messages handed to rumqttc and not written to the socket yet.
 const REQUESTS: usize = 128;
-/// Messages written to the socket with one system call.
-const BATCH: usize = 32;
+/// Messages written to the socket, or read from it, at a time.
+const BATCH: usize = 16;
 /// Number of events that the client has not processed; beyond it, polling pauses.
 const EVENTS: usize = 64;
 /// Maximum size of a packet from the broker; much larger than any valid command, so that one that is too long gets an
 /// answer. Brokers drop larger ones without a word.
-const MAX_PACKET: u32 = 8 << 20;
+const MAX_PACKET: u32 = 2 << 20;
 /// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
 /// What the system buffers of sent messages: a result waits behind no more than that.
@@ -262,6 +262,7 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
         .set_clean_start(true)
         .set_connect_timeout(CONNECT_TIMEOUT)
         .set_max_request_batch(BATCH)
+        .set_read_batch_size(BATCH)
         .set_outgoing_inflight_upper_limit(INFLIGHT)
         .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
     if let Some(user) = &options.username {

@@ -141,13 +141,11 @@ impl Journal {
         let bytes = fs::read(&path)?;
         let mut numbers: Option<(u64, u64)> = None;
         let mut end = 0;
-        for found in record::records(&bytes) {
-            if let Ok(Record { entry, range }) = found {
-                end = range.end as u64;
-                match entry {
-                    Entry::Message(n, _) => numbers = Some((numbers.map_or(n, |(first, _)| first), n)),
-                    Entry::Acknowledged(n) => self.acknowledged = self.acknowledged.max(n),
-                }
+        for Record { entry, range } in record::records(&bytes).flatten() {
+            end = range.end as u64;
+            match entry {
+                Entry::Message(n, _) => numbers = Some((numbers.map_or(n, |(first, _)| first), n)),
+                Entry::Acknowledged(n) => self.acknowledged = self.acknowledged.max(n),
             }
         }
         if end < bytes.len() as u64 {

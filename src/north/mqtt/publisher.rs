@@ -300,8 +300,8 @@ impl DriveTopics {
 
     /// Whether the drive was updated since the last look.
     fn is_fresh(&self) -> bool {
-        let snapshot = self.drive.image.snapshot();
-        self.seen.as_ref().is_none_or(|seen| !Arc::ptr_eq(seen, &snapshot))
+        let image = &self.drive.image;
+        self.seen.as_ref().is_none_or(|seen| image.is_newer_than(seen))
     }
 
     fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
