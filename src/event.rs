@@ -3,7 +3,8 @@
 mod fair_ring;
 mod refusals;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::hash::{BuildHasher, RandomState};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Instant, SystemTime};
 
 use serde::Serialize;
@@ -31,6 +32,16 @@ pub enum EventKind {
     Fault,
     /// The fault is gone.
     FaultEnd,
+    /// A motor started.
+    Started,
+    /// A motor stopped.
+    Stopped,
+    /// A warning came up.
+    Warning,
+    /// The warning is gone.
+    WarningEnd,
+    /// The fieldbus became the control place of a drive, or no longer is.
+    ControlPlace,
     /// A drive has started anew.
     Restarted,
     /// A drive says that it is another device than its profile expects.
@@ -55,6 +66,7 @@ impl EventKind {
         match self {
             EventKind::Offline
             | EventKind::Fault
+            | EventKind::Warning
             | EventKind::UnlikeProfile
             | EventKind::Supervision
             | EventKind::Unsupervised
@@ -62,6 +74,10 @@ impl EventKind {
             | EventKind::BusDown => true,
             EventKind::Online
             | EventKind::FaultEnd
+            | EventKind::Started
+            | EventKind::Stopped
+            | EventKind::WarningEnd
+            | EventKind::ControlPlace
             | EventKind::Restarted
             | EventKind::RefusedCommand
             | EventKind::BusUp => false,
@@ -75,6 +91,11 @@ impl EventKind {
             EventKind::Offline => "offline",
             EventKind::Fault => "fault",
             EventKind::FaultEnd => "fault_end",
+            EventKind::Started => "started",
+            EventKind::Stopped => "stopped",
+            EventKind::Warning => "warning",
+            EventKind::WarningEnd => "warning_end",
+            EventKind::ControlPlace => "control_place",
             EventKind::Restarted => "restarted",
             EventKind::UnlikeProfile => "unlike_profile",
             EventKind::Supervision => "supervision",
@@ -90,7 +111,8 @@ impl EventKind {
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Event {
-    /// Running number within this process, from 1.
+    /// Running number within this process, from 1; shown with the [`boot`] of the process.
+    #[serde(flatten, serialize_with = "numbered")]
     pub id: u64,
     /// When it happened.
     #[serde(serialize_with = "rfc3339")]
@@ -111,6 +133,25 @@ pub struct Event {
     pub count: Option<u64>,
     /// For people.
     pub text: String,
+}
+
+/// The name of this run of the process, different at every start: with it, the number of an event is unique.
+pub fn boot() -> &'static str {
+    static BOOT: OnceLock<String> = OnceLock::new();
+    BOOT.get_or_init(|| {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let random = RandomState::new().hash_one((now.unwrap_or_default(), std::process::id()));
+        format!("{random:016x}")
+    })
+}
+
+fn numbered<S: serde::Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Numbered {
+        id: u64,
+        boot: &'static str,
+    }
+    Numbered { id: *id, boot: boot() }.serialize(serializer)
 }
 
 /// RFC 3339 with milliseconds, UTC.

@@ -18,6 +18,28 @@ const LOAD_WINDOW: Duration = Duration::from_secs(1);
 /// What was read longer ago shows neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
 
+/// Points whose changes are events: what they are when the point comes and goes, in words.
+const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
+    (
+        ModelPoint::Running,
+        [(EventKind::Started, "has started"), (EventKind::Stopped, "has stopped")],
+    ),
+    (
+        ModelPoint::Warning,
+        [
+            (EventKind::Warning, "reports a warning"),
+            (EventKind::WarningEnd, "reports no warning any more"),
+        ],
+    ),
+    (
+        ModelPoint::Remote,
+        [
+            (EventKind::ControlPlace, "is controlled by the fieldbus"),
+            (EventKind::ControlPlace, "is no longer controlled by the fieldbus"),
+        ],
+    ),
+];
+
 /// Reports what a bus does.
 #[derive(Debug)]
 pub(super) struct Report {
@@ -27,6 +49,8 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
     faults: Vec<Option<i64>>,
+    /// What else was reported of each drive, in the order of [`WATCHED`]; `None` before the first read.
+    watched: Vec<[Option<bool>; WATCHED.len()]>,
     /// Drives whose own response to a silent master was looked at since they came online.
     looked_at: Vec<bool>,
     up: bool,
@@ -42,6 +66,7 @@ impl Report {
             window: now,
             busy: Duration::ZERO,
             looked_at: vec![false; faults.len()],
+            watched: vec![[None; WATCHED.len()]; faults.len()],
             faults,
             up: false,
             reason: String::new(),
@@ -85,6 +110,7 @@ impl Report {
         }
         if let News::Read { drive, .. } = news {
             self.look_at_fault(*drive, now);
+            self.look_at_state(*drive, now);
             self.look_at_own_response(*drive, now);
         }
     }
@@ -318,6 +344,26 @@ impl Report {
             None => self.drive_event(index, EventKind::FaultEnd, None, |name| {
                 format!("the fault of drive {name} is gone")
             }),
+        }
+    }
+
+    /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
+    /// event; what changed while the drive was offline is one.
+    fn look_at_state(&mut self, index: usize, now: Instant) {
+        let Some(drive) = self.drive(index) else { return };
+        let reading = drive.reading(now, RECENT);
+        for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
+            let Some(Value::Bool(value)) = reading.model(point).good() else {
+                continue;
+            };
+            let Some(known) = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place)) else {
+                continue;
+            };
+            if known.replace(value).is_some_and(|before| before != value) {
+                let [comes, goes] = changes;
+                let (kind, words) = if value { comes } else { goes };
+                self.drive_event(index, kind, None, |name| format!("drive {name} {words}"));
+            }
         }
     }
 

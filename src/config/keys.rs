@@ -12,11 +12,13 @@ use super::key::{
     DURATION, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
 };
 use super::log::{self, LogFormat};
+use super::mqtt::TelemetryTopic;
 use super::{bus, modbus_tcp, mqtt, values};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
 use crate::north::modbus_tcp::{Role, Uncached};
+use crate::north::mqtt::History;
 use crate::process_image::{Access, LeaseAction, OnShutdown};
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
@@ -346,12 +348,32 @@ keys! {
         base: String = Parsed {
             parse: mqtt::parse_base, words: &[], pattern: "", range: "a topic without + and #",
         }, default "drivegate";
+        /// Which telemetry is published: the state of each drive as one object, each point as a bare value, or both.
+        topics: Vec<TelemetryTopic> = List {
+            parse: mqtt::parse_topic, empty: Some("write [\"state\"], [\"points\"] or both"),
+            range: "[\"state\", \"points\"] or one of them",
+        }, default ["state", "points"];
+        /// Quality of service of published messages.
+        qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
+        /// The broker drops telemetry that is older (message expiry); `"0s"` is never.
+        expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "5min";
+        /// Values of an outage that are published afterwards, on `history` topics: those that changed, or all samples.
+        history: History = Words(&[
+            ("off", History::Off), ("changes", History::Changes), ("all", History::All),
+        ]), default "off";
         /// How often values are published.
         publish: Present = Own { schema: Publish::schema, range: "[mqtt.publish]" }, or "the defaults";
         /// Whether commands are accepted on the set topics, for drives with `access = "control"`. Anyone who may
         /// publish there can command the drives: restrict it in the broker.
         commands: bool = Flag, default false;
-        /// Where events are buffered while the broker is unreachable.
+        /// Whether commands without an `id` are refused, except stops: only with an `id` a repetition is recognised.
+        require_id: bool = Flag, default false;
+        /// Filters of response topics below `base` that results may be sent to. Topics outside of `base` are always
+        /// allowed, those of the gateway itself never.
+        response_topics: Vec<String> = List {
+            parse: mqtt::parse_filter, empty: None, range: "topic filters, such as [\"drivegate/answers/#\"]",
+        }, default [];
+        /// Where events and history are buffered while the broker is unreachable.
         buffer: Present = Own { schema: Buffer::schema, range: "[mqtt.buffer]" }, or "in memory only";
         /// Discovery for Home Assistant; not supported in this version.
         home_assistant: Present = Own { schema: || json!({ "const": false }), range: "false" }, default false;
@@ -360,12 +382,20 @@ keys! {
     /// How often values are published.
     PUBLISH: Publish {
         /// Minimum time between two messages on a topic.
-        min_interval: Duration = Time(Duration::ZERO..=HOUR), default "100ms";
+        min_interval: Duration = Time(Duration::ZERO..=HOUR), default "50ms";
         /// An unchanged value is published again after this time.
         max_interval: Duration = Time(Duration::from_millis(10)..=Duration::from_secs(86_400)), default "60s";
     }
 
-    /// Where events are buffered while the broker is unreachable; without this table, in memory only.
+    /// Quality of service of published messages: 0 is sent once, 1 until the broker acknowledges it.
+    MQTT_QOS: MqttQos {
+        /// Of states, points and buses. With 1 a distant broker limits the rate to its receive maximum per round trip.
+        telemetry: u8 = Number(0..=1, None), default 0;
+        /// Of events and history; results of commands have 1.
+        events: u8 = Number(0..=1, None), default 1;
+    }
+
+    /// Where events and history are buffered while the broker is unreachable; without this table, in memory only.
     BUFFER: Buffer {
         /// Directory of the buffer.
         dir: PathBuf = PATH, default "/var/lib/drivegate";

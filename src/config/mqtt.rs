@@ -6,13 +6,20 @@ use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, PUBLISH};
+use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
 use super::values;
 use crate::document::{Finding, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Secret};
+use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry, identity_fault};
 
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
+
+/// What telemetry is published as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum TelemetryTopic {
+    State,
+    Points,
+}
 
 /// Where the broker is.
 pub(super) struct Broker {
@@ -46,7 +53,17 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
     }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
+    let wanted = MQTT.topics.get(reader);
+    let telemetry = Telemetry {
+        state: wanted.contains(&TelemetryTopic::State),
+        points: wanted.contains(&TelemetryTopic::Points),
+        history: MQTT.history.get(reader),
+    };
+    let (telemetry_qos, event_qos) = read_qos(reader);
+    let expiry = read_expiry(reader, max_interval);
     let commands = MQTT.commands.get(reader);
+    let require_id = MQTT.require_id.get(reader);
+    let response_topics = read_response_topics(reader, topics.as_deref(), gateway);
     let buffer = read_buffer(reader, base);
     if reader.or(MQTT.home_assistant.name, false) {
         reader.problem(
@@ -67,9 +84,15 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         ca,
         identity,
         base: topics?,
+        telemetry,
+        telemetry_qos,
+        event_qos,
+        expiry,
         min_interval,
         max_interval,
         commands,
+        require_id,
+        response_topics,
         buffer,
     })
 }
@@ -184,7 +207,11 @@ fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)>
             );
         }
     }
-    Some((certificate?, key?))
+    let identity = (certificate?, key?);
+    if let Some(fault) = identity_fault(&identity) {
+        reader.problem(names[1], fault, "write the certificate and its own key");
+    }
+    Some(identity)
 }
 
 pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
@@ -197,6 +224,68 @@ pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
         ));
     }
     Ok(text.to_string())
+}
+
+pub(super) fn parse_topic(text: &str) -> Result<TelemetryTopic, Finding> {
+    match text {
+        "state" => Ok(TelemetryTopic::State),
+        "points" => Ok(TelemetryTopic::Points),
+        _ => Err(values::unknown_word(text, ["state", "points"].into_iter())),
+    }
+}
+
+pub(super) fn parse_filter(text: &str) -> Result<String, Finding> {
+    let levels: Vec<&str> = text.split('/').collect();
+    let wild = |level: &&str| level.contains(['+', '#']) && level.len() > 1;
+    let early = levels.iter().rev().skip(1).any(|level| *level == "#");
+    if text.is_empty() || text.contains('\0') || text.starts_with('$') || early || levels.iter().any(wild) {
+        return Err(Finding::new(
+            format!("`{text}` is not a topic filter"),
+            "write levels joined by /, + for any level, # at the end for all below, not starting with $",
+        ));
+    }
+    Ok(text.to_string())
+}
+
+fn read_qos(reader: &Reader<'_>) -> (Qos, Qos) {
+    let qos = |level: u8| if level == 0 { Qos::AtMostOnce } else { Qos::AtLeastOnce };
+    let Some(table) = MQTT.qos.table(reader) else {
+        return (Qos::AtMostOnce, Qos::AtLeastOnce);
+    };
+    let levels = (MQTT_QOS.telemetry.get(&table), MQTT_QOS.events.get(&table));
+    table.finish();
+    (qos(levels.0), qos(levels.1))
+}
+
+fn read_expiry(reader: &Reader<'_>, max_interval: Duration) -> Option<Duration> {
+    let expiry = Some(MQTT.expiry.get(reader)).filter(|expiry| !expiry.is_zero())?;
+    if expiry <= max_interval {
+        let [expiry, max] = [expiry, max_interval].map(format_duration);
+        reader.warning(
+            MQTT.expiry.name,
+            format!("expiry = {expiry}: an unchanged value vanishes before it is published again after {max}"),
+            "write a longer expiry or a shorter publish.max_interval",
+        );
+    }
+    Some(expiry)
+}
+
+fn read_response_topics(reader: &Reader<'_>, base: Option<&str>, gateway: Option<&str>) -> Vec<String> {
+    let filters = MQTT.response_topics.get(reader);
+    if let (Some(base), Some(gateway)) = (base, gateway) {
+        let own = format!("{base}/{gateway}");
+        for filter in filters
+            .iter()
+            .filter(|f| **f == own || f.starts_with(&format!("{own}/")))
+        {
+            reader.problem(
+                MQTT.response_topics.name,
+                format!("`{filter}` is below the gateway's own topics"),
+                "write topics that no gateway uses",
+            );
+        }
+    }
+    filters
 }
 
 fn read_publish(reader: &Reader<'_>) -> Option<(Duration, Duration)> {

@@ -37,6 +37,7 @@ client_ca = "DIR/ca.crt"
 roles = { operator = "control" }
 [mqtt]
 publish = {}
+qos = {}
 buffer = {}
 [http]
 [audit]
@@ -286,4 +287,54 @@ fn every_family_can_be_supervised() {
             );
         }
     }
+}
+
+#[test]
+fn what_mqtt_publishes_and_accepts() {
+    let mqtt = |more: &str| {
+        let (loaded, _) = load(&format!("[gateway]\nname = \"hall\"\n[mqtt]\n{more}"));
+        let first = |problems: Vec<Problem>| problems.first().map(|p| p.to_string()).unwrap_or_default();
+        let options = loaded.settings.and_then(|settings| settings.mqtt);
+        (options, first(loaded.errors), first(loaded.warnings))
+    };
+    let (options, ..) = mqtt("");
+    let options = options.unwrap();
+    assert!(options.telemetry.state && options.telemetry.points && !options.require_id);
+    assert_eq!(options.telemetry.history, mqtt_client::History::Off);
+    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtMostOnce);
+    assert_eq!(options.event_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(options.expiry, Some(Duration::from_secs(300)));
+    let (options, ..) = mqtt(
+        "topics = [\"state\"]\nqos = { telemetry = 1, events = 0 }\nexpiry = \"0s\"\nhistory = \"all\"\n\
+         response_topics = [\"drivegate/answers/#\"]\nrequire_id = true\n",
+    );
+    let options = options.unwrap();
+    assert!(options.telemetry.state && !options.telemetry.points && options.require_id);
+    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(
+        (options.event_qos, options.expiry),
+        (mqtt_client::Qos::AtMostOnce, None)
+    );
+    assert_eq!(options.response_topics, ["drivegate/answers/#"]);
+    for (key, why) in [
+        ("topics = []", "the list is empty"),
+        ("topics = [\"point\"]", "did you mean \"points\"?"),
+        ("qos = { telemetry = 2 }", "2 is out of range"),
+        ("history = \"some\"", "unknown word"),
+        ("response_topics = [\"a/#/b\"]", "not a topic filter"),
+        ("response_topics = [\"a+\"]", "not a topic filter"),
+        ("response_topics = [\"drivegate/hall/x\"]", "the gateway's own topics"),
+    ] {
+        let (_, error, _) = mqtt(key);
+        assert!(error.contains(why), "{key}: {error}");
+    }
+    assert!(mqtt("expiry = \"10s\"").2.contains("vanishes"));
+    let dir = certificates().display();
+    let pair = |key| format!("url = \"mqtts://b\"\ncertificate = \"{dir}/gateway.crt\"\nkey = \"{dir}/{key}.key\"");
+    assert!(mqtt(&pair("gateway")).0.is_some());
+    assert!(
+        mqtt(&pair("other")).1.contains("cannot be used"),
+        "{:?}",
+        mqtt(&pair("other"))
+    );
 }

@@ -17,7 +17,9 @@ mod stats;
 use std::io;
 use std::net::SocketAddr;
 
-pub use stats::{ConnectionRefusal, LostListeners, ModbusTcpStats, MqttStats, NorthStats, RefusalStats, ServerKind};
+pub use stats::{
+    ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ServerKind,
+};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]

@@ -205,4 +205,45 @@ pub struct MqttStats {
     pub published: AtomicU64,
     /// Messages waiting for the broker.
     pub buffered: AtomicU64,
+    lost: [AtomicU64; MqttLoss::ALL.len()],
+}
+
+/// What the MQTT client lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MqttLoss {
+    /// Events.
+    Event,
+    /// Results of commands.
+    Result,
+    /// Values of an outage.
+    History,
+}
+
+impl MqttLoss {
+    /// All kinds.
+    pub const ALL: [MqttLoss; 3] = [MqttLoss::Event, MqttLoss::Result, MqttLoss::History];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            MqttLoss::Event => "event",
+            MqttLoss::Result => "result",
+            MqttLoss::History => "history",
+        }
+    }
+}
+
+impl MqttStats {
+    /// Counts lost messages.
+    pub(crate) fn lost(&self, kind: MqttLoss, count: u64) {
+        if let Some(counter) = self.lost.get(kind as usize) {
+            counter.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+
+    /// Messages lost so far, by kind.
+    pub fn losses(&self) -> impl Iterator<Item = (MqttLoss, u64)> {
+        let counts = self.lost.iter().map(|c| c.load(Ordering::Relaxed));
+        MqttLoss::ALL.into_iter().zip(counts)
+    }
 }

@@ -306,7 +306,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(Family::of(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages that the MQTT broker acknowledged.",
+        "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
         SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(
@@ -315,6 +315,15 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "Messages that wait for the MQTT broker.",
         SeriesValue::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
     ));
+    let mut lost = Family::new(
+        Kind::Counter,
+        "drivegate_mqtt_lost_total",
+        "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
+    );
+    for (kind, count) in mqtt.losses() {
+        lost.add(vec![("kind", kind.name().to_string())], SeriesValue::Count(count));
+    }
+    all.push(lost);
 }
 
 fn build(plant: &Plant) -> Family {

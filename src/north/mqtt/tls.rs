@@ -1,6 +1,6 @@
 //! TLS towards the broker.
 
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use rustls::{ClientConfig, RootCertStore};
@@ -31,21 +31,34 @@ pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig
     if !options.tls {
         return Ok(None);
     }
+    let config = with_identity(options.identity.as_ref(), roots(options.ca.as_deref())?)?;
+    Ok(Some(Arc::new(config)))
+}
+
+fn with_identity(identity: Option<&(PathBuf, PathBuf)>, roots: RootCertStore) -> Result<ClientConfig, TlsConfigError> {
     let provider = Arc::new(rustls::crypto::ring::default_provider());
     let builder = ClientConfig::builder_with_provider(provider)
         .with_safe_default_protocol_versions()
         .map_err(TlsConfigError::Protocol)?
-        .with_root_certificates(roots(options.ca.as_deref())?);
-    let config = match &options.identity {
-        None => builder.with_no_client_auth(),
-        Some((certificate, key)) => builder
-            .with_client_auth_cert(pem::certificates(certificate)?, pem::private_key(key)?)
-            .map_err(|cause| TlsConfigError::UnusableIdentity {
-                file: certificate.display().to_string(),
-                cause,
-            })?,
+        .with_root_certificates(roots);
+    let Some((certificate, key)) = identity else {
+        return Ok(builder.with_no_client_auth());
     };
-    Ok(Some(Arc::new(config)))
+    builder
+        .with_client_auth_cert(pem::certificates(certificate)?, pem::private_key(key)?)
+        .map_err(|cause| TlsConfigError::UnusableIdentity {
+            file: certificate.display().to_string(),
+            cause,
+        })
+}
+
+/// Why a certificate cannot be used with a key, such as that of another certificate. Files that cannot be read are no
+/// fault here. Blocking: it reads files.
+pub(crate) fn identity_fault(identity: &(PathBuf, PathBuf)) -> Option<String> {
+    match with_identity(Some(identity), RootCertStore::empty()) {
+        Err(fault @ TlsConfigError::UnusableIdentity { .. }) => Some(fault.to_string()),
+        _ => None,
+    }
 }
 
 fn roots(ca: Option<&Path>) -> Result<RootCertStore, TlsConfigError> {

@@ -15,7 +15,7 @@ use drivegate::command::{Order, Outcome};
 use drivegate::drive::Value;
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
-use drivegate::north::mqtt::{self, Mqtt, Options};
+use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveSpec, Link};
 use tempfile::TempDir;
@@ -553,9 +553,19 @@ pub(crate) fn options(port: u16) -> Options {
         ca: None,
         identity: None,
         base: "drivegate".to_string(),
+        telemetry: Telemetry {
+            state: true,
+            points: true,
+            history: History::Off,
+        },
+        telemetry_qos: Qos::AtMostOnce,
+        event_qos: Qos::AtLeastOnce,
+        expiry: None,
         min_interval: Duration::from_millis(40),
         max_interval: Duration::from_secs(60),
         commands: true,
+        require_id: false,
+        response_topics: Vec::new(),
         buffer: None,
     }
 }
