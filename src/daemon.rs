@@ -310,7 +310,10 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
-        self.writes.audit().record_rest(Instant::now());
+        // What is held back, whenever it would be due.
+        self.plant
+            .load()
+            .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
         let audit = self.writes.audit();

@@ -198,14 +198,6 @@ impl Audit {
             .for_each(|passed| self.keep_counted(&mut records, passed));
     }
 
-    /// Records all refusals that wait for their count, at the end.
-    pub fn record_rest(&self, now: Instant) {
-        let mut records = self.records();
-        let rest = records.refusals.rest(now);
-        rest.into_iter()
-            .for_each(|passed| self.keep_counted(&mut records, passed));
-    }
-
     fn keep_counted(&self, records: &mut Records, (mut record, count): (AuditRecord, u64)) {
         record.count = count;
         if count > 1 {
@@ -299,7 +291,7 @@ mod tests {
         assert_eq!(kept[2].command, "999", "the last of them is shown");
         assert!(kept[2].text.contains("999 commands of this client were refused"));
         audit.record(record("a", 7), Reach::Refused, now + Duration::from_secs(1));
-        audit.record_rest(now + Duration::from_secs(1));
+        audit.record_due(now + Duration::from_secs(2));
         assert_eq!(audit.recent().iter().map(|r| r.count).sum::<u64>(), 2001);
     }
 

@@ -82,26 +82,16 @@ impl<T> RefusalLimit<T> {
     pub fn due(&mut self, now: Instant) -> Vec<(T, u64)> {
         self.clients.values_mut().filter_map(|client| client.due(now)).collect()
     }
-
-    /// All that waits, at the end.
-    pub fn rest(&mut self, now: Instant) -> Vec<(T, u64)> {
-        self.clients
-            .values_mut()
-            .filter_map(|client| client.pass(now))
-            .collect()
-    }
 }
 
 impl<T> Client<T> {
     fn due(&mut self, now: Instant) -> Option<(T, u64)> {
-        let is_due = now.saturating_duration_since(self.passed) >= INTERVAL;
-        is_due.then(|| self.pass(now)).flatten()
-    }
-
-    fn pass(&mut self, now: Instant) -> Option<(T, u64)> {
-        let passing = self.waiting.take()?;
+        if now.saturating_duration_since(self.passed) < INTERVAL {
+            return None;
+        }
+        let due = self.waiting.take()?;
         self.passed = now;
-        Some(passing)
+        Some(due)
     }
 }
 
@@ -173,7 +163,7 @@ mod tests {
             lines <= CLIENTS + 1 && limit.clients.len() <= CLIENTS + 1,
             "{lines} lines"
         );
-        let rest = limit.rest(start);
+        let rest = limit.due(start + SECOND);
         assert_eq!(counted + rest.iter().map(|(_, count)| count).sum::<u64>(), 100_000);
         for n in 0..1000u64 {
             limit.admit(&"a".into(), "not_allowed", Some(&n.to_string()), n, start);
@@ -181,7 +171,7 @@ mod tests {
         let kinds = limit.clients.values().map(|client| client.kinds.len());
         assert_eq!(kinds.max(), Some(KINDS));
         let later = start + FORGOTTEN;
-        limit.rest(later);
+        limit.due(later);
         assert_eq!(
             admit(&mut limit, "new", "not_allowed", 1, later),
             Some((1, 1)),
