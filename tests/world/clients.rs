@@ -128,7 +128,7 @@ impl Servers {
     }
 }
 
-fn address(host: u8, connection: u16) -> SocketAddr {
+pub fn address(host: u8, connection: u16) -> SocketAddr {
     SocketAddr::from(([127, 0, 0, host], 40_000 + connection))
 }
 
