@@ -27,7 +27,7 @@ use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
 use super::bus::{Asked, Parts, Seen, WorldBus};
-use super::clients::{Client, Servers, Way, address, answers, write_frame};
+use super::clients::{Client, Servers, Waiting, Way, address, answers, write_frame};
 use super::drives::{AFTERMATH, Truth};
 use super::history::History;
 use super::orders::{Record, Unique, Wish, converted, order_of, percent_reference, run_command, sets};

@@ -253,7 +253,8 @@ impl World {
         }
         self.accepted(id, unique);
         if let Way::Plain(waiting) = &mut self.clients[client].way {
-            waiting.push((id, placed));
+            let is_read = self.records[id].read.is_some();
+            waiting.push(Waiting { id, placed, is_read });
         }
         self.clients[client].open += usize::from(self.records[id].answer.is_none());
     }

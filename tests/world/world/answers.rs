@@ -42,12 +42,12 @@ impl World {
     }
 
     pub(super) fn collect_client(&mut self, client: usize, writes: bool) {
-        let (now, records) = (self.now, &self.records);
+        let now = self.now;
         match &mut self.clients[client].way {
             Way::Plain(waiting) => {
                 let mut answered = Vec::new();
-                waiting.retain_mut(|(id, placed)| {
-                    let asked = writes || records[*id].read.is_some();
+                waiting.retain_mut(|Waiting { id, placed, is_read }| {
+                    let asked = writes || *is_read;
                     let answer = asked.then(|| placed.answer()).flatten();
                     let waits = answer.is_none();
                     answered.extend(answer.map(|answer| (*id, answer)));
