@@ -206,3 +206,21 @@ fn links_lead_somewhere() {
         }
     }
 }
+
+#[test]
+fn every_fault_of_the_world_fits_the_core_and_is_listed() {
+    let faults: toml::Table = read(&root().join("tests/world/mutants.toml")).parse().unwrap();
+    let page = read(&root().join("docs/development.md"));
+    for fault in faults["mutant"].as_array().unwrap() {
+        let (name, promise) = (fault["name"].as_str().unwrap(), fault["promise"].as_str().unwrap());
+        assert!(
+            page.contains(&format!("| `{name}` | {promise} |")),
+            "docs/development.md lacks `{name}`"
+        );
+        for edit in fault["edit"].as_array().unwrap() {
+            let (file, old) = (edit["file"].as_str().unwrap(), edit["old"].as_str().unwrap());
+            let places = read(&root().join(file)).matches(old).count();
+            assert_eq!(places, 1, "`{name}` is to replace one place of {file}: {old}");
+        }
+    }
+}

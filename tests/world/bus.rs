@@ -61,6 +61,8 @@ pub struct WorldBus {
     /// It was asked to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
+    /// Replies may come when they are not expected any more, or twice.
+    pub late: bool,
     /// The fast cycle of the line when it is saturated with polls, as predicted.
     pub round: Duration,
     /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
@@ -150,6 +152,7 @@ impl WorldBus {
         WorldBus {
             index,
             line: line.clone(),
+            late: line.is_late(),
             handle,
             core,
             wire,
