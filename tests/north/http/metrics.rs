@@ -46,6 +46,7 @@ const FROZEN: [&str; 46] = [
     "drivegate_modbus_tcp_connections gauge ",
     "drivegate_modbus_tcp_requests_total counter function,outcome",
     "drivegate_mqtt_buffered_messages gauge ",
+    "drivegate_mqtt_lost_total counter kind",
     "drivegate_mqtt_connected gauge ",
     "drivegate_mqtt_published_total counter ",
     "drivegate_point_value gauge bus,drive,point,unit",
