@@ -273,7 +273,9 @@ impl Broker {
         let file = dir.path().join("mosquitto.conf");
         std::fs::write(
             &file,
-            format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest none\nuser root\n"),
+            format!(
+                "listener {port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\npersistence false\nlog_dest none\nuser root\n"
+            ),
         )?;
         let program = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"];
         let program = program.into_iter().find(|path| std::path::Path::new(path).exists());
