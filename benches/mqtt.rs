@@ -158,12 +158,11 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
 
 /// Updates each drive once a cycle, evenly spread, until the end.
 fn poll(plant: &Plant, cycle: Duration, end: &AtomicBool) {
-    let drives = &plant.buses[0].image.drives;
+    let drives: Vec<_> = plant.drives().map(|drive| drive.image).collect();
     let step = cycle / drives.len() as u32;
     let mut next = Instant::now();
-    for turn in 0u32.. {
-        let drive = &drives[turn as usize % drives.len()];
-        let value = (turn / drives.len() as u32 % 50_000) as u16;
+    for (turn, drive) in drives.iter().cycle().enumerate() {
+        let value = (turn / drives.len() % 50_000) as u16;
         let now = Instant::now();
         drive.update(|snapshot| {
             snapshot.link = Link::Online(SystemTime::UNIX_EPOCH);
@@ -202,7 +201,8 @@ fn states(
     let since = |later: SystemTime, earlier| later.duration_since(earlier).unwrap_or_default().as_secs_f64() * 1e3;
     for (topic, payload, at) in arrived.try_iter() {
         let state: serde_json::Value = serde_json::from_slice(&payload)?;
-        let time = state["time"].as_str().ok_or("a state without time")?;
+        let time = state.get("time").and_then(|time| time.as_str());
+        let time = time.ok_or("a state without time")?;
         let time = humantime::parse_rfc3339(time)?;
         if let Some((before, sampled)) = held.insert(topic, (at, time)) {
             periods.push(since(at, before));
@@ -274,7 +274,9 @@ impl Broker {
         let file = dir.path().join("mosquitto.conf");
         std::fs::write(
             &file,
-            format!("listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nlog_dest none\nuser root\n"),
+            format!(
+                "listener {port} 127.0.0.1\nallow_anonymous true\nset_tcp_nodelay true\npersistence false\nlog_dest none\nuser root\n"
+            ),
         )?;
         let program = ["/usr/sbin/mosquitto", "/usr/local/sbin/mosquitto"];
         let program = program.into_iter().find(|path| std::path::Path::new(path).exists());
@@ -359,7 +361,11 @@ fn proxy(broker: u16, delay: Duration) -> Result<u16, Box<dyn Error>> {
 fn receive(mut from: TcpStream, sender: &Sender<(Instant, Vec<u8>)>) {
     let mut buffer = vec![0; 64 << 10];
     while let Ok(count) = from.read(&mut buffer) {
-        if count == 0 || sender.send((Instant::now(), buffer[..count].to_vec())).is_err() {
+        if count == 0
+            || sender
+                .send((Instant::now(), buffer.get(..count).unwrap_or_default().to_vec()))
+                .is_err()
+        {
             return;
         }
     }
