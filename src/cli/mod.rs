@@ -17,6 +17,7 @@ mod run;
 mod scan;
 mod schema;
 mod simulate;
+mod token;
 mod trace;
 mod watch;
 mod write;
@@ -77,6 +78,7 @@ commands! {
     Simulate => simulate,
     Profiles => profiles,
     Map => map,
+    Token => token,
     Schema => schema,
 }
 

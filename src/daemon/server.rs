@@ -121,7 +121,7 @@ impl Server for modbus_tcp::Server {
         let only_certificates = new.differs_in_certificates_only(old);
         if only_certificates {
             self.renew_certificates(new)?;
-            tracing::info!("Modbus TCP: using the new certificates for new connections");
+            tracing::info!("Modbus TCP: using the new certificates, revocations and roles");
         }
         Ok(only_certificates)
     }
@@ -160,6 +160,15 @@ impl Server for http::Http {
         cancel: CancellationToken,
     ) -> Result<Self, ServerError> {
         http::start(options, plant, stats, cancel).await
+    }
+
+    fn update(&self, old: &Self::Options, new: &Self::Options) -> Result<bool, ServerError> {
+        let same_address = old.listen == new.listen;
+        if same_address {
+            http::Http::update(self, old, new)?;
+            tracing::info!("HTTP: using the new hosts, tokens and certificates");
+        }
+        Ok(same_address)
     }
 
     async fn stopped(self) {

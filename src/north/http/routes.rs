@@ -1,6 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
+use std::net::IpAddr;
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -15,6 +16,7 @@ use axum::{Json, response};
 use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
+use super::access::Access;
 use super::{MAX_LISTENERS, api, page, streams};
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
@@ -27,6 +29,14 @@ pub(super) struct AppState {
     pub(super) cancel: CancellationToken,
     /// Permits for event streams.
     pub(super) listeners: Arc<Semaphore>,
+}
+
+/// How a request came, as an extension of it.
+#[derive(Debug, Clone)]
+pub(super) struct Reached {
+    /// The address of this machine that the client connected to.
+    pub(super) address: IpAddr,
+    pub(super) access: Arc<Access>,
 }
 
 /// All routes.
@@ -62,14 +72,21 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .layer(middleware::from_fn(guard))
 }
 
-/// Refuses all methods that could change something and sets the common headers of all replies.
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
+/// sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
-    let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
-        next.run(request).await
-    } else {
-        let text = "this interface is read only: use GET or HEAD\n";
-        let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
-        (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+    let reached = request.extensions().get::<Reached>();
+    let admitted = reached.map(|reached| reached.access.check(request.uri(), request.headers(), reached.address));
+    let mut response = match admitted {
+        // The server adds it to every request.
+        None => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+        Some(Err(refusal)) => refusal.into_response(),
+        Some(Ok(())) if matches!(*request.method(), Method::GET | Method::HEAD) => next.run(request).await,
+        Some(Ok(())) => {
+            let text = "this interface is read only: use GET or HEAD\n";
+            let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
+            (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+        }
     };
     const SET: [(HeaderName, &str); 3] = [
         (header::CACHE_CONTROL, "no-store"),

@@ -1,9 +1,11 @@
 //! Who may connect to a listener, and with which rights.
 
 use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use futures_util::future::{Either, select};
 use ipnet::IpNet;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
@@ -100,41 +102,47 @@ impl ConnectionHandler for Admission {
                 } else {
                     Authority::ReadOnly
                 };
-                self.serve_client(stream, Client::new(peer, None, authority)).await;
+                let end = self.cancel.child_token();
+                self.serve_client(stream, Client::new(peer, None, authority), end).await;
             }
-            WriteAccess::ByCertificate(authenticator) => {
-                match self
-                    .cancel
-                    .run_until_cancelled(authenticator.authenticate(stream))
-                    .await
-                {
-                    None => {}
-                    Some(Ok((stream, identified))) => {
-                        let authority = match identified.role {
-                            Role::Control => Authority::Write,
-                            Role::Monitor => Authority::ReadOnly,
-                        };
-                        self.serve_client(stream, Client::new(peer, Some(&identified.name), authority))
-                            .await;
-                    }
-                    Some(Err(error)) => {
-                        self.state.stats.modbus_tcp.connection_refused(ConnectionRefusal::Tls);
-                        if let Some(suppressed) = self.logs.tls.permit(Instant::now()) {
-                            tracing::warn!(client = %peer, suppressed, "Modbus TCP: client refused: TLS: {error}");
-                        }
-                    }
-                }
-            }
+            WriteAccess::ByCertificate(authenticator) => self.serve_tls_client(authenticator, stream, peer).await,
         }
         drop(permit);
     }
 }
 
 impl Admission {
-    async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client) {
+    /// Serves a client until its connection ends or its certificate is no longer accepted.
+    async fn serve_tls_client(&self, authenticator: &TlsAuthenticator, stream: TcpStream, peer: SocketAddr) {
+        let end = self.cancel.child_token();
+        let identified = authenticator.authenticate(stream, peer, &end);
+        match self.cancel.run_until_cancelled(identified).await {
+            None => {}
+            Some(Ok((stream, identified))) => {
+                let authority = match identified.role {
+                    Role::Control => Authority::Write,
+                    Role::Monitor => Authority::ReadOnly,
+                };
+                let client = Client::new(peer, Some(&identified.name), authority);
+                let served = pin!(self.serve_client(stream, client, end));
+                let expired = pin!(identified.certificate.expired());
+                if let Either::Right(((), served)) = select(served, expired).await {
+                    // Commands that are under way are answered.
+                    served.await;
+                }
+            }
+            Some(Err(error)) => {
+                self.state.stats.modbus_tcp.connection_refused(ConnectionRefusal::Tls);
+                if let Some(suppressed) = self.logs.tls.permit(Instant::now()) {
+                    tracing::warn!(client = %peer, suppressed, "Modbus TCP: client refused: TLS: {error}");
+                }
+            }
+        }
+    }
+
+    async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client, end: CancellationToken) {
         let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
-        let idle_timeout = self.state.options.idle_timeout;
-        connection::serve(stream, session, idle_timeout, self.cancel.child_token()).await;
+        connection::serve(stream, session, self.state.options.idle_timeout, end).await;
     }
 }
 

@@ -5,15 +5,16 @@
 //! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
-mod certificate;
 mod client;
 mod command_words;
 mod connection;
+mod crl;
 mod dialogue;
 mod forwarded_request;
 pub(crate) mod frame;
 pub(crate) mod identify;
 mod offline;
+mod open_clients;
 mod routes;
 mod session;
 mod tls;
@@ -34,11 +35,11 @@ use self::routes::PlantView;
 use self::tls::TlsAuthenticator;
 use crate::north::connection_limit::ConnectionLimit;
 use crate::north::listener::{AcceptLoop, bind};
-use crate::north::{NorthStats, ServerError};
+use crate::north::{IdentityFault, NorthStats, ServerError};
 use crate::plant::SharedPlant;
 
 pub use self::offline::Offline;
-pub use self::tls::{Identity, IdentityFault, Role, Tls, TlsFile};
+pub use self::tls::{Identity, Role, Tls};
 
 /// Name in messages.
 const PROTOCOL: &str = "Modbus TCP";
@@ -63,11 +64,12 @@ pub struct Options {
 }
 
 impl Options {
-    /// Whether `other` differs only in the content of certificate files, which a running server can apply.
+    /// Whether `other` differs only in the content of certificate files and in roles, which a running server can apply.
     pub(crate) fn differs_in_certificates_only(&self, other: &Options) -> bool {
         let mut same = other.clone();
         if let (Some(tls), Some(own)) = (&mut same.tls, &self.tls) {
             tls.identity = own.identity.clone();
+            tls.roles = own.roles.clone();
         }
         self != other && *self == same
     }
@@ -118,13 +120,14 @@ impl Server {
         &self.tls_addresses
     }
 
-    /// Uses the certificates of `options` for new connections; open connections stay.
+    /// Uses the certificates, revocations and roles of `options`. Open connections whose certificate they do not admit
+    /// with the same rights end; the others stay.
     ///
     /// # Errors
     /// The certificates cannot be used; the previous ones stay in use.
     pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
         match (&self.authenticator, &options.tls) {
-            (Some(authenticator), Some(tls)) => Ok(authenticator.renew(&tls.identity)?),
+            (Some(authenticator), Some(tls)) => authenticator.renew(tls).map_err(unusable),
             _ => Ok(()),
         }
     }
@@ -180,7 +183,8 @@ async fn open(
         .tls
         .as_ref()
         .map(TlsAuthenticator::new)
-        .transpose()?
+        .transpose()
+        .map_err(unusable)?
         .map(Arc::new);
     raise_file_limit(options.max_connections);
     let limit = ConnectionLimit::new(options.max_connections, options.max_connections_per_address);
@@ -239,6 +243,10 @@ async fn open(
         authenticator,
         tasks: tasks.clone(),
     })
+}
+
+fn unusable(fault: IdentityFault) -> ServerError {
+    ServerError::Tls(PROTOCOL, fault)
 }
 
 /// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,

@@ -219,7 +219,7 @@ impl Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
         let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let http = http::start(Options { listen }, shared.clone(), stats(), cancel.clone())
+        let http = http::start(Options::at(listen), shared.clone(), stats(), cancel.clone())
             .await
             .expect("it starts");
         Server {

@@ -79,7 +79,7 @@ impl Works {
 
     fn identity(&self, server: &str) -> Identity {
         let [certificate, key] = ["crt", "key"].map(|kind| self.file(&format!("own/{server}.{kind}")));
-        Identity::load(&certificate, &key, &self.file("own/ca.crt"), SystemTime::now())
+        Identity::load(&certificate, &key, &self.file("own/ca.crt"), None, SystemTime::now())
             .unwrap()
             .0
     }
