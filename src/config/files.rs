@@ -4,7 +4,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::Path;
 use std::time::SystemTime;
 
-use crate::document::Reader;
+use crate::document::{Finding, Reader};
 use crate::north::{IdentityFault, TlsFile, certificate_warnings};
 
 /// Permissions of users who are neither owner nor in the group: to read, and to write.
@@ -24,6 +24,14 @@ pub(super) fn warn_of_readers(reader: &Reader<'_>, key: &str, path: &Path) {
             format!("chmod o-rw {shown}"),
         );
     }
+}
+
+/// A file that the configuration names cannot be read.
+pub(super) fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
+    Finding::new(
+        format!("cannot read {}: {error}", path.display()),
+        "check the path and its permissions",
+    )
 }
 
 /// Reports what is wrong with the files of an identity at the key of each, by `name`.

@@ -165,7 +165,7 @@ fn secret(path: &Path) -> Result<String, Finding> {
     let mut text = String::new();
     File::open(path)
         .and_then(|file| file.take(SECRET).read_to_string(&mut text))
-        .map_err(|error| cannot_read(path, &error))?;
+        .map_err(|error| files::cannot_read(path, &error))?;
     let shown = path.display();
     let line = text.lines().next().unwrap_or_default();
     if line.is_empty() {
@@ -207,13 +207,6 @@ fn check_certificates(reader: &Reader<'_>, ca: Option<&Path>, identity: Option<&
     }
 }
 
-fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
-    Finding::new(
-        format!("cannot read {}: {error}", path.display()),
-        "check the path and its permissions",
-    )
-}
-
 /// Path of a PEM file that can be read now.
 fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<PathBuf> {
     let path = values::resolved(base, key.read(reader)?);
@@ -221,7 +214,7 @@ fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<Path
         true => Ok(()),
         false => Err(std::io::Error::other("not a file")),
     });
-    reader.accept(key.name, readable.map_err(|error| cannot_read(&path, &error)));
+    reader.accept(key.name, readable.map_err(|error| files::cannot_read(&path, &error)));
     Some(path)
 }
 

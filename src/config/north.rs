@@ -6,7 +6,7 @@ use std::time::SystemTime;
 
 use super::keys::HTTP;
 use super::{files, values};
-use crate::document::{Finding, Place, Reader, read_file};
+use crate::document::{Finding, Place, Reader};
 use crate::north::http::{self, Tokens};
 use crate::north::{ServerIdentity, TlsFile};
 
@@ -47,7 +47,8 @@ pub(super) fn parse_host(text: &str) -> Result<String, Finding> {
 fn read_tokens(reader: &Reader<'_>, base: &Path) -> Option<Tokens> {
     let key = &HTTP.tokens_file;
     let path = values::resolved(base, key.read(reader)?);
-    let text = reader.accept(key.name, read_file(&path).map_err(|problem| problem.finding))?;
+    let text = std::fs::read_to_string(&path).map_err(|error| files::cannot_read(&path, &error));
+    let text = reader.accept(key.name, text)?;
     match Tokens::parse(&text) {
         Ok(tokens) => {
             if tokens.list().is_empty() {

@@ -64,8 +64,10 @@ pub(super) enum FileProblem {
     KeyMismatch,
     #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
     Unusable(rustls::Error),
-    #[error("{file} contains no usable CRL: {cause}; specify a PEM or DER file of CRLs")]
+    #[error("{file} contains no usable CRL: {cause}; specify a PEM or DER file with CRLs of version 2")]
     UnusableCrl { file: String, cause: String },
+    #[error("a CRL cannot be used: {0:?}; specify CRLs of version 2")]
+    UnsupportedCrl(rustls::CertRevocationListError),
     #[error(
         "the CRL of `{issuer}` in {file} is not signed by the CA in client_ca, so every client would be refused; \
          specify the CRL that this CA issued"
@@ -77,8 +79,8 @@ pub(super) enum FileProblem {
     )]
     NoCrl { issuer: String, file: String },
     #[error(
-        "the CRL of `{issuer}` in {file} should have been replaced by {end}; it stays in force, but newer revocations \
-         are unknown: install the current CRL"
+        "the CRL of `{issuer}` in {file} should have been replaced by {end} and stays in force, without newer revocations; \
+         install the current one"
     )]
     OldCrl { issuer: String, file: String, end: String },
 }

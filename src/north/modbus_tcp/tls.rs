@@ -9,7 +9,7 @@ use std::time::{Duration, SystemTime};
 
 use ipnet::IpNet;
 use rustls::server::danger::ClientCertVerifier;
-use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
+use rustls::server::{NoServerSessionStorage, VerifierBuilderError, WebPkiClientVerifier};
 use rustls::{RootCertStore, ServerConfig};
 use rustls_pki_types::CertificateDer;
 use tokio::net::TcpStream;
@@ -112,7 +112,10 @@ impl Identity {
         WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider())
             .with_crls(self.client_crl.clone())
             .build()
-            .map_err(|error| unusable_ca(&error))
+            .map_err(|error| match error {
+                VerifierBuilderError::InvalidCrl(error) => TlsFile::ClientCrl.fault(FileProblem::UnsupportedCrl(error)),
+                error => unusable_ca(&error),
+            })
     }
 
     /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, and a session

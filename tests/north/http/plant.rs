@@ -216,10 +216,14 @@ pub(crate) struct Server {
 
 impl Server {
     pub(crate) async fn of(plant: Plant) -> Server {
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        Server::with(plant, Options::at(listen)).await
+    }
+
+    pub(crate) async fn with(plant: Plant, options: Options) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
-        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let http = http::start(Options::at(listen), shared.clone(), stats(), cancel.clone())
+        let http = http::start(options, shared.clone(), stats(), cancel.clone())
             .await
             .expect("it starts");
         Server {
