@@ -90,6 +90,31 @@ fn every_configuration_that_ships_is_valid() {
     }
 }
 
+/// A defence that names a test which is not there proves nothing.
+#[test]
+fn the_tests_of_the_threat_model_exist() {
+    let text = read(&root().join("docs/threat-model.md"));
+    let table = text.split("## Defences").nth(1).unwrap().split("\n## ").next().unwrap();
+    let code: String = [files(&root().join("src"), "rs"), files(&root().join("tests"), "rs")]
+        .iter()
+        .flatten()
+        .map(|file| read(file))
+        .collect();
+    let is_name = |word: &&str| {
+        word.contains('_')
+            && word
+                .chars()
+                .all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
+    };
+    let named: Vec<&str> = table.split('`').skip(1).step_by(2).filter(is_name).collect();
+    assert!(named.len() > 30, "{named:?}");
+    let missing: Vec<&&str> = named
+        .iter()
+        .filter(|name| !code.contains(&format!("fn {name}(")))
+        .collect();
+    assert!(missing.is_empty(), "{missing:?}");
+}
+
 fn is_profile(block: &str) -> bool {
     let named = block.contains("\nbase = ") || block.contains("\nprotocols = ");
     named && !block.contains("[mqtt]") || block.starts_with("[n2]")

@@ -65,7 +65,7 @@ fn revocations_are_checked_before_they_refuse_everybody() {
         (dir.join("cut.crl"), "contains no usable CRL: "),
         (
             revocations(dir, "v1.crl", BOOK, "-crldays 30"),
-            "specify CRLs of version 2",
+            "CRLs of version 2",
         ),
         (dir.join("same/ca.crl"), "is not signed by the CA in client_ca"),
         (dir.join("other/ca.crl"), "contains no CRL of CA `drivegate test CA`"),
