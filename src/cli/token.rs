@@ -13,7 +13,7 @@ use crate::north::http::{Scope, Token, Tokens};
 /// The file is `tokens_file` of [http]; a running gateway reads it at a reload. It holds only the SHA-256 of each token.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:\n  \
-    drivegate token add --file /etc/drivegate/tokens --scope metrics prometheus >/etc/prometheus/drivegate.token\n  \
+    drivegate token add --file /etc/drivegate/tokens --scope metrics prometheus >prometheus.token\n  \
     drivegate token list --file /etc/drivegate/tokens\n  \
     drivegate token remove --file /etc/drivegate/tokens prometheus")]
 pub(super) struct Args {
@@ -24,6 +24,9 @@ pub(super) struct Args {
 #[derive(Debug, clap::Subcommand)]
 enum Action {
     /// Adds a token to the file and prints it; it cannot be shown again.
+    #[command(
+        after_help = "Example:\n  drivegate token add --file /etc/drivegate/tokens --scope read panel >panel.token"
+    )]
     Add {
         #[command(flatten)]
         file: TokenFile,
@@ -34,11 +37,13 @@ enum Action {
         name: String,
     },
     /// Prints names and scopes.
+    #[command(after_help = "Example:\n  drivegate token list --file /etc/drivegate/tokens")]
     List {
         #[command(flatten)]
         file: TokenFile,
     },
     /// Removes a token from the file.
+    #[command(after_help = "Example:\n  drivegate token remove --file /etc/drivegate/tokens panel")]
     Remove {
         #[command(flatten)]
         file: TokenFile,

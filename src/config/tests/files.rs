@@ -63,10 +63,7 @@ fn revocations_are_checked_before_they_refuse_everybody() {
         (dir.join("no.crl"), "cannot read "),
         (certificates().join("gateway.crt"), "gateway.crt contains no CRL; "),
         (dir.join("cut.crl"), "contains no usable CRL: "),
-        (
-            revocations(dir, "v1.crl", BOOK, "-crldays 30"),
-            "CRLs of version 2",
-        ),
+        (revocations(dir, "v1.crl", BOOK, "-crldays 30"), "CRLs of version 2"),
         (dir.join("same/ca.crl"), "is not signed by the CA in client_ca"),
         (dir.join("other/ca.crl"), "contains no CRL of CA `drivegate test CA`"),
         (
