@@ -1,9 +1,10 @@
 //! A client of a running gateway's HTTP server, for commands that show its state.
 
+mod gateway;
+
 use std::collections::VecDeque;
 use std::fmt;
 use std::future::poll_fn;
-use std::path::{Path, PathBuf};
 use std::pin::Pin;
 use std::str::FromStr;
 use std::time::Duration;
@@ -12,15 +13,11 @@ use hyper::body::{Body as _, Bytes, Incoming};
 use hyper::client::conn::http1::{self, Connection};
 use hyper::{Request, Response, StatusCode, Uri, header};
 use hyper_util::rt::TokioIo;
-use rustls_pki_types::ServerName;
 use serde::Deserialize;
-use tokio::io::{AsyncRead, AsyncWrite};
-use tokio::net::TcpStream;
 use tokio::time::timeout;
-use tokio_rustls::TlsConnector;
-use tokio_rustls::client::TlsStream;
 
-use crate::north::client_tls;
+pub(super) use self::gateway::Gateway;
+use self::gateway::Stream;
 
 /// Time for the connection and the head of the reply.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
@@ -30,20 +27,6 @@ const SILENCE: Duration = Duration::from_secs(35);
 const MOST_BYTES: usize = 1 << 20;
 /// Largest document: some thousand drives with all their points.
 const MOST_DOCUMENT: usize = 1 << 26;
-
-/// The options that say which gateway is asked, and how.
-#[derive(Debug, Clone, clap::Args)]
-pub(super) struct Gateway {
-    /// The gateway's HTTP server.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
-    url: Url,
-    /// PEM file of the CA that signed the gateway's certificate, for https:// [default: those of the system].
-    #[arg(long, value_name = "FILE")]
-    ca: Option<PathBuf>,
-    /// File whose only line is a token of the gateway, with scope `read`.
-    #[arg(long, value_name = "FILE")]
-    token_file: Option<PathBuf>,
-}
 
 /// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -107,7 +90,7 @@ pub(super) enum ClientError {
     #[error("{error}; {url}; {remedy}")]
     Refused {
         /// The gateway.
-        url: Url,
+        url: Box<Url>,
         /// Its message.
         error: String,
         /// What to do.
@@ -236,7 +219,7 @@ impl EventStream {
                     [] => "try again later".to_string(),
                     known => format!("known: {}", known.join(", ")),
                 },
-                url,
+                url: Box::new(url),
                 error,
             },
             Err(_) => ClientError::Strange(url, format!("the server answered `{status}` without a stream")),
@@ -280,14 +263,8 @@ pub(super) async fn get_json(gateway: &Gateway, path: &str) -> Result<serde_json
 async fn ask(gateway: &Gateway, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
     let url = &gateway.url;
     let unreachable = |why: String| ClientError::Unreachable(url.clone(), why);
-    let token = gateway.token_file.as_deref().map(read_token).transpose()?;
-    let socket = TcpStream::connect((url.host.as_str(), url.port))
-        .await
-        .map_err(|error| unreachable(error.to_string()))?;
-    let stream: Box<dyn Stream> = match url.tls {
-        false => Box::new(socket),
-        true => Box::new(with_tls(gateway, socket).await?),
-    };
+    let token = gateway.token()?;
+    let stream = gateway.connect().await?;
     let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("not an HTTP reply ({error})"));
     let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(strange)?;
     let mut wire = Wire(Some(Box::pin(connection)));
@@ -303,27 +280,6 @@ async fn ask(gateway: &Gateway, path: &str) -> Result<(Wire, Response<Incoming>)
     let response = wire.with(sender.send_request(request)).await.map_err(strange)?;
     Ok((wire, response))
 }
-
-/// The only line of a token file.
-fn read_token(path: &Path) -> Result<String, ClientError> {
-    let text = std::fs::read_to_string(path)
-        .map_err(|error| ClientError::File(format!("cannot read the token: {error}; {}", path.display())))?;
-    Ok(text.trim().to_string())
-}
-
-async fn with_tls(gateway: &Gateway, socket: TcpStream) -> Result<TlsStream<TcpStream>, ClientError> {
-    let url = &gateway.url;
-    let config = client_tls(gateway.ca.as_deref()).map_err(ClientError::File)?;
-    let failed = |why: String| ClientError::Tls(url.clone(), why);
-    let name = ServerName::try_from(url.host.clone()).map_err(|error| failed(error.to_string()))?;
-    let handshake = TlsConnector::from(config).connect(name, socket);
-    handshake.await.map_err(|error| failed(error.to_string()))
-}
-
-/// A connection, with TLS or without.
-trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
-
-impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
 /// The connection, which is polled only while a reply or event is awaited.
 struct Wire(Option<Pin<Box<Connected>>>);

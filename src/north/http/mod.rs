@@ -198,6 +198,7 @@ pub async fn start(
                 terms: terms.clone(),
                 cancel: cancel.clone(),
                 log: LogThrottle::default(),
+                refusals: Arc::default(),
             }),
             limit: ConnectionLimit::new(MAX_CONNECTIONS, None),
             tasks: tasks.clone(),
@@ -215,6 +216,7 @@ struct HttpConnections {
     terms: Arc<ArcSwap<Terms>>,
     cancel: CancellationToken,
     log: LogThrottle,
+    refusals: Arc<LogThrottle>,
 }
 
 impl ConnectionHandler for HttpConnections {
@@ -268,6 +270,8 @@ impl HttpConnections {
     ) {
         let reached = Reached {
             address: local,
+            peer,
+            refusals: self.refusals.clone(),
             access: terms.access.clone(),
         };
         let router = TowerToHyperService::new(self.router.clone());

@@ -1,7 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -18,6 +18,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
 use super::{MAX_LISTENERS, api, page, streams};
+use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
 
@@ -36,7 +37,10 @@ pub(super) struct AppState {
 pub(super) struct Reached {
     /// The address of this machine that the client connected to.
     pub(super) address: IpAddr,
+    pub(super) peer: SocketAddr,
     pub(super) access: Arc<Access>,
+    /// Limits the log of refused requests.
+    pub(super) refusals: Arc<LogThrottle>,
 }
 
 /// All routes.
@@ -80,7 +84,13 @@ async fn guard(request: Request, next: Next) -> Response {
     let mut response = match admitted {
         // The server adds it to every request.
         None => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
-        Some(Err(refusal)) => refusal.into_response(),
+        Some(Err(refusal)) => {
+            if let Some(suppressed) = reached.and_then(|reached| reached.refusals.permit(Instant::now())) {
+                let peer = reached.map(|reached| reached.peer);
+                tracing::warn!(target: "drivegate::http", ?peer, suppressed, "HTTP: request refused: {refusal}");
+            }
+            refusal.into_response()
+        }
         Some(Ok(())) if matches!(*request.method(), Method::GET | Method::HEAD) => next.run(request).await,
         Some(Ok(())) => {
             let text = "this interface is read only: use GET or HEAD\n";
