@@ -79,20 +79,10 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
 /// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
 /// sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
-    let reached = request.extensions().get::<Reached>();
-    let admitted = reached.map(|reached| reached.access.check(request.uri(), request.headers(), reached.address));
-    let mut response = match admitted {
-        // The server adds it to every request.
-        None => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
-        Some(Err(refusal)) => {
-            if let Some(suppressed) = reached.and_then(|reached| reached.refusals.permit(Instant::now())) {
-                let peer = reached.map(|reached| reached.peer);
-                tracing::warn!(target: "drivegate::http", ?peer, suppressed, "HTTP: request refused: {refusal}");
-            }
-            refusal.into_response()
-        }
-        Some(Ok(())) if matches!(*request.method(), Method::GET | Method::HEAD) => next.run(request).await,
-        Some(Ok(())) => {
+    let mut response = match refused(&request) {
+        Some(refusal) => refusal,
+        None if matches!(*request.method(), Method::GET | Method::HEAD) => next.run(request).await,
+        None => {
             let text = "this interface is read only: use GET or HEAD\n";
             let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
             (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
@@ -107,6 +97,21 @@ async fn guard(request: Request, next: Next) -> Response {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
     }
     response
+}
+
+/// The reply to a request that is not answered, because of its host or its token.
+fn refused(request: &Request) -> Option<Response> {
+    let Some(reached) = request.extensions().get::<Reached>() else {
+        // The server adds it to every request.
+        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
+    };
+    let admitted = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = admitted.err()?;
+    if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
+        let peer = reached.peer;
+        tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
+    }
+    Some(refusal.into_response())
 }
 
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
