@@ -114,8 +114,12 @@ impl Http {
     /// # Errors
     /// The certificates cannot be used; everything stays as it was.
     pub fn update(&self, before: &Options, options: &Options) -> Result<(), ServerError> {
+        self.apply(Terms::new(options)?, before, options);
+        Ok(())
+    }
+
+    fn apply(&self, mut terms: Terms, before: &Options, options: &Options) {
         let old = self.terms.load_full();
-        let mut terms = Terms::new(options)?;
         let same = Options {
             identity: before.identity.clone(),
             ..options.clone()
@@ -128,7 +132,6 @@ impl Http {
         if !only_certificate {
             old.replaced.cancel();
         }
-        Ok(())
     }
 
     /// Waits until the server has stopped: at most half a second after the token was cancelled.

@@ -114,8 +114,7 @@ impl ConnectionHandler for Admission {
 impl Admission {
     /// Serves a client until its connection ends or its certificate is no longer accepted.
     async fn serve_tls_client(&self, authenticator: &TlsAuthenticator, stream: TcpStream, peer: SocketAddr) {
-        let end = self.cancel.child_token();
-        let identified = authenticator.authenticate(stream, peer, &end);
+        let identified = authenticator.authenticate(stream, peer);
         match self.cancel.run_until_cancelled(identified).await {
             None => {}
             Some(Ok((stream, identified))) => {
@@ -124,10 +123,12 @@ impl Admission {
                     Role::Monitor => Authority::ReadOnly,
                 };
                 let client = Client::new(peer, Some(&identified.name), authority);
-                let served = pin!(self.serve_client(stream, client, end));
-                let expired = pin!(identified.certificate.expired());
-                if let Either::Right(((), served)) = select(served, expired).await {
+                let end = self.cancel.child_token();
+                let served = pin!(self.serve_client(stream, client, end.clone()));
+                let refused = pin!(identified.certificate.refused());
+                if let Either::Right(((), served)) = select(served, refused).await {
                     // Commands that are under way are answered.
+                    end.cancel();
                     served.await;
                 }
             }

@@ -32,7 +32,7 @@ use tokio_util::task::TaskTracker;
 use self::admission::{Admission, RefusalLogs, WriteAccess};
 use self::command_words::CommandWords;
 use self::routes::PlantView;
-use self::tls::TlsAuthenticator;
+use self::tls::{Requirements, TlsAuthenticator};
 use crate::north::connection_limit::ConnectionLimit;
 use crate::north::listener::{AcceptLoop, bind};
 use crate::north::{IdentityFault, NorthStats, ServerError};
@@ -127,7 +127,10 @@ impl Server {
     /// The certificates cannot be used; the previous ones stay in use.
     pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
         match (&self.authenticator, &options.tls) {
-            (Some(authenticator), Some(tls)) => authenticator.renew(tls).map_err(unusable),
+            (Some(authenticator), Some(tls)) => {
+                authenticator.renew(Requirements::new(tls).map_err(unusable)?);
+                Ok(())
+            }
             _ => Ok(()),
         }
     }

@@ -34,7 +34,7 @@ struct OpenClient {
     role: Role,
     /// For the log.
     who: String,
-    end: CancellationToken,
+    refused: CancellationToken,
 }
 
 impl OpenClient {
@@ -49,7 +49,7 @@ impl OpenClient {
 
     fn disconnect(&self, why: &str) {
         tracing::warn!(client = %self.who, "Modbus TCP: disconnecting a client: {why}");
-        self.end.cancel();
+        self.refused.cancel();
     }
 }
 
@@ -78,8 +78,7 @@ impl OpenClients {
         state.requirements = Arc::new(requirements);
     }
 
-    /// Registers a client whose `chain` was verified against `verified`, with the role in its certificate. `end` is
-    /// cancelled when it may not stay.
+    /// Registers a client whose `chain` was verified against `verified`, with the role in its certificate.
     ///
     /// # Errors
     /// The requirements changed since, and do not admit it.
@@ -89,7 +88,6 @@ impl OpenClients {
         chain: Vec<CertificateDer<'static>>,
         role_name: Option<String>,
         who: String,
-        end: &CancellationToken,
     ) -> Result<(CertificateGuard, Role), rustls::Error> {
         let ends = chain.iter().filter_map(|der| certificate::read(der).ok());
         let ends = ends.map(|certificate| certificate.not_after).collect();
@@ -98,6 +96,7 @@ impl OpenClients {
             state.requirements.check(&chain, SystemTime::now())?;
         }
         let role = state.requirements.role(role_name.as_deref());
+        let refused = CancellationToken::new();
         let id = state.next;
         state.next += 1;
         let client = OpenClient {
@@ -105,13 +104,14 @@ impl OpenClients {
             role_name,
             role,
             who,
-            end: end.clone(),
+            refused: refused.clone(),
         };
         state.open.insert(id, client);
         let guard = CertificateGuard {
             clients: self.clone(),
             id,
             ends,
+            refused,
         };
         Ok((guard, role))
     }
@@ -128,11 +128,19 @@ pub(super) struct CertificateGuard {
     id: u64,
     /// When its certificates expire, seconds since 1970.
     ends: Vec<u64>,
+    refused: CancellationToken,
 }
 
 impl CertificateGuard {
-    /// Waits until the client is disconnected because a certificate of its chain has expired.
-    pub(super) async fn expired(&self) {
+    /// Waits until the client may not stay: a reload no longer admits it, or a certificate of its chain has expired.
+    pub(super) async fn refused(&self) {
+        tokio::select! {
+            () = self.refused.cancelled() => {}
+            () = self.expired() => {}
+        }
+    }
+
+    async fn expired(&self) {
         let mut now = SystemTime::now();
         loop {
             let checked = now;
@@ -144,7 +152,7 @@ impl CertificateGuard {
         }
     }
 
-    /// Whether the client may not stay; then it is disconnected.
+    /// Whether the client may not stay.
     fn is_refused(&self, now: SystemTime) -> bool {
         let state = self.clients.lock();
         let Some(client) = state.open.get(&self.id) else {

@@ -15,7 +15,6 @@ use rustls_pki_types::CertificateDer;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
-use tokio_util::sync::CancellationToken;
 
 use super::crl::{self, Crls};
 use super::open_clients::{CertificateGuard, OpenClients};
@@ -137,7 +136,11 @@ pub(super) struct Requirements {
 }
 
 impl Requirements {
-    fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
+    /// Those of the configuration.
+    ///
+    /// # Errors
+    /// Its certificates cannot be used.
+    pub(super) fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
         let verifier = tls.identity.verifier()?;
         Ok(Requirements {
             config: tls.identity.server_config(verifier.clone())?,
@@ -202,18 +205,13 @@ impl TlsAuthenticator {
         })
     }
 
-    /// Uses the certificates, revocations and roles of `tls`. Clients that they do not admit, or admit with other
-    /// rights, are disconnected.
-    ///
-    /// # Errors
-    /// They cannot be used; the previous ones stay in use.
-    pub(super) fn renew(&self, tls: &Tls) -> Result<(), IdentityFault> {
-        self.clients.renew(Requirements::new(tls)?, SystemTime::now());
-        Ok(())
+    /// Uses other certificates, revocations and roles. Clients that they do not admit, or admit with other rights, are
+    /// disconnected.
+    pub(super) fn renew(&self, requirements: Requirements) {
+        self.clients.renew(requirements, SystemTime::now());
     }
 
-    /// Performs the handshake and reads the role of the client at `peer`. When its certificate is no longer accepted,
-    /// `end` is cancelled.
+    /// Performs the handshake and reads the role of the client at `peer`.
     ///
     /// # Errors
     /// Why the client is refused.
@@ -221,7 +219,6 @@ impl TlsAuthenticator {
         &self,
         stream: TcpStream,
         peer: SocketAddr,
-        end: &CancellationToken,
     ) -> Result<(TlsStream<TcpStream>, AuthenticatedClient), AuthenticationError> {
         let requirements = self.clients.requirements();
         let handshake = TlsAcceptor::from(requirements.config.clone()).accept(stream);
@@ -239,7 +236,7 @@ impl TlsAuthenticator {
         };
         let (certificate, role) = self
             .clients
-            .admit(&requirements, chain, role, format!("{name} at {peer}"), end)?;
+            .admit(&requirements, chain, role, format!("{name} at {peer}"))?;
         let client = AuthenticatedClient {
             name,
             role,
