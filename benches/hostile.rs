@@ -107,7 +107,10 @@ async fn phase(
     while Instant::now() < until {
         *value += 1;
         asked += 1;
-        answered += usize::from(matches!(timeout(PATIENCE, command(north.modbus, *value)).await, Ok(Ok(()))));
+        answered += usize::from(matches!(
+            timeout(PATIENCE, command(north.modbus, *value)).await,
+            Ok(Ok(()))
+        ));
         sleep(Duration::from_secs(1)).await;
     }
     let (latencies, lost) = scada.await?;
@@ -166,7 +169,10 @@ async fn poll(modbus: SocketAddr, until: Instant) -> (Vec<f64>, usize) {
         let asked = Instant::now();
         match &mut stream {
             Some(open) => {
-                if timeout(PATIENCE, read_model(open)).await.is_ok_and(|answer| answer.is_ok()) {
+                if timeout(PATIENCE, read_model(open))
+                    .await
+                    .is_ok_and(|answer| answer.is_ok())
+                {
                     latencies.push(asked.elapsed().as_secs_f64() * 1e3);
                 } else {
                     lost += 1;
@@ -271,7 +277,10 @@ impl Attack {
                 let mut stream = connect(ATTACKER, north.modbus).await?;
                 let many = [0, 1, 0, 0, 0, 6, 1, 3, 0x80, 0, 0, 19].repeat(100);
                 // Until its buffers and the gateway's are full.
-                while timeout(PATIENCE, stream.write_all(&many)).await.is_ok_and(|sent| sent.is_ok()) {}
+                while timeout(PATIENCE, stream.write_all(&many))
+                    .await
+                    .is_ok_and(|sent| sent.is_ok())
+                {}
             }
             Attack::Floods => repeat(north.modbus, &[0, 1, 0, 0, 0, 6, 1, 3, 0x80, 0, 0, 19]).await?,
             Attack::SlowHttpHeads => {
@@ -290,7 +299,10 @@ impl Attack {
             }
             Attack::ScrapesWithoutPause => {
                 let mut stream = connect(ATTACKER, north.http).await?;
-                let request = format!("GET /metrics HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n", north.http);
+                let request = format!(
+                    "GET /metrics HTTP/1.1\r\nHost: {}\r\nConnection: close\r\n\r\n",
+                    north.http
+                );
                 stream.write_all(request.as_bytes()).await?;
                 stream.read_to_end(&mut Vec::new()).await?;
             }
