@@ -8,6 +8,7 @@ use std::time::SystemTime;
 use drivegate::north::ServerIdentity;
 use drivegate::north::http::{Options, Scope, Token, Tokens};
 
+use tokio::net::TcpStream;
 use tokio::time::timeout;
 
 use super::client::{EventStream, PATIENCE, Reply, get, raw, request};
@@ -238,9 +239,11 @@ async fn https_with_a_certificate_that_is_renewed() {
     certificates(dir.path(), &["ca"]);
     certificates(dir.path(), &["server", "first"]);
     certificates(dir.path(), &["server", "second"]);
+    let listen = SocketAddr::from(([127, 0, 0, 1], free_port()));
     let options = |name| Options {
         identity: Some(identity(dir.path(), name)),
-        ..local()
+        max_connections: 8,
+        ..Options::at(listen)
     };
     let mut server = Server::with(plant::mixed(), options("first")).await;
     let (ca, port) = (dir.path().join("ca.crt").display().to_string(), server.address.port());
@@ -262,6 +265,14 @@ async fn https_with_a_certificate_that_is_renewed() {
     assert!(!answered(&curl(&[&url]).await), "an unknown CA");
     let plain = url.replace("https", "http");
     assert!(!answered(&curl(&[&plain]).await), "without TLS");
+    let mut silent = Vec::new();
+    for _ in 0..20 {
+        silent.push(TcpStream::connect(listen).await.unwrap());
+    }
+    assert!(
+        answered(&curl(&["--cacert", &ca, &url]).await),
+        "silent handshakes make room"
+    );
     server.reload(options("second")).await;
     let second = curl(&["--cacert", &ca, &url]).await;
     assert!(answered(&second));
@@ -269,6 +280,9 @@ async fn https_with_a_certificate_that_is_renewed() {
         String::from_utf8_lossy(&second.stderr).contains("CN=second"),
         "{second:?}"
     );
+    server.reload(Options::at(listen)).await;
+    assert!(answered(&curl(&[&plain]).await), "TLS is turned off");
+    assert!(!answered(&curl(&["--cacert", &ca, &url]).await));
 }
 
 /// The daemon with all of it, a reload, and the commands that show its state.
