@@ -20,6 +20,7 @@ mod run;
 mod scan;
 mod schema;
 mod simulate;
+mod token;
 mod trace;
 mod watch;
 mod write;
@@ -81,6 +82,7 @@ commands! {
     Profiles => profiles,
     Map => map,
     Audit => audit,
+    Token => token,
     Schema => schema,
 }
 

@@ -13,7 +13,7 @@ use serde::Deserialize;
 use tokio::signal::unix::{SignalKind, signal};
 
 use self::pcap::Capture;
-use super::client::{EventStream, Url};
+use super::client::{EventStream, Gateway};
 use super::{EXIT_FAILED, printable, report};
 use crate::process_image::Direction;
 
@@ -31,9 +31,8 @@ const FLUSH: Duration = Duration::from_secs(1);
     field \"RTAC Serial Data Subdissector\", current \"Modbus RTU\"; tshark by -d rtacser.data,mbrtu\n\n\
     Exit codes: 0 after Ctrl-C, --count or a closed pipe, 1 when the gateway sends no frames (any more).")]
 pub(super) struct Args {
-    /// The gateway's HTTP server.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
-    url: Url,
+    #[command(flatten)]
+    gateway: Gateway,
     /// Only this bus [default: all].
     #[arg(long, value_name = "NAME")]
     bus: Option<String>,
@@ -67,7 +66,7 @@ async fn trace(args: &Args) -> Result<(), String> {
         Some(bus) => format!("/api/v1/trace?bus={}", utf8_percent_encode(bus, NON_ALPHANUMERIC)),
     };
     let mut stream = tokio::select! {
-        stream = EventStream::open(&args.url, &path) => stream.map_err(|error| error.to_string())?,
+        stream = EventStream::open(&args.gateway, &path) => stream.map_err(|error| error.to_string())?,
         _ = interrupt.recv() => return Ok(()),
         _ = terminate.recv() => return Ok(()),
     };

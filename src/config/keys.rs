@@ -13,7 +13,7 @@ use super::key::{
 };
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
-use super::{bus, modbus_tcp, mqtt, values};
+use super::{bus, modbus_tcp, mqtt, north, values};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
@@ -101,6 +101,12 @@ const BUSES: List<String> = List {
     parse: values::any_text,
     empty: Some("name a bus, or leave the key out for all"),
     range: "names of buses",
+};
+
+const HOSTS: List<String> = List {
+    parse: north::parse_host,
+    empty: None,
+    range: "host names or addresses, such as [\"gateway.example.com\"]",
 };
 
 /// A list of tables with this schema.
@@ -311,6 +317,10 @@ keys! {
         key: PathBuf = PATH, required;
         /// PEM file with one or more CAs whose client certificates are accepted.
         client_ca: PathBuf = PATH, required;
+        /// PEM or DER file with the certificate revocation lists of the CAs in `client_ca`: clients whose certificate was
+        /// revoked are refused, and disconnected at a reload. Each CA needs a list; one that is out of date stays in
+        /// force, with a warning.
+        client_crl: PathBuf = PATH, or "none";
         /// Permissions of the roles in client certificates; clients without a role or with any other role may only
         /// read.
         roles: Present = Own {
@@ -407,11 +417,22 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only, but without access control: before exposing it,
-        /// put it behind a reverse proxy or a firewall.
+        /// Status page, metrics, health and JSON interface. Read-only; open to everybody who can connect unless there is
+        /// a `tokens_file`.
         listen: SocketAddr = Parsed {
             parse: values::socket, words: &[], pattern: "", range: "an address with a port",
         }, default "127.0.0.1:9488";
+        /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
+        /// this machine and its own addresses: that of a reverse proxy, a container, a name in DNS. Requests for any
+        /// other [host](http.md#hosts) get 421.
+        hosts: Vec<String> = HOSTS, default [];
+        /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
+        /// and `/readyz` require a token.
+        tokens_file: PathBuf = PATH, or "none";
+        /// PEM file with the server's certificate chain, for [https](http.md#tls); needs `key`.
+        certificate: PathBuf = PATH, or "none";
+        /// PEM file of the certificate's private key.
+        key: PathBuf = PATH, or "none";
     }
 
     /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).

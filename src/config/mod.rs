@@ -5,6 +5,7 @@
 
 mod bus;
 mod drive;
+mod files;
 mod key;
 mod keys;
 mod log;
@@ -194,7 +195,11 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref()));
-    let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
+    let (http, http_listener) = ROOT
+        .http
+        .table(reader)
+        .map(|table| north::read_http(&table, base))
+        .unzip();
     let http_listener = http_listener.flatten();
     let audit = ROOT
         .audit

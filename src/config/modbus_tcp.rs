@@ -10,9 +10,10 @@ use ipnet::IpNet;
 use super::key::Key;
 use super::keys::{IDLE, LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::north::Listener as Address;
-use super::values;
+use super::{files, values};
 use crate::document::{Finding, Place, Reader, nearest, parse_duration};
-use crate::north::modbus_tcp::{self, Identity, Role, Tls, TlsFile};
+use crate::north::TlsFile;
+use crate::north::modbus_tcp::{self, Identity, Role, Tls};
 
 /// Where the short form listens if `listen` is not written.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
@@ -219,34 +220,17 @@ fn read_tls(reader: &Reader<'_>, base: &Path, inherited: &Inherited<'_>) -> Read
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<Identity> {
     let path = |key: &Key<_>| Some(values::resolved(base, key.read(reader)?));
     let (certificate, key, client_ca) = (path(&TLS.certificate), path(&TLS.key), path(&TLS.client_ca));
+    let client_crl = path(&TLS.client_crl);
     let name = |file: TlsFile| match file {
         TlsFile::Certificate => TLS.certificate.name,
         TlsFile::Key => TLS.key.name,
         TlsFile::ClientCa => TLS.client_ca.name,
+        TlsFile::ClientCrl => TLS.client_crl.name,
     };
-    match Identity::load(&certificate?, &key?, &client_ca?, SystemTime::now()) {
-        Ok((identity, warnings)) => {
-            for fault in &warnings {
-                let text = fault.to_string();
-                let (what, remedy) = parts(&text);
-                reader.warning(name(fault.file), what, remedy);
-            }
-            Some(identity)
-        }
-        Err(errors) => {
-            for fault in &errors {
-                let text = fault.to_string();
-                let (what, remedy) = parts(&text);
-                reader.problem(name(fault.file), what, remedy);
-            }
-            None
-        }
-    }
-}
-
-/// What [`Identity::load`] reports is `what; what to do`.
-fn parts(text: &str) -> (&str, &str) {
-    text.split_once("; ").unwrap_or((text, ""))
+    let (certificate, key, client_ca) = (certificate?, key?, client_ca?);
+    files::warn_of_readers(reader, TLS.key.name, &key);
+    let loaded = Identity::load(&certificate, &key, &client_ca, client_crl.as_deref(), SystemTime::now());
+    files::reported(reader, loaded, name)
 }
 
 fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {

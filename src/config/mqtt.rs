@@ -2,14 +2,16 @@
 
 use std::fs::File;
 use std::io::Read;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::key::Key;
 use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
-use super::values;
+use super::{files, values};
 use crate::document::{Finding, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry, identity_fault};
+use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
+use crate::north::{ServerIdentity, TlsFile};
 
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
@@ -26,6 +28,16 @@ pub(super) struct Broker {
     host: String,
     port: u16,
     tls: bool,
+}
+
+impl Broker {
+    /// Whether the way to it does not leave this machine.
+    fn is_here(&self) -> bool {
+        let address: Option<IpAddr> = self.host.parse().ok();
+        address.map_or(self.host.eq_ignore_ascii_case("localhost"), |address| {
+            address.is_loopback()
+        })
+    }
 }
 
 pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> Option<Options> {
@@ -51,6 +63,9 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
             "write mqtts:// for TLS",
         );
     }
+    if tls {
+        check_certificates(reader, ca.as_deref(), identity.as_ref());
+    }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
     let wanted = MQTT.topics.get(reader);
@@ -64,6 +79,9 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
     let commands = MQTT.commands.get(reader);
     let require_id = MQTT.require_id.get(reader);
     let response_topics = read_response_topics(reader, topics.as_deref(), gateway);
+    if let Some(broker) = broker.as_ref().filter(|broker| !broker.tls && !broker.is_here()) {
+        warn_of_clear_text(reader, &broker.host, password.is_some(), commands);
+    }
     let buffer = read_buffer(reader, base);
     if reader.or(MQTT.home_assistant.name, false) {
         reader.problem(
@@ -145,7 +163,12 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
     let [plain_from_env, file_from_env] =
         [MQTT.password.place(reader), MQTT.password_file.place(reader)].map(|p| p.env.is_some());
     let file = match (plain, file) {
-        (Some(plain), None) => return Some(Secret(plain)),
+        (Some(plain), None) => {
+            if !plain_from_env {
+                files::warn_of_readers(reader, MQTT.password.name, Path::new(reader.document().file()));
+            }
+            return Some(Secret(plain));
+        }
         (Some(plain), Some(_)) if plain_from_env && !file_from_env => return Some(Secret(plain)),
         (Some(_), Some(_)) if plain_from_env == file_from_env => {
             let what = "both password and password_file are set";
@@ -154,7 +177,9 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
         }
         (_, file) => file?,
     };
-    let text = secret(&values::resolved(base, file));
+    let path = values::resolved(base, file);
+    files::warn_of_readers(reader, MQTT.password_file.name, &path);
+    let text = secret(&path);
     reader.accept(MQTT.password_file.name, text).map(Secret)
 }
 
@@ -163,7 +188,7 @@ fn secret(path: &Path) -> Result<String, Finding> {
     let mut text = String::new();
     File::open(path)
         .and_then(|file| file.take(SECRET).read_to_string(&mut text))
-        .map_err(|error| cannot_read(path, &error))?;
+        .map_err(|error| files::cannot_read(path, &error))?;
     let shown = path.display();
     let line = text.lines().next().unwrap_or_default();
     if line.is_empty() {
@@ -176,11 +201,33 @@ fn secret(path: &Path) -> Result<String, Finding> {
     Ok(line.to_string())
 }
 
-fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
-    Finding::new(
-        format!("cannot read {}: {error}", path.display()),
-        "check the path and its permissions",
-    )
+/// What others on the way to the broker could read or send.
+fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands: bool) {
+    let remedy = "write mqtts:// for TLS";
+    if password {
+        let what = format!("the password is sent to `{host}` in clear text");
+        reader.warning(MQTT.url.name, what, remedy);
+    }
+    if commands {
+        let what =
+            format!("commands come from `{host}` without TLS: who can change them on the way commands the drives");
+        reader.warning(MQTT.commands.name, what, remedy);
+    }
+}
+
+/// Whether the certificates are valid, and whether the key is that of its certificate.
+fn check_certificates(reader: &Reader<'_>, ca: Option<&Path>, identity: Option<&(PathBuf, PathBuf)>) {
+    if let Some(ca) = ca.filter(|ca| ca.is_file()) {
+        files::check_certificates(reader, MQTT.ca.name, ca);
+    }
+    if let Some((certificate, key)) = identity.filter(|(certificate, key)| certificate.is_file() && key.is_file()) {
+        files::warn_of_readers(reader, MQTT.key.name, key);
+        let loaded = ServerIdentity::load(certificate, key, SystemTime::now());
+        let _ = files::reported(reader, loaded, |file| match file {
+            TlsFile::Key => MQTT.key.name,
+            _ => MQTT.certificate.name,
+        });
+    }
 }
 
 /// Path of a PEM file that can be read now.
@@ -190,28 +237,15 @@ fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<Path
         true => Ok(()),
         false => Err(std::io::Error::other("not a file")),
     });
-    reader.accept(key.name, readable.map_err(|error| cannot_read(&path, &error)));
+    reader.accept(key.name, readable.map_err(|error| files::cannot_read(&path, &error)));
     Some(path)
 }
 
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)> {
     let certificate = read_pem(reader, &MQTT.certificate, base);
     let key = read_pem(reader, &MQTT.key, base);
-    let names = [MQTT.certificate.name, MQTT.key.name];
-    for [present, missing] in [names, [names[1], names[0]]] {
-        if reader.has(present) && !reader.has(missing) {
-            reader.problem(
-                present,
-                format!("`{present}` without `{missing}`"),
-                "write both or none",
-            );
-        }
-    }
-    let identity = (certificate?, key?);
-    if let Some(fault) = identity_fault(&identity) {
-        reader.problem(names[1], fault, "write the certificate and its own key");
-    }
-    Some(identity)
+    values::both_or_none(reader, [MQTT.certificate.name, MQTT.key.name]);
+    Some((certificate?, key?))
 }
 
 pub(super) fn parse_base(text: &str) -> Result<String, Finding> {

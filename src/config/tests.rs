@@ -5,6 +5,7 @@ use std::sync::LazyLock;
 
 use super::*;
 
+mod files;
 mod listeners;
 mod page;
 mod schema;
@@ -34,12 +35,17 @@ listen = ["127.0.0.1:1503"]
 certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
 client_ca = "DIR/ca.crt"
+client_crl = "DIR/ca.crl"
 roles = { operator = "control" }
 [mqtt]
 publish = {}
 qos = {}
 buffer = {}
 [http]
+hosts = ["gateway.example.com"]
+tokens_file = "DIR/tokens"
+certificate = "DIR/gateway.crt"
+key = "DIR/gateway.key"
 [audit]
 [log]
 "#;

@@ -125,8 +125,8 @@ mod tests {
                 uncached: modbus_tcp::Uncached::Forward,
             }),
             http: Some(http::Options {
-                listen: ([127, 0, 0, 1], 9488).into(),
                 max_connections: http,
+                ..http::Options::at(([127, 0, 0, 1], 9488).into())
             }),
         }
     }

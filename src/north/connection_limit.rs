@@ -165,6 +165,9 @@ pub(super) enum CloseReason {
     /// The configuration was reloaded.
     #[error("closed: the new configuration does not allow it")]
     NotAllowed,
+    /// Of the client's certificate, or of the rights of its role.
+    #[error("closed: its certificate is no longer accepted with the same rights")]
+    CertificateRefused,
 }
 
 /// The place of one connection under a limit.

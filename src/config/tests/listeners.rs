@@ -15,12 +15,15 @@ pub(super) fn certificates() -> &'static Path {
             certificate(dir.path(), arguments, "29");
         }
         certificate(dir.path(), &["server", "expired"], "-1");
+        certificate(dir.path(), &["crl"], "30");
+        std::fs::write(dir.path().join("tokens"), "").unwrap();
         dir
     });
     DIR.path()
 }
 
-fn certificate(dir: &Path, arguments: &[&str], days: &str) {
+/// Runs the script of the documentation.
+pub(super) fn certificate(dir: &Path, arguments: &[&str], days: &str) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus-tls-ca.sh");
     let output = std::process::Command::new(script)
         .arg(dir)
@@ -145,7 +148,7 @@ fn errors_of_certificates_name_file_and_key() {
     let dir = certificates();
     let shown = dir.display();
     let of = |from: &str, to: &str| {
-        let (loaded, _) = load(&FULL.replace(&format!("{shown}/{from}\""), &format!("{to}\"")));
+        let (loaded, _) = load(&FULL.replacen(&format!("{shown}/{from}\""), &format!("{to}\""), 1));
         assert!(loaded.settings.is_none());
         loaded
             .errors
@@ -179,7 +182,6 @@ fn errors_of_certificates_name_file_and_key() {
             "gateway.crt contains no private key",
         ),
         ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
-        ("gateway.crt", file("expired.crt"), "expired on "),
     ] {
         let found = of(from, &to);
         assert!(found.contains(wanted), "{wanted}\nis not in\n{found}");
@@ -187,10 +189,30 @@ fn errors_of_certificates_name_file_and_key() {
     }
 }
 
+/// The drives must be polled after a restart too, whatever became of a certificate.
+#[test]
+fn an_expired_certificate_is_a_warning() {
+    let dir = certificates().display();
+    let source = FULL
+        .replace(&format!("{dir}/gateway.crt"), &format!("{dir}/expired.crt"))
+        .replace(&format!("{dir}/gateway.key"), &format!("{dir}/expired.key"));
+    let (loaded, _) = load(&source);
+    assert_eq!(loaded.errors, []);
+    let expired: Vec<&str> = loaded
+        .warnings
+        .iter()
+        .filter(|warning| warning.finding.what.contains("expired.crt expired on "))
+        .map(|warning| warning.key.as_str())
+        .collect();
+    assert_eq!(expired, ["modbus_tcp.tls.certificate", "http.certificate"]);
+}
+
 #[test]
 fn new_certificates_in_the_same_files_are_seen() {
     let dir = tempfile::tempdir().unwrap();
     certificate(dir.path(), &["ca"], "30");
+    certificate(dir.path(), &["crl"], "30");
+    std::fs::write(dir.path().join("tokens"), "").unwrap();
     let source = FORM.replace("DIR", &dir.path().display().to_string());
     let renewed = || {
         let _ = std::fs::remove_file(dir.path().join("gateway.key"));

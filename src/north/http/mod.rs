@@ -3,12 +3,15 @@
 //! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
 //! The cancellation ends everything, including open event streams.
 
+mod access;
 mod api;
+mod hosts;
 mod in_use;
 mod offline;
 mod page;
 mod routes;
 mod streams;
+mod tokens;
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
@@ -17,25 +20,33 @@ use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 use axum::Router;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
 use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::time::timeout;
+use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
+use self::access::Access;
+use self::hosts::{Host, Hosts};
 use self::in_use::InUse;
+use self::routes::Reached;
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
+use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
-use super::{NorthStats, ServerError, ServerKind};
+use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
 use crate::command::Authority;
 use crate::plant::{DriveHandle, SharedPlant};
 
 pub use self::offline::Offline;
+pub use self::tokens::{Scope, Token, TokenError, Tokens};
 
 /// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
 /// a newer one.
@@ -67,6 +78,9 @@ const MAX_HEAD: usize = 16 * 1024;
 /// Time after which a client that acknowledges nothing or accepts no bytes is disconnected.
 const USER_TIMEOUT: Duration = Duration::from_secs(30);
 
+/// Time limit of a TLS handshake.
+const HANDSHAKE: Duration = Duration::from_secs(10);
+
 /// Time for pending replies when the gateway stops.
 const GRACE: Duration = Duration::from_millis(500);
 
@@ -75,11 +89,28 @@ const GRACE: Duration = Duration::from_millis(500);
 pub struct Options {
     /// Address to listen on.
     pub listen: SocketAddr,
+    /// Names and addresses that it answers under, besides its own and those of the loopback.
+    pub hosts: Vec<String>,
+    /// Who may read what; `None`: everybody everything.
+    pub tokens: Option<Tokens>,
+    /// Certificate and key; `None`: without TLS.
+    pub identity: Option<ServerIdentity>,
     /// Maximum number of open connections: [`MAX_CONNECTIONS`], or fewer where the system allows fewer open files.
     pub max_connections: usize,
 }
 
 impl Options {
+    /// Listens on that address, open to everybody, without TLS.
+    pub fn at(listen: SocketAddr) -> Options {
+        Options {
+            listen,
+            hosts: Vec::new(),
+            tokens: None,
+            identity: None,
+            max_connections: MAX_CONNECTIONS,
+        }
+    }
+
     /// Files that the connections can have open at one time, with those that are being closed.
     pub(crate) fn files(&self) -> usize {
         self.limits().files() + HEALTH.files()
@@ -91,10 +122,16 @@ impl Options {
     }
 }
 
+/// Whether `text` can stand in [`Options::hosts`]: a host name or an address, without a port.
+pub fn is_host(text: &str) -> bool {
+    Host::configured(text).is_some()
+}
+
 /// The running server.
 #[derive(Debug)]
 pub struct Http {
     listeners: Listeners<HttpConnections>,
+    terms: Arc<ArcSwap<Terms>>,
     plant: SharedPlant,
     stats: Arc<NorthStats>,
     tasks: TaskTracker,
@@ -105,26 +142,32 @@ pub struct Http {
 pub struct Change {
     options: Options,
     sockets: NewSockets,
+    terms: Terms,
 }
 
 impl Http {
     /// The address it listens on, with the port that the system chose if port 0 was configured.
     pub fn address(&self) -> Option<SocketAddr> {
-        self.listeners.addresses(false).first().copied()
+        let [plain, tls] = [false, true].map(|tls| self.listeners.addresses(tls));
+        plain.into_iter().chain(tls).next()
     }
 
-    /// Prepares other options: binds a new address. Nothing changes for any client.
+    /// Prepares other options: binds a new address and checks new certificates. Nothing changes for any client.
     ///
     /// # Errors
-    /// The address cannot be bound; everything is as before.
+    /// The address cannot be bound, or the certificates cannot be used; everything is as before.
     pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let terms = Terms::new(&options)?;
         let spec = ListenerSpec {
             address: options.listen,
-            tls: false,
+            tls: options.identity.is_some(),
             section: "[http]".to_string(),
         };
-        let sockets = self.listeners.prepare(vec![spec]).await?;
-        Ok(Change { options, sockets })
+        Ok(Change {
+            sockets: self.listeners.prepare(vec![spec]).await?,
+            terms,
+            options,
+        })
     }
 
     /// Forgets prepared options.
@@ -132,13 +175,28 @@ impl Http {
         self.listeners.abort(change.sockets);
     }
 
-    /// Applies prepared options: to the next request of each connection, if the address is the same.
-    pub fn commit(&mut self, Change { options, sockets }: Change) {
-        let (plant, stats) = (&self.plant, &self.stats);
+    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another; new
+    /// certificates are for new connections.
+    pub fn commit(&mut self, change: Change) {
+        let Change {
+            options,
+            sockets,
+            mut terms,
+        } = change;
+        let old = self.terms.load_full();
+        let same_access = old.access == terms.access;
+        if same_access {
+            terms.replaced = old.replaced.clone();
+        }
+        self.terms.store(Arc::new(terms));
+        if !same_access {
+            old.replaced.cancel();
+        }
+        let (plant, stats, terms) = (&self.plant, &self.stats, &self.terms);
         self.listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
                 Some(handler) => handler.clone(),
-                None => Arc::new(HttpConnections::new(&options, plant, stats, cancel)),
+                None => Arc::new(HttpConnections::new(&options, plant, stats, terms, cancel)),
             };
             handler.limit.set_limits(options.limits());
             (handler, Handle::current())
@@ -151,10 +209,49 @@ impl Http {
     }
 }
 
+/// What the connections are served by; a reload can replace it.
+#[derive(Debug)]
+struct Terms {
+    access: Arc<Access>,
+    tls: Option<Tls>,
+    /// Cancelled when others have taken their place.
+    replaced: CancellationToken,
+}
+
+#[derive(Clone)]
+struct Tls(TlsAcceptor);
+
+impl std::fmt::Debug for Tls {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        f.write_str("Tls")
+    }
+}
+
+impl Terms {
+    fn new(options: &Options) -> Result<Terms, ServerError> {
+        let tls = options.identity.as_ref().map(|identity| {
+            let mut config = identity.server_config(None)?;
+            config.alpn_protocols = vec![b"http/1.1".to_vec()];
+            Ok(Tls(TlsAcceptor::from(Arc::new(config))))
+        });
+        let name = rustix::system::uname();
+        Ok(Terms {
+            access: Arc::new(Access {
+                hosts: Hosts::new(&name.nodename().to_string_lossy(), &options.hosts),
+                tokens: options.tokens.clone(),
+            }),
+            tls: tls
+                .transpose()
+                .map_err(|fault| ServerError::Tls(ServerKind::Http.title(), fault))?,
+            replaced: CancellationToken::new(),
+        })
+    }
+}
+
 /// Starts the server. It runs until `cancel`.
 ///
 /// # Errors
-/// The address cannot be bound.
+/// The address cannot be bound, or the certificates cannot be used.
 pub async fn start(
     options: Options,
     plant: SharedPlant,
@@ -167,6 +264,7 @@ pub async fn start(
     tasks.close();
     let mut http = Http {
         listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel),
+        terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
         plant,
         stats,
         tasks,
@@ -179,25 +277,38 @@ pub async fn start(
 /// Serves the connections of a listener.
 #[derive(Debug)]
 struct HttpConnections {
-    router: ArcSwap<Router>,
+    router: Router,
+    terms: Arc<ArcSwap<Terms>>,
     limit: Arc<ConnectionLimit>,
     health: Arc<ConnectionLimit>,
     refusals: Refusals,
+    /// Limits the log of requests without access.
+    no_access: Arc<LogThrottle>,
     cancel: CancellationToken,
 }
 
 /// The place of a connection, and what it is for.
 struct HttpPermit {
     permit: ConnectionPermit,
-    scope: Scope,
+    coverage: Coverage,
 }
 
 /// What a connection is served.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) enum Scope {
+pub(super) enum Coverage {
     Everything,
     /// `/healthz` and `/readyz`; the rest is refused with 503.
     Health,
+}
+
+impl Coverage {
+    /// Time limit for the head of a request.
+    fn head_timeout(self) -> Duration {
+        match self {
+            Coverage::Everything => HEAD_TIMEOUT,
+            Coverage::Health => HEALTH_HEAD_TIMEOUT,
+        }
+    }
 }
 
 impl HttpConnections {
@@ -205,13 +316,16 @@ impl HttpConnections {
         options: &Options,
         plant: &SharedPlant,
         stats: &Arc<NorthStats>,
+        terms: &Arc<ArcSwap<Terms>>,
         cancel: &CancellationToken,
     ) -> HttpConnections {
         HttpConnections {
-            router: ArcSwap::from_pointee(routes::router(plant.clone(), stats.clone(), cancel.clone())),
+            router: routes::router(plant.clone(), stats.clone(), cancel.clone()),
+            terms: terms.clone(),
             limit: ConnectionLimit::new(options.limits()),
             health: ConnectionLimit::new(HEALTH),
             refusals: Refusals::new(ServerKind::Http, stats.clone()),
+            no_access: Arc::default(),
             cancel: cancel.clone(),
         }
     }
@@ -227,60 +341,103 @@ impl ConnectionHandler for HttpConnections {
             cancel: &self.cancel,
         };
         let (limits, now) = (
-            [(&self.limit, Scope::Everything), (&self.health, Scope::Health)],
+            [(&self.limit, Coverage::Everything), (&self.health, Coverage::Health)],
             Instant::now(),
         );
-        limits.into_iter().find_map(|(limit, scope)| {
+        limits.into_iter().find_map(|(limit, coverage)| {
             let permit = self
                 .refusals
                 .acquire(limit, newcomer, remedy, || Some(Authority::ReadOnly))?;
             permit.place().use_at(now, false);
-            Some(HttpPermit { permit, scope })
+            Some(HttpPermit { permit, coverage })
         })
     }
 
-    /// After the cancellation a connection has [`GRACE`] to finish its reply.
-    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, HttpPermit { permit, scope }: HttpPermit) {
+    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, place: HttpPermit) {
         set_socket_options(&stream);
-        let place = permit.place();
-        let service = service_fn(|mut request: hyper::Request<hyper::body::Incoming>| {
+        let terms = self.terms.load_full();
+        // Without an own address the client is gone.
+        let Ok(local) = stream.local_addr() else { return };
+        let local = local.ip();
+        let Some(Tls(acceptor)) = &terms.tls else {
+            return self.serve_requests(stream, peer, local, &terms, &place).await;
+        };
+        let handshake = timeout(HANDSHAKE.min(place.coverage.head_timeout()), acceptor.accept(stream));
+        let closing = place.permit.place().closing();
+        match closing.run_until_cancelled(handshake).await {
+            Some(Ok(Ok(stream))) => self.serve_requests(stream, peer, local, &terms, &place).await,
+            Some(Ok(Err(error))) => {
+                tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {error}");
+            }
+            Some(Err(_)) | None => {}
+        }
+    }
+}
+
+impl HttpConnections {
+    /// Answers the requests of a client that connected to the address `local` of this machine. After the cancellation,
+    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply.
+    async fn serve_requests(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Unpin,
+        peer: SocketAddr,
+        local: IpAddr,
+        terms: &Terms,
+        permit: &HttpPermit,
+    ) {
+        let (place, coverage) = (permit.permit.place(), permit.coverage);
+        let reached = Reached {
+            address: local,
+            peer,
+            refusals: self.no_access.clone(),
+            access: terms.access.clone(),
+        };
+        let client = routes::Client {
+            address: peer.ip(),
+            coverage,
+        };
+        let router = TowerToHyperService::new(self.router.clone());
+        let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
-            request.extensions_mut().insert(routes::Client {
-                address: peer.ip(),
-                scope,
-            });
-            let reply = TowerToHyperService::new(self.router.load().as_ref().clone()).call(request);
+            request.extensions_mut().insert(client);
+            request.extensions_mut().insert(reached.clone());
+            let reply = router.call(request);
             async move {
                 // Other clients have a turn between two pipelined requests.
                 tokio::task::yield_now().await;
                 reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body)))
             }
         });
-        let head_timeout = match scope {
-            Scope::Everything => HEAD_TIMEOUT,
-            Scope::Health => HEALTH_HEAD_TIMEOUT,
-        };
         let mut connection = pin!(
             http1::Builder::new()
                 .timer(TokioTimer::new())
-                .header_read_timeout(head_timeout)
-                .keep_alive(scope == Scope::Everything)
+                .header_read_timeout(coverage.head_timeout())
+                .keep_alive(coverage == Coverage::Everything)
                 .max_buf_size(MAX_HEAD)
                 .serve_connection(TokioIo::new(stream), service)
         );
-        let ended = match place.closing().run_until_cancelled(connection.as_mut()).await {
-            Some(ended) => ended,
-            // There is no reply to finish.
-            None if !place.is_in_use() => Ok(()),
-            None => {
-                connection.as_mut().graceful_shutdown();
-                timeout(GRACE, connection).await.unwrap_or(Ok(()))
+        let ended = tokio::select! {
+            ended = connection.as_mut() => ended,
+            () = ended(place.closing(), &terms.replaced) => match place.is_in_use() {
+                true => {
+                    connection.as_mut().graceful_shutdown();
+                    timeout(GRACE, connection).await.unwrap_or(Ok(()))
+                }
+                // There is no reply to finish.
+                false => Ok(()),
             }
         };
         // Clients that disconnect or send invalid data are normal operation.
         if let Err(error) = ended {
             tracing::debug!(target: "drivegate::http", %peer, "HTTP connection ended: {error}");
         }
+    }
+}
+
+async fn ended(server: &CancellationToken, terms: &CancellationToken) {
+    tokio::select! {
+        () = server.cancelled() => {}
+        () = terms.cancelled() => {}
     }
 }
 

@@ -1,7 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
-use std::net::IpAddr;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -16,8 +16,10 @@ use axum::{Json, response};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::{MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Scope, api, page, streams};
+use super::access::Access;
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
 use crate::north::connection_limit::{ConnectionLimit, Limits};
+use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
 
@@ -45,7 +47,18 @@ impl AppState {
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Client {
     pub(super) address: IpAddr,
-    pub(super) scope: Scope,
+    pub(super) coverage: Coverage,
+}
+
+/// How a request came, as an extension of it.
+#[derive(Debug, Clone)]
+pub(super) struct Reached {
+    /// The address of this machine that the client connected to.
+    pub(super) address: IpAddr,
+    pub(super) peer: SocketAddr,
+    pub(super) access: Arc<Access>,
+    /// Limits the log of refused requests.
+    pub(super) refusals: Arc<LogThrottle>,
 }
 
 /// All routes.
@@ -82,11 +95,14 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .layer(middleware::from_fn(guard))
 }
 
-/// Refuses all methods that could change something and sets the common headers of all replies.
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
+/// sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
-    let scope = request.extensions().get::<Client>().map(|client| client.scope);
+    let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
     let is_health = ["/healthz", "/readyz"].contains(&request.uri().path());
-    let mut response = if scope == Some(Scope::Health) && !is_health {
+    let mut response = if let Some(refusal) = refused(&request) {
+        refusal
+    } else if coverage == Some(Coverage::Health) && !is_health {
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
     } else if matches!(*request.method(), Method::GET | Method::HEAD) {
@@ -105,6 +121,21 @@ async fn guard(request: Request, next: Next) -> Response {
         response.headers_mut().insert(name, HeaderValue::from_static(value));
     }
     response
+}
+
+/// The reply to a request that is not answered, because of its host or its token.
+fn refused(request: &Request) -> Option<Response> {
+    let Some(reached) = request.extensions().get::<Reached>() else {
+        // The server adds it to every request.
+        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
+    };
+    let admitted = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = admitted.err()?;
+    if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
+        let peer = reached.peer;
+        tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
+    }
+    Some(refusal.into_response())
 }
 
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {

@@ -1,10 +1,12 @@
 //! Who may connect to a listener, and with which rights.
 
 use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
 use std::sync::Arc;
 use std::time::Duration;
 
 use arc_swap::ArcSwap;
+use futures_util::future::{Either, select};
 use ipnet::IpNet;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
@@ -18,7 +20,7 @@ use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
 use super::{ServerState, connection};
 use crate::command::Authority;
 use crate::north::ConnectionRefusal;
-use crate::north::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, Place};
+use crate::north::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, Place};
 use crate::north::listener::ConnectionHandler;
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.
@@ -63,20 +65,10 @@ impl Policy {
         })
     }
 
-    /// The same for a client that `authenticator` let in with `authority`: other roles or another server certificate
-    /// than those it was let in by require a new connection.
-    fn by_certificate(
-        &self,
-        address: IpAddr,
-        authenticator: &Arc<TlsAuthenticator>,
-        authority: Authority,
-    ) -> Option<Authority> {
-        match &self.write {
-            WriteAccess::ByCertificate(current) if Arc::ptr_eq(current, authenticator) => {
-                contains(&self.allow, address).then_some(authority)
-            }
-            _ => None,
-        }
+    /// What a client with TLS may do whose role grants `authority`; `None` if it may not connect. Its certificate and
+    /// its role are watched by the authenticator.
+    fn by_certificate(&self, address: IpAddr, authority: Authority) -> Option<Authority> {
+        contains(&self.allow, address).then_some(authority)
     }
 }
 
@@ -111,20 +103,7 @@ impl ConnectionHandler for Admission {
         match write {
             WriteAccess::ByAddress(_) => self.serve_client(stream, peer, None, &permit).await,
             WriteAccess::ByCertificate(authenticator) => {
-                let closing = permit.place().closing().clone();
-                match closing.run_until_cancelled(authenticator.authenticate(stream)).await {
-                    // Displaced, or the listener is closed.
-                    None => {}
-                    Some(Ok((stream, client))) => {
-                        let admitted = self.admit_authenticated(peer, &client, &authenticator);
-                        drop(permit);
-                        self.serve_authenticated(stream, peer, client, admitted).await;
-                    }
-                    Some(Err(error)) => {
-                        let text = format!("client refused: TLS: {error}");
-                        self.state.refusals.report(ConnectionRefusal::Tls, peer.ip(), &text);
-                    }
-                }
+                self.serve_tls_client(&authenticator, stream, peer, permit).await;
             }
         }
     }
@@ -151,30 +130,50 @@ impl Admission {
     /// Applies a new policy to open connections too: they get its rights, or are closed.
     pub(super) fn update(&self, policy: Policy, buses: Option<Vec<String>>) {
         self.view.show(buses);
-        let before = self.policy.swap(Arc::new(policy.clone()));
+        self.policy.store(Arc::new(policy.clone()));
         self.state
             .connections
-            .review(self.listener, |place: &Place| match &before.write {
+            .review(self.listener, |place: &Place| match &policy.write {
                 WriteAccess::ByAddress(_) => policy.by_address(place.address()),
-                WriteAccess::ByCertificate(authenticator) => {
-                    policy.by_certificate(place.address(), authenticator, place.rights().authority())
-                }
+                WriteAccess::ByCertificate(_) => policy.by_certificate(place.address(), place.rights().authority()),
             });
     }
 
-    /// A place among the connections for a client whose handshake is complete.
-    fn admit_authenticated(
+    /// Serves a client with TLS until its connection ends or its certificate is no longer accepted.
+    async fn serve_tls_client(
         &self,
+        authenticator: &TlsAuthenticator,
+        stream: TcpStream,
         peer: SocketAddr,
-        client: &AuthenticatedClient,
-        authenticator: &Arc<TlsAuthenticator>,
-    ) -> Option<ConnectionPermit> {
+        handshake: ConnectionPermit,
+    ) {
+        let closing = handshake.place().closing();
+        match closing
+            .run_until_cancelled(authenticator.authenticate(stream, peer))
+            .await
+        {
+            // Displaced, or the listener is closed.
+            None => {}
+            Some(Ok((stream, client))) => {
+                let admitted = self.admit_authenticated(peer, &client);
+                drop(handshake);
+                self.serve_authenticated(stream, peer, client, admitted).await;
+            }
+            Some(Err(error)) => {
+                let text = format!("client refused: TLS: {error}");
+                self.state.refusals.report(ConnectionRefusal::Tls, peer.ip(), &text);
+            }
+        }
+    }
+
+    /// A place among the connections for a client whose handshake is complete.
+    fn admit_authenticated(&self, peer: SocketAddr, client: &AuthenticatedClient) -> Option<ConnectionPermit> {
         let authority = match client.role {
             Role::Control => Authority::Write,
             Role::Monitor => Authority::ReadOnly,
         };
         // A reload during the handshake may have changed who is let in.
-        let judge = || self.policy.load().by_certificate(peer.ip(), authenticator, authority);
+        let judge = || self.policy.load().by_certificate(peer.ip(), authority);
         self.acquire(&self.state.connections, peer.ip(), remedy, judge)
     }
 
@@ -186,9 +185,16 @@ impl Admission {
         client: AuthenticatedClient,
         admitted: Option<ConnectionPermit>,
     ) {
-        match admitted {
-            Some(permit) => self.serve_client(stream, peer, Some(&client.name), &permit).await,
-            None => connection::close(&mut stream).await,
+        let Some(permit) = admitted else {
+            connection::close(&mut stream).await;
+            return;
+        };
+        let refused = pin!(client.certificate.refused());
+        let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
+        if let Either::Left(((), served)) = select(refused, served).await {
+            // Commands that are under way are answered.
+            permit.place().close(CloseReason::CertificateRefused);
+            served.await;
         }
     }
 

@@ -5,15 +5,16 @@
 //! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
-mod certificate;
 mod client;
 mod command_words;
 mod connection;
+mod crl;
 mod dialogue;
 mod forwarded_request;
 pub(crate) mod frame;
 pub(crate) mod identify;
 mod offline;
+mod open_clients;
 mod routes;
 mod session;
 mod tls;
@@ -32,15 +33,15 @@ use tokio_util::task::TaskTracker;
 use self::admission::{Admission, Policy, WriteAccess};
 use self::command_words::CommandWords;
 use self::routes::PlantView;
-use self::tls::TlsAuthenticator;
+use self::tls::{Requirements, TlsAuthenticator};
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::listener::{ListenerSpec, Listeners, NewSockets};
 use crate::north::refusals::Refusals;
-use crate::north::{NorthStats, ServerError, ServerKind};
+use crate::north::{NorthStats, ServerError, ServerKind, certificate};
 use crate::plant::SharedPlant;
 
 pub use self::offline::Offline;
-pub use self::tls::{Identity, IdentityFault, Role, Tls, TlsFile};
+pub use self::tls::{Identity, Role, Tls};
 
 /// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
 /// accepted.
@@ -169,8 +170,8 @@ pub struct Server {
 pub struct Change {
     options: Options,
     sockets: NewSockets,
-    /// For the TLS listener, if it is new or has other roles.
-    authenticator: Option<Arc<TlsAuthenticator>>,
+    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
+    requirements: Option<Requirements>,
 }
 
 impl Server {
@@ -184,22 +185,23 @@ impl Server {
         self.listeners.addresses(true)
     }
 
-    /// Prepares other options: binds new addresses and loads new certificates. Nothing changes for any client.
+    /// Prepares other options: binds new addresses and checks new certificates. Nothing changes for any client.
     ///
     /// # Errors
     /// An address cannot be bound, or the certificates cannot be used; everything is as before.
     pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
         let before = self.state.options.load_full();
-        let roles = |tls: &Option<Tls>| tls.as_ref().map(|tls| tls.roles.clone());
-        let authenticator = match &options.tls {
-            Some(tls) if self.authenticator.is_none() || roles(&before.tls) != roles(&options.tls) => {
-                Some(Arc::new(TlsAuthenticator::new(tls)?))
+        let requirements = match (&options.tls, &before.tls) {
+            (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => None,
+            (Some(tls), _) => {
+                let requirements = Requirements::new(tls);
+                Some(requirements.map_err(|fault| ServerError::Tls(ServerKind::ModbusTcp.title(), fault))?)
             }
-            _ => None,
+            (None, _) => None,
         };
         Ok(Change {
+            requirements,
             sockets: self.listeners.prepare(options.listener_specs()).await?,
-            authenticator,
             options,
         })
     }
@@ -210,19 +212,22 @@ impl Server {
     }
 
     /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
-    /// rights are those of the new options from then on.
+    /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
+    /// rights are disconnected.
     pub fn commit(&mut self, change: Change) {
         let Change {
             options,
             sockets,
-            authenticator,
+            requirements,
         } = change;
-        match authenticator {
-            Some(authenticator) => self.authenticator = Some(authenticator),
-            None => self.renew_if_changed(&options),
-        }
-        if options.tls.is_none() {
-            self.authenticator = None;
+        match (&self.authenticator, requirements) {
+            (_, None) if options.tls.is_none() => self.authenticator = None,
+            (_, None) => {}
+            (Some(authenticator), Some(requirements)) => {
+                authenticator.renew(requirements);
+                tracing::info!("Modbus TCP: using the new certificates, revocations and roles");
+            }
+            (None, Some(requirements)) => self.authenticator = Some(Arc::new(TlsAuthenticator::new(requirements))),
         }
         let options = Arc::new(options);
         self.state.connections.set_limits(options.limits());
@@ -261,29 +266,6 @@ impl Server {
             };
             (admission, runtime)
         });
-    }
-
-    fn renew_if_changed(&self, options: &Options) {
-        let identity = |tls: &Option<Tls>| tls.as_ref().map(|tls| tls.identity.clone());
-        if identity(&self.state.options.load().tls) == identity(&options.tls) {
-            return;
-        }
-        match self.renew_certificates(options) {
-            Ok(()) => tracing::info!("Modbus TCP: using the new certificates for new connections"),
-            // They were checked when the configuration was read.
-            Err(error) => tracing::error!("{error}; keeping the previous certificates"),
-        }
-    }
-
-    /// Uses the certificates of `options` for new connections; open connections stay.
-    ///
-    /// # Errors
-    /// The certificates cannot be used; the previous ones stay in use.
-    pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
-        match (&self.authenticator, &options.tls) {
-            (Some(authenticator), Some(tls)) => Ok(authenticator.renew(&tls.identity)?),
-            _ => Ok(()),
-        }
     }
 
     /// Waits until all listeners and connections have ended, after the cancellation.

@@ -47,7 +47,6 @@ pub use self::offline::{Offline, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
 pub(super) use self::request::resolve as point_value;
-pub(crate) use self::tls::identity_fault;
 
 /// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]

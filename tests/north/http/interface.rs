@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::Exception;
-use drivegate::north::http;
+use drivegate::north::http::{self, Options};
 use drivegate::process_image::Link;
 use serde_json::{Value, json};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
@@ -353,7 +353,7 @@ async fn bad_requests_harm_nobody() {
     // A request that never ends, and a body that never comes.
     let mut half = TcpStream::connect(server.address).await.unwrap();
     half.write_all(b"GET /healthz HT").await.unwrap();
-    let body = "GET /healthz HTTP/1.1\r\nHost: x\r\nConnection: close\r\nContent-Length: 1000000\r\n\r\n";
+    let body = "GET /healthz HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\nContent-Length: 1000000\r\n\r\n";
     assert_eq!(raw(server.address, body).await.status, 200);
     assert_eq!(get(server.address, "/healthz").await.status, 200);
 }
@@ -362,7 +362,7 @@ async fn bad_requests_harm_nobody() {
 #[tokio::test(start_paused = true)]
 async fn a_client_that_does_not_finish_its_request_loses_its_place() {
     let server = Server::of(plant::mixed()).await;
-    let whole = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n";
+    let whole = "GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n";
     for sent in ["", "GET /healthz HTTP/1.1\r\nHost:", whole] {
         let begun = tokio::time::Instant::now();
         let mut stream = TcpStream::connect(server.address).await.unwrap();
@@ -378,7 +378,7 @@ async fn a_client_that_does_not_finish_its_request_loses_its_place() {
 #[tokio::test]
 async fn pipelined_requests_keep_their_order() {
     let server = Server::of(plant::mixed()).await;
-    let two = "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\nGET /nowhere HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n";
+    let two = "GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\nGET /nowhere HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n";
     let reply = raw(server.address, two).await;
     assert_eq!(reply.status, 200);
     assert!(reply.body.starts_with("ok\nHTTP/1.1 404"), "{}", reply.body);
@@ -388,14 +388,10 @@ async fn pipelined_requests_keep_their_order() {
 async fn an_address_in_use_is_told() {
     let server = Server::of(plant::mixed()).await;
     let shared = Arc::new(ArcSwap::from_pointee(plant::mixed()));
-    let error = http::start(
-        plant::options(server.address),
-        shared,
-        plant::stats(),
-        CancellationToken::new(),
-    )
-    .await
-    .unwrap_err();
+    let options = Options::at(server.address);
+    let error = http::start(options, shared, plant::stats(), CancellationToken::new())
+        .await
+        .unwrap_err();
     let text = error.to_string();
     assert!(
         text.contains(&format!("HTTP on {}: Address already in use", server.address)) && text.ends_with("of [http]"),

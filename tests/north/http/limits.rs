@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 
-use drivegate::north::http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS};
+use drivegate::north::http::{MAX_CONNECTIONS, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, Options};
 use drivegate::north::{ConnectionRefusal, ServerKind};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 use tokio::net::{TcpSocket, TcpStream};
@@ -21,7 +21,7 @@ async fn connect_from(from: [u8; 4], address: SocketAddr) -> TcpStream {
 /// The status of a request from this loopback address.
 async fn status_from(from: [u8; 4], address: SocketAddr, path: &str) -> u16 {
     let mut stream = connect_from(from, address).await;
-    let head = format!("GET {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n\r\n");
+    let head = format!("GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n");
     stream.write_all(head.as_bytes()).await.unwrap();
     let mut reply = String::new();
     let read = timeout(PATIENCE, stream.read_to_string(&mut reply)).await;
@@ -38,7 +38,7 @@ fn turned_away(server: &Server, why: ConnectionRefusal) -> u64 {
 async fn stream_from(from: [u8; 4], address: SocketAddr) -> (TcpStream, u16) {
     let mut stream = connect_from(from, address).await;
     stream
-        .write_all(b"GET /api/v1/events HTTP/1.0\r\nHost: test\r\n\r\n")
+        .write_all(b"GET /api/v1/events HTTP/1.0\r\nHost: localhost\r\n\r\n")
         .await
         .unwrap();
     let mut head = [0; 12];
@@ -55,7 +55,7 @@ async fn slow_heads_and_idle_connections_keep_nobody_out() {
         let sent = match n % 3 {
             0 => "",
             1 => "GET /healthz HT",
-            _ => "GET /healthz HTTP/1.1\r\nHost: x\r\n\r\n",
+            _ => "GET /healthz HTTP/1.1\r\nHost: localhost\r\n\r\n",
         };
         stream.write_all(sent.as_bytes()).await.unwrap();
         open.push(stream);
@@ -73,7 +73,11 @@ async fn slow_heads_and_idle_connections_keep_nobody_out() {
 /// An address whose connections are all in use is served the two paths for monitoring only.
 #[tokio::test]
 async fn health_has_places_of_its_own() {
-    let server = Server::with(plant::mixed(), 4).await;
+    let options = Options {
+        max_connections: 4,
+        ..Options::at(SocketAddr::from(([127, 0, 0, 1], 0)))
+    };
+    let server = Server::with(plant::mixed(), options).await;
     let mut open = Vec::new();
     for _ in 0..2 {
         let stream = EventStream::open(server.address, "/api/v1/trace", "").await;

@@ -1,6 +1,7 @@
 //! The HTTP interface against a hand-made plant, with plain clients, promtool, a real Prometheus and a
 //! real browser.
 
+mod access;
 mod client;
 mod interface;
 mod limits;

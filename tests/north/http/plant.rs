@@ -14,7 +14,7 @@ use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
-use drivegate::north::http::{self, Http, MAX_CONNECTIONS, Options};
+use drivegate::north::http::{self, Http, Options};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, Link, Outcome, PollCycle};
 use tokio_util::sync::CancellationToken;
@@ -207,14 +207,6 @@ pub(crate) fn stats() -> Arc<NorthStats> {
     Arc::new(stats)
 }
 
-/// The server at this address.
-pub(crate) fn options(listen: SocketAddr) -> Options {
-    Options {
-        listen,
-        max_connections: MAX_CONNECTIONS,
-    }
-}
-
 /// A served plant.
 pub(crate) struct Server {
     pub(crate) shared: SharedPlant,
@@ -226,19 +218,14 @@ pub(crate) struct Server {
 
 impl Server {
     pub(crate) async fn of(plant: Plant) -> Server {
-        Server::with(plant, MAX_CONNECTIONS).await
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        Server::with(plant, Options::at(listen)).await
     }
 
-    /// One with fewer connections.
-    pub(crate) async fn with(plant: Plant, max_connections: usize) -> Server {
+    pub(crate) async fn with(plant: Plant, options: Options) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
-        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
         let stats = stats();
-        let options = Options {
-            max_connections,
-            ..options(listen)
-        };
         let http = http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");
@@ -249,6 +236,12 @@ impl Server {
             address: http.address().expect("an address"),
             http,
         }
+    }
+
+    /// Reloads other options.
+    pub(crate) async fn reload(&mut self, options: Options) {
+        let change = self.http.prepare(options).await.expect("it is possible");
+        self.http.commit(change);
     }
 
     pub(crate) fn plant(&self) -> Arc<Plant> {

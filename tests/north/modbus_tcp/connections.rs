@@ -4,7 +4,6 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
-use drivegate::north::ServerError;
 use drivegate::north::modbus_tcp::{self, Uncached};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
@@ -246,13 +245,6 @@ async fn an_operator_gets_in_whoever_else_is_connected() {
     rig.end().await;
 }
 
-/// Applies other options as a reload does.
-async fn reload(rig: &mut Rig, options: modbus_tcp::Options) -> Result<(), ServerError> {
-    let change = rig.server.prepare(options).await?;
-    rig.server.commit(change);
-    Ok(())
-}
-
 #[tokio::test]
 async fn a_reload_changes_rights_and_closes_only_who_is_no_longer_allowed() {
     let mut options = options();
@@ -267,7 +259,7 @@ async fn a_reload_changes_rights_and_closes_only_who_is_no_longer_allowed() {
     options.listeners[0].write = vec!["127.0.0.1/32".parse().unwrap()];
     options.listeners[0].allow = ["127.0.0.1/32", "127.0.0.2/32"].map(|net| net.parse().unwrap()).into();
     (options.max_connections, options.uncached) = (2, Uncached::Refuse);
-    reload(&mut rig, options.clone()).await.unwrap();
+    rig.reload(options.clone()).await.unwrap();
     assert!(clients[2].is_closed().await, "no longer in `allow`");
     assert!(may_write(&mut clients[0]).await, "has the right from now on");
     assert_eq!(clients[1].ask(1, &words(6, &WRITE)).await, [0x86, 1], "has lost it");
@@ -280,7 +272,7 @@ async fn a_reload_changes_rights_and_closes_only_who_is_no_longer_allowed() {
     );
     let address = rig.address();
     options.listeners[0].buses = Some(vec!["line2".to_string()]);
-    reload(&mut rig, options).await.unwrap();
+    rig.reload(options).await.unwrap();
     assert_eq!(rig.address(), address);
     assert_eq!(
         clients[1].ask(1, &words(3, &[2102, 1])).await,
@@ -299,14 +291,14 @@ async fn a_reload_that_cannot_bind_changes_nothing() {
     let mut refused = options();
     refused.listeners[0].allow = Vec::new();
     refused.listeners[0].listen.push(taken.local_addr().unwrap());
-    let why = reload(&mut rig, refused).await.unwrap_err().to_string();
+    let why = rig.reload(refused).await.unwrap_err().to_string();
     assert!(why.contains("Address already in use"), "{why}");
     assert!(may_write(&mut client).await);
     assert!(may_write(&mut rig.client().await).await);
     // Another address replaces the first one: who is connected there is disconnected.
     let mut moved = options();
     moved.listeners[0].listen = vec![SocketAddr::from(([127, 0, 0, 5], 0))];
-    reload(&mut rig, moved).await.unwrap();
+    rig.reload(moved).await.unwrap();
     assert!(client.is_closed().await);
     assert!(tokio::net::TcpStream::connect(address).await.is_err());
     assert!(may_write(&mut rig.client().await).await);

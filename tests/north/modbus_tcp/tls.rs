@@ -25,7 +25,7 @@ use crate::support::process::Running;
 use crate::support::tools;
 
 /// Runs the script.
-fn make(dir: &Path, arguments: &[&str], days: &str) {
+pub(super) fn make(dir: &Path, arguments: &[&str], days: &str) {
     let script = tools::root().join("docs/modbus-tls-ca.sh");
     let output = Command::new(script)
         .arg(dir)
@@ -52,9 +52,9 @@ fn sign_with_printable_role(dir: &Path, name: &str) {
 }
 
 /// Two CAs; below the first a server and clients of all kinds.
-struct Works(TempDir);
+pub(super) struct Works(TempDir);
 
-static WORKS: LazyLock<Works> = LazyLock::new(|| {
+pub(super) static WORKS: LazyLock<Works> = LazyLock::new(|| {
     let dir = tempfile::tempdir().unwrap();
     let (own, other) = (dir.path().join("own"), dir.path().join("other"));
     for ca in [&own, &other] {
@@ -73,13 +73,13 @@ static WORKS: LazyLock<Works> = LazyLock::new(|| {
 });
 
 impl Works {
-    fn file(&self, name: &str) -> PathBuf {
+    pub(super) fn file(&self, name: &str) -> PathBuf {
         self.0.path().join(name)
     }
 
     fn identity(&self, server: &str) -> Identity {
         let [certificate, key] = ["crt", "key"].map(|kind| self.file(&format!("own/{server}.{kind}")));
-        Identity::load(&certificate, &key, &self.file("own/ca.crt"), SystemTime::now())
+        Identity::load(&certificate, &key, &self.file("own/ca.crt"), None, SystemTime::now())
             .unwrap()
             .0
     }
@@ -106,7 +106,7 @@ impl Works {
     }
 
     /// A client that shows the certificate `own/NAME`, or none.
-    fn client(&self, name: Option<&str>, version: &'static SupportedProtocolVersion) -> Arc<ClientConfig> {
+    pub(super) fn client(&self, name: Option<&str>, version: &'static SupportedProtocolVersion) -> Arc<ClientConfig> {
         let mut roots = RootCertStore::empty();
         roots.add(self.chain("own/ca").remove(0)).unwrap();
         let provider = Arc::new(rustls::crypto::ring::default_provider());
@@ -124,7 +124,7 @@ impl Works {
     }
 }
 
-fn tls_options() -> Options {
+pub(super) fn tls_options() -> Options {
     // No listener without TLS may write, so a write can only come from a role.
     let mut plain = listener();
     plain.write = Vec::new();
@@ -135,17 +135,17 @@ fn tls_options() -> Options {
     }
 }
 
-struct TlsClient(tokio_rustls::client::TlsStream<TcpStream>);
+pub(super) struct TlsClient(tokio_rustls::client::TlsStream<TcpStream>);
 
 impl TlsClient {
     /// A client whose handshake is through; with TLS 1.3 that says nothing about its certificate yet.
-    async fn connect(address: SocketAddr, config: Arc<ClientConfig>) -> std::io::Result<TlsClient> {
+    pub(super) async fn connect(address: SocketAddr, config: Arc<ClientConfig>) -> std::io::Result<TlsClient> {
         let stream = TcpStream::connect(address).await?;
         let name = ServerName::try_from("127.0.0.1").unwrap();
         Ok(TlsClient(TlsConnector::from(config).connect(name, stream).await?))
     }
 
-    async fn ask(&mut self, unit: u8, pdu: &[u8]) -> std::io::Result<Vec<u8>> {
+    pub(super) async fn ask(&mut self, unit: u8, pdu: &[u8]) -> std::io::Result<Vec<u8>> {
         let exchange = async {
             self.0.write_all(&frame(7, unit, pdu)).await?;
             let mut header = [0; 7];
@@ -157,12 +157,20 @@ impl TlsClient {
         tokio::time::timeout(PATIENCE, exchange).await.expect("no answer")
     }
 
+    /// Waits until the server closes the connection in order.
+    pub(super) async fn is_ended(&mut self) {
+        let end = tokio::time::timeout(PATIENCE, self.0.read(&mut [0]))
+            .await
+            .expect("it stays open");
+        assert_eq!(end.expect("a notice of the end"), 0);
+    }
+
     fn server_certificate(&self) -> CertificateDer<'static> {
         self.0.get_ref().1.peer_certificates().unwrap()[0].clone()
     }
 }
 
-fn refused(rig: &Rig) -> u64 {
+pub(super) fn refused(rig: &Rig) -> u64 {
     refused_for(rig, ConnectionRefusal::Tls)
 }
 
@@ -341,30 +349,6 @@ async fn handshakes_keep_nobody_out() {
 }
 
 #[tokio::test]
-async fn other_roles_require_a_new_connection() {
-    let mut rig = Rig::with(tls_options()).await;
-    let address = rig.server.tls_addresses()[0];
-    let config = WORKS.client(Some("own/hmi"), &TLS13);
-    let write = words(6, &[0x8101, 5000]);
-    let mut before = TlsClient::connect(address, config.clone()).await.unwrap();
-    assert_eq!(before.ask(1, &write).await.unwrap(), write);
-    let mut options = tls_options();
-    options
-        .tls
-        .as_mut()
-        .unwrap()
-        .roles
-        .insert("operator".to_string(), Role::Monitor);
-    let change = rig.server.prepare(options).await.unwrap();
-    assert_eq!(before.ask(1, &write).await.unwrap(), write, "nothing has changed yet");
-    rig.server.commit(change);
-    assert!(before.ask(1, &write).await.is_err());
-    let mut after = TlsClient::connect(address, config).await.unwrap();
-    assert_eq!(after.ask(1, &write).await.unwrap(), [0x86, 1]);
-    rig.end().await;
-}
-
-#[tokio::test]
 async fn pipelining_and_listeners_are_the_same_with_tls() {
     let mut options = tls_options();
     let tls = options.tls.as_mut().unwrap();
@@ -385,13 +369,13 @@ async fn pipelining_and_listeners_are_the_same_with_tls() {
 
 #[tokio::test]
 async fn certificates_are_renewed_under_way() {
-    let rig = Rig::with(tls_options()).await;
+    let mut rig = Rig::with(tls_options()).await;
     let address = rig.server.tls_addresses()[0];
     let config = WORKS.client(Some("own/hmi"), &TLS13);
     let mut before = TlsClient::connect(address, config.clone()).await.unwrap();
     let mut renewed = tls_options();
     renewed.tls.as_mut().unwrap().identity = WORKS.identity("second");
-    rig.server.renew_certificates(&renewed).unwrap();
+    rig.reload(renewed).await.unwrap();
     let mut after = TlsClient::connect(address, config).await.unwrap();
     assert_eq!(before.server_certificate(), WORKS.chain("own/gateway")[0]);
     assert_eq!(after.server_certificate(), WORKS.chain("own/second")[0]);
