@@ -136,7 +136,8 @@ fn rounds(frames: &[Recorded]) -> Vec<f64> {
         .cloned()
         .collect();
     let starts = starts(&reads, Direction::ToDrives);
-    starts.windows(2).map(|pair| (pair[1] - pair[0]) * 1e3).collect()
+    let pairs = starts.iter().zip(starts.iter().skip(1));
+    pairs.map(|(start, next)| (next - start) * 1e3).collect()
 }
 
 async fn connect(from: Ipv4Addr, to: SocketAddr) -> io::Result<TcpStream> {
@@ -264,14 +265,14 @@ impl Attack {
             Attack::None => {}
             Attack::SilentConnections => {
                 let mut stream = connect(ATTACKER, north.modbus).await?;
-                stream.read(&mut [0; 1]).await?;
+                let _until_closed = stream.read(&mut [0; 1]).await?;
             }
             Attack::RefusedWrites => repeat(north.modbus, &[0, 1, 0, 0, 0, 6, 1, 6, 0x81, 0x01, 0, 7]).await?,
             Attack::BadHeaders => {
                 let mut stream = connect(ATTACKER, north.modbus).await?;
                 let bytes: Vec<u8> = (0..64).map(|n| (n * 37 + number) as u8 | 0x80).collect();
                 stream.write_all(&bytes).await?;
-                stream.read(&mut [0; 1]).await?;
+                let _until_closed = stream.read(&mut [0; 1]).await?;
             }
             Attack::ReadsNothing => {
                 let mut stream = connect(ATTACKER, north.modbus).await?;

@@ -11,6 +11,7 @@ mod offline;
 mod page;
 mod routes;
 mod streams;
+mod terms;
 mod tokens;
 
 use std::net::{IpAddr, SocketAddr};
@@ -29,14 +30,13 @@ use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
 use tokio::runtime::Handle;
 use tokio::time::timeout;
-use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use self::access::Access;
-use self::hosts::{Host, Hosts};
+use self::hosts::Host;
 use self::in_use::InUse;
 use self::routes::Reached;
+use self::terms::{Terms, Tls};
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
 use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
@@ -181,17 +181,9 @@ impl Http {
         let Change {
             options,
             sockets,
-            mut terms,
+            terms,
         } = change;
-        let old = self.terms.load_full();
-        let same_access = old.access == terms.access;
-        if same_access {
-            terms.replaced = old.replaced.clone();
-        }
-        self.terms.store(Arc::new(terms));
-        if !same_access {
-            old.replaced.cancel();
-        }
+        terms.replace(&self.terms);
         let (plant, stats, terms) = (&self.plant, &self.stats, &self.terms);
         self.listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
@@ -206,45 +198,6 @@ impl Http {
     /// Waits until the server has stopped: at most half a second after the token was cancelled.
     pub async fn stopped(self) {
         self.tasks.wait().await;
-    }
-}
-
-/// What the connections are served by; a reload can replace it.
-#[derive(Debug)]
-struct Terms {
-    access: Arc<Access>,
-    tls: Option<Tls>,
-    /// Cancelled when others have taken their place.
-    replaced: CancellationToken,
-}
-
-#[derive(Clone)]
-struct Tls(TlsAcceptor);
-
-impl std::fmt::Debug for Tls {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.write_str("Tls")
-    }
-}
-
-impl Terms {
-    fn new(options: &Options) -> Result<Terms, ServerError> {
-        let tls = options.identity.as_ref().map(|identity| {
-            let mut config = identity.server_config(None)?;
-            config.alpn_protocols = vec![b"http/1.1".to_vec()];
-            Ok(Tls(TlsAcceptor::from(Arc::new(config))))
-        });
-        let name = rustix::system::uname();
-        Ok(Terms {
-            access: Arc::new(Access {
-                hosts: Hosts::new(&name.nodename().to_string_lossy(), &options.hosts),
-                tokens: options.tokens.clone(),
-            }),
-            tls: tls
-                .transpose()
-                .map_err(|fault| ServerError::Tls(ServerKind::Http.title(), fault))?,
-            replaced: CancellationToken::new(),
-        })
     }
 }
 
