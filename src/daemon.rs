@@ -15,6 +15,7 @@ use crate::bus::supervision::Lease;
 use crate::command::{CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
+use crate::history::{RecorderTask, Recordings};
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
@@ -33,6 +34,9 @@ pub enum StartError {
     /// The system does not provide a thread or a file descriptor for the bus of that name.
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
+    /// The system does not provide a thread for the recorder.
+    #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
+    Recorder(std::io::Error),
     /// A server cannot start, and the previous servers cannot be started again.
     #[error("{0}; the previous servers cannot be restarted: {1}")]
     NotRestored(Box<ServerError>, Box<ServerError>),
@@ -51,6 +55,8 @@ pub struct Daemon {
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
+    recordings: Arc<Recordings>,
+    recorder: Option<RecorderTask>,
     /// Beats of the bus threads at the last check, by bus.
     beats: BTreeMap<String, u64>,
 }
@@ -62,12 +68,14 @@ impl Daemon {
     /// A server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let recordings = Arc::new(Recordings::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
             buses: Vec::new(),
             events: events.clone(),
             writes: writes.clone(),
+            recordings: recordings.clone(),
         };
         let mut daemon = Daemon {
             plant: Arc::new(ArcSwap::from_pointee(plant)),
@@ -80,11 +88,14 @@ impl Daemon {
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
             local: ServerSlot::default(),
+            recordings,
+            recorder: None,
             beats: BTreeMap::new(),
         };
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
+        daemon.apply_recorder(&settings)?;
         daemon.replace_buses(&settings, prepared);
         daemon.apply_servers(&settings).await?;
         daemon.apply_local(&settings).await;
@@ -143,7 +154,9 @@ impl Daemon {
                 Err(restart) => StartError::NotRestored(error.into(), restart.into()),
             });
         }
+        let recorder = self.apply_recorder(&settings);
         self.replace_buses(&settings, prepared);
+        recorder?;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.settings = settings;
@@ -206,7 +219,11 @@ impl Daemon {
             buses: kept.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
+            recordings: self.recordings.clone(),
         }));
+        if let Some(recorder) = &self.recorder {
+            recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
+        }
         self.buses = kept;
     }
 
@@ -224,6 +241,22 @@ impl Daemon {
             self.events.clone(),
         )
         .map_err(failed)
+    }
+
+    /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
+    fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
+        if self.recorder.is_some() && self.settings.recordings == settings.recordings {
+            return Ok(());
+        }
+        if let Some(recorder) = self.recorder.take() {
+            recorder.stop();
+        }
+        if settings.recordings.max_count > 0 {
+            let (recordings, events) = (self.recordings.clone(), self.events.clone());
+            let started = RecorderTask::start(settings.recordings.clone(), recordings, events, &self.writes);
+            self.recorder = Some(started.map_err(StartError::Recorder)?);
+        }
+        Ok(())
     }
 
     async fn apply_servers(&mut self, settings: &Settings) -> Result<(), ServerError> {
@@ -262,9 +295,13 @@ impl Daemon {
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
+        let recorder = self.recorder.take();
         let stopped = tokio::task::spawn_blocking(move || {
             for (_, task) in buses {
                 task.stop();
+            }
+            if let Some(recorder) = recorder {
+                recorder.stop();
             }
         });
         within(STOP_BUSES, "buses", async {

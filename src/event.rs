@@ -44,6 +44,8 @@ pub enum EventKind {
     BusUp,
     /// The port of a bus was lost or cannot be opened.
     BusDown,
+    /// A recording was made, or lost.
+    Recording,
 }
 
 impl EventKind {
@@ -61,7 +63,8 @@ impl EventKind {
             | EventKind::FaultEnd
             | EventKind::Restarted
             | EventKind::RefusedCommand
-            | EventKind::BusUp => false,
+            | EventKind::BusUp
+            | EventKind::Recording => false,
         }
     }
 
@@ -80,6 +83,7 @@ impl EventKind {
             EventKind::NotConfirmed => "not_confirmed",
             EventKind::BusUp => "bus_up",
             EventKind::BusDown => "bus_down",
+            EventKind::Recording => "recording",
         }
     }
 }
@@ -105,6 +109,20 @@ pub struct Event {
     pub fault_code: Option<i64>,
     /// For people.
     pub text: String,
+    /// The recording that was made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordingMade>,
+}
+
+/// A recording that was made.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RecordingMade {
+    /// Its id.
+    pub id: String,
+    /// What made it.
+    pub trigger: &'static str,
+    /// What it shows, for people.
+    pub summary: String,
 }
 
 /// RFC 3339 with milliseconds, UTC.
@@ -200,6 +218,7 @@ impl Events {
             drive: Some(drive.to_string()),
             fault_code: None,
             text,
+            recording: None,
         });
     }
 
@@ -233,6 +252,7 @@ mod tests {
             drive: None,
             fault_code: None,
             text,
+            recording: None,
         }
     }
 

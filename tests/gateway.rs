@@ -17,6 +17,7 @@ mod gateway {
     mod drive_access;
     mod local_socket;
     mod operators;
+    mod recordings;
     mod restart;
     mod slow_log;
     mod trace;

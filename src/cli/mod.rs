@@ -12,6 +12,8 @@ mod log;
 mod map;
 mod profiles;
 mod read;
+mod record;
+mod recordings;
 mod report;
 mod run;
 mod scan;
@@ -72,6 +74,8 @@ commands! {
     Scan => scan,
     Read => read,
     Write => write,
+    Record => record,
+    Recordings => recordings,
     Watch => watch,
     Trace => trace,
     Simulate => simulate,

@@ -12,8 +12,13 @@ use crate::document::{Finding, Problem, parse_duration};
 
 /// Prints `text` to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
+    print_bytes(text.as_bytes())
+}
+
+/// Writes `bytes` to stdout.
+pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     let mut stdout = io::stdout().lock();
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(why) => {

@@ -1,10 +1,11 @@
 //! What was commanded: one record a command, the last 1,000 kept.
 
 use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 use std::time::{Duration, SystemTime};
 
 use serde::{Serialize, Serializer};
+use tokio::sync::broadcast;
 
 use crate::drive::Value;
 
@@ -104,13 +105,20 @@ impl AuditRecord {
 
 /// The last records.
 #[derive(Debug, Default)]
-pub struct Audit(Mutex<VecDeque<Arc<AuditRecord>>>);
+pub struct Audit {
+    kept: Mutex<VecDeque<Arc<AuditRecord>>>,
+    /// For whoever wants each record as it comes.
+    sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
+}
+
+/// Records that a listener may be behind.
+const IN_FLIGHT: usize = 4096;
 
 impl Audit {
     /// Keeps a record. When 1,000 are kept, it takes the place of the oldest of its own client if that has half of
     /// them, else of the oldest of the client that has most.
     pub(super) fn keep(&self, record: AuditRecord) {
-        let mut kept = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
         if kept.len() >= AUDIT_KEPT {
             let own = kept.iter().filter(|r| r.share == record.share).count();
             let from = if own >= AUDIT_SHARE {
@@ -121,12 +129,22 @@ impl Audit {
             let oldest = kept.iter().position(|r| Some(&r.share) == from.as_ref());
             kept.remove(oldest.unwrap_or(0));
         }
-        kept.push_back(Arc::new(record));
+        let record = Arc::new(record);
+        kept.push_back(record.clone());
+        if let Some(sender) = self.sender.get() {
+            // The last listener may have gone.
+            let _ = sender.send(record);
+        }
+    }
+
+    /// Hears all records from now on; a listener that is 4,096 behind loses the oldest.
+    pub fn subscribe(&self) -> broadcast::Receiver<Arc<AuditRecord>> {
+        self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
 
     /// All that are kept, oldest first.
     pub fn recent(&self) -> Vec<Arc<AuditRecord>> {
-        self.0
+        self.kept
             .lock()
             .unwrap_or_else(PoisonError::into_inner)
             .iter()

@@ -11,6 +11,7 @@ mod log;
 mod modbus_tcp;
 mod mqtt;
 mod north;
+mod recordings;
 mod shutdown;
 mod unique;
 mod values;
@@ -29,11 +30,14 @@ use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
+use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
+/// Where the gateway keeps its state unless it is told otherwise.
+const STATE_DIR: &str = "/var/lib/drivegate";
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
 
@@ -44,6 +48,10 @@ pub struct Settings {
     pub gateway: String,
     /// Where `drivegate read` and `drivegate write` reach the gateway.
     pub socket: SocketPath,
+    /// Directory of what the gateway keeps.
+    pub state_dir: PathBuf,
+    /// What the recorder keeps.
+    pub recordings: RecorderOptions,
     /// Directories of the user's profiles.
     pub profile_dirs: Vec<PathBuf>,
     /// Built-in profiles and the user's.
@@ -140,7 +148,7 @@ fn not_text(name: &str) -> Problem {
 /// The outcome, and every key the loader knows.
 fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> (Loaded, Vec<String>) {
     let mut document = Document::parse(path.display().to_string(), source);
-    for section in [ROOT.gateway.name, ROOT.log.name] {
+    for section in [ROOT.gateway.name, ROOT.recordings.name, ROOT.log.name] {
         document.ensure_section(section);
     }
     let (variables, broken): (Vec<_>, Vec<_>) = env
@@ -164,12 +172,24 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
 
 fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
     let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
-    let (name, socket, profile_dirs, profiles) = match gateway {
+    let (name, socket, state_dir, profile_dirs, profiles) = match gateway {
         Some(gateway) => {
             profile_errors.extend(gateway.errors);
-            (gateway.name, gateway.socket, gateway.profile_dirs, gateway.profiles)
+            (
+                gateway.name,
+                gateway.socket,
+                gateway.state_dir,
+                gateway.profile_dirs,
+                gateway.profiles,
+            )
         }
-        None => (None, SocketPath::Default, Vec::new(), Profiles::built_in()),
+        None => (
+            None,
+            SocketPath::Default,
+            default_state_dir(),
+            Vec::new(),
+            Profiles::built_in(),
+        ),
     };
     let broken = !profile_errors.is_empty();
     let tables = ROOT.bus.tables(reader);
@@ -190,6 +210,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .map(|table| mqtt::read(&table, base, name.as_deref()));
     let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
     let http_listener = http_listener.flatten();
+    let recordings = ROOT.recordings.table(reader);
+    let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
@@ -204,6 +226,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     Some(Settings {
         gateway: name?,
         socket,
+        state_dir,
+        recordings: recordings?,
         profile_dirs,
         profiles,
         stale_after: match &modbus_tcp {
@@ -262,6 +286,7 @@ fn flipped<T>(section: Option<Option<T>>) -> Option<Option<T>> {
 struct Gateway {
     name: Option<String>,
     socket: SocketPath,
+    state_dir: PathBuf,
     profile_dirs: Vec<PathBuf>,
     profiles: Profiles,
     errors: Vec<Problem>,
@@ -274,6 +299,8 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
         Some(path) => SocketPath::At(values::resolved(base, path)),
     };
+    let state_dir = GATEWAY.state_dir.written(reader);
+    let state_dir = state_dir.map_or_else(default_state_dir, |dir| values::resolved(base, dir));
     let mut profiles = Profiles::built_in();
     let mut errors = Vec::new();
     let dirs = GATEWAY.profile_dirs.get(reader);
@@ -292,9 +319,19 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     Gateway {
         name,
         socket,
+        state_dir,
         profile_dirs,
         profiles,
         errors,
+    }
+}
+
+/// The state directory of the systemd unit, else the usual one.
+fn default_state_dir() -> PathBuf {
+    let given = std::env::var("STATE_DIRECTORY").unwrap_or_default();
+    match given.split(':').next() {
+        Some(dir) if !dir.is_empty() => PathBuf::from(dir),
+        _ => PathBuf::from(STATE_DIR),
     }
 }
 

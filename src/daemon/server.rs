@@ -238,6 +238,7 @@ mod tests {
             buses: Vec::new(),
             events: Default::default(),
             writes: Default::default(),
+            recordings: Default::default(),
         };
         let (plant, stats): (SharedPlant, _) = (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default());
         let mut slot = ServerSlot::<Recorder>::default();

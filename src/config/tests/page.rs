@@ -9,6 +9,7 @@ fn with_tables(page: &str) -> String {
         ("[[bus]]", "Bus"),
         ("[[bus.drive]]", "Drive"),
         ("[bus.drive.supervision]", "Supervision"),
+        ("[[bus.drive.trigger]]", "Trigger"),
         ("[modbus_tcp]", "ModbusTcp"),
         ("[[modbus_tcp.listener]]", "Listener"),
         ("[modbus_tcp.tls]", "Tls"),
@@ -16,6 +17,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.publish]", "Publish"),
         ("[mqtt.buffer]", "Buffer"),
         ("[http]", "Http"),
+        ("[recordings]", "Recordings"),
         ("[log]", "Log"),
     ];
     let mut page = page.to_string();

@@ -240,6 +240,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         input_is_holding,
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
+        on_fault: read_on_fault(reader, &points),
         ranges,
         points,
         faults,
@@ -249,6 +250,30 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     reader.finish();
     name.map(|_| profile)
+}
+
+/// `on_fault`: points of the drive's own registers that are read at once when a fault comes up.
+fn read_on_fault(reader: &Reader<'_>, points: &[Point]) -> Vec<usize> {
+    let names: Vec<String> = reader.or("on_fault", Vec::new());
+    let mut found = Vec::new();
+    for name in names {
+        let index = points.iter().position(|point| point.name == name);
+        match index.filter(|index| points.get(*index).is_some_and(|point| point.raw().is_some())) {
+            Some(index) => found.push(index),
+            None => {
+                let near = document::nearest(&name, points.iter().map(|point| point.name.as_str()));
+                let near = near
+                    .filter(|near| *near != name)
+                    .map(|near| format!("did you mean `{near}`?"));
+                reader.problem(
+                    "on_fault",
+                    format!("`{name}` is no point with an address of its own"),
+                    near.unwrap_or_else(|| "name points that have `at`".to_string()),
+                );
+            }
+        }
+    }
+    found
 }
 
 /// The base of this profile; the files are merged by now, so only an unknown name is left to report.

@@ -486,3 +486,30 @@ fn mistakes_of_identify() {
         assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
     }
 }
+
+#[test]
+fn points_for_faults_have_an_address() {
+    let source = |names: &str| format!("name = \"p\"\nbase = \"vacon-nx\"\non_fault = [{names}]\n");
+    let profile = Profile::parse("p", &source("\"fault_code_id99\", \"heatsink_temperature\""), false).unwrap();
+    let names: Vec<&str> = profile
+        .on_fault
+        .iter()
+        .map(|i| profile.points[*i].name.as_str())
+        .collect();
+    assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
+    // What is polled anyway needs no read of its own.
+    let plan = crate::drive::Plan::of(&profile);
+    assert_eq!(
+        plan.on_fault
+            .iter()
+            .map(|read| (read.start, read.count))
+            .collect::<Vec<_>>(),
+        [(98, 1)]
+    );
+    let all = mistakes("p", &source("\"fault_code_id9\", \"frequency_reference\""));
+    assert!(all.contains("p:3, on_fault; did you mean `fault_code_id99`?"), "{all}");
+    assert!(
+        all.contains("`frequency_reference` is no point with an address of its own"),
+        "{all}"
+    );
+}

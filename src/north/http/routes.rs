@@ -16,6 +16,7 @@ use tokio::sync::Semaphore;
 use tokio_util::sync::CancellationToken;
 
 use super::{MAX_LISTENERS, api, page, streams};
+use crate::history::export;
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
 
@@ -27,6 +28,8 @@ pub(super) struct AppState {
     pub(super) cancel: CancellationToken,
     /// Permits for event streams.
     pub(super) listeners: Arc<Semaphore>,
+    /// The permit for reading a recording.
+    pub(super) files: Semaphore,
 }
 
 /// All routes.
@@ -36,6 +39,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         stats,
         cancel,
         listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
+        files: Semaphore::new(1),
     });
     Router::new()
         .route("/", get(status_page))
@@ -55,6 +59,8 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/audit", get(audit))
+        .route("/api/v1/recordings", get(recordings))
+        .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/trace", get(streams::trace))
         .fallback(unknown)
@@ -176,6 +182,38 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
 async fn audit(State(app): State<Arc<AppState>>) -> Response {
     let records = app.plant.load().writes.audit().recent();
     Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+}
+
+/// The recordings, oldest first.
+async fn recordings(State(app): State<Arc<AppState>>) -> Response {
+    let entries = app.plant.load().recordings.list();
+    Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+}
+
+/// One recording with all its samples and frames.
+async fn recording(State(app): State<Arc<AppState>>, Path(id): Path<String>) -> Response {
+    let recordings = app.plant.load().recordings.clone();
+    // Files are read and converted away from the tasks of other clients, one at a time.
+    let Ok(_permit) = app.files.acquire().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let wanted = id.clone();
+    let read = tokio::task::spawn_blocking(move || {
+        let json = |recording| export::json(&recording).to_string();
+        recordings.read(&wanted).map(|read| read.map(json))
+    });
+    match read.await {
+        Ok(Some(Ok(json))) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
+        Ok(Some(Err(error))) => {
+            let error = api::ErrorReply {
+                error: error.to_string(),
+                known: Vec::new(),
+            };
+            (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
+        }
+        Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
 }
 
 async fn unknown(uri: Uri) -> Response {

@@ -184,6 +184,9 @@ impl Client {
             return;
         };
         self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
+        if let Some((topic, payload)) = payload::recording(&self.topics, event) {
+            self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
+        }
     }
 
     fn on_connection_event(&mut self, event: ConnectionEvent) {

@@ -270,6 +270,15 @@ pub(super) fn event(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)>
     Some((topics.drive(drive, "event"), payload))
 }
 
+/// A recording that was made, if the event tells of one.
+pub(super) fn recording(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
+    let (drive, made) = (event.drive.as_deref()?, event.recording.as_ref()?);
+    let payload = serde_json::json!({
+        "id": made.id, "time": rfc3339(event.time), "trigger": made.trigger, "summary": made.summary,
+    });
+    Some((topics.drive(drive, "recording"), payload.to_string().into_bytes()))
+}
+
 /// RFC 3339, UTC, milliseconds.
 pub(super) fn rfc3339(time: SystemTime) -> String {
     humantime::format_rfc3339_millis(time).to_string()
@@ -422,6 +431,7 @@ mod tests {
             drive: Some("p1".to_string()),
             fault_code: Some(53),
             text: "gone".to_string(),
+            recording: None,
         };
         let (topic, payload) = event(&topics, &object).unwrap();
         assert_eq!(topic, "drivegate/hall/drive/p1/event");

@@ -148,6 +148,7 @@ pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
         drive: Some(drive.to_string()),
         fault_code: (kind == EventKind::Fault).then_some(7),
         text: text.to_string(),
+        recording: None,
     }
 }
 

@@ -448,6 +448,7 @@ impl Gateway {
             drive: Some(drive.to_string()),
             fault_code: None,
             text: text.to_string(),
+            recording: None,
         });
         time
     }

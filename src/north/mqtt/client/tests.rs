@@ -39,6 +39,7 @@ async fn burst(client: &mut Client, count: usize) {
             drive: Some("p1".to_string()),
             fault_code: None,
             text: format!("event {n}"),
+            recording: None,
         });
     }
     let received = client.events.recv().await;
