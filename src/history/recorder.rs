@@ -354,6 +354,10 @@ impl DriveRing {
             }
             return Some(pending.id.clone());
         }
+        // A drive that was never there is not lost.
+        if trigger.kind == TriggerKind::Lost && self.samples.iter().next().is_none() {
+            return None;
+        }
         let pause = trigger.kind.pause();
         let last = self.last.get(&trigger.kind);
         if last.is_some_and(|last| trigger.at.saturating_duration_since(*last) < pause) {

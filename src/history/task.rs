@@ -352,7 +352,6 @@ impl Writer {
                          there is room and permission; everything else goes on",
                         store::path_of(self.store.dir(), &header.id).display()
                     );
-                    tracing::warn!(target: "drivegate::history", "{text}");
                     publish(&self.events, bus, Some(drive), text, None);
                 }
             }

@@ -5,7 +5,7 @@ use std::fs;
 use drivegate::sim::wire::SimulatedBus;
 use serde_json::Value;
 
-use crate::support::process::{Running, drivegate, get, until};
+use crate::support::process::{Running, drivegate, get, point, until};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, drive};
 
 /// A gateway that records a drive for a second before and after.
@@ -27,7 +27,8 @@ fn start(recordings: &str) -> (Site, Running, SimulatedBus) {
 
 /// Standard output of a command that succeeds.
 fn printed(site: &Site, arguments: &[&str]) -> String {
-    let arguments = [arguments, &["--config", &site.config()]].concat();
+    let config = site.config();
+    let arguments = [arguments, &["--config", &config]].concat();
     let output = drivegate(&arguments).output().unwrap();
     assert!(output.status.success(), "{arguments:?}: {output:?}");
     String::from_utf8(output.stdout).unwrap()
@@ -95,10 +96,10 @@ fn a_fault_makes_a_recording_and_a_directory_that_cannot_be_written_costs_that_o
     gateway.until_printed("is lost: cannot write");
     fs::remove_file(site.file("state/recordings")).unwrap();
     line.with_drive(1, |drive, _| drive.set_reset(true));
-    line.with_drive(1, |drive, _| drive.set_reset(false));
     until("the end of the fault", || {
-        (crate::support::process::point(site.http, "pump-1", "fault") == false).then_some(())
+        (point(site.http, "pump-1", "fault") == false).then_some(())
     });
+    line.with_drive(1, |drive, _| drive.set_reset(false));
     trip(2);
     let entry = until("the recording", || listed(&site).first().cloned());
     assert_eq!(entry["trigger"], "fault");

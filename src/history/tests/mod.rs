@@ -310,13 +310,19 @@ fn triggers_while_a_recording_goes_on_are_noted_in_it() {
 fn what_repeats_makes_a_recording_a_minute() {
     let mut rig = Rig::new(options(), 1, &[]);
     let mut begun = 0;
-    for _ in 0..300 {
-        let lost = Trigger {
+    let lost = |rig: &mut Rig| {
+        let trigger = Trigger {
             kind: TriggerKind::Lost,
             at: rig.clock.now,
             text: "away".to_string(),
         };
-        rig.recorder.trigger("pump-1", lost, rig.clock);
+        rig.recorder.trigger("pump-1", trigger, rig.clock)
+    };
+    assert_eq!(lost(&mut rig), None, "it was never there");
+    rig.poll(0, RUNS, 0, 0);
+    rig.recorder.tick(rig.clock);
+    for _ in 0..300 {
+        lost(&mut rig);
         rig.pass(SECOND);
         begun += rig.recorder.tick(rig.clock).len();
     }

@@ -439,6 +439,18 @@ mod tests {
         let expected = serde_json::json!({"id": 4, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
         assert_eq!(payload, expected);
+        assert_eq!(recording(&topics, &object), None);
+        object.recording = Some(crate::event::RecordingMade {
+            id: "20231114T221320.001Z-p1".to_string(),
+            trigger: "fault",
+            summary: "fault 53".to_string(),
+        });
+        let (topic, payload) = recording(&topics, &object).unwrap();
+        assert_eq!(topic, "drivegate/hall/drive/p1/recording");
+        let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
+        let expected = serde_json::json!({"id": "20231114T221320.001Z-p1", "time": "2023-11-14T22:13:20.001Z",
+            "trigger": "fault", "summary": "fault 53"});
+        assert_eq!(payload, expected);
         object.drive = None;
         assert_eq!(event(&topics, &object), None);
     }
