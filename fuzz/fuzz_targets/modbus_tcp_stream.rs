@@ -66,6 +66,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     }))
 });
 
