@@ -81,7 +81,10 @@ fn comment(recording: &Recording, frame: &Frame, protocol: Option<Protocol>, byt
         let opened = protocol.open_frame(bytes).filter(|_| frame.verdict == Verdict::Sent);
         match opened.and_then(|(_, pdu)| RequestPdu::decode(&pdu).ok()) {
             Some(pdu) => describe::request_on(protocol, &pdu),
-            None => describe::stray(protocol, bytes),
+            // It was asked for, unless the verdict says otherwise.
+            None => describe::stray(protocol, bytes)
+                .trim_start_matches("foreign: ")
+                .to_string(),
         }
     });
     let meaning = meaning.unwrap_or_default();

@@ -8,9 +8,10 @@ use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use super::{FAULT, RUNS, Rig, SECOND, options};
-use crate::history::recording::RecordingError;
+use crate::history::recording::{Frame, RecordingError};
 use crate::history::store::{self, Store};
 use crate::history::{RecorderOptions, Recording, export, pcapng};
+use crate::process_image::Verdict;
 
 fn recording() -> Recording {
     let mut rig = Rig::new(options(), 2, &[]);
@@ -87,7 +88,13 @@ fn what_is_broken_is_told_of_with_its_place() {
 
 #[test]
 fn exports() {
-    let recording = recording();
+    let mut recording = recording();
+    recording.frames.push(Frame {
+        t: 0.5,
+        drive: Some(0),
+        verdict: Verdict::Ok,
+        hex: "01030200017984".to_string(),
+    });
     let csv = export::csv(&recording);
     let mut lines = csv.lines();
     let title: Vec<&str> = lines.next().unwrap().split(',').collect();
@@ -121,7 +128,9 @@ fn exports() {
     }
     assert_eq!(kinds[..3], [0x0A0D_0D0A, 1, 6]);
     assert_eq!(kinds.len(), 2 + recording.frames.len());
-    assert!(String::from_utf8_lossy(&capture).contains("pump-2, timeout"));
+    let text = String::from_utf8_lossy(&capture);
+    assert!(text.contains("pump-2, timeout"));
+    assert!(text.contains("+0.500000 s, pump-1, ok: address 1, function 3, 1 register"));
 }
 
 #[test]
