@@ -34,17 +34,20 @@ pub(super) struct Args {
 #[derive(Debug, clap::Subcommand)]
 enum Action {
     /// Lists the recordings, oldest first.
+    #[command(after_help = "Example:\n  drivegate recordings list --json")]
     List {
         /// JSON instead of a table.
         #[arg(long)]
         json: bool,
     },
     /// Shows a recording.
+    #[command(after_help = "Example:\n  drivegate recordings show 20260302T074012.118Z-pump-1")]
     Show {
         /// Id, or path of the file.
         id: String,
     },
     /// Writes a recording in another form.
+    #[command(after_help = "Example:\n  drivegate recordings export 20260302T074012.118Z-pump-1 --csv > trip.csv")]
     Export(Export),
 }
 
