@@ -46,7 +46,8 @@ bench: ## Run the benchmarks
 FUZZ_RUNS ?= 200000
 fuzz: ## Run every fuzz target FUZZ_RUNS times; wants nightly Rust and cargo-fuzz
 	for target in $$(cargo +nightly fuzz list); do \
-		cargo +nightly fuzz run -s none "$$target" -- -runs=$(FUZZ_RUNS) -max_len=600; \
+		mkdir -p fuzz/corpus/$$target; \
+		cargo +nightly fuzz run -s none "$$target" fuzz/corpus/$$target fuzz/seeds/$$target -- -runs=$(FUZZ_RUNS) -max_len=4096; \
 	done
 
 WORLD := cargo test --locked --profile world --test world

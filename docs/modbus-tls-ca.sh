@@ -6,8 +6,10 @@
 #   modbus-tls-ca.sh DIR server NAME [HOST...]    DIR/NAME.crt, DIR/NAME.key, for these names and addresses
 #                                                 (default: localhost 127.0.0.1 ::1)
 #   modbus-tls-ca.sh DIR client NAME [ROLE]       DIR/NAME.crt, DIR/NAME.key; without a role it may only read
+#   modbus-tls-ca.sh DIR revoke NAME...           revokes DIR/NAME.crt, and writes the list DIR/ca.crl for client_crl
+#   modbus-tls-ca.sh DIR crl                      DIR/ca.crl anew, before it is out of date
 #
-# DAYS sets the validity of a certificate (default 825; the CA: ten years). Existing files are not replaced.
+# DAYS sets the validity of a certificate (default 825; the CA: ten years; a revocation list: 365). Existing files are not replaced.
 # Keys are readable by their owner only; keep DIR/ca.key safe and secret.
 set -eu
 
@@ -15,7 +17,7 @@ set -eu
 role_oid=1.3.6.1.4.1.50316.802.1
 
 fail() { echo "error: $*" >&2; exit 2; }
-usage="write: $0 DIR ca | server NAME [HOST...] | client NAME [ROLE]"
+usage="write: $0 DIR ca | server NAME [HOST...] | client NAME [ROLE] | revoke NAME... | crl"
 
 [ $# -ge 2 ] || fail "no command; $usage"
 dir=$1 command=$2
@@ -49,6 +51,27 @@ sign() {
         -days "${DAYS:-825}" -sha256 -extfile "$dir/$1.ext" -out "$dir/$1.crt"
     rm "$dir/$1.csr" "$dir/$1.ext"
     chmod 644 "$dir/$1.crt"
+}
+
+# authority OPTION...: openssl's book of revoked certificates, DIR/ca.index.
+authority() {
+    [ -r "$dir/ca.key" ] || fail "$dir/ca.key is missing; run $0 $dir ca first"
+    [ -e "$dir/ca.index" ] || : >"$dir/ca.index"
+    [ -e "$dir/ca.crlnumber" ] || echo 01 >"$dir/ca.crlnumber"
+    cat >"$dir/ca.cnf" <<END
+[ca]
+default_ca = book
+[book]
+database = $dir/ca.index
+crlnumber = $dir/ca.crlnumber
+default_md = sha256
+# Without extensions a list has version 1, which is not accepted any more.
+crl_extensions = extensions
+[extensions]
+authorityKeyIdentifier = keyid:always
+END
+    openssl ca -config "$dir/ca.cnf" -cert "$dir/ca.crt" -keyfile "$dir/ca.key" "$@"
+    rm "$dir/ca.cnf"
 }
 
 case $command in
@@ -96,6 +119,19 @@ keyUsage=critical,digitalSignature
 extendedKeyUsage=clientAuth
 ${role:+$role_oid=ASN1:UTF8String:$role}
 END
+        ;;
+    revoke)
+        [ $# -ge 1 ] || fail "no name; $usage"
+        for name in "$@"; do
+            [ -r "$dir/$name.crt" ] || fail "$dir/$name.crt is missing; name a certificate in $dir"
+            authority -revoke "$dir/$name.crt"
+        done
+        authority -gencrl -crldays "${DAYS:-365}" -out "$dir/ca.crl"
+        chmod 644 "$dir/ca.crl"
+        ;;
+    crl)
+        authority -gencrl -crldays "${DAYS:-365}" -out "$dir/ca.crl"
+        chmod 644 "$dir/ca.crl"
         ;;
     *) fail "unknown command \`$command\`; $usage" ;;
 esac

@@ -1,5 +1,6 @@
 //! The gateway as a whole: start, reload and the order of shutdown.
 
+mod file_limit;
 mod server;
 
 use std::collections::BTreeMap;
@@ -8,11 +9,11 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 
-use self::server::{ServerSlot, within};
+use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
-use crate::command::{CommandQueue, WriteStats};
+use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{RecorderTask, Recordings};
@@ -24,6 +25,11 @@ use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
+
+/// Time limit for the audit file to be written.
+const STOP_AUDIT: Duration = Duration::from_secs(1);
+/// Interval at which refusals are reported whose count is due.
+const REFUSALS_REPORTED: Duration = Duration::from_millis(250);
 
 /// Why the gateway cannot start or apply a new configuration.
 #[derive(Debug, thiserror::Error)]
@@ -37,9 +43,6 @@ pub enum StartError {
     /// The system does not provide a thread for the recorder.
     #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
     Recorder(std::io::Error),
-    /// A server cannot start, and the previous servers cannot be started again.
-    #[error("{0}; the previous servers cannot be restarted: {1}")]
-    NotRestored(Box<ServerError>, Box<ServerError>),
 }
 
 /// A running gateway.
@@ -57,9 +60,13 @@ pub struct Daemon {
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
     recorder: Option<RecorderTask>,
+    /// Reports refusals whose count is due.
+    reporter: tokio::task::JoinHandle<()>,
     /// Beats of the bus threads at the last check, by bus.
     beats: BTreeMap<String, u64>,
 }
+
+type PreparedServers = (Prepared<modbus_tcp::Server>, Prepared<http::Http>);
 
 impl Daemon {
     /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
@@ -67,6 +74,7 @@ impl Daemon {
     /// # Errors
     /// A server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
+        let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
         let plant = Plant {
@@ -77,8 +85,9 @@ impl Daemon {
             writes: writes.clone(),
             recordings: recordings.clone(),
         };
+        let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
-            plant: Arc::new(ArcSwap::from_pointee(plant)),
+            plant: shared.clone(),
             settings: settings.clone(),
             buses: Vec::new(),
             events,
@@ -90,14 +99,17 @@ impl Daemon {
             local: ServerSlot::default(),
             recordings,
             recorder: None,
+            reporter: report_refusals(shared),
             beats: BTreeMap::new(),
         };
+        daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings)?;
         daemon.replace_buses(&settings, prepared);
-        daemon.apply_servers(&settings).await?;
+        let servers = daemon.prepare_servers(&settings).await?;
+        daemon.commit_servers(servers).await;
         daemon.apply_local(&settings).await;
         Ok(daemon)
     }
@@ -109,13 +121,13 @@ impl Daemon {
 
     /// The address that the HTTP server listens on.
     pub fn http_address(&self) -> Option<std::net::SocketAddr> {
-        self.http.server().map(http::Http::address)
+        self.http.server().and_then(http::Http::address)
     }
 
     /// The addresses that the Modbus TCP server listens on without TLS.
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
         let server = self.modbus_tcp.server();
-        server.map(|server| server.addresses().to_vec()).unwrap_or_default()
+        server.map(modbus_tcp::Server::addresses).unwrap_or_default()
     }
 
     /// Path of the local socket, if it is open.
@@ -142,23 +154,22 @@ impl Daemon {
     /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// A bus or a server cannot start. Everything runs as before, unless the error says that the previous servers
-    /// cannot be restarted.
+    /// A bus or a server cannot start: everything runs as before. Or a changed recorder cannot: everything else runs as
+    /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
-        let before = self.settings.clone();
+        let settings = file_limit::fit(settings);
         // Everything that can fail comes before anything that runs is stopped for good.
         let prepared = self.prepare_buses(&settings)?;
-        if let Err(error) = self.apply_servers(&settings).await {
-            return Err(match self.apply_servers(&before).await {
-                Ok(()) => error.into(),
-                Err(restart) => StartError::NotRestored(error.into(), restart.into()),
-            });
+        let servers = self.prepare_servers(&settings).await?;
+        if let Err(error) = self.apply_recorder(&settings) {
+            self.abort_servers(servers).await;
+            return Err(error);
         }
-        let recorder = self.apply_recorder(&settings);
+        self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared);
-        recorder?;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
+        self.apply_audit(&settings).await;
         self.settings = settings;
         Ok(())
     }
@@ -259,12 +270,28 @@ impl Daemon {
         Ok(())
     }
 
-    async fn apply_servers(&mut self, settings: &Settings) -> Result<(), ServerError> {
+    /// Prepares the servers that listen on the network: all of them or none.
+    async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let (plant, stats) = (&self.plant, &self.stats);
-        self.modbus_tcp
-            .apply(settings.modbus_tcp.as_ref(), plant, stats)
-            .await?;
-        self.http.apply(settings.http.as_ref(), plant, stats).await
+        let options = settings.modbus_tcp.as_ref();
+        let modbus_tcp = self.modbus_tcp.prepare(options, plant, stats).await?;
+        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
+            Ok(http) => Ok((modbus_tcp, http)),
+            Err(error) => {
+                self.modbus_tcp.abort(modbus_tcp).await;
+                Err(error)
+            }
+        }
+    }
+
+    async fn abort_servers(&mut self, (modbus_tcp, http): PreparedServers) {
+        self.modbus_tcp.abort(modbus_tcp).await;
+        self.http.abort(http).await;
+    }
+
+    async fn commit_servers(&mut self, (modbus_tcp, http): PreparedServers) {
+        self.modbus_tcp.commit(modbus_tcp).await;
+        self.http.commit(http).await;
     }
 
     async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
@@ -285,6 +312,24 @@ impl Daemon {
                 "{error}; `drivegate read` and `drivegate write` cannot use this gateway; set `socket` of [gateway], or \
                  socket = \"\" to do without"
             );
+        }
+    }
+
+    /// Writes the audit to the configured file. The gateway runs on without it if there is no thread for it.
+    async fn apply_audit(&self, settings: &Settings) {
+        let audit = self.writes.audit();
+        let before = audit.file();
+        if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
+            return;
+        }
+        // Its predecessor may have the same path.
+        audit.write_to(None);
+        if let Some(before) = before {
+            within(STOP_AUDIT, "the audit file", before.stop()).await;
+        }
+        match settings.audit.clone().map(AuditFile::start).transpose() {
+            Ok(file) => audit.write_to(file.map(Arc::new)),
+            Err(error) => tracing::error!("cannot start the thread of the audit file: {error}; free memory or threads"),
         }
     }
 
@@ -309,8 +354,17 @@ impl Daemon {
             let _ = stopped.await;
         })
         .await;
+        self.reporter.abort();
+        // What is held back, whenever it would be due.
+        self.plant
+            .load()
+            .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
+        let audit = self.writes.audit();
+        if let Some(file) = audit.file() {
+            within(STOP_AUDIT, "the audit file", file.stop()).await;
+        }
     }
 
     /// Stops the drives with `on_shutdown = "stop"`; each bus has the time that this takes on its line.
@@ -343,4 +397,15 @@ impl Daemon {
             );
         }
     }
+}
+
+/// Reports refusals of the plant whose count is due.
+fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
+    tokio::spawn(async move {
+        let mut ticks = tokio::time::interval(REFUSALS_REPORTED);
+        loop {
+            ticks.tick().await;
+            plant.load().report_refusals(Instant::now());
+        }
+    })
 }

@@ -1,23 +1,27 @@
 //! What happened: state changes that people and the cloud want to know of, each published once.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, PoisonError};
-use std::time::{Duration, Instant, SystemTime};
+mod fair_ring;
+mod refusals;
+
+use std::hash::{BuildHasher, RandomState};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Instant, SystemTime};
 
 use serde::Serialize;
 use tokio::sync::broadcast;
 
+pub use fair_ring::FairRing;
+pub use refusals::RefusalLimit;
+
 /// Events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
 pub const BURST: usize = 16_384;
-/// Events kept for late readers.
+/// Events of drives and buses kept for late readers.
 const KEPT: usize = 4096;
-/// Refused commands of one drive that are published within [`REFUSALS_IN`]: a client without authority can send them at any rate.
-const REFUSALS: u32 = 10;
-/// The time for which refused commands are counted.
-const REFUSALS_IN: Duration = Duration::from_secs(1);
+/// Refused commands kept beside them.
+const REFUSALS_KEPT: usize = 512;
 
 /// What kind of thing happened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventKind {
     /// A drive answers (again).
@@ -28,6 +32,16 @@ pub enum EventKind {
     Fault,
     /// The fault is gone.
     FaultEnd,
+    /// A motor started.
+    Started,
+    /// A motor stopped.
+    Stopped,
+    /// A warning came up.
+    Warning,
+    /// The warning is gone.
+    WarningEnd,
+    /// The fieldbus became the control place of a drive, or no longer is.
+    ControlPlace,
     /// A drive has started anew.
     Restarted,
     /// A drive says that it is another device than its profile expects.
@@ -54,6 +68,7 @@ impl EventKind {
         match self {
             EventKind::Offline
             | EventKind::Fault
+            | EventKind::Warning
             | EventKind::UnlikeProfile
             | EventKind::Supervision
             | EventKind::Unsupervised
@@ -61,6 +76,10 @@ impl EventKind {
             | EventKind::BusDown => true,
             EventKind::Online
             | EventKind::FaultEnd
+            | EventKind::Started
+            | EventKind::Stopped
+            | EventKind::WarningEnd
+            | EventKind::ControlPlace
             | EventKind::Restarted
             | EventKind::RefusedCommand
             | EventKind::BusUp
@@ -75,6 +94,11 @@ impl EventKind {
             EventKind::Offline => "offline",
             EventKind::Fault => "fault",
             EventKind::FaultEnd => "fault_end",
+            EventKind::Started => "started",
+            EventKind::Stopped => "stopped",
+            EventKind::Warning => "warning",
+            EventKind::WarningEnd => "warning_end",
+            EventKind::ControlPlace => "control_place",
             EventKind::Restarted => "restarted",
             EventKind::UnlikeProfile => "unlike_profile",
             EventKind::Supervision => "supervision",
@@ -91,7 +115,8 @@ impl EventKind {
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Event {
-    /// Running number within this process, from 1.
+    /// Running number within this process, from 1; shown with the [`boot`] of the process.
+    #[serde(flatten, serialize_with = "numbered")]
     pub id: u64,
     /// When it happened.
     #[serde(serialize_with = "rfc3339")]
@@ -107,6 +132,9 @@ pub struct Event {
     /// Fault code, where there is one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub fault_code: Option<i64>,
+    /// Refused commands only: how many of one client it stands for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub count: Option<u64>,
     /// For people.
     pub text: String,
     /// The recording that was made.
@@ -125,101 +153,142 @@ pub struct RecordingMade {
     pub summary: String,
 }
 
+/// The name of this run of the process, different at every start: with it, the number of an event is unique.
+pub fn boot() -> &'static str {
+    static BOOT: OnceLock<String> = OnceLock::new();
+    BOOT.get_or_init(|| {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        let random = RandomState::new().hash_one((now.unwrap_or_default(), std::process::id()));
+        format!("{random:016x}")
+    })
+}
+
+fn numbered<S: serde::Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
+    #[derive(Serialize)]
+    struct Numbered {
+        id: u64,
+        boot: &'static str,
+    }
+    Numbered { id: *id, boot: boot() }.serialize(serializer)
+}
+
 /// RFC 3339 with milliseconds, UTC.
 pub fn rfc3339<S: serde::Serializer>(time: &SystemTime, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.collect_str(&humantime::format_rfc3339_millis(*time))
+}
+
+/// A command that was refused.
+#[derive(Debug)]
+pub struct RefusedCommand<'r> {
+    /// The client, as shares are reckoned.
+    pub client: &'r Arc<str>,
+    /// Code of the reason.
+    pub reason: &'static str,
+    /// The bus.
+    pub bus: &'r str,
+    /// The drive.
+    pub drive: &'r str,
+    /// For people.
+    pub text: String,
 }
 
 /// Where events are published and received.
 #[derive(Debug, Clone)]
 pub struct Events {
     sender: broadcast::Sender<Arc<Event>>,
-    kept: Arc<Mutex<(u64, VecDeque<Arc<Event>>)>>,
-    /// By drive; names come from the configuration, so they are few.
-    refusals: Arc<Mutex<BTreeMap<String, Refusals>>>,
+    store: Arc<Mutex<Store>>,
 }
 
-/// Refused commands of a drive.
+/// The last events. Those of drives and buses are apart from refused commands, and no drive or kind pushes out another.
 #[derive(Debug)]
-struct Refusals {
-    since: Instant,
-    published: u32,
-    omitted: u64,
-}
-
-impl Refusals {
-    /// Whether one may be published now, and how many were left out before it.
-    fn admit(&mut self, now: Instant) -> Option<u64> {
-        if now.saturating_duration_since(self.since) >= REFUSALS_IN {
-            self.since = now;
-            self.published = 0;
-        }
-        if self.published == REFUSALS {
-            self.omitted += 1;
-            return None;
-        }
-        self.published += 1;
-        Some(std::mem::take(&mut self.omitted))
-    }
+struct Store {
+    number: u64,
+    kept: FairRing<(EventKind, String), Arc<Event>>,
+    refused: FairRing<String, Arc<Event>>,
+    limit: RefusalLimit<Event>,
 }
 
 impl Default for Events {
     fn default() -> Self {
         Events {
             sender: broadcast::channel(BURST).0,
-            kept: Arc::default(),
-            refusals: Arc::default(),
+            store: Arc::new(Mutex::new(Store {
+                number: 0,
+                kept: FairRing::new(KEPT),
+                refused: FairRing::new(REFUSALS_KEPT),
+                limit: RefusalLimit::default(),
+            })),
         }
     }
 }
 
 impl Events {
+    fn store(&self) -> MutexGuard<'_, Store> {
+        self.store.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// Publishes an event; its id is set here.
-    pub fn publish(&self, mut event: Event) {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        kept.0 += 1;
-        event.id = kept.0;
+    pub fn publish(&self, event: Event) {
+        self.publish_in(&mut self.store(), event);
+    }
+
+    /// Under the lock, so that listeners hear the events in the order of their ids.
+    fn publish_in(&self, store: &mut Store, mut event: Event) {
+        store.number += 1;
+        event.id = store.number;
         let (kind, drive) = (event.kind.name(), event.drive.as_deref().unwrap_or(""));
         if event.kind.is_trouble() {
             tracing::warn!(target: "drivegate::event", kind, bus = %event.bus, drive, "{}", event.text);
         } else {
-            tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, "{}", event.text);
+            tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, count = event.count, "{}", event.text);
         }
-        let event = Arc::new(event);
-        if kept.1.len() == KEPT {
-            kept.1.pop_front();
+        let (number, event) = (event.id, Arc::new(event));
+        let source = event.drive.clone().unwrap_or_else(|| event.bus.clone());
+        match event.kind {
+            EventKind::RefusedCommand => store.refused.push(source, number, event.clone()),
+            kind => store.kept.push((kind, source), number, event.clone()),
         }
-        kept.1.push_back(event.clone());
         // Nobody listening is no error.
         let _ = self.sender.send(event);
     }
 
-    /// Publishes that a command to `drive` was refused: ten a second at most, the next one says how many were left out.
-    /// The audit has them all.
-    pub fn publish_refusal(&self, bus: &str, drive: &str, mut text: String, now: Instant) {
-        let omitted = {
-            let mut refusals = self.refusals.lock().unwrap_or_else(PoisonError::into_inner);
-            let of_drive = refusals.entry(drive.to_string()).or_insert(Refusals {
-                since: now,
-                published: 0,
-                omitted: 0,
-            });
-            of_drive.admit(now)
-        };
-        let Some(omitted) = omitted else { return };
-        if omitted > 0 {
-            text = format!("{text} ({omitted} more refused before are in the audit log)");
-        }
-        self.publish(Event {
+    /// Publishes that a command was refused: the first of a kind at once, then one event a second for each client, which
+    /// stands for all of them.
+    pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
+        let event = Event {
             id: 0,
             time: SystemTime::now(),
             kind: EventKind::RefusedCommand,
-            bus: bus.to_string(),
-            drive: Some(drive.to_string()),
+            bus: refused.bus.to_string(),
+            drive: Some(refused.drive.to_string()),
             fault_code: None,
-            text,
+            count: None,
+            text: refused.text,
             recording: None,
-        });
+        };
+        let mut store = self.store();
+        let passed = store
+            .limit
+            .admit(refused.client, refused.reason, Some(refused.drive), event, now);
+        passed
+            .into_iter()
+            .for_each(|passed| self.publish_counted(&mut store, passed));
+    }
+
+    /// Publishes the refusals that waited long enough for their count.
+    pub fn publish_due(&self, now: Instant) {
+        let mut store = self.store();
+        let due = store.limit.due(now);
+        due.into_iter()
+            .for_each(|passed| self.publish_counted(&mut store, passed));
+    }
+
+    fn publish_counted(&self, store: &mut Store, (mut event, count): (Event, u64)) {
+        event.count = Some(count);
+        if count > 1 {
+            event.text = format!("{} ({count} commands of this client were refused)", event.text);
+        }
+        self.publish_in(store, event);
     }
 
     /// Hears all events from now on; a listener that is more than [`BURST`] behind loses the oldest.
@@ -227,20 +296,20 @@ impl Events {
         self.sender.subscribe()
     }
 
-    /// The last 4,096 events, oldest first.
+    /// The last 4,096 events of drives and buses and the last 512 refused commands, oldest first.
     pub fn recent(&self) -> Vec<Arc<Event>> {
-        self.kept
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .1
-            .iter()
-            .cloned()
-            .collect()
+        let store = self.store();
+        let all = store.kept.iter().chain(store.refused.iter());
+        let mut all: Vec<_> = all.map(|(_, event)| event.clone()).collect();
+        all.sort_unstable_by_key(|event| event.id);
+        all
     }
 }
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use super::*;
 
     fn event(text: String) -> Event {
@@ -251,6 +320,7 @@ mod tests {
             bus: "line1".to_string(),
             drive: None,
             fault_code: None,
+            count: None,
             text,
             recording: None,
         }
@@ -269,20 +339,44 @@ mod tests {
     }
 
     #[test]
-    fn a_flood_of_refusals_is_counted_not_told() {
-        let events = Events::default();
-        let now = Instant::now();
-        for _ in 0..1000 {
-            events.publish_refusal("line1", "pump-1", "refused".to_string(), now);
+    fn refusals_push_out_no_event_of_a_drive_and_a_drive_none_of_another() {
+        let (events, start) = (Events::default(), Instant::now());
+        let fault = |drive: &str, kind| Event {
+            kind,
+            drive: Some(drive.to_string()),
+            ..event("F1".to_string())
+        };
+        events.publish(fault("pump-1", EventKind::Fault));
+        let client = |n: u32| Arc::from(format!("modbus_tcp 10.0.0.{}", n % 64));
+        for n in 0..100_000 {
+            let refused = RefusedCommand {
+                client: &client(n),
+                reason: "not_allowed",
+                bus: "line1",
+                drive: "pump-1",
+                text: "refused".to_string(),
+            };
+            events.publish_refusal(refused, start + Duration::from_millis(n.into()));
         }
-        events.publish_refusal("line1", "pump-2", "refused".to_string(), now);
-        assert_eq!(
-            events.recent().len(),
-            11,
-            "ten of one drive, none of them at the cost of another drive"
+        events.publish_due(start + Duration::from_secs(200));
+        let refused: Vec<_> = events
+            .recent()
+            .into_iter()
+            .filter(|e| e.kind == EventKind::RefusedCommand)
+            .collect();
+        assert_eq!(refused.len(), REFUSALS_KEPT);
+        assert!(
+            refused
+                .last()
+                .unwrap()
+                .text
+                .contains("commands of this client were refused)")
         );
-        events.publish_refusal("line1", "pump-1", "refused".to_string(), now + REFUSALS_IN);
-        let last = events.recent().last().map(|e| e.text.clone()).unwrap();
-        assert_eq!(last, "refused (990 more refused before are in the audit log)");
+        (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Online)));
+        (0..2 * KEPT).for_each(|_| events.publish(fault("pump-2", EventKind::Fault)));
+        let kept = events.recent();
+        assert_eq!(kept.len(), KEPT + REFUSALS_KEPT);
+        assert_eq!((kept[0].id, kept[0].drive.as_deref()), (1, Some("pump-1")));
+        assert!(kept.is_sorted_by_key(|event| event.id));
     }
 }

@@ -14,7 +14,7 @@ use crate::command::{
     WriteStats,
 };
 use crate::drive::{ModelPoint, Value};
-use crate::event::Events;
+use crate::event::{Events, RefusedCommand};
 use crate::history::Recordings;
 use crate::process_image::{BusImage, DriveImage, Reading};
 
@@ -146,6 +146,13 @@ impl BusHandle {
 }
 
 impl Plant {
+    /// Logs and publishes the refusals that were held back for their count and are due at `now`; to be called several
+    /// times a second.
+    pub fn report_refusals(&self, now: Instant) {
+        self.events.publish_due(now);
+        self.writes.audit().record_due(now);
+    }
+
     /// Refuses a command to a drive that there is not; audited and counted. `why` names the nearest one.
     pub fn refuse_unknown(&self, drive: &str, what: &str, why: String, origin: Origin, now: Instant) -> Answer {
         let outcome = Outcome::Refused(Refusal::UnknownDrive(why));
@@ -216,7 +223,7 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
             Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, now),
             Err(refusal) => {
-                self.publish_refusal(&what, &refusal.to_string(), ticket.origin(), now);
+                self.publish_refusal(&what, &refusal, ticket.origin(), now);
                 ticket.answer(Outcome::Refused(refusal), now);
             }
             Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
@@ -234,17 +241,23 @@ impl DriveHandle {
 
     /// Refuses a command before it became an order; audited, counted and published like any other refusal.
     pub fn refuse(&self, what: &str, refusal: Refusal, origin: Origin, now: Instant) -> Answer {
-        self.publish_refusal(what, &refusal.to_string(), &origin, now);
+        self.publish_refusal(what, &refusal, &origin, now);
         let name = &self.image.spec.name;
         turn_away(&self.writes, name, what, Outcome::Refused(refusal), origin, now)
     }
 
     /// Publishes that a command was refused; a flood of them is counted.
-    fn publish_refusal(&self, what: &str, why: &str, origin: &Origin, now: Instant) {
+    fn publish_refusal(&self, what: &str, refusal: &Refusal, origin: &Origin, now: Instant) {
         let what = if what.is_empty() { "an empty command" } else { what };
-        let text = format!("refused {what} from {} {}: {why}", origin.kind.name(), origin.who);
         let spec = &self.image.spec;
-        self.events.publish_refusal(&spec.bus, &spec.name, text, now);
+        let refused = RefusedCommand {
+            client: origin.client(),
+            reason: refusal.code(),
+            bus: &spec.bus,
+            drive: &spec.name,
+            text: format!("refused {what} from {} {}: {refusal}", origin.kind.name(), origin.who),
+        };
+        self.events.publish_refusal(refused, now);
     }
 
     fn describe(&self, order: &Order) -> String {

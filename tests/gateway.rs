@@ -10,6 +10,7 @@
 mod support;
 
 mod gateway {
+    mod audit;
     mod bad_commands;
     mod cli;
     mod commands;
@@ -18,6 +19,7 @@ mod gateway {
     mod local_socket;
     mod operators;
     mod recordings;
+    mod reload;
     mod restart;
     mod slow_log;
     mod trace;

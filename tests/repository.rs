@@ -12,6 +12,7 @@ mod support;
 mod repository {
     mod config;
     mod documents;
+    mod fuzz_seeds;
     mod layering;
     mod packaging;
 }

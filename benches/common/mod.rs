@@ -173,7 +173,7 @@ fn read_north(modbus: Option<SocketAddr>, http: SocketAddr, units: u8) -> std::i
 pub fn scrape(http: SocketAddr) -> std::io::Result<String> {
     let mut client = TcpStream::connect(http)?;
     client.set_read_timeout(Some(Duration::from_secs(5)))?;
-    client.write_all(b"GET /metrics HTTP/1.1\r\nHost: bench\r\nConnection: close\r\n\r\n")?;
+    client.write_all(b"GET /metrics HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")?;
     let mut text = String::new();
     client.read_to_string(&mut text)?;
     Ok(text)

@@ -131,7 +131,7 @@ fn one_drive(port: &str) -> Result<Settings, Box<dyn Error>> {
         keys: "cycle = \"10ms\"",
         drive_keys: "turnaround = \"0.5ms\"",
     };
-    let server = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nstale_after = \"5s\"\n";
+    let server = "[modbus_tcp]\nlisten = [\"127.0.0.1:0\"]\nmax_connections = 1000\nmax_connections_per_address = 1000\nstale_after = \"5s\"\n";
     settings(&(bus.toml() + server))
 }
 

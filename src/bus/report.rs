@@ -20,6 +20,28 @@ const LOAD_WINDOW: Duration = Duration::from_secs(1);
 /// What was read longer ago shows neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
 
+/// Points whose changes are events: what they are when the point comes and goes, in words.
+const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
+    (
+        ModelPoint::Running,
+        [(EventKind::Started, "has started"), (EventKind::Stopped, "has stopped")],
+    ),
+    (
+        ModelPoint::Warning,
+        [
+            (EventKind::Warning, "reports a warning"),
+            (EventKind::WarningEnd, "reports no warning any more"),
+        ],
+    ),
+    (
+        ModelPoint::Remote,
+        [
+            (EventKind::ControlPlace, "is controlled by the fieldbus"),
+            (EventKind::ControlPlace, "is no longer controlled by the fieldbus"),
+        ],
+    ),
+];
+
 /// Reports what a bus does.
 #[derive(Debug)]
 pub(super) struct Report {
@@ -29,6 +51,8 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
     faults: Vec<Option<i64>>,
+    /// What else was reported of each drive, in the order of [`WATCHED`]; `None` before the first read.
+    watched: Vec<[Option<bool>; WATCHED.len()]>,
     /// Drives whose own response to a silent master was looked at since they came online.
     looked_at: Vec<bool>,
     up: bool,
@@ -44,6 +68,7 @@ impl Report {
             window: now,
             busy: Duration::ZERO,
             looked_at: vec![false; faults.len()],
+            watched: vec![[None; WATCHED.len()]; faults.len()],
             faults,
             up: false,
             reason: String::new(),
@@ -86,8 +111,10 @@ impl Report {
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
         }
         let News::Read { drive, .. } = news else { return None };
+        let new_fault = self.look_at_fault(*drive, now);
+        self.look_at_state(*drive, now);
         self.look_at_own_response(*drive, now);
-        self.look_at_fault(*drive, now).then_some(*drive)
+        new_fault.then_some(*drive)
     }
 
     fn drive(&self, index: usize) -> Option<Arc<DriveImage>> {
@@ -112,6 +139,7 @@ impl Report {
             bus: self.image.spec.name.clone(),
             drive,
             fault_code,
+            count: None,
             text,
             recording: None,
         });
@@ -330,6 +358,26 @@ impl Report {
             }),
         }
         active.is_some()
+    }
+
+    /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
+    /// event; what changed while the drive was offline is one.
+    fn look_at_state(&mut self, index: usize, now: Instant) {
+        let Some(drive) = self.drive(index) else { return };
+        let reading = drive.reading(now, RECENT);
+        for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
+            let Some(Value::Bool(value)) = reading.model(point).good() else {
+                continue;
+            };
+            let Some(known) = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place)) else {
+                continue;
+            };
+            if known.replace(value).is_some_and(|before| before != value) {
+                let [comes, goes] = changes;
+                let (kind, words) = if value { comes } else { goes };
+                self.drive_event(index, kind, None, |name| format!("drive {name} {words}"));
+            }
+        }
     }
 
     fn fast_round(&self, cycle: Option<Duration>) {

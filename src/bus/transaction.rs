@@ -143,11 +143,6 @@ impl Transaction {
         &self.request
     }
 
-    /// The frame that was sent.
-    pub fn frame(&self) -> &[u8] {
-        &self.frame
-    }
-
     /// Bytes came in.
     pub fn on_bytes(&mut self, now: Instant, bytes: &[u8]) -> Step {
         self.first_byte.get_or_insert(now);

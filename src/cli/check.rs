@@ -5,7 +5,6 @@ use std::path::Path;
 use std::process::ExitCode;
 use std::time::Duration;
 
-use comfy_table::CellAlignment;
 use serde::Serialize;
 
 use super::{ConfigFile, EXIT_CONFIG, report};
@@ -177,11 +176,7 @@ fn bus_text(bus: &BusSettings, recorder: &RecorderOptions) -> String {
             format!("{:.2}", milliseconds(request.wire)),
         ]);
     }
-    for column in 3..6 {
-        if let Some(column) = table.column_mut(column) {
-            column.set_cell_alignment(CellAlignment::Right);
-        }
-    }
+    (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
     text + &summary(bus, &prediction) + &memory(bus, recorder)

@@ -1,5 +1,7 @@
 //! A client of a running gateway's HTTP server, for commands that show its state.
 
+mod gateway;
+
 use std::collections::VecDeque;
 use std::fmt;
 use std::future::poll_fn;
@@ -12,8 +14,10 @@ use hyper::client::conn::http1::{self, Connection};
 use hyper::{Request, Response, StatusCode, Uri, header};
 use hyper_util::rt::TokioIo;
 use serde::Deserialize;
-use tokio::net::TcpStream;
 use tokio::time::timeout;
+
+pub(super) use self::gateway::Gateway;
+use self::gateway::Stream;
 
 /// Time for the connection and the head of the reply.
 const OPEN_TIMEOUT: Duration = Duration::from_secs(10);
@@ -27,6 +31,7 @@ const MOST_DOCUMENT: usize = 1 << 26;
 /// Address of a gateway's HTTP server: `http://host:port`, with a path behind a proxy that adds one.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Url {
+    tls: bool,
     /// An IPv6 address without its brackets.
     host: String,
     port: u16,
@@ -40,21 +45,20 @@ impl FromStr for Url {
     fn from_str(text: &str) -> Result<Url, String> {
         let form = "write it as http://127.0.0.1:9488";
         let uri: Uri = text.parse().map_err(|why| format!("{why}; {form}"))?;
-        match uri.scheme_str() {
-            Some("http") => {}
-            Some("https") => {
-                return Err("https:// is not supported; connect to the gateway itself with http://".to_string());
-            }
+        let tls = match uri.scheme_str() {
+            Some("http") => false,
+            Some("https") => true,
             _ => return Err(format!("http:// is missing; {form}")),
-        }
+        };
         let authority = uri.authority().map(ToString::to_string).unwrap_or_default();
         if authority.contains('@') || uri.query().is_some() {
             return Err(format!("user, password and query are not supported; {form}"));
         }
         let host = uri.host().unwrap_or_default();
         Ok(Url {
+            tls,
             host: host.trim_start_matches('[').trim_end_matches(']').to_string(),
-            port: uri.port_u16().unwrap_or(80),
+            port: uri.port_u16().unwrap_or(if tls { 443 } else { 80 }),
             authority,
             path: uri.path().trim_end_matches('/').to_string(),
         })
@@ -63,7 +67,8 @@ impl FromStr for Url {
 
 impl fmt::Display for Url {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "http://{}{}", self.authority, self.path)
+        let scheme = if self.tls { "https" } else { "http" };
+        write!(f, "{scheme}://{}{}", self.authority, self.path)
     }
 }
 
@@ -75,11 +80,17 @@ pub(super) enum ClientError {
         "cannot reach the gateway: {1}; {0}; start it with an [http] section, or pass its `listen` address with --url"
     )]
     Unreachable(Url, String),
+    /// A file of the command line cannot be used.
+    #[error("{0}")]
+    File(String),
+    /// The TLS handshake failed.
+    #[error("no TLS connection: {1}; {0}; pass the CA of the gateway's certificate with --ca, or use http://")]
+    Tls(Url, String),
     /// The gateway refused, with a reason.
     #[error("{error}; {url}; {remedy}")]
     Refused {
         /// The gateway.
-        url: Url,
+        url: Box<Url>,
         /// Its message.
         error: String,
         /// What to do.
@@ -129,9 +140,10 @@ impl EventStream {
     ///
     /// # Errors
     /// When the gateway cannot be reached, refuses, or is not a gateway.
-    pub(super) async fn open(url: &Url, path: &str) -> Result<EventStream, ClientError> {
+    pub(super) async fn open(gateway: &Gateway, path: &str) -> Result<EventStream, ClientError> {
+        let url = &gateway.url;
         let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
-        let (wire, response) = timeout(OPEN_TIMEOUT, ask(url, path)).await.map_err(|_| late())??;
+        let (wire, response) = timeout(OPEN_TIMEOUT, ask(gateway, path)).await.map_err(|_| late())??;
         let kind = response.headers().get(header::CONTENT_TYPE);
         let is_stream = kind.is_some_and(|kind| kind.as_bytes().starts_with(b"text/event-stream"));
         let status = response.status();
@@ -200,10 +212,14 @@ impl EventStream {
         match serde_json::from_slice::<Problem>(&text) {
             Ok(Problem { error, known }) => ClientError::Refused {
                 remedy: match known.as_slice() {
+                    [] if status == StatusCode::UNAUTHORIZED || status == StatusCode::FORBIDDEN => {
+                        "pass a token with scope `read` with --token-file".to_string()
+                    }
+                    [] if status == StatusCode::MISDIRECTED_REQUEST => "reload the gateway after that".to_string(),
                     [] => "try again later".to_string(),
                     known => format!("known: {}", known.join(", ")),
                 },
-                url,
+                url: Box::new(url),
                 error,
             },
             Err(_) => ClientError::Strange(url, format!("the server answered `{status}` without a stream")),
@@ -215,10 +231,11 @@ impl EventStream {
 ///
 /// # Errors
 /// When the gateway cannot be reached, refuses, or is not a gateway.
-pub(super) async fn get_json(url: &Url, path: &str) -> Result<serde_json::Value, ClientError> {
+pub(super) async fn get_json(gateway: &Gateway, path: &str) -> Result<serde_json::Value, ClientError> {
+    let url = &gateway.url;
     let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
     let whole = async {
-        let (wire, response) = ask(url, path).await?;
+        let (wire, response) = ask(gateway, path).await?;
         let status = response.status();
         let mut stream = EventStream {
             url: url.clone(),
@@ -243,17 +260,21 @@ pub(super) async fn get_json(url: &Url, path: &str) -> Result<serde_json::Value,
     timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
 }
 
-async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
+async fn ask(gateway: &Gateway, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
+    let url = &gateway.url;
     let unreachable = |why: String| ClientError::Unreachable(url.clone(), why);
-    let socket = TcpStream::connect((url.host.as_str(), url.port))
-        .await
-        .map_err(|error| unreachable(error.to_string()))?;
+    let token = gateway.token()?;
+    let stream = gateway.connect().await?;
     let strange = |error: hyper::Error| ClientError::Strange(url.clone(), format!("not an HTTP reply ({error})"));
-    let (mut sender, connection) = http1::handshake(TokioIo::new(socket)).await.map_err(strange)?;
+    let (mut sender, connection) = http1::handshake(TokioIo::new(stream)).await.map_err(strange)?;
     let mut wire = Wire(Some(Box::pin(connection)));
-    let request = Request::get(format!("{}{path}", url.path))
+    let mut request = Request::get(format!("{}{path}", url.path))
         .header(header::HOST, &url.authority)
-        .header(header::ACCEPT, "text/event-stream, application/json")
+        .header(header::ACCEPT, "text/event-stream, application/json");
+    if let Some(token) = token {
+        request = request.header(header::AUTHORIZATION, format!("Bearer {token}"));
+    }
+    let request = request
         .body(String::new())
         .map_err(|error| unreachable(error.to_string()))?;
     let response = wire.with(sender.send_request(request)).await.map_err(strange)?;
@@ -263,7 +284,7 @@ async fn ask(url: &Url, path: &str) -> Result<(Wire, Response<Incoming>), Client
 /// The connection, which is polled only while a reply or event is awaited.
 struct Wire(Option<Pin<Box<Connected>>>);
 
-type Connected = Connection<TokioIo<TcpStream>, String>;
+type Connected = Connection<TokioIo<Box<dyn Stream>>, String>;
 
 impl fmt::Debug for Wire {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -352,10 +373,12 @@ mod tests {
         let url: Url = "http://[::1]/plant/".parse().unwrap();
         assert_eq!((url.host.as_str(), url.port, url.path.as_str()), ("::1", 80, "/plant"));
         assert_eq!(url.to_string(), "http://[::1]/plant");
+        let url: Url = "https://gateway.example".parse().unwrap();
+        assert_eq!((url.tls, url.host.as_str(), url.port), (true, "gateway.example", 443));
+        assert_eq!(url.to_string(), "https://gateway.example");
         for (bad, why) in [
             ("127.0.0.1:9488", "http:// is missing"),
             ("gateway", "http:// is missing"),
-            ("https://gateway", "https:// is not supported"),
             ("http://me:secret@gateway", "not supported"),
             ("http://gateway/?a=b", "not supported"),
             ("http://", "write it as"),

@@ -116,7 +116,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
         match demo(args).await {
             Ok(()) => ExitCode::SUCCESS,
             Err(error) => {
-                eprintln!("error: {error}");
+                report::error(&error.to_string());
                 ExitCode::from(EXIT_FAILED)
             }
         }

@@ -1,36 +1,38 @@
 //! Log lines: for the journal under systemd, coloured on a terminal, else JSON.
 
-use std::fmt;
+mod line;
+
 use std::io::IsTerminal;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use tracing::{Event, Level, Subscriber};
-use tracing_appender::non_blocking::{ErrorCounter, NonBlockingBuilder, WorkerGuard};
+use tracing::{Level, Metadata};
+use tracing_appender::non_blocking::{ErrorCounter, NonBlocking, NonBlockingBuilder, WorkerGuard};
 use tracing_subscriber::filter::LevelFilter;
-use tracing_subscriber::fmt::format::Writer;
+use tracing_subscriber::fmt::MakeWriter;
 use tracing_subscriber::fmt::writer::BoxMakeWriter;
-use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::layer::SubscriberExt;
-use tracing_subscriber::registry::LookupSpan;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
+use self::line::LogLine;
+use crate::command::SENT;
 use crate::config::{LogFormat, LogSettings};
 
 /// Where commands are logged (`command::AuditRecord`), and the level of their lines.
 const AUDIT: &str = "audit";
 const AUDIT_LINES: Level = Level::INFO;
 
-/// Lines buffered for a slow reader of the log; further ones are dropped and counted.
+/// Lines buffered for a slow reader of the log, and as many of commands that were sent to a drive; further ones are dropped
+/// and counted.
 const WAITING: usize = 8192;
 
 /// The log of a running program; buffered lines are written when it is dropped.
 #[derive(Debug)]
 pub(super) struct LogHandle {
     filter: reload::Handle<EnvFilter, Registry>,
-    lost: ErrorCounter,
+    lost: [ErrorCounter; 2],
     reported: AtomicUsize,
-    _writer: WorkerGuard,
+    _writers: [WorkerGuard; 2],
 }
 
 impl LogHandle {
@@ -43,7 +45,7 @@ impl LogHandle {
 
     /// Reports how many lines were dropped since the last report, if any.
     pub(super) fn report_lost(&self) {
-        let lost = self.lost.dropped_lines();
+        let lost = self.lost.iter().map(ErrorCounter::dropped_lines).sum::<usize>();
         let more = lost.saturating_sub(self.reported.swap(lost, Ordering::Relaxed));
         if more > 0 {
             tracing::warn!("dropped {more} log lines: the reader of the log is too slow or has stopped");
@@ -51,20 +53,44 @@ impl LogHandle {
     }
 }
 
-/// Starts logging to standard error, on a thread of its own: a reader that stalls (a full pipe, a hanging collector) must
+/// Two ways to standard error, so that no other line can take the room of commands that were sent to a drive.
+struct Ways {
+    sent: NonBlocking,
+    others: NonBlocking,
+}
+
+impl<'w> MakeWriter<'w> for Ways {
+    type Writer = NonBlocking;
+
+    fn make_writer(&'w self) -> NonBlocking {
+        self.others.clone()
+    }
+
+    fn make_writer_for(&'w self, metadata: &Metadata<'_>) -> NonBlocking {
+        match metadata.name() {
+            SENT => self.sent.clone(),
+            _ => self.others.clone(),
+        }
+    }
+}
+
+/// Starts logging to standard error, on threads of its own: a reader that stalls (a full pipe, a hanging collector) must
 /// not delay a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
-    let (writer, guard) = NonBlockingBuilder::default()
-        .buffered_lines_limit(WAITING)
-        .lossy(true)
-        .thread_name("log")
-        .finish(std::io::stderr());
-    let lost = writer.error_counter();
+    let way = |name: &str| {
+        NonBlockingBuilder::default()
+            .buffered_lines_limit(WAITING)
+            .lossy(true)
+            .thread_name(name)
+            .finish(std::io::stderr())
+    };
+    let ((sent, sent_guard), (others, others_guard)) = (way("log-commands"), way("log"));
+    let lost = [sent.error_counter(), others.error_counter()];
     LogHandle {
-        filter: subscribe(settings, BoxMakeWriter::new(writer)),
+        filter: subscribe(settings, BoxMakeWriter::new(Ways { sent, others })),
         lost,
         reported: AtomicUsize::new(0),
-        _writer: guard,
+        _writers: [sent_guard, others_guard],
     }
 }
 
@@ -82,11 +108,11 @@ fn subscribe(settings: &LogSettings, writer: BoxMakeWriter) -> reload::Handle<En
         LogFormat::Auto => LogFormat::Json,
         other => other,
     };
-    let lines = tracing_subscriber::fmt::layer().with_writer(writer);
+    let lines = tracing_subscriber::fmt::layer().with_writer(writer).with_ansi(terminal);
+    let line = LogLine::new(format);
     let lines = match format {
-        LogFormat::Journal => lines.with_ansi(false).event_format(JournalLine).boxed(),
-        LogFormat::Text => lines.with_ansi(terminal).with_target(true).boxed(),
-        LogFormat::Json | LogFormat::Auto => lines.json().flatten_event(true).boxed(),
+        LogFormat::Journal | LogFormat::Text => lines.event_format(line).boxed(),
+        LogFormat::Json | LogFormat::Auto => lines.json().event_format(line).boxed(),
     };
     // A second start in one process keeps the first subscriber.
     if tracing_subscriber::registry()
@@ -117,27 +143,6 @@ fn filter(level: &str) -> EnvFilter {
         return EnvFilter::new(level);
     }
     EnvFilter::new(format!("{level},{AUDIT}={AUDIT_LINES}"))
-}
-
-/// A line with its priority in front, as systemd reads it; the journal adds the time.
-struct JournalLine;
-
-impl<S, N> FormatEvent<S, N> for JournalLine
-where
-    S: Subscriber + for<'a> LookupSpan<'a>,
-    N: for<'a> FormatFields<'a> + 'static,
-{
-    fn format_event(&self, context: &FmtContext<'_, S, N>, mut writer: Writer<'_>, event: &Event<'_>) -> fmt::Result {
-        let priority = match *event.metadata().level() {
-            Level::ERROR => 3,
-            Level::WARN => 4,
-            Level::INFO => 6,
-            Level::DEBUG | Level::TRACE => 7,
-        };
-        write!(writer, "<{priority}>{}: ", event.metadata().target())?;
-        context.format_fields(writer.by_ref(), event)?;
-        writeln!(writer)
-    }
 }
 
 #[cfg(test)]

@@ -4,21 +4,25 @@
 //! line in `commands!` below.
 
 mod addresses;
+mod audit;
 mod check;
 mod client;
 mod demo;
 mod drive_access;
 mod log;
 mod map;
+mod printable;
 mod profiles;
 mod read;
 mod record;
 mod recordings;
+mod reload;
 mod report;
 mod run;
 mod scan;
 mod schema;
 mod simulate;
+mod token;
 mod trace;
 mod watch;
 mod write;
@@ -81,6 +85,8 @@ commands! {
     Simulate => simulate,
     Profiles => profiles,
     Map => map,
+    Audit => audit,
+    Token => token,
     Schema => schema,
 }
 

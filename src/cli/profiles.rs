@@ -4,7 +4,7 @@ use std::fmt::Write;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use super::{EXIT_CONFIG, EXIT_USAGE, report};
+use super::{EXIT_CONFIG, EXIT_USAGE, printable, report};
 use crate::codec::Protocol;
 use crate::codec::n2::ASSUMPTIONS;
 use crate::config::{Settings, environment, unknown_profile};
@@ -107,7 +107,7 @@ fn show(profile: &Profile) -> String {
     } else {
         bauds.join(", ")
     };
-    let mut text = format!("{}: {}\n\n", profile.name, profile.title);
+    let mut text = format!("{}: {}\n\n", profile.name, printable::line(&profile.title));
     for (what, value) in [
         ("origin", origin(profile).to_string()),
         ("based on", profile.base.clone().unwrap_or_default()),
@@ -152,7 +152,7 @@ fn show(profile: &Profile) -> String {
     .filter(|(_, value)| !value.is_empty())
     {
         // Writing to a String cannot fail.
-        let _ = writeln!(text, "  {what:<14}{value}");
+        let _ = writeln!(text, "  {what:<14}{}", printable::line(&value));
     }
     if profile.input_is_holding {
         text += "  input registers read the same as holding registers\n";

@@ -4,18 +4,18 @@ use std::io::{self, Write};
 use std::process::ExitCode;
 use std::time::Duration;
 
-use comfy_table::{ContentArrangement, Table, TableComponent, presets};
+use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 
-use super::EXIT_FAILED;
+use super::{EXIT_FAILED, printable};
 use crate::config::Loaded;
 use crate::document::{Finding, Problem, parse_duration};
 
-/// Prints `text` to stdout.
+/// Prints the lines of `text`, harmless for a terminal, to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
-    print_bytes(text.as_bytes())
+    print_bytes(printable::lines(text).as_bytes())
 }
 
-/// Writes `bytes` to stdout.
+/// Writes `bytes` to stdout as they are.
 pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     let mut stdout = io::stdout().lock();
     match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
@@ -62,20 +62,38 @@ pub(super) fn problems(loaded: &Loaded) {
 
 fn line(kind: &str, message: &str) {
     // With stderr gone there is nowhere left to report that.
-    let _ = writeln!(io::stderr().lock(), "{kind}: {message}");
+    let _ = writeln!(io::stderr().lock(), "{kind}: {}", printable::line(message));
 }
 
 /// A table without a frame, as wide as the terminal at most.
-pub(super) fn table<const N: usize>(header: [&str; N]) -> Table {
+pub(super) fn table<T: AsRef<str>>(header: impl IntoIterator<Item = T>) -> TextTable {
     let mut table = Table::new();
     table.load_preset(presets::NOTHING);
     table.set_style(TableComponent::HeaderLines, '─');
     table.set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header(header);
-    table
+    table.set_header(header.into_iter().map(|cell| printable::line(cell.as_ref())));
+    TextTable(table)
+}
+
+/// A table whose header and cells are each one line of text.
+pub(super) struct TextTable(Table);
+
+impl TextTable {
+    /// Adds a row.
+    pub(super) fn add_row<T: AsRef<str>>(&mut self, cells: impl IntoIterator<Item = T>) {
+        self.0
+            .add_row(cells.into_iter().map(|cell| printable::line(cell.as_ref())));
+    }
+
+    /// Aligns a column to the right, as figures are.
+    pub(super) fn align_right(&mut self, column: usize) {
+        if let Some(column) = self.0.column_mut(column) {
+            column.set_cell_alignment(CellAlignment::Right);
+        }
+    }
 }
 
 /// The table's lines, without the blanks that fill up the last column.
-pub(super) fn lines(table: &Table) -> String {
-    table.lines().map(|line| format!("{}\n", line.trim_end())).collect()
+pub(super) fn lines(table: &TextTable) -> String {
+    table.0.lines().map(|line| format!("{}\n", line.trim_end())).collect()
 }

@@ -335,13 +335,13 @@ impl Scan<'_> {
             return ExitCode::from(EXIT_FAILED);
         }
         if let Some((setting, address)) = self.garbage.first() {
-            eprintln!(
-                "note: received invalid frames {} times, first at {} {}, address {address}: the line may have another baud, \
+            report::note(&format!(
+                "received invalid frames {} times, first at {} {}, address {address}: the line may have another baud, \
                  format or protocol, or two drives the same address",
                 self.garbage.len(),
                 setting.protocol.name(),
                 setting.format
-            );
+            ));
         }
         if self.found.is_empty() {
             report::error(&format!(

@@ -212,7 +212,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn failed(code: u8, message: &str) -> ExitCode {
-    eprintln!("error: {message}");
+    report::error(message);
     ExitCode::from(code)
 }
 

@@ -7,8 +7,8 @@ use std::time::Duration;
 use serde_json::Value;
 use tokio::signal::unix::{SignalKind, signal};
 
-use super::client::{Url, get_json};
-use super::{EXIT_FAILED, report};
+use super::client::{Gateway, get_json};
+use super::{EXIT_FAILED, printable, report};
 
 /// Refresh interval.
 const PAUSE: Duration = Duration::from_millis(500);
@@ -17,11 +17,13 @@ const PAUSE: Duration = Duration::from_millis(500);
 ///
 /// On a terminal the table refreshes twice a second until Ctrl-C; otherwise it is printed once.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Examples:\n  drivegate watch\n  drivegate watch --url http://10.0.0.5:9488 --once")]
+#[command(
+    after_help = "Examples:\n  drivegate watch\n  drivegate watch --url http://10.0.0.5:9488 --once\n  \
+    drivegate watch --url https://gateway.example:9488 --ca ca.crt --token-file token"
+)]
 pub(super) struct Args {
-    /// The gateway's HTTP server.
-    #[arg(long, value_name = "URL", default_value = "http://127.0.0.1:9488")]
-    url: Url,
+    #[command(flatten)]
+    gateway: Gateway,
     /// Print the table once and exit.
     #[arg(long)]
     once: bool,
@@ -42,7 +44,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 async fn watch(args: &Args) -> Result<ExitCode, String> {
     let live = !args.once && io::stdout().is_terminal();
     if !live {
-        return Ok(report::print(&page(&args.url).await?));
+        return Ok(report::print(&page(&args.gateway).await?));
     }
     let signals = |error: io::Error| format!("cannot handle signals: {error}; the system; free file descriptors");
     let mut interrupt = signal(SignalKind::interrupt()).map_err(signals)?;
@@ -55,13 +57,13 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
             _ = tick.tick() => {}
         }
         // Survive a restart of the gateway.
-        let text = match page(&args.url).await {
+        let text = match page(&args.gateway).await {
             Ok(text) => text,
             Err(why) => format!("{why}\n\ntrying again\n"),
         };
         let mut stdout = io::stdout().lock();
         // Redraws from the top, clearing the rest of each line and of the screen.
-        let text = text.replace('\n', "\x1b[K\r\n");
+        let text = printable::lines(&text).replace('\n', "\x1b[K\r\n");
         if write!(stdout, "\x1b[H{text}\x1b[J")
             .and_then(|()| stdout.flush())
             .is_err()
@@ -71,11 +73,11 @@ async fn watch(args: &Args) -> Result<ExitCode, String> {
     }
 }
 
-async fn page(url: &Url) -> Result<String, String> {
-    let buses = get_json(url, "/api/v1/buses")
+async fn page(gateway: &Gateway) -> Result<String, String> {
+    let buses = get_json(gateway, "/api/v1/buses")
         .await
         .map_err(|error| error.to_string())?;
-    let drives = get_json(url, "/api/v1/drives")
+    let drives = get_json(gateway, "/api/v1/drives")
         .await
         .map_err(|error| error.to_string())?;
     Ok(format!("{}\n{}", lines(&buses), table(&drives)))

@@ -3,7 +3,7 @@
 use std::process::ExitCode;
 
 use super::drive_access::{Target, Way, target};
-use super::{EXIT_FAILED, EXIT_USAGE, report};
+use super::{EXIT_FAILED, EXIT_USAGE, printable, report};
 use crate::drive::model::Kind;
 use crate::drive::{Point, Value};
 use crate::north::local::protocol::{Outcome, Request, Setting, WriteOutcome, WriteRequest};
@@ -122,7 +122,8 @@ fn acknowledged(what: &str, write: &WriteOutcome, way: Way) -> String {
         Way::Direct => "",
     };
     format!(
-        "{what}: acknowledged after {:.0} ms, {confirmed}{way}\n",
+        "{}: acknowledged after {:.0} ms, {confirmed}{way}\n",
+        printable::line(what),
         write.latency_ms
     )
 }

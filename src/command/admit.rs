@@ -1,4 +1,5 @@
-//! Which commands are let through: authority first, then address, then value. Pure.
+//! Which commands are let through: authority first, then address, then value; and why the others are not, in words.
+//! Codes and exceptions of a `Refusal` are in `command/mod.rs`. Pure.
 
 use super::{Authority, Order, Refusal, Urgency};
 use crate::codec::n2::Object;

@@ -1,18 +1,29 @@
-//! What was commanded: one record a command, the last 1,000 kept.
+//! What was commanded, and what became of it: in the log, in memory and, where it is configured, in a file.
+//!
+//! Commands that were sent to a drive have a way of their own through all of that, which nothing else can fill. Refusals
+//! are limited for each client.
 
-use std::collections::{BTreeMap, VecDeque};
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
-use std::time::{Duration, SystemTime};
+pub mod chain;
+mod file;
 
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use arc_swap::ArcSwapOption;
 use serde::{Serialize, Serializer};
 use tokio::sync::broadcast;
 
 use crate::drive::Value;
+use crate::event::{FairRing, RefusalLimit};
 
-/// Records kept.
+pub use file::{AuditFile, AuditFileOptions};
+
+/// Records of commands that were sent to a drive, kept in memory.
 pub const AUDIT_KEPT: usize = 1000;
-/// Records that one client may have among them once there are that many: a flood pushes out its own.
-pub const AUDIT_SHARE: usize = AUDIT_KEPT / 2;
+/// Records of commands that were not sent, kept beside them.
+const UNSENT_KEPT: usize = 500;
+/// Name of the log events of commands that were sent: the log has a way of its own for them.
+pub(crate) const SENT: &str = "sent command";
 
 /// One value that a command sets.
 #[derive(Debug, Clone, PartialEq, Serialize)]
@@ -53,6 +64,8 @@ pub struct AuditRecord {
     /// From acceptance to the read that showed the effect, ms.
     #[serde(rename = "confirmed_ms", serialize_with = "milliseconds_or_null")]
     pub confirmed: Option<Duration>,
+    /// Commands that it stands for: refusals of one client are counted.
+    pub count: u64,
     /// The client among others: see [`super::Origin::client`].
     #[serde(skip)]
     pub(super) share: Arc<str>,
@@ -77,9 +90,20 @@ fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -
     }
 }
 
+/// How far a command came.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Reach {
+    /// It was sent to the drive, or begun.
+    Sent,
+    /// It was in the queue and was not sent.
+    Queued,
+    /// It was turned away.
+    Refused,
+}
+
 impl AuditRecord {
     /// Writes it to the log under target `audit`, one structured line.
-    pub(super) fn log(&self) {
+    fn log(&self, sent: bool) {
         let points: Vec<String> = self
             .points
             .iter()
@@ -88,25 +112,33 @@ impl AuditRecord {
                 None => format!("{}:?->{}", c.point, c.new),
             })
             .collect();
-        tracing::info!(
-            target: "audit",
-            source = self.source,
-            client = %self.client,
-            drive = %self.drive,
-            command = %self.command,
-            points = %points.join(" "),
-            result = self.result,
-            latency_us = self.latency.as_micros() as u64,
-            confirmed_us = self.confirmed.map(|c| c.as_micros() as u64),
-            "{}", self.text
-        );
+        macro_rules! line {
+            ($name:expr) => {
+                tracing::info!(
+                    name: $name,
+                    target: "audit",
+                    source = self.source,
+                    client = %self.client,
+                    drive = %self.drive,
+                    command = %self.command,
+                    points = %points.join(" "),
+                    result = self.result,
+                    latency_us = self.latency.as_micros() as u64,
+                    confirmed_us = self.confirmed.map(|c| c.as_micros() as u64),
+                    count = (self.count > 1).then_some(self.count),
+                    "{}", self.text
+                )
+            };
+        }
+        if sent { line!(SENT) } else { line!("unsent command") }
     }
 }
 
-/// The last records.
+/// The audit: the last records, and the way of new ones.
 #[derive(Debug, Default)]
 pub struct Audit {
-    kept: Mutex<VecDeque<Arc<AuditRecord>>>,
+    records: Mutex<Records>,
+    file: ArcSwapOption<AuditFile>,
     /// For whoever wants each record as it comes.
     sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
 }
@@ -114,27 +146,38 @@ pub struct Audit {
 /// Records that a listener may be behind.
 const IN_FLIGHT: usize = 4096;
 
+#[derive(Debug)]
+struct Records {
+    number: u64,
+    sent: FairRing<Arc<str>, Arc<AuditRecord>>,
+    unsent: FairRing<Arc<str>, Arc<AuditRecord>>,
+    refusals: RefusalLimit<AuditRecord>,
+}
+
+impl Default for Records {
+    fn default() -> Records {
+        Records {
+            number: 0,
+            sent: FairRing::new(AUDIT_KEPT),
+            unsent: FairRing::new(UNSENT_KEPT),
+            refusals: RefusalLimit::default(),
+        }
+    }
+}
+
 impl Audit {
-    /// Keeps a record. When 1,000 are kept, it takes the place of the oldest of its own client if that has half of
-    /// them, else of the oldest of the client that has most.
-    pub(super) fn keep(&self, record: AuditRecord) {
-        let mut kept = self.kept.lock().unwrap_or_else(PoisonError::into_inner);
-        if kept.len() >= AUDIT_KEPT {
-            let own = kept.iter().filter(|r| r.share == record.share).count();
-            let from = if own >= AUDIT_SHARE {
-                Some(record.share.clone())
-            } else {
-                largest_share(&kept)
-            };
-            let oldest = kept.iter().position(|r| Some(&r.share) == from.as_ref());
-            kept.remove(oldest.unwrap_or(0));
-        }
-        let record = Arc::new(record);
-        kept.push_back(record.clone());
-        if let Some(sender) = self.sender.get() {
-            // The last listener may have gone.
-            let _ = sender.send(record);
-        }
+    fn records(&self) -> MutexGuard<'_, Records> {
+        self.records.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// Records from now on go to `file` too, or to none.
+    pub fn write_to(&self, file: Option<Arc<AuditFile>>) {
+        self.file.store(file);
+    }
+
+    /// The file, if there is one.
+    pub fn file(&self) -> Option<Arc<AuditFile>> {
+        self.file.load_full()
     }
 
     /// Hears all records from now on; a listener that is 4,096 behind loses the oldest.
@@ -142,32 +185,68 @@ impl Audit {
         self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
 
+    /// Takes the record of a command that is finished at `now`. Refusals of one client are counted after the first of a
+    /// kind; their records follow within a second or so ([`Audit::record_due`]).
+    pub(super) fn record(&self, record: AuditRecord, reach: Reach, now: Instant) {
+        let mut records = self.records();
+        if reach != Reach::Refused {
+            return self.keep(&mut records, record, reach == Reach::Sent);
+        }
+        // Names of drives that do not exist are invented by the client.
+        let drive = (record.result != super::Refusal::UNKNOWN_DRIVE).then(|| record.drive.clone());
+        let (share, result) = (record.share.clone(), record.result);
+        let passed = records.refusals.admit(&share, result, drive.as_deref(), record, now);
+        passed
+            .into_iter()
+            .for_each(|passed| self.keep_counted(&mut records, passed));
+    }
+
+    /// Records the refusals that waited long enough for their count.
+    pub fn record_due(&self, now: Instant) {
+        let mut records = self.records();
+        let due = records.refusals.due(now);
+        due.into_iter()
+            .for_each(|passed| self.keep_counted(&mut records, passed));
+    }
+
+    fn keep_counted(&self, records: &mut Records, (mut record, count): (AuditRecord, u64)) {
+        record.count = count;
+        if count > 1 {
+            record.text = format!("{} ({count} commands of this client were refused)", record.text);
+        }
+        self.keep(records, record, false);
+    }
+
+    fn keep(&self, records: &mut Records, record: AuditRecord, sent: bool) {
+        record.log(sent);
+        let record = Arc::new(record);
+        records.number += 1;
+        let number = records.number;
+        let ring = if sent { &mut records.sent } else { &mut records.unsent };
+        ring.push(record.share.clone(), number, record.clone());
+        if let Some(sender) = self.sender.get() {
+            // The last listener may have gone.
+            let _ = sender.send(record.clone());
+        }
+        if let Some(file) = &*self.file.load() {
+            file.push(record, sent);
+        }
+    }
+
     /// All that are kept, oldest first.
     pub fn recent(&self) -> Vec<Arc<AuditRecord>> {
-        self.kept
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .iter()
-            .cloned()
-            .collect()
+        let records = self.records();
+        let mut all: Vec<_> = records.sent.iter().chain(records.unsent.iter()).cloned().collect();
+        all.sort_unstable_by_key(|(number, _)| *number);
+        all.into_iter().map(|(_, record)| record).collect()
     }
-}
-
-/// The client that has most of the records.
-fn largest_share(kept: &VecDeque<Arc<AuditRecord>>) -> Option<Arc<str>> {
-    let mut shares: BTreeMap<&Arc<str>, usize> = BTreeMap::new();
-    for record in kept {
-        *shares.entry(&record.share).or_default() += 1;
-    }
-    let largest = shares.into_iter().max_by_key(|(_, records)| *records);
-    largest.map(|(share, _)| share.clone())
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn record(share: &str, command: usize) -> AuditRecord {
+    pub(super) fn record(share: &str, command: usize) -> AuditRecord {
         AuditRecord {
             time: SystemTime::UNIX_EPOCH,
             source: "mqtt",
@@ -183,36 +262,52 @@ mod tests {
             text: String::new(),
             latency: Duration::from_micros(1500),
             confirmed: None,
+            count: 1,
             share: share.into(),
         }
     }
 
     #[test]
-    fn a_flood_pushes_out_its_own() {
-        let audit = Audit::default();
-        for i in 0..AUDIT_SHARE {
-            audit.keep(record("quiet", i));
+    fn nothing_that_was_not_sent_pushes_out_what_was() {
+        let (audit, now) = (Audit::default(), Instant::now());
+        for i in 0..AUDIT_KEPT {
+            audit.record(record("operator", i), Reach::Sent, now);
         }
-        for i in 0..10_000 {
-            audit.keep(record("flood", i));
+        for i in 0..50_000 {
+            audit.record(
+                record("flood", i),
+                Reach::Refused,
+                now + Duration::from_millis(i as u64),
+            );
+            audit.record(record("flood", i), Reach::Queued, now);
         }
         let kept = audit.recent();
-        assert_eq!(kept.len(), AUDIT_KEPT);
-        assert_eq!(kept.iter().filter(|r| r.client == "quiet").count(), AUDIT_SHARE);
-        assert_eq!(kept.last().unwrap().command, "9999", "the newest comes last");
+        assert_eq!(kept.len(), AUDIT_KEPT + UNSENT_KEPT);
+        assert_eq!(kept.iter().filter(|r| r.client == "operator").count(), AUDIT_KEPT);
+        assert_eq!(kept.last().unwrap().command, "49999", "the newest comes last");
     }
 
     #[test]
-    fn a_quiet_client_among_a_flood_loses_nothing() {
-        let audit = Audit::default();
-        for i in 0..20_000 {
-            audit.keep(record("flood", i));
-            if i % 1000 == 0 {
-                audit.keep(record("quiet", i));
-            }
+    fn refusals_are_counted_and_none_is_lost() {
+        let (audit, now) = (Audit::default(), Instant::now());
+        for i in 0..1000 {
+            audit.record(record("a", i), Reach::Refused, now);
+            let unknown = AuditRecord {
+                result: "unknown_drive",
+                drive: format!("invented-{i}"),
+                ..record("b", i)
+            };
+            audit.record(unknown, Reach::Refused, now);
         }
-        let quiet = audit.recent().iter().filter(|r| r.client == "quiet").count();
-        assert_eq!(quiet, 20);
+        assert_eq!(audit.recent().len(), 2, "the first of a kind");
+        audit.record_due(now + Duration::from_secs(1));
+        let kept = audit.recent();
+        assert_eq!(kept.iter().map(|r| r.count).collect::<Vec<_>>(), [1, 1, 999, 999]);
+        assert_eq!(kept[2].command, "999", "the last of them is shown");
+        assert!(kept[2].text.contains("999 commands of this client were refused"));
+        audit.record(record("a", 7), Reach::Refused, now + Duration::from_secs(1));
+        audit.record_due(now + Duration::from_secs(2));
+        assert_eq!(audit.recent().iter().map(|r| r.count).sum::<u64>(), 2001);
     }
 
     #[test]
@@ -223,8 +318,8 @@ mod tests {
             serde_json::json!({"point": "run", "old": null, "new": true})
         );
         assert_eq!(
-            (&json["latency_ms"], &json["confirmed_ms"]),
-            (&1.5.into(), &serde_json::Value::Null)
+            (&json["latency_ms"], &json["confirmed_ms"], &json["count"]),
+            (&1.5.into(), &serde_json::Value::Null, &1.into())
         );
         assert_eq!(json["time"], "1970-01-01T00:00:00.000Z");
         assert!(json.get("share").is_none());

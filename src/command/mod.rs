@@ -3,6 +3,9 @@
 //! The north sides build an [`Order`], [`admit`] checks it against authority, profile and limits, and the
 //! [`CommandQueue`] of the bus takes it. The [`Ticket`] inside a command answers when it is used or dropped,
 //! so a command can neither be answered twice nor be forgotten.
+//!
+//! [`Outcome`] has the code, the text and the Modbus exception of every result; the texts of refusals are where the
+//! refusal is decided, mostly in `admit`.
 
 mod admit;
 mod audit;
@@ -10,7 +13,8 @@ mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
-pub use audit::{AUDIT_KEPT, AUDIT_SHARE, Audit, AuditRecord, Change};
+pub(crate) use audit::SENT;
+pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
@@ -246,6 +250,22 @@ impl Outcome {
         }
     }
 
+    /// How far the command came.
+    fn reach(&self) -> audit::Reach {
+        use audit::Reach;
+        match self {
+            Outcome::Acknowledged(_)
+            | Outcome::Exception(_)
+            | Outcome::TimedOut
+            | Outcome::Garbled
+            | Outcome::Interrupted(_) => Reach::Sent,
+            Outcome::Expired | Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::ShuttingDown => {
+                Reach::Queued
+            }
+            Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
+        }
+    }
+
     /// Whether the drive took it.
     pub fn is_ok(&self) -> bool {
         matches!(self, Outcome::Acknowledged(_))
@@ -320,13 +340,15 @@ pub enum Refusal {
 }
 
 impl Refusal {
+    const UNKNOWN_DRIVE: &str = "unknown_drive";
+
     /// The code in results.
     pub fn code(&self) -> &'static str {
         match self {
             Refusal::NotAllowed(_) => "not_allowed",
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
-            Refusal::UnknownDrive(_) => "unknown_drive",
+            Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
         }
     }
 

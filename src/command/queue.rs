@@ -70,7 +70,8 @@ pub struct Chosen {
 impl Pending {
     /// Takes a command in. A stop removes the queued run and reference commands of its drive, or joins the stop that
     /// waits; a newer reference takes the place of an older one. Stops always find room. When 64 other commands and
-    /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would have.
+    /// reads wait, a command takes the place of the youngest of a client that has more waiting than its own client would
+    /// have, or of a drive that its client has more waiting for.
     pub fn push(&mut self, mut command: Command, now: Instant) {
         self.numbered += 1;
         command.number = self.numbered;
@@ -136,22 +137,26 @@ impl Pending {
         self.waiting.iter_mut().filter(|_| command.reference_only).find(same)
     }
 
-    /// Whose place a command takes in a full queue.
+    /// Whose place a command takes in a full queue: the youngest of the client that has the most, or else, within its own
+    /// client, of the drive that has the most; neither may have fewer than it would have itself.
     fn victim(&self, command: &Command) -> Option<usize> {
-        let held = |client: &str| {
-            let of_client = |c: &&Command| c.ticket.client() == client && c.urgency != Urgency::Stop;
-            self.waiting.iter().filter(of_client).count()
+        let client = command.ticket.client();
+        self.youngest_of_most(|c| Some(c.ticket.client()), client)
+            .or_else(|| self.youngest_of_most(|c| (c.ticket.client() == client).then_some(c.drive), command.drive))
+    }
+
+    /// The youngest of those with the most of one kind, if they are more than the `own` ones would be with one more.
+    fn youngest_of_most<'p, K: PartialEq>(&'p self, kind: impl Fn(&'p Command) -> Option<K>, own: K) -> Option<usize> {
+        let others = || {
+            self.waiting
+                .iter()
+                .enumerate()
+                .filter(|(_, c)| c.urgency != Urgency::Stop)
         };
-        let candidates = self
-            .waiting
-            .iter()
-            .enumerate()
-            .filter(|(_, c)| c.urgency != Urgency::Stop);
-        let own = held(command.ticket.client()) + 1;
-        candidates
-            .max_by_key(|(index, c)| (held(c.ticket.client()), *index))
-            .filter(|(_, c)| held(c.ticket.client()) > own)
-            .map(|(index, _)| index)
+        let held = |wanted: &K| others().filter(|(_, c)| kind(c).as_ref() == Some(wanted)).count();
+        let counted = others().filter_map(|(index, c)| Some((held(&kind(c)?), index)));
+        let (most, index) = counted.max()?;
+        (most > held(&own) + 1).then_some(index)
     }
 
     /// Drives for which a stop came in since the last call: nothing that was begun for them goes on, whatever becomes of

@@ -153,9 +153,11 @@ impl Ticket {
             text,
             latency,
             confirmed: self.confirmed,
+            count: 1,
         };
-        record.log();
-        self.stats.audit.keep(record);
+        self.stats
+            .audit
+            .record(record, outcome.reach(), self.accepted + latency);
     }
 }
 

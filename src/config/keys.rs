@@ -12,11 +12,13 @@ use super::key::{
     DURATION, Figure, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
 };
 use super::log::{self, LogFormat};
-use super::{bus, modbus_tcp, mqtt, recordings, values};
+use super::mqtt::TelemetryTopic;
+use super::{bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
 use crate::north::modbus_tcp::{Role, Uncached};
+use crate::north::mqtt::History;
 use crate::process_image::{Access, LeaseAction, OnShutdown};
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
@@ -109,6 +111,12 @@ const BUSES: List<String> = List {
     range: "names of buses",
 };
 
+const HOSTS: List<String> = List {
+    parse: north::parse_host,
+    empty: None,
+    range: "host names or addresses, such as [\"gateway.example.com\"]",
+};
+
 /// A list of tables with this schema.
 fn each(item: Value) -> Value {
     json!({ "type": "array", "items": item })
@@ -138,6 +146,8 @@ keys! {
         mqtt: Present = Own { schema: Mqtt::schema, range: "[mqtt]" }, or "not started";
         /// HTTP server for metrics, health and the status page; not started without this section.
         http: Present = Own { schema: Http::schema, range: "[http]" }, or "not started";
+        /// File of all commands; not written without this section.
+        audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What the recorder keeps.
         recordings: Present = Own { schema: Recordings::schema, range: "[recordings]" }, or "the defaults";
         /// What is logged.
@@ -152,7 +162,7 @@ keys! {
         /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps, such as [recordings](recordings.md).
+        /// Directory of what the gateway keeps: [recordings](recordings.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
@@ -283,11 +293,11 @@ keys! {
         allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
         /// Who may write; no one by default. Modbus TCP has no passwords: keep it narrow, or use TLS.
         write: Vec<IpNet> = NETWORKS, default [];
-        /// Concurrent connections, over all listeners. The daemon raises its limit of open files as far as permitted,
-        /// and warns if that is not enough.
+        /// Concurrent connections, over all listeners; an eighth of them only for clients that may write. The daemon
+        /// raises its limit of open files; if the system does not permit enough, it serves fewer connections and warns.
         max_connections: usize = CONNECTIONS, default 64;
-        /// Concurrent connections from one address.
-        max_connections_per_address: usize = CONNECTIONS, or "none";
+        /// Concurrent connections from one address. Clients behind one NAT or proxy share an address.
+        max_connections_per_address: usize = CONNECTIONS, default 16;
         /// A connection without a request for this time is closed. A peer that disappeared is detected by TCP keepalive
         /// after 90 s in any case.
         idle_timeout: Option<Duration> = Parsed {
@@ -331,6 +341,10 @@ keys! {
         key: PathBuf = PATH, required;
         /// PEM file with one or more CAs whose client certificates are accepted.
         client_ca: PathBuf = PATH, required;
+        /// PEM or DER file with the certificate revocation lists of the CAs in `client_ca`: clients whose certificate was
+        /// revoked are refused, and disconnected at a reload. Each CA needs a list; one that is out of date stays in
+        /// force, with a warning.
+        client_crl: PathBuf = PATH, or "none";
         /// Permissions of the roles in client certificates; clients without a role or with any other role may only
         /// read.
         roles: Present = Own {
@@ -368,12 +382,32 @@ keys! {
         base: String = Parsed {
             parse: mqtt::parse_base, words: &[], pattern: "", range: "a topic without + and #",
         }, default "drivegate";
+        /// Which telemetry is published: the state of each drive as one object, each point as a bare value, or both.
+        topics: Vec<TelemetryTopic> = List {
+            parse: mqtt::parse_topic, empty: Some("write [\"state\"], [\"points\"] or both"),
+            range: "[\"state\", \"points\"] or one of them",
+        }, default ["state", "points"];
+        /// Quality of service of published messages.
+        qos: Present = Own { schema: MqttQos::schema, range: "[mqtt.qos]" }, or "the defaults";
+        /// The broker drops telemetry that is older (message expiry); `"0s"` is never.
+        expiry: Duration = Time(Duration::ZERO..=Duration::from_secs(365 * 86_400)), default "5min";
+        /// Values of an outage that are published afterwards, on `history` topics: those that changed, or all samples.
+        history: History = Words(&[
+            ("off", History::Off), ("changes", History::Changes), ("all", History::All),
+        ]), default "off";
         /// How often values are published.
         publish: Present = Own { schema: Publish::schema, range: "[mqtt.publish]" }, or "the defaults";
         /// Whether commands are accepted on the set topics, for drives with `access = "control"`. Anyone who may
         /// publish there can command the drives: restrict it in the broker.
         commands: bool = Flag, default false;
-        /// Where events are buffered while the broker is unreachable.
+        /// Whether commands without an `id` are refused, except stops: only with an `id` a repetition is recognised.
+        require_id: bool = Flag, default false;
+        /// Filters of response topics below `base` that results may be sent to. Topics outside of `base` are always
+        /// allowed, those of the gateway itself never.
+        response_topics: Vec<String> = List {
+            parse: mqtt::parse_filter, empty: None, range: "topic filters, such as [\"drivegate/answers/#\"]",
+        }, default [];
+        /// Where events and history are buffered while the broker is unreachable.
         buffer: Present = Own { schema: Buffer::schema, range: "[mqtt.buffer]" }, or "in memory only";
         /// Discovery for Home Assistant; not supported in this version.
         home_assistant: Present = Own { schema: || json!({ "const": false }), range: "false" }, default false;
@@ -382,12 +416,20 @@ keys! {
     /// How often values are published.
     PUBLISH: Publish {
         /// Minimum time between two messages on a topic.
-        min_interval: Duration = Time(Duration::ZERO..=HOUR), default "100ms";
+        min_interval: Duration = Time(Duration::ZERO..=HOUR), default "50ms";
         /// An unchanged value is published again after this time.
         max_interval: Duration = Time(Duration::from_millis(10)..=Duration::from_secs(86_400)), default "60s";
     }
 
-    /// Where events are buffered while the broker is unreachable; without this table, in memory only.
+    /// Quality of service of published messages: 0 is sent once, 1 until the broker acknowledges it.
+    MQTT_QOS: MqttQos {
+        /// Of states, points and buses. With 1 a distant broker limits the rate to its receive maximum per round trip.
+        telemetry: u8 = Number(0..=1, None), default 0;
+        /// Of events and history; results of commands have 1.
+        events: u8 = Number(0..=1, None), default 1;
+    }
+
+    /// Where events and history are buffered while the broker is unreachable; without this table, in memory only.
     BUFFER: Buffer {
         /// Directory of the buffer.
         dir: PathBuf = PATH, default "/var/lib/drivegate";
@@ -399,11 +441,32 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only, but without access control: before exposing it,
-        /// put it behind a reverse proxy or a firewall.
+        /// Status page, metrics, health and JSON interface. Read-only; open to everybody who can connect unless there is
+        /// a `tokens_file`.
         listen: SocketAddr = Parsed {
             parse: values::socket, words: &[], pattern: "", range: "an address with a port",
         }, default "127.0.0.1:9488";
+        /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
+        /// this machine and its own addresses: that of a reverse proxy, a container, a name in DNS. Requests for any
+        /// other [host](http.md#hosts) get 421.
+        hosts: Vec<String> = HOSTS, default [];
+        /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
+        /// and `/readyz` require a token.
+        tokens_file: PathBuf = PATH, or "none";
+        /// PEM file with the server's certificate chain, for [https](http.md#tls); needs `key`.
+        certificate: PathBuf = PATH, or "none";
+        /// PEM file of the certificate's private key.
+        key: PathBuf = PATH, or "none";
+    }
+
+    /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).
+    AUDIT: AuditTable {
+        /// The file; a relative path is relative to `state_dir` of `[gateway]`.
+        file: PathBuf = PATH, default "audit.jsonl";
+        /// Size of the file and the seven older ones beside it; the oldest is removed.
+        max_bytes: u64 = Parsed {
+            parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
+        }, default "64MiB";
     }
 
     /// What the recorder keeps: [recordings](recordings.md) of the time around faults.

@@ -1,7 +1,10 @@
-//! `[log]`.
+//! `[log]` and `[audit]`.
 
-use super::keys::LOG;
+use std::path::Path;
+
+use super::keys::{AUDIT, LOG};
 use super::values;
+use crate::command::AuditFileOptions;
 use crate::document::{Finding, Reader};
 
 /// Format of log lines.
@@ -35,6 +38,16 @@ pub(super) const PATTERN: &str = concat!(
     r"^\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*",
     r"(,\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*)*$"
 );
+
+/// `[audit]`; `state_dir` is that of the gateway.
+pub(super) fn read_audit(reader: &Reader<'_>, state_dir: &Path) -> AuditFileOptions {
+    let options = AuditFileOptions {
+        path: values::resolved(state_dir, AUDIT.file.get(reader)),
+        max_bytes: AUDIT.max_bytes.get(reader),
+    };
+    reader.finish();
+    options
+}
 
 pub(super) fn read(reader: &Reader<'_>) -> LogSettings {
     let settings = LogSettings {

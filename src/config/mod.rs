@@ -5,6 +5,7 @@
 
 mod bus;
 mod drive;
+mod files;
 mod key;
 mod keys;
 mod log;
@@ -28,6 +29,7 @@ use std::time::Duration;
 
 use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
+use crate::command::AuditFileOptions;
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
@@ -68,6 +70,8 @@ pub struct Settings {
     pub mqtt: Option<mqtt_client::Options>,
     /// Absent: not started.
     pub http: Option<http::Options>,
+    /// File of all commands; absent: not written.
+    pub audit: Option<AuditFileOptions>,
     /// What is logged.
     pub log: LogSettings,
 }
@@ -172,25 +176,16 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
 
 fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> Option<Settings> {
     let gateway = ROOT.gateway.table(reader).map(|table| read_gateway(&table, base));
-    let (name, socket, state_dir, profile_dirs, profiles) = match gateway {
-        Some(gateway) => {
-            profile_errors.extend(gateway.errors);
-            (
-                gateway.name,
-                gateway.socket,
-                gateway.state_dir,
-                gateway.profile_dirs,
-                gateway.profiles,
-            )
-        }
-        None => (
-            None,
-            SocketPath::Default,
-            default_state_dir(),
-            Vec::new(),
-            Profiles::built_in(),
-        ),
-    };
+    let mut gateway = gateway.unwrap_or_default();
+    profile_errors.append(&mut gateway.errors);
+    let Gateway {
+        name,
+        socket,
+        state_dir,
+        profile_dirs,
+        profiles,
+        ..
+    } = gateway;
     let broken = !profile_errors.is_empty();
     let tables = ROOT.bus.tables(reader);
     let buses: Vec<bus::Found> = tables
@@ -208,8 +203,16 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref()));
-    let (http, http_listener) = ROOT.http.table(reader).map(|table| north::read_http(&table)).unzip();
+    let (http, http_listener) = ROOT
+        .http
+        .table(reader)
+        .map(|table| north::read_http(&table, base))
+        .unzip();
     let http_listener = http_listener.flatten();
+    let audit = ROOT
+        .audit
+        .table(reader)
+        .map(|table| log::read_audit(&table, &state_dir));
     let recordings = ROOT.recordings.table(reader);
     let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
@@ -239,6 +242,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http)?,
+        audit,
         log: log?,
     })
 }
@@ -290,6 +294,19 @@ struct Gateway {
     profile_dirs: Vec<PathBuf>,
     profiles: Profiles,
     errors: Vec<Problem>,
+}
+
+impl Default for Gateway {
+    fn default() -> Gateway {
+        Gateway {
+            name: None,
+            socket: SocketPath::Default,
+            state_dir: default_state_dir(),
+            profile_dirs: Vec::new(),
+            profiles: Profiles::built_in(),
+            errors: Vec::new(),
+        }
+    }
 }
 
 fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {

@@ -10,9 +10,10 @@ use ipnet::IpNet;
 use super::key::Key;
 use super::keys::{IDLE, LISTENER, MODBUS_TCP, ROLES, TLS};
 use super::north::Listener as Address;
-use super::values;
+use super::{files, values};
 use crate::document::{Finding, Place, Reader, nearest, parse_duration};
-use crate::north::modbus_tcp::{self, Identity, Role, Tls, TlsFile};
+use crate::north::TlsFile;
+use crate::north::modbus_tcp::{self, Identity, Role, Tls};
 
 /// Where the short form listens if `listen` is not written.
 const DEFAULT_LISTEN: SocketAddr = SocketAddr::new(IpAddr::V4(Ipv4Addr::LOCALHOST), 1502);
@@ -67,7 +68,10 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, buses: &[&str]) -> ModbusTc
             .as_ref()
             .is_some_and(|tls| tls.roles.values().any(|role| *role == Role::Control));
     let max_connections = MODBUS_TCP.max_connections.get(reader);
-    let max_connections_per_address = MODBUS_TCP.max_connections_per_address.read(reader);
+    let max_connections_per_address = MODBUS_TCP.max_connections_per_address.get(reader);
+    let tls_allow = tls.iter().flat_map(|tls| &tls.allow);
+    let allowed: Vec<&IpNet> = found.listeners.iter().flat_map(|l| &l.allow).chain(tls_allow).collect();
+    warn_of_shares(reader, &allowed, max_connections, max_connections_per_address);
     let idle_timeout = MODBUS_TCP.idle_timeout.get(reader);
     let uncached = MODBUS_TCP.uncached.get(reader);
     let stale_after = MODBUS_TCP.stale_after.get(reader);
@@ -216,34 +220,17 @@ fn read_tls(reader: &Reader<'_>, base: &Path, inherited: &Inherited<'_>) -> Read
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<Identity> {
     let path = |key: &Key<_>| Some(values::resolved(base, key.read(reader)?));
     let (certificate, key, client_ca) = (path(&TLS.certificate), path(&TLS.key), path(&TLS.client_ca));
+    let client_crl = path(&TLS.client_crl);
     let name = |file: TlsFile| match file {
         TlsFile::Certificate => TLS.certificate.name,
         TlsFile::Key => TLS.key.name,
         TlsFile::ClientCa => TLS.client_ca.name,
+        TlsFile::ClientCrl => TLS.client_crl.name,
     };
-    match Identity::load(&certificate?, &key?, &client_ca?, SystemTime::now()) {
-        Ok((identity, warnings)) => {
-            for fault in &warnings {
-                let text = fault.to_string();
-                let (what, remedy) = parts(&text);
-                reader.warning(name(fault.file), what, remedy);
-            }
-            Some(identity)
-        }
-        Err(errors) => {
-            for fault in &errors {
-                let text = fault.to_string();
-                let (what, remedy) = parts(&text);
-                reader.problem(name(fault.file), what, remedy);
-            }
-            None
-        }
-    }
-}
-
-/// What [`Identity::load`] reports is `what; what to do`.
-fn parts(text: &str) -> (&str, &str) {
-    text.split_once("; ").unwrap_or((text, ""))
+    let (certificate, key, client_ca) = (certificate?, key?, client_ca?);
+    files::warn_of_readers(reader, TLS.key.name, &key);
+    let loaded = Identity::load(&certificate, &key, &client_ca, client_crl.as_deref(), SystemTime::now());
+    files::reported(reader, loaded, name)
 }
 
 fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
@@ -265,6 +252,61 @@ fn read_roles(reader: &Reader<'_>) -> BTreeMap<String, Role> {
         );
     }
     roles
+}
+
+/// Networks whose addresses are those of hosts on the same site, not of a NAT in between.
+const PRIVATE: [&str; 8] = [
+    "10.0.0.0/8",
+    "172.16.0.0/12",
+    "192.168.0.0/16",
+    "169.254.0.0/16",
+    "127.0.0.0/8",
+    "::1/128",
+    "fc00::/7",
+    "fe80::/10",
+];
+
+/// Warns where the share of one address is probably too small: fewer connections are possible than are asked for, or
+/// clients come through a NAT and share an address.
+fn warn_of_shares(reader: &Reader<'_>, allowed: &[&IpNet], total: usize, per_address: usize) {
+    let hosts = |network: &IpNet| match network.network().is_loopback() {
+        true => 1,
+        false => 1_usize
+            .checked_shl(u32::from(network.max_prefix_len() - network.prefix_len()))
+            .unwrap_or(usize::MAX),
+    };
+    let hosts = allowed
+        .iter()
+        .map(|network| hosts(network))
+        .fold(0, usize::saturating_add);
+    let possible = hosts.saturating_mul(per_address);
+    if reader.has(MODBUS_TCP.max_connections.name) && hosts > 0 && possible < total {
+        reader.warning(
+            MODBUS_TCP.max_connections.name,
+            format!(
+                "at most {possible} connections are possible, {per_address} for each address in `allow`; clients behind \
+                 one NAT or proxy share an address"
+            ),
+            "raise max_connections_per_address, or lower max_connections",
+        );
+    }
+    let is_private = |network: &IpNet| {
+        let mut private = PRIVATE.iter().filter_map(|text| text.parse::<IpNet>().ok());
+        private.any(|private| private.contains(network))
+    };
+    let public = allowed
+        .iter()
+        .find(|network| !is_private(network) && network.prefix_len() < network.max_prefix_len());
+    if let (Some(public), false) = (public, reader.has(MODBUS_TCP.max_connections_per_address.name)) {
+        reader.warning(
+            MODBUS_TCP.allow.name,
+            format!(
+                "clients in {public} can come through a NAT or proxy; those behind one share its address and the \
+                 {per_address} connections that one address may have"
+            ),
+            "write max_connections_per_address, as many as the clients behind one address need",
+        );
+    }
 }
 
 /// Warns of who can reach a listener and who cannot, where that is probably a mistake.

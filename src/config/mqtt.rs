@@ -2,23 +2,42 @@
 
 use std::fs::File;
 use std::io::Read;
+use std::net::IpAddr;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, PUBLISH};
-use super::values;
+use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
+use super::{files, values};
 use crate::document::{Finding, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Secret};
+use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
+use crate::north::{ServerIdentity, TlsFile};
 
 /// Most bytes of a secret: a longer file is not a password.
 const SECRET: u64 = 4096;
+
+/// What telemetry is published as.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum TelemetryTopic {
+    State,
+    Points,
+}
 
 /// Where the broker is.
 pub(super) struct Broker {
     host: String,
     port: u16,
     tls: bool,
+}
+
+impl Broker {
+    /// Whether the way to it does not leave this machine.
+    fn is_here(&self) -> bool {
+        let address: Option<IpAddr> = self.host.parse().ok();
+        address.map_or(self.host.eq_ignore_ascii_case("localhost"), |address| {
+            address.is_loopback()
+        })
+    }
 }
 
 pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> Option<Options> {
@@ -44,9 +63,25 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
             "write mqtts:// for TLS",
         );
     }
+    if tls {
+        check_certificates(reader, ca.as_deref(), identity.as_ref());
+    }
     let topics = MQTT.base.read(reader);
     let (min_interval, max_interval) = read_publish(reader)?;
+    let wanted = MQTT.topics.get(reader);
+    let telemetry = Telemetry {
+        state: wanted.contains(&TelemetryTopic::State),
+        points: wanted.contains(&TelemetryTopic::Points),
+        history: MQTT.history.get(reader),
+    };
+    let (telemetry_qos, event_qos) = read_qos(reader);
+    let expiry = read_expiry(reader, max_interval);
     let commands = MQTT.commands.get(reader);
+    let require_id = MQTT.require_id.get(reader);
+    let response_topics = read_response_topics(reader, topics.as_deref(), gateway);
+    if let Some(broker) = broker.as_ref().filter(|broker| !broker.tls && !broker.is_here()) {
+        warn_of_clear_text(reader, &broker.host, password.is_some(), commands);
+    }
     let buffer = read_buffer(reader, base);
     if reader.or(MQTT.home_assistant.name, false) {
         reader.problem(
@@ -67,9 +102,15 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         ca,
         identity,
         base: topics?,
+        telemetry,
+        telemetry_qos,
+        event_qos,
+        expiry,
         min_interval,
         max_interval,
         commands,
+        require_id,
+        response_topics,
         buffer,
     })
 }
@@ -122,7 +163,12 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
     let [plain_from_env, file_from_env] =
         [MQTT.password.place(reader), MQTT.password_file.place(reader)].map(|p| p.env.is_some());
     let file = match (plain, file) {
-        (Some(plain), None) => return Some(Secret(plain)),
+        (Some(plain), None) => {
+            if !plain_from_env {
+                files::warn_of_readers(reader, MQTT.password.name, Path::new(reader.document().file()));
+            }
+            return Some(Secret(plain));
+        }
         (Some(plain), Some(_)) if plain_from_env && !file_from_env => return Some(Secret(plain)),
         (Some(_), Some(_)) if plain_from_env == file_from_env => {
             let what = "both password and password_file are set";
@@ -131,7 +177,9 @@ fn read_password(reader: &Reader<'_>, base: &Path) -> Option<Secret> {
         }
         (_, file) => file?,
     };
-    let text = secret(&values::resolved(base, file));
+    let path = values::resolved(base, file);
+    files::warn_of_readers(reader, MQTT.password_file.name, &path);
+    let text = secret(&path);
     reader.accept(MQTT.password_file.name, text).map(Secret)
 }
 
@@ -140,7 +188,7 @@ fn secret(path: &Path) -> Result<String, Finding> {
     let mut text = String::new();
     File::open(path)
         .and_then(|file| file.take(SECRET).read_to_string(&mut text))
-        .map_err(|error| cannot_read(path, &error))?;
+        .map_err(|error| files::cannot_read(path, &error))?;
     let shown = path.display();
     let line = text.lines().next().unwrap_or_default();
     if line.is_empty() {
@@ -153,11 +201,33 @@ fn secret(path: &Path) -> Result<String, Finding> {
     Ok(line.to_string())
 }
 
-fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
-    Finding::new(
-        format!("cannot read {}: {error}", path.display()),
-        "check the path and its permissions",
-    )
+/// What others on the way to the broker could read or send.
+fn warn_of_clear_text(reader: &Reader<'_>, host: &str, password: bool, commands: bool) {
+    let remedy = "write mqtts:// for TLS";
+    if password {
+        let what = format!("the password is sent to `{host}` in clear text");
+        reader.warning(MQTT.url.name, what, remedy);
+    }
+    if commands {
+        let what =
+            format!("commands come from `{host}` without TLS: who can change them on the way commands the drives");
+        reader.warning(MQTT.commands.name, what, remedy);
+    }
+}
+
+/// Whether the certificates are valid, and whether the key is that of its certificate.
+fn check_certificates(reader: &Reader<'_>, ca: Option<&Path>, identity: Option<&(PathBuf, PathBuf)>) {
+    if let Some(ca) = ca.filter(|ca| ca.is_file()) {
+        files::check_certificates(reader, MQTT.ca.name, ca);
+    }
+    if let Some((certificate, key)) = identity.filter(|(certificate, key)| certificate.is_file() && key.is_file()) {
+        files::warn_of_readers(reader, MQTT.key.name, key);
+        let loaded = ServerIdentity::load(certificate, key, SystemTime::now());
+        let _ = files::reported(reader, loaded, |file| match file {
+            TlsFile::Key => MQTT.key.name,
+            _ => MQTT.certificate.name,
+        });
+    }
 }
 
 /// Path of a PEM file that can be read now.
@@ -167,23 +237,14 @@ fn read_pem(reader: &Reader<'_>, key: &Key<PathBuf>, base: &Path) -> Option<Path
         true => Ok(()),
         false => Err(std::io::Error::other("not a file")),
     });
-    reader.accept(key.name, readable.map_err(|error| cannot_read(&path, &error)));
+    reader.accept(key.name, readable.map_err(|error| files::cannot_read(&path, &error)));
     Some(path)
 }
 
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<(PathBuf, PathBuf)> {
     let certificate = read_pem(reader, &MQTT.certificate, base);
     let key = read_pem(reader, &MQTT.key, base);
-    let names = [MQTT.certificate.name, MQTT.key.name];
-    for [present, missing] in [names, [names[1], names[0]]] {
-        if reader.has(present) && !reader.has(missing) {
-            reader.problem(
-                present,
-                format!("`{present}` without `{missing}`"),
-                "write both or none",
-            );
-        }
-    }
+    values::both_or_none(reader, [MQTT.certificate.name, MQTT.key.name]);
     Some((certificate?, key?))
 }
 
@@ -197,6 +258,68 @@ pub(super) fn parse_base(text: &str) -> Result<String, Finding> {
         ));
     }
     Ok(text.to_string())
+}
+
+pub(super) fn parse_topic(text: &str) -> Result<TelemetryTopic, Finding> {
+    match text {
+        "state" => Ok(TelemetryTopic::State),
+        "points" => Ok(TelemetryTopic::Points),
+        _ => Err(values::unknown_word(text, ["state", "points"].into_iter())),
+    }
+}
+
+pub(super) fn parse_filter(text: &str) -> Result<String, Finding> {
+    let levels: Vec<&str> = text.split('/').collect();
+    let wild = |level: &&str| level.contains(['+', '#']) && level.len() > 1;
+    let early = levels.iter().rev().skip(1).any(|level| *level == "#");
+    if text.is_empty() || text.contains('\0') || text.starts_with('$') || early || levels.iter().any(wild) {
+        return Err(Finding::new(
+            format!("`{text}` is not a topic filter"),
+            "write levels joined by /, + for any level, # at the end for all below, not starting with $",
+        ));
+    }
+    Ok(text.to_string())
+}
+
+fn read_qos(reader: &Reader<'_>) -> (Qos, Qos) {
+    let qos = |level: u8| if level == 0 { Qos::AtMostOnce } else { Qos::AtLeastOnce };
+    let Some(table) = MQTT.qos.table(reader) else {
+        return (Qos::AtMostOnce, Qos::AtLeastOnce);
+    };
+    let levels = (MQTT_QOS.telemetry.get(&table), MQTT_QOS.events.get(&table));
+    table.finish();
+    (qos(levels.0), qos(levels.1))
+}
+
+fn read_expiry(reader: &Reader<'_>, max_interval: Duration) -> Option<Duration> {
+    let expiry = Some(MQTT.expiry.get(reader)).filter(|expiry| !expiry.is_zero())?;
+    if expiry <= max_interval {
+        let [expiry, max] = [expiry, max_interval].map(format_duration);
+        reader.warning(
+            MQTT.expiry.name,
+            format!("expiry = {expiry}: an unchanged value vanishes before it is published again after {max}"),
+            "write a longer expiry or a shorter publish.max_interval",
+        );
+    }
+    Some(expiry)
+}
+
+fn read_response_topics(reader: &Reader<'_>, base: Option<&str>, gateway: Option<&str>) -> Vec<String> {
+    let filters = MQTT.response_topics.get(reader);
+    if let (Some(base), Some(gateway)) = (base, gateway) {
+        let own = format!("{base}/{gateway}");
+        for filter in filters
+            .iter()
+            .filter(|f| **f == own || f.starts_with(&format!("{own}/")))
+        {
+            reader.problem(
+                MQTT.response_topics.name,
+                format!("`{filter}` is below the gateway's own topics"),
+                "write topics that no gateway uses",
+            );
+        }
+    }
+    filters
 }
 
 fn read_publish(reader: &Reader<'_>) -> Option<(Duration, Duration)> {

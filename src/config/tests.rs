@@ -6,6 +6,7 @@ use std::sync::LazyLock;
 use super::*;
 use crate::process_image::TriggerLimit;
 
+mod files;
 mod listeners;
 mod page;
 mod schema;
@@ -35,11 +36,18 @@ listen = ["127.0.0.1:1503"]
 certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
 client_ca = "DIR/ca.crt"
+client_crl = "DIR/ca.crl"
 roles = { operator = "control" }
 [mqtt]
 publish = {}
+qos = {}
 buffer = {}
 [http]
+hosts = ["gateway.example.com"]
+tokens_file = "DIR/tokens"
+certificate = "DIR/gateway.crt"
+key = "DIR/gateway.key"
+[audit]
 [log]
 [[bus.drive.trigger]]
 point = "motor_current"
@@ -307,5 +315,55 @@ fn the_recorder_keeps_its_files_in_the_state_directory() {
     assert_eq!(
         (elsewhere.recordings.max_count, elsewhere.state_dir.as_path()),
         (0, Path::new("/srv"))
+    );
+}
+
+#[test]
+fn what_mqtt_publishes_and_accepts() {
+    let mqtt = |more: &str| {
+        let (loaded, _) = load(&format!("[gateway]\nname = \"hall\"\n[mqtt]\n{more}"));
+        let first = |problems: Vec<Problem>| problems.first().map(|p| p.to_string()).unwrap_or_default();
+        let options = loaded.settings.and_then(|settings| settings.mqtt);
+        (options, first(loaded.errors), first(loaded.warnings))
+    };
+    let (options, ..) = mqtt("");
+    let options = options.unwrap();
+    assert!(options.telemetry.state && options.telemetry.points && !options.require_id);
+    assert_eq!(options.telemetry.history, mqtt_client::History::Off);
+    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtMostOnce);
+    assert_eq!(options.event_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(options.expiry, Some(Duration::from_secs(300)));
+    let (options, ..) = mqtt(
+        "topics = [\"state\"]\nqos = { telemetry = 1, events = 0 }\nexpiry = \"0s\"\nhistory = \"all\"\n\
+         response_topics = [\"drivegate/answers/#\"]\nrequire_id = true\n",
+    );
+    let options = options.unwrap();
+    assert!(options.telemetry.state && !options.telemetry.points && options.require_id);
+    assert_eq!(options.telemetry_qos, mqtt_client::Qos::AtLeastOnce);
+    assert_eq!(
+        (options.event_qos, options.expiry),
+        (mqtt_client::Qos::AtMostOnce, None)
+    );
+    assert_eq!(options.response_topics, ["drivegate/answers/#"]);
+    for (key, why) in [
+        ("topics = []", "the list is empty"),
+        ("topics = [\"point\"]", "did you mean \"points\"?"),
+        ("qos = { telemetry = 2 }", "2 is out of range"),
+        ("history = \"some\"", "unknown word"),
+        ("response_topics = [\"a/#/b\"]", "not a topic filter"),
+        ("response_topics = [\"a+\"]", "not a topic filter"),
+        ("response_topics = [\"drivegate/hall/x\"]", "the gateway's own topics"),
+    ] {
+        let (_, error, _) = mqtt(key);
+        assert!(error.contains(why), "{key}: {error}");
+    }
+    assert!(mqtt("expiry = \"10s\"").2.contains("vanishes"));
+    let dir = certificates().display();
+    let pair = |key| format!("url = \"mqtts://b\"\ncertificate = \"{dir}/gateway.crt\"\nkey = \"{dir}/{key}.key\"");
+    assert!(mqtt(&pair("gateway")).0.is_some());
+    assert!(
+        mqtt(&pair("other")).1.contains("cannot be used"),
+        "{:?}",
+        mqtt(&pair("other"))
     );
 }

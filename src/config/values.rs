@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use ipnet::IpNet;
 
-use crate::document::{Finding, nearest};
+use crate::document::{Finding, Reader, nearest};
 
 /// Most characters of a name.
 pub(super) const NAME_LENGTH: usize = 64;
@@ -105,6 +105,16 @@ pub(super) fn host_port(text: &str, default: Option<u16>) -> Option<(String, u16
         None => default?,
     };
     Some((host.to_string(), port))
+}
+
+/// Reports one of two keys that is there without the other.
+pub(super) fn both_or_none(reader: &Reader<'_>, names: [&str; 2]) {
+    for [present, missing] in [names, [names[1], names[0]]] {
+        if reader.has(present) && !reader.has(missing) {
+            let what = format!("`{present}` without `{missing}`");
+            reader.problem(present, what, "write both or none");
+        }
+    }
 }
 
 /// `path` relative to the directory of the configuration file.

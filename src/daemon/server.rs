@@ -26,13 +26,35 @@ pub(super) trait Server: Sized + std::fmt::Debug {
         cancel: CancellationToken,
     ) -> Result<Self, ServerError>;
 
-    /// Applies new options to the running server; false if it must be restarted for them.
-    fn update(&self, _old: &Self::Options, _new: &Self::Options) -> Result<bool, ServerError> {
-        Ok(false)
-    }
-
     /// Waits until it has stopped, after the cancellation.
     async fn stopped(self);
+}
+
+/// A server that applies new options while it runs, in two steps.
+pub(super) trait Reconfigure: Server {
+    /// What the first step has prepared.
+    type Change;
+
+    /// Does all that can fail; nothing changes for any client.
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError>;
+
+    /// Applies what was prepared.
+    fn commit(&mut self, change: Self::Change);
+
+    /// Forgets what was prepared.
+    fn abort(&mut self, change: Self::Change);
+}
+
+/// What [`ServerSlot::prepare`] has prepared.
+pub(super) enum Prepared<S: Reconfigure> {
+    /// The server stays as it is.
+    Same,
+    /// It stops.
+    Stop,
+    /// It was started.
+    Started(Running<S>),
+    /// It runs on with other options.
+    Changed(S::Options, S::Change),
 }
 
 /// A server that runs with some options, or none.
@@ -40,7 +62,7 @@ pub(super) trait Server: Sized + std::fmt::Debug {
 pub(super) struct ServerSlot<S: Server>(Option<Running<S>>);
 
 #[derive(Debug)]
-struct Running<S: Server> {
+pub(super) struct Running<S: Server> {
     options: S::Options,
     cancel: CancellationToken,
     server: S,
@@ -58,41 +80,98 @@ impl<S: Server> ServerSlot<S> {
         self.0.as_ref().map(|running| &running.server)
     }
 
-    /// Makes the server run as configured: unchanged options leave it alone, others are applied or restart it.
+    /// Makes the server run as configured: unchanged options leave it alone, others restart it.
     ///
     /// # Errors
-    /// It does not start, and does not run afterwards; or it refuses new options and runs on with the old ones.
+    /// It does not start, and does not run afterwards.
     pub(super) async fn apply(
         &mut self,
         configured: Option<&S::Options>,
         plant: &SharedPlant,
         stats: &Arc<NorthStats>,
     ) -> Result<(), ServerError> {
-        if let (Some(running), Some(options)) = (&mut self.0, configured)
-            && (running.options == *options || running.server.update(&running.options, options)?)
-        {
-            running.options = options.clone();
+        if self.0.as_ref().map(|running| &running.options) == configured {
             return Ok(());
         }
-        // Its addresses, client id and files are free before its successor uses them.
+        // Its client id and files are free before its successor uses them.
         self.stop().await;
-        if let Some(options) = configured.cloned() {
-            let cancel = CancellationToken::new();
-            let server = S::start(options.clone(), plant.clone(), stats.clone(), cancel.clone()).await?;
-            self.0 = Some(Running {
-                options,
-                cancel,
-                server,
-            });
+        if let Some(options) = configured {
+            self.0 = Some(Running::start(options, plant, stats).await?);
         }
         Ok(())
     }
 
     /// Stops the server if it runs.
     pub(super) async fn stop(&mut self) {
-        if let Some(Running { cancel, server, .. }) = self.0.take() {
-            cancel.cancel();
-            within(STOP_TIMEOUT, S::NAME, server.stopped()).await;
+        if let Some(running) = self.0.take() {
+            running.stop().await;
+        }
+    }
+}
+
+impl<S: Server> Running<S> {
+    async fn start(
+        options: &S::Options,
+        plant: &SharedPlant,
+        stats: &Arc<NorthStats>,
+    ) -> Result<Running<S>, ServerError> {
+        let cancel = CancellationToken::new();
+        let server = S::start(options.clone(), plant.clone(), stats.clone(), cancel.clone()).await?;
+        Ok(Running {
+            options: options.clone(),
+            cancel,
+            server,
+        })
+    }
+
+    async fn stop(self) {
+        self.cancel.cancel();
+        within(STOP_TIMEOUT, S::NAME, self.server.stopped()).await;
+    }
+}
+
+impl<S: Reconfigure> ServerSlot<S> {
+    /// Prepares the server to run as configured. [`ServerSlot::commit`] cannot fail after that.
+    ///
+    /// # Errors
+    /// It cannot run so; it runs as before.
+    pub(super) async fn prepare(
+        &mut self,
+        configured: Option<&S::Options>,
+        plant: &SharedPlant,
+        stats: &Arc<NorthStats>,
+    ) -> Result<Prepared<S>, ServerError> {
+        Ok(match (&mut self.0, configured) {
+            (None, None) => Prepared::Same,
+            (Some(_), None) => Prepared::Stop,
+            (None, Some(options)) => Prepared::Started(Running::start(options, plant, stats).await?),
+            (Some(running), Some(options)) if running.options == *options => Prepared::Same,
+            (Some(running), Some(options)) => {
+                let change = running.server.prepare(options.clone()).await?;
+                Prepared::Changed(options.clone(), change)
+            }
+        })
+    }
+
+    /// Makes the server run as prepared.
+    pub(super) async fn commit(&mut self, prepared: Prepared<S>) {
+        match (prepared, &mut self.0) {
+            (Prepared::Stop, _) => self.stop().await,
+            (Prepared::Started(running), slot) => *slot = Some(running),
+            (Prepared::Changed(options, change), Some(running)) => {
+                running.server.commit(change);
+                running.options = options;
+            }
+            (Prepared::Same | Prepared::Changed(..), _) => {}
+        }
+    }
+
+    /// Leaves the server as it was before it was prepared.
+    pub(super) async fn abort(&mut self, prepared: Prepared<S>) {
+        match (prepared, &mut self.0) {
+            (Prepared::Started(running), _) => running.stop().await,
+            (Prepared::Changed(_, change), Some(running)) => running.server.abort(change),
+            _ => {}
         }
     }
 }
@@ -117,17 +196,24 @@ impl Server for modbus_tcp::Server {
         modbus_tcp::start(options, plant, stats, cancel).await
     }
 
-    fn update(&self, old: &Self::Options, new: &Self::Options) -> Result<bool, ServerError> {
-        let only_certificates = new.differs_in_certificates_only(old);
-        if only_certificates {
-            self.renew_certificates(new)?;
-            tracing::info!("Modbus TCP: using the new certificates for new connections");
-        }
-        Ok(only_certificates)
-    }
-
     async fn stopped(self) {
         modbus_tcp::Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for modbus_tcp::Server {
+    type Change = modbus_tcp::Change;
+
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError> {
+        modbus_tcp::Server::prepare(self, options).await
+    }
+
+    fn commit(&mut self, change: Self::Change) {
+        modbus_tcp::Server::commit(self, change);
+    }
+
+    fn abort(&mut self, change: Self::Change) {
+        modbus_tcp::Server::abort(self, change);
     }
 }
 
@@ -167,6 +253,22 @@ impl Server for http::Http {
     }
 }
 
+impl Reconfigure for http::Http {
+    type Change = http::Change;
+
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError> {
+        http::Http::prepare(self, options).await
+    }
+
+    fn commit(&mut self, change: Self::Change) {
+        http::Http::commit(self, change);
+    }
+
+    fn abort(&mut self, change: Self::Change) {
+        http::Http::abort(self, change);
+    }
+}
+
 impl Server for mqtt::Mqtt {
     const NAME: &'static str = "MQTT";
     type Options = mqtt::Options;
@@ -187,51 +289,72 @@ impl Server for mqtt::Mqtt {
 
 #[cfg(test)]
 mod tests {
+    use std::cell::RefCell;
     use std::io;
-    use std::sync::Mutex;
 
     use super::*;
 
-    /// What the test server did.
-    static LOG: Mutex<Vec<String>> = Mutex::new(Vec::new());
+    thread_local! {
+        /// What the test server did.
+        static LOG: RefCell<Vec<String>> = const { RefCell::new(Vec::new()) };
+    }
+
+    fn log(text: String) {
+        LOG.with_borrow_mut(|log| log.push(text));
+    }
+
+    fn logged() -> Vec<String> {
+        LOG.take()
+    }
 
     #[derive(Debug)]
     struct Recorder(CancellationToken);
 
     impl Server for Recorder {
         const NAME: &'static str = "test";
-        /// Name, and a part that can be applied while it runs.
-        type Options = (&'static str, u8);
+        type Options = &'static str;
 
         async fn start(
-            (name, part): Self::Options,
+            name: Self::Options,
             _: SharedPlant,
             _: Arc<NorthStats>,
             cancel: CancellationToken,
         ) -> Result<Self, ServerError> {
-            LOG.lock().unwrap().push(format!("start {name} {part}"));
-            match name {
-                "taken" => Err(ServerError::Thread(io::ErrorKind::AddrInUse.into())),
-                _ => Ok(Recorder(cancel)),
-            }
-        }
-
-        fn update(&self, old: &Self::Options, new: &Self::Options) -> Result<bool, ServerError> {
-            LOG.lock().unwrap().push(format!("update {}", new.1));
-            match new.1 {
-                0 => Err(ServerError::Thread(io::ErrorKind::InvalidInput.into())),
-                _ => Ok(old.0 == new.0),
-            }
+            log(format!("start {name}"));
+            possible(name).map(|_| Recorder(cancel))
         }
 
         async fn stopped(self) {
             assert!(self.0.is_cancelled());
-            LOG.lock().unwrap().push("stopped".to_string());
+            log("stopped".to_string());
         }
     }
 
-    #[tokio::test]
-    async fn a_server_is_started_compared_and_stopped() {
+    impl Reconfigure for Recorder {
+        type Change = &'static str;
+
+        async fn prepare(&mut self, name: Self::Options) -> Result<Self::Change, ServerError> {
+            log(format!("prepare {name}"));
+            possible(name)
+        }
+
+        fn commit(&mut self, name: Self::Change) {
+            log(format!("commit {name}"));
+        }
+
+        fn abort(&mut self, name: Self::Change) {
+            log(format!("abort {name}"));
+        }
+    }
+
+    fn possible(name: &'static str) -> Result<&'static str, ServerError> {
+        match name {
+            "taken" => Err(ServerError::Thread(io::ErrorKind::AddrInUse.into())),
+            name => Ok(name),
+        }
+    }
+
+    fn world() -> (SharedPlant, Arc<NorthStats>) {
         let plant = crate::plant::Plant {
             gateway: "test".to_string(),
             stale_after: Duration::from_secs(1),
@@ -240,33 +363,51 @@ mod tests {
             writes: Default::default(),
             recordings: Default::default(),
         };
-        let (plant, stats): (SharedPlant, _) = (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default());
+        (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
+    }
+
+    #[tokio::test]
+    async fn a_server_is_started_compared_and_stopped() {
+        let (plant, stats) = world();
         let mut slot = ServerSlot::<Recorder>::default();
-        let log = || std::mem::take(&mut *LOG.lock().unwrap());
         for (configured, succeeds, runs, expected) in [
             (None, true, false, &[][..]),
-            (Some(("a", 1)), true, true, &["start a 1"]),
-            (Some(("a", 1)), true, true, &[]),
-            (Some(("a", 2)), true, true, &["update 2"]),
-            (Some(("a", 0)), false, true, &["update 0"]),
-            (Some(("a", 2)), true, true, &[]),
-            (Some(("b", 2)), true, true, &["update 2", "stopped", "start b 2"]),
-            (
-                Some(("taken", 2)),
-                false,
-                false,
-                &["update 2", "stopped", "start taken 2"],
-            ),
-            (Some(("b", 2)), true, true, &["start b 2"]),
+            (Some("a"), true, true, &["start a"]),
+            (Some("a"), true, true, &[]),
+            (Some("b"), true, true, &["stopped", "start b"]),
+            (Some("taken"), false, false, &["stopped", "start taken"]),
+            (Some("b"), true, true, &["start b"]),
             (None, true, false, &["stopped"]),
         ] {
             let applied = slot.apply(configured.as_ref(), &plant, &stats).await;
-            assert_eq!(
-                (applied.is_ok(), slot.server().is_some()),
-                (succeeds, runs),
-                "{configured:?}"
-            );
-            assert_eq!(log(), expected, "{configured:?}");
+            let state = (applied.is_ok(), slot.server().is_some());
+            assert_eq!(state, (succeeds, runs), "{configured:?}");
+            assert_eq!(logged(), expected, "{configured:?}");
+        }
+    }
+
+    #[tokio::test]
+    async fn a_running_server_changes_in_two_steps() {
+        let (plant, stats) = world();
+        let mut slot = ServerSlot::<Recorder>::default();
+        for (configured, commit, expected, runs) in [
+            (Some("a"), false, &["start a", "stopped"][..], None),
+            (Some("a"), true, &["start a"], Some("a")),
+            (Some("a"), true, &[], Some("a")),
+            (Some("b"), false, &["prepare b", "abort b"], Some("a")),
+            (Some("taken"), true, &["prepare taken"], Some("a")),
+            (Some("b"), true, &["prepare b", "commit b"], Some("b")),
+            (None, false, &[], Some("b")),
+            (None, true, &["stopped"], None),
+            (Some("taken"), true, &["start taken"], None),
+        ] {
+            match slot.prepare(configured.as_ref(), &plant, &stats).await {
+                Ok(prepared) if commit => slot.commit(prepared).await,
+                Ok(prepared) => slot.abort(prepared).await,
+                Err(_) => assert_eq!(configured, Some("taken")),
+            }
+            assert_eq!(logged(), expected, "{configured:?}");
+            assert_eq!(slot.0.as_ref().map(|running| running.options), runs, "{configured:?}");
         }
     }
 }

@@ -194,6 +194,11 @@ impl Document {
         Reader::of(self, &self.root, Place::default())
     }
 
+    /// Its path.
+    pub(crate) fn file(&self) -> &str {
+        &self.file
+    }
+
     /// Adds a problem.
     pub(crate) fn problem(&self, place: &Place, what: impl Into<String>, remedy: impl Into<String>) {
         let problem = self.at(place, Finding::new(what, remedy));

@@ -1,4 +1,5 @@
-//! A drive family as data: its points, their addresses and scales, and what the drive allows.
+//! A drive family as data: its points, their addresses and scales, and what the drive allows. Files are read, and the
+//! built-in ones listed, in `profile_file`.
 
 mod raw;
 

@@ -367,6 +367,7 @@ fn publish(events: &Events, bus: String, drive: Option<String>, text: String, re
         bus,
         drive,
         fault_code: None,
+        count: None,
         text,
         recording,
     });

@@ -1,32 +1,79 @@
-//! Limits the connections that are open at one time: in total and for each client address.
+//! Limits the connections that are open at one time, in total and for each client address, and decides which connection
+//! yields when a limit is reached. [`decide`] is pure; [`ConnectionLimit`] keeps the connections it decides about.
 
+use std::cmp::Reverse;
 use std::collections::HashMap;
 use std::net::IpAddr;
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::Instant;
 
-/// The limits of a server, and the connections that count against them.
-#[derive(Debug)]
-pub(super) struct ConnectionLimit {
-    total: usize,
-    per_address: Option<usize>,
-    open: Mutex<OpenConnections>,
+use tokio_util::sync::CancellationToken;
+
+use crate::command::Authority;
+
+/// Maximum number of displaced connections that are not closed yet.
+const MAX_CLOSING: usize = 32;
+
+/// How many connections a server may have open.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Limits {
+    /// For all clients together.
+    pub(super) total: usize,
+    /// How many of them only clients that may write can have.
+    pub(super) reserved: usize,
+    /// For one address.
+    pub(super) per_address: usize,
 }
 
-#[derive(Debug, Default)]
-struct OpenConnections {
-    total: usize,
-    /// Only addresses with at least one connection.
-    by_address: HashMap<IpAddr, usize>,
+impl Limits {
+    /// `total` connections, of which one address may have `per_address`.
+    pub(super) fn new(total: usize, per_address: usize) -> Limits {
+        Limits {
+            total,
+            reserved: 0,
+            per_address,
+        }
+    }
+
+    /// Maximum number of displaced connections that are not closed yet; beyond it newcomers are refused instead.
+    fn closing(&self) -> usize {
+        self.total.min(MAX_CLOSING)
+    }
+
+    /// Maximum number of connections that have a file descriptor.
+    pub(super) fn files(&self) -> usize {
+        self.total + self.closing()
+    }
+
+    /// Reserves an eighth of the connections, at least one of two, for clients that may write.
+    pub(super) fn with_reserve(self) -> Limits {
+        let reserved = if self.total < 2 { 0 } else { (self.total / 8).max(1) };
+        Limits { reserved, ..self }
+    }
 }
 
-/// A connection that counts against the limit until this is dropped.
-#[derive(Debug)]
-pub(super) struct ConnectionPermit {
-    limit: Arc<ConnectionLimit>,
+/// An open connection, as far as [`decide`] needs to know it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+struct Open {
     address: IpAddr,
+    authority: Authority,
+    /// It does not yield to another connection of the same address. See [`Place::use_at`].
+    in_use: bool,
+    /// Time of its last use, ms.
+    used: u64,
 }
 
-/// Why there is no permit, with the limit that was reached.
+/// Whether a new connection is admitted.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Decision {
+    Admit,
+    /// In place of the open connection with this index.
+    Replace(usize),
+    Refuse(LimitReached),
+}
+
+/// The limit that keeps a connection out.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum LimitReached {
     /// For all clients together.
@@ -35,75 +82,293 @@ pub(super) enum LimitReached {
     Address(usize),
 }
 
+/// Decides about a new connection from `address`.
+///
+/// A connection in use is not closed for another one from the same address, except for one that may write if it itself
+/// may not. When no place is left, the address with the most connections gives up its longest idle one to an address that
+/// has fewer. Who may write never yields to somebody who may not.
+fn decide<I>(limits: &Limits, open: I, address: IpAddr, authority: Authority) -> Decision
+where
+    I: Iterator<Item = Open> + Clone,
+{
+    let mut held: HashMap<IpAddr, usize> = HashMap::new();
+    let (mut total, mut readers) = (0, 0);
+    for connection in open.clone() {
+        *held.entry(connection.address).or_default() += 1;
+        total += 1;
+        readers += usize::from(connection.authority == Authority::ReadOnly);
+    }
+    let count = |address: &IpAddr| held.get(address).copied().unwrap_or_default();
+    let own = count(&address);
+    let address_full = own >= limits.per_address;
+    let free = total < limits.total
+        && (authority == Authority::Write || readers < limits.total.saturating_sub(limits.reserved));
+    if free && !address_full {
+        return Decision::Admit;
+    }
+    let yields = |connection: &Open| {
+        let writes = connection.authority == Authority::Write;
+        match (writes, authority) {
+            (true, Authority::ReadOnly) => false,
+            _ if connection.address != address => !address_full && count(&connection.address) > own,
+            (false, Authority::Write) => true,
+            _ => !connection.in_use,
+        }
+    };
+    let candidates = open.enumerate().filter(|(_, connection)| yields(connection));
+    let first = candidates.min_by_key(|(_, connection)| {
+        let writes = connection.authority == Authority::Write;
+        (
+            writes,
+            Reverse(count(&connection.address)),
+            connection.in_use,
+            connection.used,
+        )
+    });
+    match first {
+        Some((index, _)) => Decision::Replace(index),
+        None if address_full => Decision::Refuse(LimitReached::Address(limits.per_address)),
+        None => Decision::Refuse(LimitReached::Total(limits.total)),
+    }
+}
+
+/// What a client may do; a reload can change it while the client is connected.
+#[derive(Debug, Clone)]
+pub(super) struct Rights(Arc<AtomicBool>);
+
+impl Rights {
+    /// As of now.
+    pub(super) fn authority(&self) -> Authority {
+        match self.0.load(Ordering::Relaxed) {
+            true => Authority::Write,
+            false => Authority::ReadOnly,
+        }
+    }
+
+    fn set(&self, authority: Authority) {
+        self.0.store(authority == Authority::Write, Ordering::Relaxed);
+    }
+}
+
+impl From<Authority> for Rights {
+    fn from(authority: Authority) -> Rights {
+        Rights(Arc::new(AtomicBool::new(authority == Authority::Write)))
+    }
+}
+
+/// Why the gateway closes a connection that could go on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum CloseReason {
+    /// See [`decide`].
+    #[error("closed in favour of another client, because the maximum number of connections is reached")]
+    Displaced,
+    /// The configuration was reloaded.
+    #[error("closed: the new configuration does not allow it")]
+    NotAllowed,
+    /// Of the client's certificate, or of the rights of its role.
+    #[error("closed: its certificate is no longer accepted with the same rights")]
+    CertificateRefused,
+}
+
+/// The place of one connection under a limit.
+#[derive(Debug)]
+pub(super) struct Place {
+    address: IpAddr,
+    /// The listener that accepted it.
+    listener: usize,
+    rights: Rights,
+    in_use: AtomicBool,
+    /// Time of the last use, ms after `start`.
+    used: AtomicU64,
+    start: Instant,
+    closing: CancellationToken,
+    why: OnceLock<CloseReason>,
+}
+
+impl Place {
+    /// Address of the client.
+    pub(super) fn address(&self) -> IpAddr {
+        self.address
+    }
+
+    /// What the client may do.
+    pub(super) fn rights(&self) -> &Rights {
+        &self.rights
+    }
+
+    /// Cancelled when the connection must end: its place is taken, [`Place::close`] was called, or its server stops.
+    pub(super) fn closing(&self) -> &CancellationToken {
+        &self.closing
+    }
+
+    /// Why the connection must end; `None` if its server stops.
+    pub(super) fn close_reason(&self) -> Option<CloseReason> {
+        self.why.get().copied()
+    }
+
+    /// Ends the connection; the first reason counts.
+    pub(super) fn close(&self, why: CloseReason) {
+        let _ = self.why.set(why);
+        self.closing.cancel();
+    }
+
+    /// The connection did something at `now` and is `in_use` from then on.
+    pub(super) fn use_at(&self, now: Instant, in_use: bool) {
+        let used = now.saturating_duration_since(self.start).as_millis();
+        self.used
+            .store(u64::try_from(used).unwrap_or(u64::MAX), Ordering::Relaxed);
+        self.in_use.store(in_use, Ordering::Relaxed);
+    }
+
+    /// Whether the connection is in use.
+    pub(super) fn is_in_use(&self) -> bool {
+        self.in_use.load(Ordering::Relaxed)
+    }
+
+    fn open(self: &Arc<Place>) -> Open {
+        Open {
+            address: self.address,
+            authority: self.rights.authority(),
+            in_use: self.is_in_use(),
+            used: self.used.load(Ordering::Relaxed),
+        }
+    }
+}
+
+/// The limits of a server, and the connections that count against them.
+#[derive(Debug)]
+pub(super) struct ConnectionLimit {
+    start: Instant,
+    table: Mutex<Table>,
+}
+
+#[derive(Debug)]
+struct Table {
+    limits: Limits,
+    open: Vec<Arc<Place>>,
+    /// Displaced connections that are not closed yet.
+    closing: usize,
+}
+
+/// A connection that counts against the limit until this is dropped.
+#[derive(Debug)]
+pub(super) struct ConnectionPermit {
+    limit: Arc<ConnectionLimit>,
+    place: Arc<Place>,
+}
+
+impl ConnectionPermit {
+    pub(super) fn place(&self) -> &Arc<Place> {
+        &self.place
+    }
+}
+
+/// A connection that asks for a place.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Newcomer<'c> {
+    /// Address of the client.
+    pub(super) address: IpAddr,
+    /// The listener that accepted it, for [`ConnectionLimit::review`].
+    pub(super) listener: usize,
+    /// Ends the connection together with its server.
+    pub(super) cancel: &'c CancellationToken,
+}
+
+/// Why a connection gets no place.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum NoPlace {
+    /// It may not connect at all.
+    NotAllowed,
+    /// A limit is reached and no other connection yields.
+    Limit(LimitReached),
+}
+
 impl ConnectionLimit {
-    /// `total` connections, of which one address may have `per_address`; `None` is no limit per address.
-    pub(super) fn new(total: usize, per_address: Option<usize>) -> Arc<ConnectionLimit> {
+    pub(super) fn new(limits: Limits) -> Arc<ConnectionLimit> {
+        let table = Table {
+            limits,
+            open: Vec::new(),
+            closing: 0,
+        };
         Arc::new(ConnectionLimit {
-            total,
-            per_address,
-            open: Mutex::default(),
+            start: Instant::now(),
+            table: Mutex::new(table),
         })
     }
 
-    /// A permit for one connection from `address`.
+    /// Applies other limits to newcomers; open connections stay.
+    pub(super) fn set_limits(&self, limits: Limits) {
+        self.lock().limits = limits;
+    }
+
+    /// A place for a newcomer, and the address of the connection that it displaced. `judge` says what the newcomer may
+    /// do, or that it may not connect; it is called while no [`ConnectionLimit::review`] runs, so a reload misses nobody.
     ///
     /// # Errors
-    /// The limit that is reached.
-    pub(super) fn acquire(self: &Arc<Self>, address: IpAddr) -> Result<ConnectionPermit, LimitReached> {
-        let mut open = self.lock();
-        let own = open.by_address.get(&address).copied().unwrap_or_default();
-        if let Some(limit) = self.per_address.filter(|limit| own >= *limit) {
-            return Err(LimitReached::Address(limit));
-        }
-        if open.total >= self.total {
-            return Err(LimitReached::Total(self.total));
-        }
-        open.total += 1;
-        open.by_address.insert(address, own + 1);
-        Ok(ConnectionPermit {
-            limit: self.clone(),
-            address,
-        })
+    /// Why there is none.
+    pub(super) fn acquire(
+        self: &Arc<Self>,
+        newcomer: Newcomer<'_>,
+        now: Instant,
+        judge: impl FnOnce() -> Option<Authority>,
+    ) -> Result<(ConnectionPermit, Option<IpAddr>), NoPlace> {
+        let mut table = self.lock();
+        let authority = judge().ok_or(NoPlace::NotAllowed)?;
+        let open = table.open.iter().map(Place::open);
+        let displaced = match decide(&table.limits, open, newcomer.address, authority) {
+            Decision::Admit => None,
+            Decision::Refuse(limit) => return Err(NoPlace::Limit(limit)),
+            Decision::Replace(_) if table.closing >= table.limits.closing() => {
+                return Err(NoPlace::Limit(LimitReached::Total(table.limits.total)));
+            }
+            Decision::Replace(index) => {
+                let displaced = table.open.swap_remove(index);
+                table.closing += 1;
+                displaced.close(CloseReason::Displaced);
+                Some(displaced.address)
+            }
+        };
+        let place = Arc::new(Place {
+            address: newcomer.address,
+            listener: newcomer.listener,
+            rights: authority.into(),
+            in_use: AtomicBool::new(false),
+            used: AtomicU64::new(0),
+            start: self.start,
+            closing: newcomer.cancel.child_token(),
+            why: OnceLock::new(),
+        });
+        place.use_at(now, false);
+        table.open.push(place.clone());
+        let limit = self.clone();
+        Ok((ConnectionPermit { limit, place }, displaced))
     }
 
-    fn lock(&self) -> MutexGuard<'_, OpenConnections> {
-        self.open.lock().unwrap_or_else(PoisonError::into_inner)
+    /// Judges the open connections of one listener anew: what they may do from now on, or `None` to close them.
+    pub(super) fn review(&self, listener: usize, judge: impl Fn(&Place) -> Option<Authority>) {
+        let table = self.lock();
+        for place in table.open.iter().filter(|place| place.listener == listener) {
+            match judge(place) {
+                Some(authority) => place.rights.set(authority),
+                None => place.close(CloseReason::NotAllowed),
+            }
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Table> {
+        self.table.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
 impl Drop for ConnectionPermit {
     fn drop(&mut self) {
-        let mut open = self.limit.lock();
-        open.total = open.total.saturating_sub(1);
-        if let Some(own) = open.by_address.get_mut(&self.address) {
-            *own = own.saturating_sub(1);
-            if *own == 0 {
-                open.by_address.remove(&self.address);
-            }
+        let mut table = self.limit.lock();
+        match table.open.iter().position(|place| Arc::ptr_eq(place, &self.place)) {
+            Some(index) => drop(table.open.swap_remove(index)),
+            None => table.closing = table.closing.saturating_sub(1),
         }
     }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn limits_in_total_and_per_address() {
-        let limit = ConnectionLimit::new(3, Some(2));
-        let [one, other, third] = [1, 2, 3].map(|n| IpAddr::from([10, 0, 0, n]));
-        let first = limit.acquire(one).unwrap();
-        let _second = limit.acquire(one).unwrap();
-        assert_eq!(limit.acquire(one).unwrap_err(), LimitReached::Address(2));
-        let _other = limit.acquire(other).unwrap();
-        assert_eq!(limit.acquire(third).unwrap_err(), LimitReached::Total(3));
-        drop(first);
-        let again = limit.acquire(third).unwrap();
-        drop(again);
-        assert_eq!(
-            limit.lock().by_address.len(),
-            2,
-            "addresses without a connection are forgotten"
-        );
-    }
-}
+mod tests;

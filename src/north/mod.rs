@@ -1,8 +1,10 @@
 //! The north sides: Modbus TCP, MQTT, HTTP and the local socket. They read the process image and queue commands; they never
 //! name the bus.
 
+mod certificate;
 mod connection_limit;
 pub mod http;
+mod identity;
 mod listener;
 pub mod local;
 mod log_throttle;
@@ -10,13 +12,18 @@ pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 mod pem;
+mod refusals;
 pub(crate) mod register_map;
 mod stats;
 
 use std::io;
 use std::net::SocketAddr;
 
-pub use stats::{ConnectionRefusal, ModbusTcpStats, MqttStats, NorthStats};
+pub(crate) use identity::client_tls;
+pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
+pub use stats::{
+    ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ServerKind,
+};
 
 /// Why a server cannot start.
 #[derive(Debug, thiserror::Error)]
@@ -39,9 +46,9 @@ pub enum ServerError {
     /// The local socket cannot be opened.
     #[error("{0}")]
     Local(io::Error),
-    /// The certificates of the server cannot be used.
-    #[error("TLS of Modbus TCP: {0}")]
-    Tls(#[from] modbus_tcp::IdentityFault),
+    /// The certificates of a server, named first, cannot be used.
+    #[error("TLS of {0}: {1}")]
+    Tls(&'static str, IdentityFault),
 }
 
 fn remedy(cause: &io::Error) -> &'static str {

@@ -1,6 +1,9 @@
 //! Counters of the north sides, for the metrics.
 
+use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
+use std::sync::{Mutex, PoisonError};
 
 /// Counters of all north sides.
 #[derive(Debug, Default)]
@@ -9,6 +12,10 @@ pub struct NorthStats {
     pub modbus_tcp: ModbusTcpStats,
     /// Of the MQTT client.
     pub mqtt: MqttStats,
+    /// Refused connections of all servers.
+    pub refused: RefusalStats,
+    /// Listeners that do not work.
+    pub lost_listeners: LostListeners,
 }
 
 const FUNCTIONS: [u8; 11] = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43];
@@ -24,25 +31,58 @@ const OUTCOMES: [(u8, &str); 8] = [
 ];
 const OTHER: &str = "other";
 
-/// Why a Modbus TCP client was refused.
+/// The servers that refuse connections.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum ServerKind {
+    /// Modbus TCP, with and without TLS.
+    ModbusTcp,
+    /// HTTP.
+    Http,
+}
+
+impl ServerKind {
+    /// All servers.
+    pub const ALL: [ServerKind; 2] = [ServerKind::ModbusTcp, ServerKind::Http];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            ServerKind::ModbusTcp => "modbus_tcp",
+            ServerKind::Http => "http",
+        }
+    }
+
+    /// Name in messages.
+    pub fn title(self) -> &'static str {
+        match self {
+            ServerKind::ModbusTcp => "Modbus TCP",
+            ServerKind::Http => "HTTP",
+        }
+    }
+}
+
+/// Why a connection was refused, or closed in favour of another one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum ConnectionRefusal {
     /// Its address is not in `allow`.
     NotAllowed,
-    /// `max_connections` is reached.
+    /// The server has as many connections as it may have.
     Full,
-    /// `max_connections_per_address` is reached.
+    /// Its address has as many connections as it may have.
     AddressFull,
+    /// It was closed in favour of another connection.
+    Displaced,
     /// The handshake failed: no certificate, an untrusted or expired one, a malformed role, or no TLS at all.
     Tls,
 }
 
 impl ConnectionRefusal {
     /// All reasons.
-    pub const ALL: [ConnectionRefusal; 4] = [
+    pub const ALL: [ConnectionRefusal; 5] = [
         ConnectionRefusal::NotAllowed,
         ConnectionRefusal::Full,
         ConnectionRefusal::AddressFull,
+        ConnectionRefusal::Displaced,
         ConnectionRefusal::Tls,
     ];
 
@@ -52,8 +92,55 @@ impl ConnectionRefusal {
             ConnectionRefusal::NotAllowed => "not_allowed",
             ConnectionRefusal::Full => "full",
             ConnectionRefusal::AddressFull => "address_full",
+            ConnectionRefusal::Displaced => "displaced",
             ConnectionRefusal::Tls => "tls",
         }
+    }
+}
+
+/// Counters of refused connections.
+#[derive(Debug, Default)]
+pub struct RefusalStats([[AtomicU64; ConnectionRefusal::ALL.len()]; ServerKind::ALL.len()]);
+
+impl RefusalStats {
+    /// Counts a refused connection.
+    pub(crate) fn add(&self, server: ServerKind, why: ConnectionRefusal) {
+        if let Some(counter) = self.0.get(server as usize).and_then(|row| row.get(why as usize)) {
+            counter.fetch_add(1, Ordering::Relaxed);
+        }
+    }
+
+    /// Connections to `server` that were refused so far, by reason.
+    pub fn of(&self, server: ServerKind) -> impl Iterator<Item = (ConnectionRefusal, u64)> {
+        let row = self.0.get(server as usize).into_iter().flatten();
+        ConnectionRefusal::ALL
+            .into_iter()
+            .zip(row.map(|c| c.load(Ordering::Relaxed)))
+    }
+}
+
+/// Listeners whose socket is lost, by server and address, with the reason.
+#[derive(Debug, Default)]
+pub struct LostListeners(Mutex<BTreeMap<(&'static str, SocketAddr), String>>);
+
+impl LostListeners {
+    /// The listener of `server` at `address` is lost for this reason, or works again.
+    pub(crate) fn set(&self, server: ServerKind, address: SocketAddr, reason: Option<String>) {
+        let mut lost = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let key = (server.title(), address);
+        match reason {
+            Some(reason) => drop(lost.insert(key, reason)),
+            None => drop(lost.remove(&key)),
+        }
+    }
+
+    /// One line per lost listener.
+    pub fn reasons(&self) -> Vec<String> {
+        let lost = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let line = |((server, address), why): (&(&str, SocketAddr), &String)| {
+            format!("{server} does not listen on {address}: {why}; retrying")
+        };
+        lost.iter().map(line).collect()
     }
 }
 
@@ -61,7 +148,6 @@ impl ConnectionRefusal {
 #[derive(Debug, Default)]
 pub struct ModbusTcpStats {
     connections: AtomicU64,
-    refused_connections: [AtomicU64; ConnectionRefusal::ALL.len()],
     requests: [[AtomicU64; OUTCOMES.len() + 1]; FUNCTIONS.len() + 1],
 }
 
@@ -79,19 +165,6 @@ impl ModbusTcpStats {
     /// Clients connected now.
     pub fn connections(&self) -> u64 {
         self.connections.load(Ordering::Relaxed)
-    }
-
-    /// Counts a refused client.
-    pub(crate) fn connection_refused(&self, why: ConnectionRefusal) {
-        if let Some(counter) = self.refused_connections.get(why as usize) {
-            counter.fetch_add(1, Ordering::Relaxed);
-        }
-    }
-
-    /// Clients refused so far, by reason.
-    pub fn refused_connections(&self) -> impl Iterator<Item = (ConnectionRefusal, u64)> {
-        let counts = self.refused_connections.iter().map(|c| c.load(Ordering::Relaxed));
-        ConnectionRefusal::ALL.into_iter().zip(counts)
     }
 
     /// Counts an answer; `exception` is 0 for a regular one.
@@ -132,4 +205,45 @@ pub struct MqttStats {
     pub published: AtomicU64,
     /// Messages waiting for the broker.
     pub buffered: AtomicU64,
+    lost: [AtomicU64; MqttLoss::ALL.len()],
+}
+
+/// What the MQTT client lost.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum MqttLoss {
+    /// Events.
+    Event,
+    /// Results of commands.
+    Result,
+    /// Values of an outage.
+    History,
+}
+
+impl MqttLoss {
+    /// All kinds.
+    pub const ALL: [MqttLoss; 3] = [MqttLoss::Event, MqttLoss::Result, MqttLoss::History];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            MqttLoss::Event => "event",
+            MqttLoss::Result => "result",
+            MqttLoss::History => "history",
+        }
+    }
+}
+
+impl MqttStats {
+    /// Counts lost messages.
+    pub(crate) fn lost(&self, kind: MqttLoss, count: u64) {
+        if let Some(counter) = self.lost.get(kind as usize) {
+            counter.fetch_add(count, Ordering::Relaxed);
+        }
+    }
+
+    /// Messages lost so far, by kind.
+    pub fn losses(&self) -> impl Iterator<Item = (MqttLoss, u64)> {
+        let counts = self.lost.iter().map(|c| c.load(Ordering::Relaxed));
+        MqttLoss::ALL.into_iter().zip(counts)
+    }
 }

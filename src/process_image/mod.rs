@@ -19,7 +19,8 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use arc_swap::ArcSwap;
+use arc_swap::{ArcSwap, ArcSwapOption};
+use tokio::sync::Notify;
 
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, Value};
@@ -144,6 +145,8 @@ pub struct DriveImage {
     /// Process data of a line that cannot be faster is not stale before that age, ns; a reload may change it.
     stale_floor: AtomicU64,
     snapshot: ArcSwap<Snapshot>,
+    /// Woken by every update.
+    listener: ArcSwapOption<Notify>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
@@ -165,6 +168,7 @@ impl DriveImage {
             slow_cycle,
             stale_floor: AtomicU64::new(0),
             snapshot,
+            listener: ArcSwapOption::empty(),
             outcomes,
             turnaround: AtomicU64::new(0),
             heartbeat: Mutex::default(),
@@ -195,6 +199,19 @@ impl DriveImage {
         let mut next = Snapshot::clone(&self.snapshot.load());
         change(&mut next);
         self.snapshot.store(Arc::new(next));
+        if let Some(listener) = &*self.listener.load() {
+            listener.notify_one();
+        }
+    }
+
+    /// Whether the image was updated since `seen` was taken.
+    pub fn is_newer_than(&self, seen: &Arc<Snapshot>) -> bool {
+        !Arc::ptr_eq(&self.snapshot.load(), seen)
+    }
+
+    /// Wakes `listener` at every update from now on, in place of an earlier one.
+    pub fn notify(&self, listener: Arc<Notify>) {
+        self.listener.store(Some(listener));
     }
 
     /// How a reader at `now` looks at the drive.

@@ -268,19 +268,21 @@ impl Reading<'_> {
     /// A value of the drive's own registers: as good as the worst of them, as old as the oldest. What is no value
     /// (a float that is no number) is bad.
     fn raw_sample(&self, raw: &Raw, kind: Kind) -> Sample {
-        let cells: Option<Vec<_>> = raw.addresses().map(|a| self.snapshot.cell(raw.table, a)).collect();
-        let Some(cells) = cells.filter(|cells| cells.len() == usize::from(raw.form.items())) else {
-            return Sample::NONE;
-        };
-        let words: Vec<u16> = cells.iter().map(|(_, cell)| cell.word).collect();
-        let at: Option<Vec<Instant>> = cells.iter().map(|(_, cell)| cell.at).collect();
-        let at = at.and_then(|at| at.into_iter().min());
+        let (mut words, mut times, mut quality) = ([0; 2], [None; 2], Quality::Good);
+        for (offset, (word, time)) in (0..raw.form.items()).zip(words.iter_mut().zip(&mut times)) {
+            let address = raw.address.checked_add(offset);
+            let Some((class, cell)) = address.and_then(|address| self.snapshot.cell(raw.table, address)) else {
+                return Sample::NONE;
+            };
+            (*word, *time) = (cell.word, cell.at);
+            quality = quality.worse(self.quality(class, cell));
+        }
+        // One that was never read comes before all times.
+        let at = times.into_iter().take(usize::from(raw.form.items())).min().flatten();
         let value = at.and_then(|_| raw.decode(&words, kind));
-        let qualities = cells.iter().map(|(class, cell)| self.quality(*class, cell));
-        let worst = qualities.fold(Quality::Good, Quality::worse);
         Sample {
             value,
-            quality: if value.is_some() { worst } else { Quality::Bad },
+            quality: if value.is_some() { quality } else { Quality::Bad },
             at,
         }
     }

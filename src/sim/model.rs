@@ -100,6 +100,9 @@ pub(crate) trait Model: fmt::Debug {
     /// One update period, which ends at `now`.
     fn step(&mut self, now: SimTime);
 
+    /// Brings what a master reads up to date, after the last of some steps.
+    fn refresh(&mut self) {}
+
     /// Whether it would run if it were commanded to.
     fn ready(&self) -> bool;
 
@@ -111,10 +114,15 @@ pub(crate) trait Model: fmt::Debug {
 
     /// Advances to `now`, in steps of [`UPDATE_PERIOD`].
     fn advance(&mut self, now: SimTime) {
+        let mut stepped = false;
         while let Some(at) = self.body_mut().steps.due(now) {
             if self.body().powered {
                 self.step(at);
+                stepped = true;
             }
+        }
+        if stepped {
+            self.refresh();
         }
     }
 

@@ -7,9 +7,11 @@ use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
 use drivegate::sim::broker::Broker;
-use rumqttc::v5::mqttbytes::QoS;
-use rumqttc::v5::mqttbytes::v5::{DisconnectReasonCode, Packet, PublishProperties};
-use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions, StateError};
+use rumqttc::mqttbytes::QoS;
+use rumqttc::{
+    AsyncClient, ConnectionError, DisconnectReasonCode, Event, EventLoop, MqttOptions, Packet, PublishProperties,
+    StateError,
+};
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
@@ -85,8 +87,8 @@ impl Bench {
 
     /// A client of the library: nothing happens but by `next`.
     fn library_client(&self, id: &str) -> (AsyncClient, EventLoop) {
-        let options = MqttOptions::new(id, "127.0.0.1", self.broker.local_addr().port());
-        AsyncClient::new(options, 10)
+        let options = MqttOptions::new(id, ("127.0.0.1", self.broker.local_addr().port()));
+        AsyncClient::builder(options).capacity(10).build()
     }
 }
 

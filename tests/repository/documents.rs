@@ -16,7 +16,9 @@ fn read(path: &Path) -> String {
 
 /// The documents for people.
 fn documents() -> Vec<PathBuf> {
-    let mut found = vec![root().join("README.md"), root().join("CHANGELOG.md")];
+    let mut found = ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"]
+        .map(|name| root().join(name))
+        .to_vec();
     found.extend(files(&root().join("docs"), "md"));
     found
 }
@@ -60,6 +62,7 @@ fn every_configuration_that_ships_is_valid() {
         &script,
         &[&tls, "server", "gateway", "pump-house.example", "192.168.1.5"],
     );
+    fs::write(dir.path().join("tokens"), "").unwrap();
     for document in documents() {
         for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
             if is_profile(block) {
@@ -87,6 +90,37 @@ fn every_configuration_that_ships_is_valid() {
             &["check", "--config", &path.display().to_string()],
         );
     }
+}
+
+/// A defence that names a test which is not there proves nothing.
+#[test]
+fn the_tests_of_the_threat_model_exist() {
+    let text = read(&root().join("docs/threat-model.md"));
+    let table = text.split("## Defences").nth(1).unwrap().split("\n## ").next().unwrap();
+    let code: String = [files(&root().join("src"), "rs"), files(&root().join("tests"), "rs")]
+        .iter()
+        .flatten()
+        .map(|file| read(file))
+        .collect();
+    let is_name = |word: &&str| {
+        word.contains('_')
+            && word
+                .chars()
+                .all(|c| c.is_ascii_lowercase() || c == '_' || c.is_ascii_digit())
+    };
+    let proofs = table
+        .lines()
+        .filter_map(|line| line.trim_end_matches(" |").rsplit_once(" | "));
+    let named: Vec<&str> = proofs
+        .flat_map(|(_, proof)| proof.split('`').skip(1).step_by(2))
+        .filter(is_name)
+        .collect();
+    assert!(named.len() > 30, "{named:?}");
+    let missing: Vec<&&str> = named
+        .iter()
+        .filter(|name| !code.contains(&format!("fn {name}(")))
+        .collect();
+    assert!(missing.is_empty(), "{missing:?}");
 }
 
 fn is_profile(block: &str) -> bool {
@@ -201,6 +235,24 @@ fn links_lead_somewhere() {
             }
             let target = document.parent().unwrap().join(link.split('#').next().unwrap());
             assert!(target.exists(), "{}: {link}", document.display());
+        }
+    }
+}
+
+#[test]
+fn every_fault_of_the_world_fits_the_core_and_is_listed() {
+    let faults: toml::Table = read(&root().join("tests/world/mutants.toml")).parse().unwrap();
+    let page = read(&root().join("docs/development.md"));
+    for fault in faults["mutant"].as_array().unwrap() {
+        let (name, promise) = (fault["name"].as_str().unwrap(), fault["promise"].as_str().unwrap());
+        assert!(
+            page.contains(&format!("| `{name}` | {promise} |")),
+            "docs/development.md lacks `{name}`"
+        );
+        for edit in fault["edit"].as_array().unwrap() {
+            let (file, old) = (edit["file"].as_str().unwrap(), edit["old"].as_str().unwrap());
+            let places = read(&root().join(file)).matches(old).count();
+            assert_eq!(places, 1, "`{name}` is to replace one place of {file}: {old}");
         }
     }
 }

@@ -61,6 +61,8 @@ pub struct WorldBus {
     /// It was asked to stop its drives: its polls cease.
     pub ending: bool,
     pub exchanges: u64,
+    /// Replies may come when they are not expected any more, or twice.
+    pub late: bool,
     /// The fast cycle of the line when it is saturated with polls, as predicted.
     pub round: Duration,
     /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
@@ -70,6 +72,8 @@ pub struct WorldBus {
     until: Instant,
     commands: bool,
     asked: Option<Asked>,
+    /// The exchange before: a late reply may have ended it while its request was still on the wire.
+    ended: Option<Asked>,
 }
 
 /// What a line has that is not in its description.
@@ -150,6 +154,7 @@ impl WorldBus {
         WorldBus {
             index,
             line: line.clone(),
+            late: line.is_late(),
             handle,
             core,
             wire,
@@ -165,6 +170,7 @@ impl WorldBus {
             until: now,
             commands: true,
             asked: None,
+            ended: None,
         }
     }
 
@@ -179,7 +185,7 @@ impl WorldBus {
         if self.open {
             self.core.opened(now);
         }
-        self.asked = None;
+        (self.asked, self.ended) = (None, None);
         (self.until, self.commands) = (now, true);
     }
 
@@ -235,7 +241,7 @@ impl WorldBus {
             return;
         }
         self.open = open;
-        self.asked = None;
+        (self.asked, self.ended) = (None, None);
         if open {
             self.core.opened(now);
             (self.until, self.commands) = (now, true);
@@ -306,7 +312,9 @@ impl WorldBus {
 
     fn note_acts(&mut self, seen: &mut Vec<Seen>) {
         for act in self.wire.take_acts() {
-            let Some(asked) = &mut self.asked else { continue };
+            let Some(asked) = self.asked.as_mut().or(self.ended.as_mut()) else {
+                continue;
+            };
             let spec = &self.handle.image.drives[asked.drive].spec;
             assert_eq!(spec.address, act.address, "a drive acted that was not asked");
             let request = Request {
@@ -326,7 +334,8 @@ impl WorldBus {
         if self.core.asked().is_none()
             && let Some(asked) = self.asked.take()
         {
-            seen.push(Seen::Over(asked));
+            seen.push(Seen::Over(asked.clone()));
+            self.ended = Some(asked);
         }
     }
 }

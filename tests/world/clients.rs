@@ -27,12 +27,19 @@ pub struct Client {
 }
 
 pub enum Way {
-    /// Orders given by the function that all north sides use; the number of each and what it waits with.
-    Plain(Vec<(usize, Placed)>),
+    /// Orders given by the function that all north sides use.
+    Plain(Vec<Waiting>),
     /// By the id in the result.
     Mqtt(Box<mqtt::Offline>, Broker),
     /// By the id of the transaction.
     ModbusTcp(Box<modbus_tcp::Offline>, BTreeMap<u16, usize>, u16),
+}
+
+/// An order that a client waits for.
+pub struct Waiting {
+    pub id: usize,
+    pub placed: Placed,
+    pub is_read: bool,
 }
 
 /// The broker between a client and the gateway, whose session outlives the connection.
@@ -83,7 +90,7 @@ impl Servers {
             listeners: Vec::new(),
             tls: None,
             max_connections: 64,
-            max_connections_per_address: None,
+            max_connections_per_address: 64,
             idle_timeout: None,
             uncached: Uncached::Forward,
         };
@@ -128,7 +135,7 @@ impl Servers {
     }
 }
 
-fn address(host: u8, connection: u16) -> SocketAddr {
+pub fn address(host: u8, connection: u16) -> SocketAddr {
     SocketAddr::from(([127, 0, 0, host], 40_000 + connection))
 }
 

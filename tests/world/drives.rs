@@ -1,9 +1,12 @@
 //! What is true of a drive, as seen on its line and inside it, and what must follow from that.
 
-use std::collections::VecDeque;
+use std::collections::{HashMap, VecDeque};
 use std::time::{Duration, Instant};
 
 use drivegate::codec::RequestPdu;
+use drivegate::command::written;
+
+use super::orders::{Unique, sets};
 
 /// Acts of a drive that are remembered.
 const KEPT: usize = 400;
@@ -19,6 +22,8 @@ pub struct Truth {
     pub last_stop_over: Option<Instant>,
     /// Place of the last order that went onto the wire, stops apart.
     pub last_place: usize,
+    /// The last order with these words: they come again after some thousands.
+    pub uniques: HashMap<Unique, usize>,
     /// What the drive did, with the words that it answered.
     pub acts: VecDeque<(Instant, RequestPdu, Option<Vec<u16>>)>,
     /// The latest time at which a client was heard of for certain, and the latest at which it may have been.
@@ -87,6 +92,7 @@ impl Truth {
             may_run: None,
             last_stop_over: None,
             last_place: 0,
+            uniques: HashMap::new(),
             acts: VecDeque::new(),
             heard: (None, None),
             running_since: None,
@@ -107,6 +113,18 @@ impl Truth {
         }
     }
 
+    /// The last order that sets words of this write which only it writes.
+    pub fn order_of(&self, pdu: &RequestPdu) -> Option<usize> {
+        let (table, items) = written(pdu)?;
+        let tails = (0..items.len()).flat_map(|from| (from + 1..=items.len()).map(move |to| from..to));
+        let unique = |range: std::ops::Range<usize>| {
+            let part = items.get(range)?;
+            let words = part.iter().map(|(_, word)| *word).collect();
+            self.uniques.get(&(table, part.first()?.0, words)).copied()
+        };
+        tails.filter_map(unique).max()
+    }
+
     pub fn act(&mut self, at: Instant, pdu: RequestPdu, words: Option<Vec<u16>>) {
         if self.acts.len() == KEPT {
             self.acts.pop_front();
@@ -124,6 +142,16 @@ impl Truth {
                 .rev()
                 .take_while(|(at, ..)| *at >= since)
                 .any(|(_, pdu, words)| which(pdu, words.as_ref()))
+    }
+
+    /// Whether the last write of these registers set just that, however long ago: what is stored is written on change only.
+    pub fn was_set_last(&self, unique: &Unique) -> bool {
+        let (table, address, _) = unique;
+        let touches = |pdu: &RequestPdu| {
+            written(pdu).is_some_and(|(of, items)| of == *table && items.iter().any(|(at, _)| at == address))
+        };
+        let last = self.acts.iter().rev().find(|(_, pdu, _)| touches(pdu));
+        last.is_some_and(|(_, pdu, _)| sets(pdu, unique))
     }
 
     pub fn trouble(&mut self, until: Instant) {

@@ -62,7 +62,7 @@ def put_in(tree, mutants):
     edits = {}
     for mutant in mutants:
         for edit in mutant["edit"]:
-            text = tree[edit["file"]].decode()
+            text = tree.get(edit["file"], b"").decode()
             if text.count(edit["old"]) != 1:
                 sys.exit(f'{mutant["name"]}: stands {text.count(edit["old"])} times in {edit["file"]}: {edit["old"]}')
             begin = text.index(edit["old"])

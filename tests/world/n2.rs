@@ -114,7 +114,8 @@ fn a_drive_that_starts_anew_in_mid_run() {
     let now = rig.bus.sim(rig.now);
     rig.bus.wire.slaves().board(1).unwrap().restart(now);
     rig.until("it is identified again", PATIENCE, |rig| count(rig, ">01F") >= 2);
-    assert_eq!(events.try_recv().unwrap().kind, EventKind::Restarted);
+    let mut reported = || std::iter::from_fn(|| events.try_recv().ok()).any(|e| e.kind == EventKind::Restarted);
+    assert!(reported());
     let before = count(&rig, ">01110203");
     rig.until("values are read again", PATIENCE, |rig| {
         count(rig, ">01110203") > before + 2
@@ -131,7 +132,7 @@ fn a_drive_that_starts_anew_in_mid_run() {
     rig.until("it waits for Identify once more", PATIENCE, |rig| {
         count(rig, ">01F") > identified
     });
-    assert_eq!(events.try_recv().unwrap().kind, EventKind::Restarted);
+    assert!(reported());
 }
 
 #[test]

@@ -21,6 +21,8 @@ pub enum Wish {
     RawBlock(bool),
     Reset,
     Reverse,
+    /// A parameter of the drive, which it stores: the acceleration time (N2).
+    Parameter,
     RawRead,
     /// A speed in the unit that is not the drive's own: Hz of one that knows percent, percent of one that knows Hz.
     Converted,
@@ -41,9 +43,10 @@ impl Wish {
         )
     }
 
-    /// Whether it sets a reference and nothing else, so that a newer one takes its place.
-    pub fn is_reference(self) -> bool {
-        matches!(self, Wish::Reference | Wish::Converted)
+    /// Whether it takes the place of an older one that waits: a reference, or the same parameter.
+    pub fn replaces(self, older: Wish) -> bool {
+        let is_reference = |wish| matches!(wish, Wish::Reference | Wish::Converted);
+        (is_reference(self) && is_reference(older)) || (self == Wish::Parameter && older == self)
     }
 
     /// One that the dice choose.
@@ -60,6 +63,7 @@ impl Wish {
             83..=85 => Wish::RawBlock(false),
             86..=91 => Wish::Reset,
             92..=94 => Wish::Reverse,
+            95..=96 => Wish::Parameter,
             _ => Wish::RawRead,
         }
     }
@@ -190,6 +194,18 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
         }
         Wish::Reset => model(ModelPoint::FaultReset, Value::Bool(true)),
         Wish::Reverse => model(ModelPoint::Reverse, Value::Bool(number % 2 == 0)),
+        Wish::Parameter => {
+            let named = profile.point_index("acceleration_time");
+            let index = named.filter(|_| profile.name.ends_with("n2"))?;
+            let raw = profile.points[index].raw()?;
+            // 1 to 20.99 s.
+            let value = Value::Number((100 + number % 2_000) as f64 / 100.0);
+            let words = raw.encode(value, 0).ok()?;
+            Some((
+                Order::Points(vec![(index, value)]),
+                Some((raw.table, raw.address, words)),
+            ))
+        }
         Wish::Converted => {
             let point = if converts_hertz(profile) {
                 ModelPoint::FrequencyReference

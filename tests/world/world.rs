@@ -27,7 +27,7 @@ use tokio::sync::broadcast;
 use tokio::sync::oneshot;
 
 use super::bus::{Asked, Parts, Seen, WorldBus};
-use super::clients::{Client, Servers, Way, answers, write_frame};
+use super::clients::{Client, Servers, Waiting, Way, address, answers, write_frame};
 use super::drives::{AFTERMATH, Truth};
 use super::history::History;
 use super::orders::{Record, Unique, Wish, converted, order_of, percent_reference, run_command, sets};
@@ -106,6 +106,8 @@ pub struct World {
     /// Drives that are off until then.
     off: Vec<(usize, u8, Instant)>,
     history: History,
+    /// Writes that were answered when answers were last looked for.
+    answered: u64,
     figures: Figures,
     stopping: bool,
 }
@@ -161,6 +163,7 @@ impl World {
             open: BTreeMap::new(),
             off: Vec::new(),
             history: History::default(),
+            answered: 0,
             figures: Figures::default(),
             stopping: false,
             scenario,
@@ -203,20 +206,21 @@ impl World {
 
     /// The next thing that happens anywhere.
     fn step(&mut self) {
-        let buses = self.buses.iter().map(WorldBus::wake_at);
+        let wakes: Vec<Instant> = self.buses.iter().map(WorldBus::wake_at).collect();
         let clients = self.clients.iter().filter(|_| !self.stopping).map(|client| client.next);
         let others = [self.next_incident, self.next_reload, Some(self.next_look)];
         let off = self.off.iter().map(|(_, _, until)| *until);
         let others = others.into_iter().chain(self.away.iter().copied()).flatten();
+        let buses = wakes.iter().copied();
         let next = buses.chain(clients).chain(others).chain(off).min().unwrap();
         assert!(next >= self.now.min(next), "time runs backwards");
         self.now = self.now.max(next);
-        for index in 0..self.buses.len() {
-            if self.buses[index].wake_at() <= self.now {
+        for (index, wake) in wakes.into_iter().enumerate() {
+            if wake <= self.now {
                 self.step_bus(index);
             }
         }
-        self.collect();
+        self.collect_news();
         if !self.stopping {
             for index in 0..self.clients.len() {
                 if self.clients[index].next <= self.now {

@@ -11,7 +11,7 @@ use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Outcome, Urgency, written};
-use crate::drive::PlannedRead;
+use crate::drive::{PlannedRead, Point, Raw};
 
 /// First wait before a stop is tried again at a drive that did not answer one.
 const STOP_AGAIN: Duration = Duration::from_millis(500);
@@ -187,9 +187,11 @@ impl Master {
         drive.late.answered(&pdu, now);
         drive.was_read = true;
         let Some(words) = reply.words() else { return };
-        for (address, word) in (read.start..).zip(&words) {
-            let commanded = |p: &crate::drive::Point| p.write && p.raw().is_some_and(|r| r.covers(read.table, address));
-            if image.spec.profile.points.iter().any(commanded) {
+        let written = image.spec.profile.points.iter().filter(|point| point.write);
+        let commanded = written.filter_map(Point::raw).filter(|raw| raw.table == read.table);
+        for address in commanded.flat_map(Raw::addresses) {
+            let place = address.checked_sub(read.start).map(usize::from);
+            if let Some(word) = place.and_then(|place| words.get(place)) {
                 drive.words.learn(read.table, address, *word);
             }
         }
@@ -286,7 +288,7 @@ impl Master {
     /// What was written is read back soon.
     fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
         if let Some((table, items)) = written(&step.pdu) {
-            let covers = |read: &crate::drive::PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
+            let covers = |read: &PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
             self.schedule.refresh(index, covers, now);
         }
     }

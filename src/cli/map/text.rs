@@ -6,6 +6,7 @@ use comfy_table::{Table as TextTable, presets};
 
 use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
+use crate::cli::printable;
 use crate::codec::Table;
 use crate::drive::Profile;
 use crate::north::register_map::GATEWAY_UNIT;
@@ -38,7 +39,7 @@ pub(super) fn render(map: &Map<'_>) -> String {
             out,
             "\nProfile {} ({}), units {}\n",
             profile.name,
-            profile.title,
+            printable::line(&profile.title),
             units.join(", ")
         );
         // What a unit of this profile can have; the table above shows which units can be written.
@@ -96,7 +97,7 @@ fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
     table
         .load_preset(presets::NOTHING)
         .set_header(header.iter().map(|h| h.replace('_', " ")));
-    table.add_rows(rows);
+    table.add_rows(rows.map(|row| row.into_iter().map(|cell| printable::line(&cell))));
     let mut out: String = table.trim_fmt();
     out.push('\n');
     out

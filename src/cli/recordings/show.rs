@@ -2,10 +2,9 @@
 
 use std::fmt::Write as _;
 
-use comfy_table::CellAlignment;
 use serde_json::Value as Json;
 
-use crate::cli::report;
+use crate::cli::{printable, report};
 use crate::history::Recording;
 use crate::process_image::Verdict;
 
@@ -88,7 +87,7 @@ fn timeline(recording: &Recording) -> String {
     lines.sort_by(|a, b| a.0.total_cmp(&b.0));
     let text: String = lines
         .into_iter()
-        .map(|(t, line)| format!("{t:+10.3} s  {}\n", plain(&line)))
+        .map(|(t, line)| format!("{t:+10.3} s  {}\n", printable::line(&line)))
         .collect();
     if text.is_empty() { text } else { text + "\n" }
 }
@@ -114,7 +113,6 @@ fn samples(recording: &Recording) -> String {
     let of_read: Vec<_> = recording.samples.iter().filter(|sample| sample.read == read).collect();
     let after = of_read.partition_point(|sample| sample.t < 0.0);
     let from = after.saturating_sub(SHOWN.0);
-    let mut table = report::table(["t, s"]);
     let title = |place: usize| {
         let column = header.points.get(place);
         column.map_or(String::new(), |column| match column.unit.as_str() {
@@ -122,7 +120,8 @@ fn samples(recording: &Recording) -> String {
             unit => format!("{}, {unit}", column.name),
         })
     };
-    table.set_header(std::iter::once("t, s".to_string()).chain(columns.iter().map(|(_, place)| title(*place))));
+    let titles = columns.iter().map(|(_, place)| title(*place));
+    let mut table = report::table(std::iter::once("t, s".to_string()).chain(titles));
     for sample in of_read.iter().skip(from).take(SHOWN.0 + SHOWN.1) {
         let value = |at: usize| match sample.values.get(at) {
             None | Some(Json::Null) => "-".to_string(),
@@ -130,13 +129,6 @@ fn samples(recording: &Recording) -> String {
         };
         table.add_row(std::iter::once(format!("{:+.3}", sample.t)).chain(columns.iter().map(|(at, _)| value(*at))));
     }
-    for column in table.column_iter_mut() {
-        column.set_cell_alignment(CellAlignment::Right);
-    }
+    (0..=columns.len()).for_each(|column| table.align_right(column));
     report::lines(&table)
-}
-
-/// Replaces control characters, which could command a terminal.
-fn plain(text: &str) -> String {
-    text.chars().map(|c| if c.is_control() { '?' } else { c }).collect()
 }

@@ -6,6 +6,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use crate::cli::printable;
+
 /// Characters of the bar.
 const BAR: usize = 24;
 /// Shortest interval between updates of a terminal.
@@ -71,7 +73,7 @@ impl Progress {
     pub(super) fn print_line(&mut self, text: &str) {
         let clear = if self.live { "\r\x1b[K" } else { "" };
         // With stderr gone there is nowhere left to report that.
-        let _ = writeln!(std::io::stderr().lock(), "{clear}{text}");
+        let _ = writeln!(std::io::stderr().lock(), "{clear}{}", printable::line(text));
         self.shown = None;
     }
 
@@ -87,6 +89,7 @@ impl Progress {
 
     fn print(&self, text: &str) {
         let mut stderr = std::io::stderr().lock();
+        let text = printable::line(text);
         let _ = if self.live {
             write!(stderr, "\r\x1b[K{text}").and_then(|()| stderr.flush())
         } else {

@@ -228,6 +228,17 @@ fn clients_take_turns_and_each_keeps_its_order() {
 }
 
 #[test]
+fn a_flood_on_one_drive_takes_no_places_of_another() {
+    let mut bench = Bench::new();
+    let mut flood: Vec<_> = (0..CAPACITY).map(|i| bench.push_from("a", 1, &[i])).collect();
+    let mut other: Vec<_> = (0..CAPACITY).map(|i| bench.push_from("a", 2, &[i])).collect();
+    let refused = |many: &mut Vec<Receiver<Answer>>| many.iter_mut().filter_map(outcome).count();
+    assert_eq!((refused(&mut flood), refused(&mut other)), (CAPACITY / 2, CAPACITY / 2));
+    assert!(outcome(&mut flood[0]).is_none() && outcome(&mut other[0]).is_none());
+    assert_eq!(bench.pending.len(), CAPACITY);
+}
+
+#[test]
 fn within_a_client_its_drives_take_turns() {
     let mut bench = Bench::new();
     let _many: Vec<_> = (0..3).map(|i| bench.push_from("a", 1, &[i])).collect();

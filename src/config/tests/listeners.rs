@@ -15,12 +15,15 @@ pub(super) fn certificates() -> &'static Path {
             certificate(dir.path(), arguments, "29");
         }
         certificate(dir.path(), &["server", "expired"], "-1");
+        certificate(dir.path(), &["crl"], "30");
+        std::fs::write(dir.path().join("tokens"), "").unwrap();
         dir
     });
     DIR.path()
 }
 
-fn certificate(dir: &Path, arguments: &[&str], days: &str) {
+/// Runs the script of the documentation.
+pub(super) fn certificate(dir: &Path, arguments: &[&str], days: &str) {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("docs/modbus-tls-ca.sh");
     let output = std::process::Command::new(script)
         .arg(dir)
@@ -145,7 +148,7 @@ fn errors_of_certificates_name_file_and_key() {
     let dir = certificates();
     let shown = dir.display();
     let of = |from: &str, to: &str| {
-        let (loaded, _) = load(&FULL.replace(&format!("{shown}/{from}\""), &format!("{to}\"")));
+        let (loaded, _) = load(&FULL.replacen(&format!("{shown}/{from}\""), &format!("{to}\""), 1));
         assert!(loaded.settings.is_none());
         loaded
             .errors
@@ -179,7 +182,6 @@ fn errors_of_certificates_name_file_and_key() {
             "gateway.crt contains no private key",
         ),
         ("ca.crt", file(""), "modbus_tcp.tls.client_ca; "),
-        ("gateway.crt", file("expired.crt"), "expired on "),
     ] {
         let found = of(from, &to);
         assert!(found.contains(wanted), "{wanted}\nis not in\n{found}");
@@ -187,10 +189,30 @@ fn errors_of_certificates_name_file_and_key() {
     }
 }
 
+/// The drives must be polled after a restart too, whatever became of a certificate.
+#[test]
+fn an_expired_certificate_is_a_warning() {
+    let dir = certificates().display();
+    let source = FULL
+        .replace(&format!("{dir}/gateway.crt"), &format!("{dir}/expired.crt"))
+        .replace(&format!("{dir}/gateway.key"), &format!("{dir}/expired.key"));
+    let (loaded, _) = load(&source);
+    assert_eq!(loaded.errors, []);
+    let expired: Vec<&str> = loaded
+        .warnings
+        .iter()
+        .filter(|warning| warning.finding.what.contains("expired.crt expired on "))
+        .map(|warning| warning.key.as_str())
+        .collect();
+    assert_eq!(expired, ["modbus_tcp.tls.certificate", "http.certificate"]);
+}
+
 #[test]
 fn new_certificates_in_the_same_files_are_seen() {
     let dir = tempfile::tempdir().unwrap();
     certificate(dir.path(), &["ca"], "30");
+    certificate(dir.path(), &["crl"], "30");
+    std::fs::write(dir.path().join("tokens"), "").unwrap();
     let source = FORM.replace("DIR", &dir.path().display().to_string());
     let renewed = || {
         let _ = std::fs::remove_file(dir.path().join("gateway.key"));
@@ -199,11 +221,10 @@ fn new_certificates_in_the_same_files_are_seen() {
         settings(&source).modbus_tcp.unwrap()
     };
     let (one, two) = (renewed(), renewed());
-    assert!(two.differs_in_certificates_only(&one));
-    assert!(!one.differs_in_certificates_only(&one.clone()));
-    let mut other = two.clone();
-    other.max_connections += 1;
-    assert!(!other.differs_in_certificates_only(&one));
+    assert_ne!(one, two);
+    let mut with_old_certificates = two.clone();
+    with_old_certificates.tls = one.tls.clone();
+    assert_eq!(with_old_certificates, one, "nothing else differs");
     let debug = format!("{one:?}");
     let key = std::fs::read_to_string(dir.path().join("gateway.key")).unwrap();
     assert!(
@@ -217,4 +238,44 @@ fn new_certificates_in_the_same_files_are_seen() {
         "{:?}",
         loaded.warnings
     );
+}
+
+#[test]
+fn shares_that_are_probably_too_small() {
+    let warnings = |modbus_tcp: &str| {
+        let (loaded, _) = load(&format!("[gateway]\nname = \"g\"\n[modbus_tcp]\n{modbus_tcp}\n"));
+        let shares = loaded.warnings.iter().map(|warning| warning.finding.what.clone());
+        shares.filter(|what| what.contains("share")).collect::<Vec<_>>()
+    };
+    for quiet in [
+        "",
+        "allow = [\"10.0.0.5\"]",
+        "allow = [\"192.168.0.0/16\", \"fd00::/8\"]\nmax_connections = 1000",
+        "allow = [\"10.0.0.5\", \"10.0.0.6\"]\nmax_connections = 32",
+        "allow = [\"203.0.113.7\"]\nmax_connections = 16",
+        "allow = [\"0.0.0.0/0\"]\nmax_connections_per_address = 64",
+    ] {
+        assert_eq!(warnings(quiet), Vec::<String>::new(), "{quiet}");
+    }
+    for (modbus_tcp, wanted) in [
+        (
+            "max_connections = 100",
+            "at most 32 connections are possible, 16 for each address in `allow`",
+        ),
+        (
+            "allow = [\"10.0.0.5\"]\nmax_connections = 17",
+            "at most 16 connections are possible",
+        ),
+        (
+            "allow = [\"10.0.0.0/8\", \"0.0.0.0/0\"]",
+            "clients in 0.0.0.0/0 can come through a NAT",
+        ),
+        (
+            "allow = [\"2001:db8::/32\"]",
+            "share its address and the 16 connections",
+        ),
+    ] {
+        let found = warnings(modbus_tcp);
+        assert!(found.len() == 1 && found[0].contains(wanted), "{modbus_tcp}: {found:?}");
+    }
 }

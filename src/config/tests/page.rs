@@ -14,9 +14,11 @@ fn with_tables(page: &str) -> String {
         ("[[modbus_tcp.listener]]", "Listener"),
         ("[modbus_tcp.tls]", "Tls"),
         ("[mqtt]", "Mqtt"),
+        ("[mqtt.qos]", "MqttQos"),
         ("[mqtt.publish]", "Publish"),
         ("[mqtt.buffer]", "Buffer"),
         ("[http]", "Http"),
+        ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),
         ("[log]", "Log"),
     ];

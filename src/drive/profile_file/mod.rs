@@ -1,4 +1,5 @@
-//! Profile files: TOML to a validated [`Profile`], every error with its line.
+//! Profile files: TOML to a validated [`Profile`], every error with its line. `BUILT_IN` lists the profiles that are
+//! part of the program.
 
 mod base;
 mod derived;

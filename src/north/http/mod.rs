@@ -3,36 +3,70 @@
 //! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
 //! The cancellation ends everything, including open event streams.
 
+mod access;
 mod api;
+mod hosts;
+mod in_use;
+mod offline;
 mod page;
 mod routes;
 mod streams;
+mod terms;
+mod tokens;
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use arc_swap::ArcSwap;
 use axum::Router;
+use hyper::body::Incoming;
 use hyper::server::conn::http1;
+use hyper::service::{Service, service_fn};
 use hyper_util::rt::{TokioIo, TokioTimer};
 use hyper_util::service::TowerToHyperService;
+use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio::runtime::Handle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached};
-use super::listener::{AcceptLoop, ConnectionHandler, bind};
+use self::hosts::Host;
+use self::in_use::InUse;
+use self::routes::Reached;
+use self::terms::{Terms, Tls};
+use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
+use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
-use super::{NorthStats, ServerError};
+use super::refusals::Refusals;
+use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
+use crate::command::Authority;
 use crate::plant::{DriveHandle, SharedPlant};
 
-/// Maximum number of open connections; further clients get 503.
+pub use self::offline::Offline;
+pub use self::tokens::{Scope, Token, TokenError, Tokens};
+
+/// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
+/// a newer one.
 pub const MAX_CONNECTIONS: usize = 128;
 
 /// Maximum number of open event streams; each occupies a connection for a long time.
 pub const MAX_LISTENERS: usize = 32;
+
+/// Maximum number of open event streams of one address.
+pub const MAX_LISTENERS_PER_ADDRESS: usize = 16;
+
+/// Connections beyond the limits, which are served `/healthz` and `/readyz` only: whatever the others do, these two answer.
+const HEALTH: Limits = Limits {
+    total: 8,
+    reserved: 0,
+    per_address: 4,
+};
+
+/// Time limit for the head of a request on such a connection.
+const HEALTH_HEAD_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// Time limit for the head of a request, from the connection or from the previous reply on. It bounds slow senders and
 /// idle connections.
@@ -44,6 +78,9 @@ const MAX_HEAD: usize = 16 * 1024;
 /// Time after which a client that acknowledges nothing or accepts no bytes is disconnected.
 const USER_TIMEOUT: Duration = Duration::from_secs(30);
 
+/// Time limit of a TLS handshake.
+const HANDSHAKE: Duration = Duration::from_secs(10);
+
 /// Time for pending replies when the gateway stops.
 const GRACE: Duration = Duration::from_millis(500);
 
@@ -52,19 +89,110 @@ const GRACE: Duration = Duration::from_millis(500);
 pub struct Options {
     /// Address to listen on.
     pub listen: SocketAddr,
+    /// Names and addresses that it answers under, besides its own and those of the loopback.
+    pub hosts: Vec<String>,
+    /// Who may read what; `None`: everybody everything.
+    pub tokens: Option<Tokens>,
+    /// Certificate and key; `None`: without TLS.
+    pub identity: Option<ServerIdentity>,
+    /// Maximum number of open connections: [`MAX_CONNECTIONS`], or fewer where the system allows fewer open files.
+    pub max_connections: usize,
+}
+
+impl Options {
+    /// Listens on that address, open to everybody, without TLS.
+    pub fn at(listen: SocketAddr) -> Options {
+        Options {
+            listen,
+            hosts: Vec::new(),
+            tokens: None,
+            identity: None,
+            max_connections: MAX_CONNECTIONS,
+        }
+    }
+
+    /// Files that the connections can have open at one time, with those that are being closed.
+    pub(crate) fn files(&self) -> usize {
+        self.limits().files() + HEALTH.files()
+    }
+
+    /// Half of the connections can be those of one address.
+    fn limits(&self) -> Limits {
+        Limits::new(self.max_connections, self.max_connections.div_ceil(2))
+    }
+}
+
+/// Whether `text` can stand in [`Options::hosts`]: a host name or an address, without a port.
+pub fn is_host(text: &str) -> bool {
+    Host::configured(text).is_some()
 }
 
 /// The running server.
 #[derive(Debug)]
 pub struct Http {
-    address: SocketAddr,
+    listeners: Listeners<HttpConnections>,
+    terms: Arc<ArcSwap<Terms>>,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
     tasks: TaskTracker,
+}
+
+/// What [`Http::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: NewSockets,
+    terms: Terms,
 }
 
 impl Http {
     /// The address it listens on, with the port that the system chose if port 0 was configured.
-    pub fn address(&self) -> SocketAddr {
-        self.address
+    pub fn address(&self) -> Option<SocketAddr> {
+        let [plain, tls] = [false, true].map(|tls| self.listeners.addresses(tls));
+        plain.into_iter().chain(tls).next()
+    }
+
+    /// Prepares other options: binds a new address and checks new certificates. Nothing changes for any client.
+    ///
+    /// # Errors
+    /// The address cannot be bound, or the certificates cannot be used; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let terms = Terms::new(&options)?;
+        let spec = ListenerSpec {
+            address: options.listen,
+            tls: options.identity.is_some(),
+            section: "[http]".to_string(),
+        };
+        Ok(Change {
+            sockets: self.listeners.prepare(vec![spec]).await?,
+            terms,
+            options,
+        })
+    }
+
+    /// Forgets prepared options.
+    pub fn abort(&mut self, change: Change) {
+        self.listeners.abort(change.sockets);
+    }
+
+    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another; new
+    /// certificates are for new connections.
+    pub fn commit(&mut self, change: Change) {
+        let Change {
+            options,
+            sockets,
+            terms,
+        } = change;
+        terms.replace(&self.terms);
+        let (plant, stats, terms) = (&self.plant, &self.stats, &self.terms);
+        self.listeners.commit(sockets, |_, open, cancel| {
+            let handler = match open {
+                Some(handler) => handler.clone(),
+                None => Arc::new(HttpConnections::new(&options, plant, stats, terms, cancel)),
+            };
+            handler.limit.set_limits(options.limits());
+            (handler, Handle::current())
+        });
     }
 
     /// Waits until the server has stopped: at most half a second after the token was cancelled.
@@ -76,7 +204,7 @@ impl Http {
 /// Starts the server. It runs until `cancel`.
 ///
 /// # Errors
-/// The address cannot be bound.
+/// The address cannot be bound, or the certificates cannot be used.
 pub async fn start(
     options: Options,
     plant: SharedPlant,
@@ -84,73 +212,192 @@ pub async fn start(
     cancel: CancellationToken,
 ) -> Result<Http, ServerError> {
     let tasks = TaskTracker::new();
-    let mut address = options.listen;
-    for (socket, bound) in bind(&[options.listen], "HTTP", "[http]").await? {
-        address = bound;
-        tracing::info!(target: "drivegate::http", %address, "HTTP: listening");
-        let accept = AcceptLoop {
-            protocol: "HTTP",
-            handler: Arc::new(HttpConnections {
-                router: routes::router(plant.clone(), stats.clone(), cancel.clone()),
-                cancel: cancel.clone(),
-                log: LogThrottle::default(),
-            }),
-            limit: ConnectionLimit::new(MAX_CONNECTIONS, None),
-            tasks: tasks.clone(),
-            cancel: cancel.clone(),
-        };
-        tasks.spawn(accept.run(socket));
-    }
+    // A reload can replace the listener, so the server ends with the token and not with its last task.
+    tasks.spawn(cancel.clone().cancelled_owned());
     tasks.close();
-    Ok(Http { address, tasks })
+    let mut http = Http {
+        listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel),
+        terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
+        plant,
+        stats,
+        tasks,
+    };
+    let change = http.prepare(options).await?;
+    http.commit(change);
+    Ok(http)
 }
 
-/// Serves the connections of the HTTP server.
+/// Serves the connections of a listener.
+#[derive(Debug)]
 struct HttpConnections {
     router: Router,
+    terms: Arc<ArcSwap<Terms>>,
+    limit: Arc<ConnectionLimit>,
+    health: Arc<ConnectionLimit>,
+    refusals: Refusals,
+    /// Limits the log of requests without access.
+    no_access: Arc<LogThrottle>,
     cancel: CancellationToken,
-    log: LogThrottle,
+}
+
+/// The place of a connection, and what it is for.
+struct HttpPermit {
+    permit: ConnectionPermit,
+    coverage: Coverage,
+}
+
+/// What a connection is served.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Coverage {
+    Everything,
+    /// `/healthz` and `/readyz`; the rest is refused with 503.
+    Health,
+}
+
+impl Coverage {
+    /// Time limit for the head of a request.
+    fn head_timeout(self) -> Duration {
+        match self {
+            Coverage::Everything => HEAD_TIMEOUT,
+            Coverage::Health => HEALTH_HEAD_TIMEOUT,
+        }
+    }
+}
+
+impl HttpConnections {
+    fn new(
+        options: &Options,
+        plant: &SharedPlant,
+        stats: &Arc<NorthStats>,
+        terms: &Arc<ArcSwap<Terms>>,
+        cancel: &CancellationToken,
+    ) -> HttpConnections {
+        HttpConnections {
+            router: routes::router(plant.clone(), stats.clone(), cancel.clone()),
+            terms: terms.clone(),
+            limit: ConnectionLimit::new(options.limits()),
+            health: ConnectionLimit::new(HEALTH),
+            refusals: Refusals::new(ServerKind::Http, stats.clone()),
+            no_access: Arc::default(),
+            cancel: cancel.clone(),
+        }
+    }
 }
 
 impl ConnectionHandler for HttpConnections {
-    fn admits(&self, _: IpAddr) -> bool {
-        true
+    type Permit = HttpPermit;
+
+    fn admit(&self, address: IpAddr) -> Option<HttpPermit> {
+        let newcomer = Newcomer {
+            address,
+            listener: 0,
+            cancel: &self.cancel,
+        };
+        let (limits, now) = (
+            [(&self.limit, Coverage::Everything), (&self.health, Coverage::Health)],
+            Instant::now(),
+        );
+        limits.into_iter().find_map(|(limit, coverage)| {
+            let permit = self
+                .refusals
+                .acquire(limit, newcomer, remedy, || Some(Authority::ReadOnly))?;
+            permit.place().use_at(now, false);
+            Some(HttpPermit { permit, coverage })
+        })
     }
 
-    /// Replies 503; what does not fit the socket's buffer at once is discarded.
-    fn refuse(&self, stream: &TcpStream, peer: SocketAddr, _: LimitReached) {
-        const REPLY: &[u8] =
-            b"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nRetry-After: 5\r\nContent-Length: 0\r\n\r\n";
-        let _ = stream.try_write(REPLY);
-        if let Some(suppressed) = self.log.permit(Instant::now()) {
-            tracing::warn!(target: "drivegate::http", %peer, suppressed,
-                "HTTP: client refused: {MAX_CONNECTIONS} connections are open");
+    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, place: HttpPermit) {
+        set_socket_options(&stream);
+        let terms = self.terms.load_full();
+        // Without an own address the client is gone.
+        let Ok(local) = stream.local_addr() else { return };
+        let local = local.ip();
+        let Some(Tls(acceptor)) = &terms.tls else {
+            return self.serve_requests(stream, peer, local, &terms, &place).await;
+        };
+        let handshake = timeout(HANDSHAKE.min(place.coverage.head_timeout()), acceptor.accept(stream));
+        let closing = place.permit.place().closing();
+        match closing.run_until_cancelled(handshake).await {
+            Some(Ok(Ok(stream))) => self.serve_requests(stream, peer, local, &terms, &place).await,
+            Some(Ok(Err(error))) => {
+                tracing::debug!(target: "drivegate::http", %peer, "HTTP: TLS handshake failed: {error}");
+            }
+            Some(Err(_)) | None => {}
         }
     }
+}
 
-    /// After the cancellation a connection has [`GRACE`] to finish its reply.
-    async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
-        set_socket_options(&stream);
-        let service = TowerToHyperService::new(self.router.clone());
+impl HttpConnections {
+    /// Answers the requests of a client that connected to the address `local` of this machine. After the cancellation,
+    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply.
+    async fn serve_requests(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Unpin,
+        peer: SocketAddr,
+        local: IpAddr,
+        terms: &Terms,
+        permit: &HttpPermit,
+    ) {
+        let (place, coverage) = (permit.permit.place(), permit.coverage);
+        let reached = Reached {
+            address: local,
+            peer,
+            refusals: self.no_access.clone(),
+            access: terms.access.clone(),
+        };
+        let client = routes::Client {
+            address: peer.ip(),
+            coverage,
+        };
+        let router = TowerToHyperService::new(self.router.clone());
+        let service = service_fn(|mut request: hyper::Request<Incoming>| {
+            let in_use = InUse::new(place.clone());
+            request.extensions_mut().insert(client);
+            request.extensions_mut().insert(reached.clone());
+            let reply = router.call(request);
+            async move {
+                // Other clients have a turn between two pipelined requests.
+                tokio::task::yield_now().await;
+                reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body)))
+            }
+        });
         let mut connection = pin!(
             http1::Builder::new()
                 .timer(TokioTimer::new())
-                .header_read_timeout(HEAD_TIMEOUT)
+                .header_read_timeout(coverage.head_timeout())
+                .keep_alive(coverage == Coverage::Everything)
                 .max_buf_size(MAX_HEAD)
                 .serve_connection(TokioIo::new(stream), service)
         );
-        let ended = match self.cancel.run_until_cancelled(connection.as_mut()).await {
-            Some(ended) => ended,
-            None => {
-                connection.as_mut().graceful_shutdown();
-                timeout(GRACE, connection).await.unwrap_or(Ok(()))
+        let ended = tokio::select! {
+            ended = connection.as_mut() => ended,
+            () = ended(place.closing(), &terms.replaced) => match place.is_in_use() {
+                true => {
+                    connection.as_mut().graceful_shutdown();
+                    timeout(GRACE, connection).await.unwrap_or(Ok(()))
+                }
+                // There is no reply to finish.
+                false => Ok(()),
             }
         };
         // Clients that disconnect or send invalid data are normal operation.
         if let Err(error) = ended {
             tracing::debug!(target: "drivegate::http", %peer, "HTTP connection ended: {error}");
         }
-        drop(permit);
+    }
+}
+
+async fn ended(server: &CancellationToken, terms: &CancellationToken) {
+    tokio::select! {
+        () = server.cancelled() => {}
+        () = terms.cancelled() => {}
+    }
+}
+
+fn remedy(reached: LimitReached) -> String {
+    match reached {
+        LimitReached::Total(_) => "close unused connections".to_string(),
+        LimitReached::Address(_) => "close unused connections of this address".to_string(),
     }
 }
 

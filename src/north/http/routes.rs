@@ -1,6 +1,7 @@
 //! The routes of the HTTP server.
 
 use std::fmt::Write as _;
+use std::net::{IpAddr, SocketAddr};
 use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
@@ -12,11 +13,14 @@ use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
 use axum::routing::get;
 use axum::{Json, response};
-use tokio::sync::Semaphore;
+use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::{MAX_LISTENERS, api, page, streams};
+use super::access::Access;
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
 use crate::history::export;
+use crate::north::connection_limit::{ConnectionLimit, Limits};
+use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics};
 use crate::plant::{Plant, SharedPlant};
 
@@ -26,10 +30,38 @@ pub(super) struct AppState {
     pub(super) plant: SharedPlant,
     pub(super) stats: Arc<NorthStats>,
     pub(super) cancel: CancellationToken,
-    /// Permits for event streams.
-    pub(super) listeners: Arc<Semaphore>,
-    /// The permit for reading a recording.
-    pub(super) files: Semaphore,
+    /// Open event streams.
+    pub(super) listeners: Arc<ConnectionLimit>,
+    /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
+    /// and `/healthz` does not wait for it.
+    rendering: Semaphore,
+    /// The permit for reading a recording: what waits for the disk holds up nothing else.
+    files: Semaphore,
+}
+
+impl AppState {
+    /// A turn to render a large reply.
+    async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+        self.rendering.acquire().await.ok()
+    }
+}
+
+/// Who asks.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Client {
+    pub(super) address: IpAddr,
+    pub(super) coverage: Coverage,
+}
+
+/// How a request came, as an extension of it.
+#[derive(Debug, Clone)]
+pub(super) struct Reached {
+    /// The address of this machine that the client connected to.
+    pub(super) address: IpAddr,
+    pub(super) peer: SocketAddr,
+    pub(super) access: Arc<Access>,
+    /// Limits the log of refused requests.
+    pub(super) refusals: Arc<LogThrottle>,
 }
 
 /// All routes.
@@ -38,7 +70,8 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         plant,
         stats,
         cancel,
-        listeners: Arc::new(Semaphore::new(MAX_LISTENERS)),
+        listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
+        rendering: Semaphore::new(1),
         files: Semaphore::new(1),
     });
     Router::new()
@@ -68,9 +101,17 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .layer(middleware::from_fn(guard))
 }
 
-/// Refuses all methods that could change something and sets the common headers of all replies.
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
+/// sets the common headers of all replies.
 async fn guard(request: Request, next: Next) -> Response {
-    let mut response = if matches!(*request.method(), Method::GET | Method::HEAD) {
+    let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
+    let is_health = ["/healthz", "/readyz"].contains(&request.uri().path());
+    let mut response = if let Some(refusal) = refused(&request) {
+        refusal
+    } else if coverage == Some(Coverage::Health) && !is_health {
+        let text = "too many connections are open; close some and try again\n";
+        (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
+    } else if matches!(*request.method(), Method::GET | Method::HEAD) {
         next.run(request).await
     } else {
         let text = "this interface is read only: use GET or HEAD\n";
@@ -88,7 +129,23 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
+/// The reply to a request that is not answered, because of its host or its token.
+fn refused(request: &Request) -> Option<Response> {
+    let Some(reached) = request.extensions().get::<Reached>() else {
+        // The server adds it to every request.
+        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
+    };
+    let admitted = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = admitted.err()?;
+    if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
+        let peer = reached.peer;
+        tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
+    }
+    Some(refusal.into_response())
+}
+
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
+    let _turn = app.turn().await;
     let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
     (policy, Html(page::render(&app.plant.load(), Instant::now())))
 }
@@ -98,6 +155,7 @@ async fn asset(content_type: &'static str, body: &'static str) -> impl IntoRespo
 }
 
 async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+    let _turn = app.turn().await;
     let accept: Vec<&str> = headers
         .get_all(header::ACCEPT)
         .iter()
@@ -117,7 +175,8 @@ async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Res
 }
 
 async fn ready(State(app): State<Arc<AppState>>) -> Response {
-    let reasons = unready(&app.plant.load());
+    let mut reasons = unready(&app.plant.load());
+    reasons.extend(app.stats.lost_listeners.reasons());
     if reasons.is_empty() {
         return "ready\n".into_response();
     }
@@ -151,6 +210,7 @@ fn unready(plant: &Plant) -> Vec<String> {
 }
 
 async fn drives(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
@@ -180,12 +240,14 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
 
 /// The last commands, newest last.
 async fn audit(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
     let records = app.plant.load().writes.audit().recent();
     Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
 /// The recordings, oldest first.
 async fn recordings(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
     let entries = app.plant.load().recordings.list();
     Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }

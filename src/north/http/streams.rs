@@ -6,24 +6,26 @@
 use std::convert::Infallible;
 use std::fmt::Write as _;
 use std::sync::{Arc, OnceLock};
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use axum::Json;
-use axum::extract::{RawQuery, State};
+use axum::extract::{Extension, RawQuery, State};
 use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::sse::{Event as Message, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::{Stream, StreamExt, stream};
 use percent_encoding::percent_decode_str;
 use serde::Serialize;
-use tokio::sync::{OwnedSemaphorePermit, broadcast};
+use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
-use super::routes::{AppState, not_found};
-use super::{MAX_LISTENERS, api};
+use super::api;
+use super::routes::{AppState, Client, not_found};
 use crate::codec::{Protocol, describe};
+use crate::command::Authority;
 use crate::event::Event;
+use crate::north::connection_limit::{ConnectionPermit, LimitReached, Newcomer, NoPlace};
 use crate::process_image::{Direction, FrameRecord};
 
 /// Time after which a browser reconnects.
@@ -36,7 +38,11 @@ const LAST_EVENT_ID: HeaderName = HeaderName::from_static("last-event-id");
 
 /// `GET /api/v1/events`: the recent events that the client has not received yet, then each new one. A client that
 /// accepts JSON only gets the recent events without a stream.
-pub(super) async fn events(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
+pub(super) async fn events(
+    State(app): State<Arc<AppState>>,
+    Extension(client): Extension<Client>,
+    headers: HeaderMap,
+) -> Response {
     let plant = app.plant.load();
     // Subscribed before the recent events are read: an event in between is in both and is sent once.
     let live = plant.events.subscribe();
@@ -55,16 +61,21 @@ pub(super) async fn events(State(app): State<Arc<AppState>>, headers: HeaderMap)
         };
         return ([(header::VARY, "accept")], Json(kept)).into_response();
     }
-    let Some(permit) = stream_permit(&app) else {
-        return full();
+    let permit = match stream_permit(&app, client) {
+        Ok(permit) => permit,
+        Err(refused) => return full(&refused),
     };
     let kept: Vec<Message> = kept.iter().map(|event| event_message(event)).collect();
     let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
-    respond(stream::iter(kept).chain(live), &app, permit)
+    respond(stream::iter(kept).chain(live), permit)
 }
 
 /// `GET /api/v1/trace?bus=`: the frames of one bus, or of all, from now on.
-pub(super) async fn trace(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+pub(super) async fn trace(
+    State(app): State<Arc<AppState>>,
+    Extension(client): Extension<Client>,
+    RawQuery(query): RawQuery,
+) -> Response {
     let wanted = match query.as_deref().map(bus_of) {
         None | Some(Ok(None)) => None,
         Some(Ok(Some(name))) => Some(name),
@@ -93,19 +104,37 @@ pub(super) async fn trace(State(app): State<Arc<AppState>>, RawQuery(query): Raw
         let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
         return not_found(format!("there is no bus `{name}`"), known.collect());
     }
-    match stream_permit(&app) {
-        Some(permit) => respond(stream::select_all(streams), &app, permit),
-        None => full(),
+    match stream_permit(&app, client) {
+        Ok(permit) => respond(stream::select_all(streams), permit),
+        Err(refused) => full(&refused),
     }
 }
 
-fn stream_permit(app: &AppState) -> Option<OwnedSemaphorePermit> {
-    app.listeners.clone().try_acquire_owned().ok()
+/// A place for an event stream, or why there is none. The address with the most streams gives one up to an address
+/// that has fewer.
+fn stream_permit(app: &AppState, client: Client) -> Result<ConnectionPermit, String> {
+    let newcomer = Newcomer {
+        address: client.address,
+        listener: 0,
+        cancel: &app.cancel,
+    };
+    let now = Instant::now();
+    match app.listeners.acquire(newcomer, now, || Some(Authority::ReadOnly)) {
+        Ok((permit, _)) => {
+            permit.place().use_at(now, true);
+            Ok(permit)
+        }
+        Err(NoPlace::Limit(LimitReached::Address(limit))) => {
+            Err(format!("{limit} event streams of your address are open"))
+        }
+        Err(NoPlace::Limit(LimitReached::Total(limit))) => Err(format!("{limit} event streams are open")),
+        Err(NoPlace::NotAllowed) => Err("event streams are not allowed".to_string()),
+    }
 }
 
-fn full() -> Response {
+fn full(why: &str) -> Response {
     let problem = api::ErrorReply {
-        error: format!("{MAX_LISTENERS} event streams are open; close one and try again"),
+        error: format!("{why}; close one and try again"),
         known: Vec::new(),
     };
     let retry = [(header::RETRY_AFTER, "5")];
@@ -126,16 +155,12 @@ fn messages_of<T: Clone + Send + 'static>(
 }
 
 /// The reply; `permit` is released when the stream ends or the client disconnects.
-fn respond(
-    messages: impl Stream<Item = Message> + Send + 'static,
-    app: &AppState,
-    permit: OwnedSemaphorePermit,
-) -> Response {
+fn respond(messages: impl Stream<Item = Message> + Send + 'static, permit: ConnectionPermit) -> Response {
     // Something is sent at once, so that the client sees the stream open before the first event.
     let hello = Message::default().retry(RETRY).comment("open");
     let messages = stream::iter([hello])
         .chain(messages)
-        .take_until(app.cancel.clone().cancelled_owned())
+        .take_until(permit.place().closing().clone().cancelled_owned())
         .map(move |message| {
             let _held = &permit;
             Ok::<_, Infallible>(message)

@@ -1,4 +1,5 @@
-//! The families of series and their values.
+//! Every metric with its name, help, labels and values. Those of the common drive model are listed in `model`; counters
+//! of the servers come from `NorthStats`.
 
 use std::sync::atomic::Ordering;
 use std::time::Instant;
@@ -7,7 +8,7 @@ use super::model::MODEL;
 use super::process;
 use crate::drive::{PollClass, State};
 use crate::history::TriggerKind;
-use crate::north::NorthStats;
+use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
 
@@ -251,6 +252,18 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
         "Time from the acceptance of a command to its answer.",
         SeriesValue::Histogram(plant.writes.seconds()),
     ));
+    let mut lost = Family::new(
+        Kind::Counter,
+        "drivegate_audit_lost_total",
+        "Records that the audit file lacks because the disk did not take them.",
+    );
+    if let Some(file) = plant.writes.audit().file() {
+        let (sent, not_sent) = file.lost();
+        for (kind, count) in [("sent", sent), ("not_sent", not_sent)] {
+            lost.add(vec![("kind", kind.to_string())], SeriesValue::Count(count));
+        }
+    }
+    all.push(lost);
 }
 
 fn recordings(plant: &Plant, all: &mut Vec<Family>) {
@@ -286,11 +299,17 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(requests);
     let mut refused = Family::new(
         Kind::Counter,
-        "drivegate_modbus_tcp_refused_total",
-        "Modbus TCP clients refused, by reason.",
+        "drivegate_connections_refused_total",
+        "Connections refused, or closed in favour of others, by server and reason.",
     );
-    for (reason, count) in stats.modbus_tcp.refused_connections().filter(|(_, count)| *count > 0) {
-        refused.add(vec![("reason", reason.name().to_string())], SeriesValue::Count(count));
+    for server in ServerKind::ALL {
+        for (reason, count) in stats.refused.of(server).filter(|(_, count)| *count > 0) {
+            let labels = vec![
+                ("server", server.name().to_string()),
+                ("reason", reason.name().to_string()),
+            ];
+            refused.add(labels, SeriesValue::Count(count));
+        }
     }
     all.push(refused);
     let mqtt = &stats.mqtt;
@@ -303,7 +322,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(Family::of(
         Kind::Counter,
         "drivegate_mqtt_published_total",
-        "Messages that the MQTT broker acknowledged.",
+        "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
         SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
     ));
     all.push(Family::of(
@@ -312,6 +331,15 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "Messages that wait for the MQTT broker.",
         SeriesValue::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
     ));
+    let mut lost = Family::new(
+        Kind::Counter,
+        "drivegate_mqtt_lost_total",
+        "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
+    );
+    for (kind, count) in mqtt.losses() {
+        lost.add(vec![("kind", kind.name().to_string())], SeriesValue::Count(count));
+    }
+    all.push(lost);
 }
 
 fn build(plant: &Plant) -> Family {

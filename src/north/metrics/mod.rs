@@ -1,7 +1,7 @@
 //! Prometheus metrics: the plant at one time as families of series (`docs/http.md`).
 //!
-//! The names are frozen. Every drive is read once per scrape, so its series are consistent. A point that is not good
-//! has no series: a graph shows a gap, never an old value.
+//! Metrics are added, never renamed or removed. Every drive is read once per scrape, so its series are consistent. A
+//! point that is not good has no series: a graph shows a gap, never an old value.
 
 mod families;
 mod model;

@@ -1,24 +1,27 @@
 //! Who may connect to a listener, and with which rights.
 
 use std::net::{IpAddr, SocketAddr};
+use std::pin::pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
+use arc_swap::ArcSwap;
+use futures_util::future::{Either, select};
 use ipnet::IpNet;
 use tokio::io::{AsyncRead, AsyncWrite};
 use tokio::net::TcpStream;
+use tokio_rustls::server::TlsStream;
 use tokio_util::sync::CancellationToken;
 
 use super::client::Client;
 use super::routes::PlantView;
 use super::session::ClientSession;
-use super::tls::{Role, TlsAuthenticator};
+use super::tls::{AuthenticatedClient, Role, TlsAuthenticator};
 use super::{ServerState, connection};
 use crate::command::Authority;
 use crate::north::ConnectionRefusal;
-use crate::north::connection_limit::{ConnectionPermit, LimitReached};
+use crate::north::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, LimitReached, Newcomer, Place};
 use crate::north::listener::ConnectionHandler;
-use crate::north::log_throttle::LogThrottle;
 
 /// A peer that disappeared without closing is detected after 60 s + 3 * 10 s.
 const KEEPALIVE_IDLE: Duration = Duration::from_secs(60);
@@ -34,108 +37,206 @@ pub(super) enum WriteAccess {
     ByCertificate(Arc<TlsAuthenticator>),
 }
 
-/// Admits clients to the sockets of one section of the configuration.
-pub(super) struct Admission {
-    /// For messages: `[modbus_tcp]`.
-    pub(super) section: String,
+/// Who may connect to a listener, and with which rights. A reload replaces it.
+#[derive(Debug, Clone)]
+pub(super) struct Policy {
     pub(super) allow: Vec<IpNet>,
     pub(super) write: WriteAccess,
-    pub(super) view: Arc<PlantView>,
-    pub(super) state: Arc<ServerState>,
-    pub(super) cancel: CancellationToken,
-    pub(super) logs: RefusalLogs,
 }
 
-/// Refusals repeat, so each kind is throttled.
-#[derive(Debug, Default)]
-pub(super) struct RefusalLogs {
-    not_allowed: LogThrottle,
-    limit: LogThrottle,
-    tls: LogThrottle,
+impl Policy {
+    /// Lets nobody in.
+    pub(super) fn nobody() -> (Policy, Option<Vec<String>>) {
+        let write = WriteAccess::ByAddress(Vec::new());
+        (
+            Policy {
+                allow: Vec::new(),
+                write,
+            },
+            None,
+        )
+    }
+
+    /// What a client at this address may do if it shows no certificate; `None` if it may not connect.
+    fn by_address(&self, address: IpAddr) -> Option<Authority> {
+        contains(&self.allow, address).then(|| match &self.write {
+            WriteAccess::ByAddress(write) if contains(write, address) => Authority::Write,
+            _ => Authority::ReadOnly,
+        })
+    }
+
+    /// What a client with TLS may do whose role grants `authority`; `None` if it may not connect. Its certificate and
+    /// its role are watched by the authenticator.
+    fn by_certificate(&self, address: IpAddr, authority: Authority) -> Option<Authority> {
+        contains(&self.allow, address).then_some(authority)
+    }
+}
+
+/// Admits clients to one listener.
+#[derive(Debug)]
+pub(super) struct Admission {
+    /// Number of the listener, unique in the server.
+    listener: usize,
+    policy: ArcSwap<Policy>,
+    view: Arc<PlantView>,
+    state: Arc<ServerState>,
+    /// Ends all connections of the listener.
+    cancel: CancellationToken,
 }
 
 impl ConnectionHandler for Admission {
-    fn admits(&self, address: IpAddr) -> bool {
-        let admitted = contains(&self.allow, address);
-        if !admitted {
-            self.state
-                .stats
-                .modbus_tcp
-                .connection_refused(ConnectionRefusal::NotAllowed);
-            if let Some(suppressed) = self.logs.not_allowed.permit(Instant::now()) {
-                let section = &self.section;
-                tracing::warn!(client = %address, suppressed,
-                    "Modbus TCP: client refused: its address is not in `allow` of {section}");
-            }
-        }
-        admitted
-    }
+    /// With TLS, of the handshakes only.
+    type Permit = ConnectionPermit;
 
-    fn refuse(&self, _: &TcpStream, peer: SocketAddr, reached: LimitReached) {
-        let (refusal, why, key) = match reached {
-            LimitReached::Total(limit) => (
-                ConnectionRefusal::Full,
-                format!("{limit} connections are open"),
-                "max_connections",
-            ),
-            LimitReached::Address(limit) => (
-                ConnectionRefusal::AddressFull,
-                format!("{limit} connections are open from its address"),
-                "max_connections_per_address",
-            ),
-        };
-        self.state.stats.modbus_tcp.connection_refused(refusal);
-        if let Some(suppressed) = self.logs.limit.permit(Instant::now()) {
-            tracing::warn!(client = %peer.ip(), suppressed,
-                "Modbus TCP: client refused: {why}; raise `{key}` of [modbus_tcp] or close unused connections");
+    fn admit(&self, client: IpAddr) -> Option<ConnectionPermit> {
+        let policy = self.policy.load();
+        let judge = || self.policy.load().by_address(client);
+        match policy.write {
+            WriteAccess::ByAddress(_) => self.acquire(&self.state.connections, client, remedy, judge),
+            WriteAccess::ByCertificate(_) => self.acquire(&self.state.handshakes, client, handshake_remedy, judge),
         }
     }
 
     async fn serve(self: Arc<Self>, stream: TcpStream, peer: SocketAddr, permit: ConnectionPermit) {
         set_socket_options(&stream);
-        match &self.write {
-            WriteAccess::ByAddress(write) => {
-                let authority = if contains(write, peer.ip()) {
-                    Authority::Write
-                } else {
-                    Authority::ReadOnly
-                };
-                self.serve_client(stream, Client::new(peer, None, authority)).await;
-            }
+        let write = self.policy.load().write.clone();
+        match write {
+            WriteAccess::ByAddress(_) => self.serve_client(stream, peer, None, &permit).await,
             WriteAccess::ByCertificate(authenticator) => {
-                match self
-                    .cancel
-                    .run_until_cancelled(authenticator.authenticate(stream))
-                    .await
-                {
-                    None => {}
-                    Some(Ok((stream, identified))) => {
-                        let authority = match identified.role {
-                            Role::Control => Authority::Write,
-                            Role::Monitor => Authority::ReadOnly,
-                        };
-                        self.serve_client(stream, Client::new(peer, Some(&identified.name), authority))
-                            .await;
-                    }
-                    Some(Err(error)) => {
-                        self.state.stats.modbus_tcp.connection_refused(ConnectionRefusal::Tls);
-                        if let Some(suppressed) = self.logs.tls.permit(Instant::now()) {
-                            tracing::warn!(client = %peer, suppressed, "Modbus TCP: client refused: TLS: {error}");
-                        }
-                    }
-                }
+                self.serve_tls_client(&authenticator, stream, peer, permit).await;
             }
         }
-        drop(permit);
     }
 }
 
 impl Admission {
-    async fn serve_client(&self, stream: impl AsyncRead + AsyncWrite + Unpin, client: Client) {
-        let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
-        let idle_timeout = self.state.options.idle_timeout;
-        connection::serve(stream, session, idle_timeout, self.cancel.child_token()).await;
+    /// `listener` is unique in the server; the connections end with `cancel`.
+    pub(super) fn new(
+        listener: usize,
+        policy: Policy,
+        view: PlantView,
+        state: Arc<ServerState>,
+        cancel: CancellationToken,
+    ) -> Admission {
+        Admission {
+            listener,
+            policy: ArcSwap::from_pointee(policy),
+            view: Arc::new(view),
+            state,
+            cancel,
+        }
     }
+
+    /// Applies a new policy to open connections too: they get its rights, or are closed.
+    pub(super) fn update(&self, policy: Policy, buses: Option<Vec<String>>) {
+        self.view.show(buses);
+        self.policy.store(Arc::new(policy.clone()));
+        self.state
+            .connections
+            .review(self.listener, |place: &Place| match &policy.write {
+                WriteAccess::ByAddress(_) => policy.by_address(place.address()),
+                WriteAccess::ByCertificate(_) => policy.by_certificate(place.address(), place.rights().authority()),
+            });
+    }
+
+    /// Serves a client with TLS until its connection ends or its certificate is no longer accepted.
+    async fn serve_tls_client(
+        &self,
+        authenticator: &TlsAuthenticator,
+        stream: TcpStream,
+        peer: SocketAddr,
+        handshake: ConnectionPermit,
+    ) {
+        let closing = handshake.place().closing();
+        match closing
+            .run_until_cancelled(authenticator.authenticate(stream, peer))
+            .await
+        {
+            // Displaced, or the listener is closed.
+            None => {}
+            Some(Ok((stream, client))) => {
+                let admitted = self.admit_authenticated(peer, &client);
+                drop(handshake);
+                self.serve_authenticated(stream, peer, client, admitted).await;
+            }
+            Some(Err(error)) => {
+                let text = format!("client refused: TLS: {error}");
+                self.state.refusals.report(ConnectionRefusal::Tls, peer.ip(), &text);
+            }
+        }
+    }
+
+    /// A place among the connections for a client whose handshake is complete.
+    fn admit_authenticated(&self, peer: SocketAddr, client: &AuthenticatedClient) -> Option<ConnectionPermit> {
+        let authority = match client.role {
+            Role::Control => Authority::Write,
+            Role::Monitor => Authority::ReadOnly,
+        };
+        // A reload during the handshake may have changed who is let in.
+        let judge = || self.policy.load().by_certificate(peer.ip(), authority);
+        self.acquire(&self.state.connections, peer.ip(), remedy, judge)
+    }
+
+    /// Serves a client with TLS; without a place, its connection is closed.
+    async fn serve_authenticated(
+        &self,
+        mut stream: TlsStream<TcpStream>,
+        peer: SocketAddr,
+        client: AuthenticatedClient,
+        admitted: Option<ConnectionPermit>,
+    ) {
+        let Some(permit) = admitted else {
+            connection::close(&mut stream).await;
+            return;
+        };
+        let refused = pin!(client.certificate.refused());
+        let served = pin!(self.serve_client(stream, peer, Some(&client.name), &permit));
+        if let Either::Left(((), served)) = select(refused, served).await {
+            // Commands that are under way are answered.
+            permit.place().close(CloseReason::CertificateRefused);
+            served.await;
+        }
+    }
+
+    async fn serve_client(
+        &self,
+        stream: impl AsyncRead + AsyncWrite + Unpin,
+        peer: SocketAddr,
+        name: Option<&str>,
+        permit: &ConnectionPermit,
+    ) {
+        let client = Client::new(peer, name, permit.place().rights().clone());
+        let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
+        let idle_timeout = self.state.options.load().idle_timeout;
+        connection::serve(stream, session, idle_timeout, permit.place()).await;
+    }
+
+    fn acquire(
+        &self,
+        limit: &Arc<ConnectionLimit>,
+        address: IpAddr,
+        remedy: fn(LimitReached) -> String,
+        judge: impl FnOnce() -> Option<Authority>,
+    ) -> Option<ConnectionPermit> {
+        let newcomer = Newcomer {
+            address,
+            listener: self.listener,
+            cancel: &self.cancel,
+        };
+        self.state.refusals.acquire(limit, newcomer, remedy, judge)
+    }
+}
+
+fn remedy(reached: LimitReached) -> String {
+    let key = match reached {
+        LimitReached::Total(_) => "max_connections",
+        LimitReached::Address(_) => "max_connections_per_address",
+    };
+    format!("raise `{key}` of [modbus_tcp] or close unused connections")
+}
+
+fn handshake_remedy(_: LimitReached) -> String {
+    "their TLS handshakes are not complete; they have 10 s for that".to_string()
 }
 
 fn contains(networks: &[IpNet], address: IpAddr) -> bool {

@@ -3,12 +3,13 @@
 use std::net::SocketAddr;
 use std::sync::Arc;
 
-use crate::command::{Authority, Origin, SourceKind};
+use crate::command::{Origin, SourceKind};
+use crate::north::connection_limit::Rights;
 
 /// A connected client.
 #[derive(Debug, Clone)]
 pub(super) struct Client {
-    pub(super) authority: Authority,
+    pub(super) rights: Rights,
     /// Its name in the audit: its address, after the name in its certificate if it has one.
     pub(super) who: String,
     /// The same without the port: all connections of a client share it.
@@ -17,14 +18,14 @@ pub(super) struct Client {
 
 impl Client {
     /// The client at `peer`, with the `name` in its certificate if it has one.
-    pub(super) fn new(peer: SocketAddr, name: Option<&str>, authority: Authority) -> Client {
+    pub(super) fn new(peer: SocketAddr, name: Option<&str>, rights: impl Into<Rights>) -> Client {
         let (kind, ip) = (SourceKind::ModbusTcp.name(), peer.ip());
         let (who, client) = match name {
             Some(name) => (format!("{name} at {peer}"), format!("{kind} {name} at {ip}")),
             None => (peer.to_string(), format!("{kind} {ip}")),
         };
         Client {
-            authority,
+            rights: rights.into(),
             who,
             client: client.into(),
         }
@@ -39,6 +40,7 @@ impl Client {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::command::Authority;
 
     #[test]
     fn the_connections_of_a_client_share_its_name() {

@@ -9,12 +9,12 @@ use futures_util::FutureExt;
 use futures_util::stream::StreamExt;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::{Instant, Sleep};
-use tokio_util::sync::CancellationToken;
 
-use super::dialogue::Dialogue;
+use super::dialogue::{Consumed, Dialogue};
 use super::forwarded_request::AnsweredRequest;
 use super::frame::NotModbus;
 use super::session::ClientSession;
+use crate::north::connection_limit::{CloseReason, Place};
 
 /// Time limit for the rest of a frame.
 const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
@@ -22,6 +22,8 @@ const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for pending requests when the gateway stops, and for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Maximum number of bytes that are read and discarded before a connection is closed.
+const MAX_DISCARDED: usize = 64 * 1024;
 /// Number of requests after which a client that sends without pause yields to the others.
 const TURN: usize = 128;
 
@@ -30,8 +32,10 @@ const TURN: usize = 128;
 enum End {
     #[error("the client closed the connection")]
     Client,
-    #[error("the gateway is stopping")]
-    Cancelled,
+    #[error("closed: the listener or the gateway is stopping")]
+    Stopping,
+    #[error(transparent)]
+    Closed(#[from] CloseReason),
     #[error("closed: not Modbus TCP: {0}")]
     NotModbus(#[from] NotModbus),
     #[error("closed: the client did not complete a frame within {FRAME_TIMEOUT:?}")]
@@ -44,12 +48,12 @@ enum End {
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or the gateway stops.
+/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     session: ClientSession,
     idle_timeout: Option<Duration>,
-    cancel: CancellationToken,
+    place: &Place,
 ) {
     tracing::debug!(client = session.who(), "Modbus TCP: connected");
     let now = Instant::now();
@@ -57,26 +61,36 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
         now,
         stream,
         dialogue: Dialogue::new(session),
+        place,
         since_yield: 0,
         idle: idle_timeout.map(|timeout| Idle::new(timeout, now)),
     };
-    let end = match connection.run(&cancel).await {
+    let end = match connection.run().await {
         Ok(never) => match never {},
         Err(end) => end,
     };
-    if matches!(end, End::Cancelled) {
+    if matches!(end, End::Stopping | End::Closed(_)) {
         connection.finish_pending().await;
     }
     // With TLS, a close notification distinguishes the end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
-        let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.stream.shutdown()).await;
+        close(&mut connection.stream).await;
+    }
+    if matches!(end, End::NotModbus(_)) {
+        let _ = tokio::time::timeout(CLOSE_TIMEOUT, connection.discard_input()).await;
     }
     tracing::debug!(client = connection.dialogue.who(), "Modbus TCP: {end}");
 }
 
-struct Connection<S> {
+/// Closes the connection of a client that is not served.
+pub(super) async fn close<S: AsyncWrite + Unpin>(stream: &mut S) {
+    let _ = tokio::time::timeout(CLOSE_TIMEOUT, stream.shutdown()).await;
+}
+
+struct Connection<'p, S> {
     stream: S,
     dialogue: Dialogue,
+    place: &'p Place,
     /// The time as of the last wait; the clock is read once per request.
     now: Instant,
     /// Requests since the last yield.
@@ -84,44 +98,46 @@ struct Connection<S> {
     idle: Option<Idle>,
 }
 
-impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
-    async fn run(&mut self, cancel: &CancellationToken) -> Result<Infallible, End> {
-        let mut client_done = false;
+impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
+    async fn run(&mut self) -> Result<Infallible, End> {
+        // Once this is set nothing more is read; the requests that wait for the bus are still answered.
+        let mut input_end: Option<End> = None;
         let mut half_frame_since: Option<Instant> = None;
         // One future for the whole connection, so that it registers with the token once and not with every request.
-        let mut cancelled = std::pin::pin!(cancel.cancelled());
+        let place = self.place;
+        let mut closing = std::pin::pin!(place.closing().cancelled());
         loop {
-            let worked = self.dialogue.process(self.now.into_std());
+            let consumed = self.process(&mut input_end);
             self.dialogue.collect(self.now.into_std());
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
                     biased;
-                    () = &mut cancelled => return Err(End::Cancelled),
+                    () = &mut closing => return Err(self.close_reason()),
                     flushed = flush(&mut self.stream, &mut self.dialogue) => flushed?,
                 }
                 self.now = Instant::now();
             }
-            let consumed = worked?;
             if consumed.frames > 0 {
                 half_frame_since = None;
-                self.restart_idle();
+                self.used();
                 self.yield_if_due(consumed.frames).await;
-                if self.since_yield == 0 && cancel.is_cancelled() {
-                    return Err(End::Cancelled);
+                if self.since_yield == 0 && place.closing().is_cancelled() {
+                    return Err(self.close_reason());
                 }
             }
             let full = self.dialogue.is_full();
-            if !full && self.dialogue.has_more() {
+            let unusable = matches!(input_end, Some(End::NotModbus(_)));
+            if !full && !unusable && self.dialogue.has_more() {
                 self.now = Instant::now();
                 continue;
             }
-            if client_done && !self.dialogue.is_waiting() {
-                return Err(End::Client);
+            if let (Some(_), false) = (&input_end, self.dialogue.is_waiting()) {
+                return Err(input_end.unwrap_or(End::Client));
             }
             // While the gateway itself does not read, an incomplete frame is not the client's fault.
-            let half = self.dialogue.has_input() && !full && !client_done;
+            let half = self.dialogue.has_input() && !full && input_end.is_none();
             half_frame_since = half.then(|| half_frame_since.unwrap_or_else(Instant::now));
-            let reading = if full || client_done {
+            let reading = if full || input_end.is_some() {
                 Reading::Paused
             } else {
                 Reading::On
@@ -129,18 +145,35 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             let event = tokio::select! {
                 biased;
                 event = self.next(reading, half_frame_since) => event?,
-                () = &mut cancelled => return Err(End::Cancelled),
+                () = &mut closing => return Err(self.close_reason()),
             };
             self.now = Instant::now();
             match event {
                 Event::Answer(answered) => {
                     self.dialogue.finish(answered, self.now.into_std());
-                    self.restart_idle();
+                    self.used();
                 }
-                Event::Input(0) => client_done = true,
+                Event::Input(0) => input_end = Some(End::Client),
                 Event::Input(count) => self.dialogue.received(count),
             }
         }
+    }
+
+    /// Processes the input, unless an earlier part of it was not Modbus.
+    fn process(&mut self, input_end: &mut Option<End>) -> Consumed {
+        if matches!(input_end, Some(End::NotModbus(_))) {
+            return Consumed::default();
+        }
+        let (consumed, misfit) = self.dialogue.process(self.now.into_std());
+        if let Some(misfit) = misfit {
+            *input_end = Some(misfit.into());
+        }
+        consumed
+    }
+
+    /// Why the connection must end.
+    fn close_reason(&self) -> End {
+        self.place.close_reason().map_or(End::Stopping, End::Closed)
     }
 
     /// Waits for answers of the bus and, with `Reading::On`, for input.
@@ -162,8 +195,9 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         }
     }
 
-    /// Restarts the idle timeout.
-    fn restart_idle(&mut self) {
+    /// The client made requests: the idle timeout restarts.
+    fn used(&mut self) {
+        self.place.use_at(self.now.into_std(), true);
         if let Some(idle) = &mut self.idle {
             idle.since = self.now;
         }
@@ -175,6 +209,18 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         if self.since_yield >= TURN {
             self.since_yield = 0;
             tokio::task::yield_now().await;
+        }
+    }
+
+    /// Reads what the client has sent behind data that is not Modbus: the system resets a connection that is closed with
+    /// unread input, and the client could lose the last answers.
+    async fn discard_input(&mut self) {
+        let (mut space, mut discarded) = ([0; 1024], 0);
+        while let Ok(count) = self.stream.read(&mut space).await
+            && count > 0
+            && discarded < MAX_DISCARDED
+        {
+            discarded += count;
         }
     }
 

@@ -80,16 +80,14 @@ impl Dialogue {
         }
     }
 
-    /// Processes the frames in the input, [`TURN`] at most, while there is room for their results.
-    ///
-    /// # Errors
-    /// The input is not Modbus. The requests before it are answered.
-    pub(super) fn process(&mut self, now: Instant) -> Result<Consumed, NotModbus> {
+    /// Processes the frames in the input, [`TURN`] at most, while there is room for their results. Input that is not
+    /// Modbus ends it: the requests before that are answered or wait for the bus, and nothing behind it can be processed.
+    pub(super) fn process(&mut self, now: Instant) -> (Consumed, Option<NotModbus>) {
         let mut consumed = Consumed::default();
         self.session.refresh();
-        let result = loop {
+        let misfit = loop {
             if self.is_full() || self.output.len() >= OUTPUT || consumed.frames >= TURN {
-                break Ok(consumed);
+                break None;
             }
             match frame::decode(self.input.get(consumed.bytes..self.filled).unwrap_or_default()) {
                 Ok(Some(frame)) => {
@@ -97,13 +95,13 @@ impl Dialogue {
                     consumed.frames += 1;
                     self.waiting.extend(self.session.take(&frame, now, &mut self.output));
                 }
-                Ok(None) => break Ok(consumed),
-                Err(misfit) => break Err(misfit),
+                Ok(None) => break None,
+                Err(misfit) => break Some(misfit),
             }
         };
         self.input.copy_within(consumed.bytes..self.filled, 0);
         self.filled -= consumed.bytes;
-        result
+        (consumed, misfit)
     }
 
     /// Whether the input begins with a complete frame, or with data that is not Modbus.

@@ -108,7 +108,7 @@ impl ForwardedRequest {
     pub(super) fn send(self, work: BusWork, client: &Client, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
-            BusWork::Order(order) => forwarded.place(order, client, client.authority, now),
+            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), now),
             BusWork::Refused(refusal) => {
                 let what = describe::request(&forwarded.request);
                 let answer = forwarded.drive.refuse(&what, refusal, client.origin(), now);

@@ -5,15 +5,16 @@
 //! not delay the ones behind it, so replies can overtake one another; each has its transaction id.
 
 mod admission;
-mod certificate;
 mod client;
 mod command_words;
 mod connection;
+mod crl;
 mod dialogue;
 mod forwarded_request;
 pub(crate) mod frame;
 pub(crate) mod identify;
 mod offline;
+mod open_clients;
 mod routes;
 mod session;
 mod tls;
@@ -23,27 +24,41 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use arc_swap::ArcSwap;
 use ipnet::IpNet;
 use tokio::runtime::{Builder, Handle};
 use tokio_util::sync::CancellationToken;
 use tokio_util::task::TaskTracker;
 
-use self::admission::{Admission, RefusalLogs, WriteAccess};
+use self::admission::{Admission, Policy, WriteAccess};
 use self::command_words::CommandWords;
 use self::routes::PlantView;
-use self::tls::TlsAuthenticator;
-use crate::north::connection_limit::ConnectionLimit;
-use crate::north::listener::{AcceptLoop, bind};
-use crate::north::{NorthStats, ServerError};
+use self::tls::{Requirements, TlsAuthenticator};
+use crate::north::connection_limit::{ConnectionLimit, Limits};
+use crate::north::listener::{ListenerSpec, Listeners, NewSockets};
+use crate::north::refusals::Refusals;
+use crate::north::{NorthStats, ServerError, ServerKind, certificate};
 use crate::plant::SharedPlant;
 
 pub use self::offline::Offline;
-pub use self::tls::{Identity, IdentityFault, Role, Tls, TlsFile};
+pub use self::tls::{Identity, Role, Tls};
 
-/// Name in messages.
-const PROTOCOL: &str = "Modbus TCP";
-/// Files that the gateway needs beside those of the connections: ports, queues, other servers and their clients.
-const OTHER_FILES: u64 = 512;
+/// The role in a client certificate in DER, for the fuzzer; `None` if it is no certificate, an error if the role is not
+/// accepted.
+pub fn certificate_role(der: &[u8]) -> Option<Result<Option<String>, String>> {
+    let certificate = certificate::read(der).ok()?;
+    Some(certificate.role.map_err(|why| why.to_string()))
+}
+
+/// Section of the TLS listener.
+const TLS_SECTION: &str = "[modbus_tcp.tls]";
+/// Maximum number of TLS handshakes at one time, and how many of them one address may have. A handshake that takes long
+/// yields to a newer one, so silent connections hold nobody up.
+const HANDSHAKES: Limits = Limits {
+    total: 64,
+    reserved: 0,
+    per_address: 16,
+};
 
 /// Configuration of the Modbus TCP server.
 #[derive(Debug, Clone, PartialEq)]
@@ -55,7 +70,7 @@ pub struct Options {
     /// Maximum number of open connections to all listeners.
     pub max_connections: usize,
     /// Maximum number of open connections from one address.
-    pub max_connections_per_address: Option<usize>,
+    pub max_connections_per_address: usize,
     /// Time without a request after which a connection is closed; `None` never closes it.
     pub idle_timeout: Option<Duration>,
     /// How raw reads outside the poll plan are handled.
@@ -63,13 +78,51 @@ pub struct Options {
 }
 
 impl Options {
-    /// Whether `other` differs only in the content of certificate files, which a running server can apply.
-    pub(crate) fn differs_in_certificates_only(&self, other: &Options) -> bool {
-        let mut same = other.clone();
-        if let (Some(tls), Some(own)) = (&mut same.tls, &self.tls) {
-            tls.identity = own.identity.clone();
+    /// Files that the connections can have open at one time, with those that are being closed.
+    pub(crate) fn files(&self) -> usize {
+        let handshakes = if self.tls.is_some() {
+            self.handshakes().files()
+        } else {
+            0
+        };
+        self.limits().files() + handshakes
+    }
+
+    fn handshakes(&self) -> Limits {
+        Limits {
+            total: HANDSHAKES.total.min(self.max_connections.max(8)),
+            ..HANDSHAKES
         }
-        self != other && *self == same
+    }
+
+    /// Connections, with some kept for those who may write if there are any.
+    fn limits(&self) -> Limits {
+        let limits = Limits::new(self.max_connections, self.max_connections_per_address);
+        let by_address = self.listeners.iter().any(|listener| !listener.write.is_empty());
+        let by_role = self
+            .tls
+            .iter()
+            .flat_map(|tls| tls.roles.values())
+            .any(|role| *role == Role::Control);
+        if by_address || by_role {
+            limits.with_reserve()
+        } else {
+            limits
+        }
+    }
+
+    fn listener_specs(&self) -> Vec<ListenerSpec> {
+        let spec = |address: &SocketAddr, tls, section: &str| ListenerSpec {
+            address: *address,
+            tls,
+            section: section.to_string(),
+        };
+        let plain = self.listeners.iter();
+        let plain = plain.flat_map(|l| l.listen.iter().map(move |address| spec(address, false, &l.section)));
+        let tls = self.tls.iter().flat_map(|tls| &tls.listen);
+        plain
+            .chain(tls.map(|address| spec(address, true, TLS_SECTION)))
+            .collect()
     }
 }
 
@@ -101,32 +154,118 @@ pub enum Uncached {
 /// A running server.
 #[derive(Debug)]
 pub struct Server {
-    addresses: Vec<SocketAddr>,
-    tls_addresses: Vec<SocketAddr>,
+    listeners: Listeners<Admission>,
     authenticator: Option<Arc<TlsAuthenticator>>,
+    state: Arc<ServerState>,
+    plant: SharedPlant,
+    /// Where clients without TLS are served.
+    own: Handle,
+    /// Listeners opened so far.
+    opened: usize,
     tasks: TaskTracker,
+}
+
+/// What [`Server::commit`] needs to apply new options: all that can fail is done.
+#[derive(Debug)]
+pub struct Change {
+    options: Options,
+    sockets: NewSockets,
+    /// For the clients of the TLS listener, if it is new or its certificates, revocations or roles have changed.
+    requirements: Option<Requirements>,
 }
 
 impl Server {
     /// The addresses without TLS, with the port that the system chose if port 0 was configured.
-    pub fn addresses(&self) -> &[SocketAddr] {
-        &self.addresses
+    pub fn addresses(&self) -> Vec<SocketAddr> {
+        self.listeners.addresses(false)
     }
 
     /// The addresses with TLS.
-    pub fn tls_addresses(&self) -> &[SocketAddr] {
-        &self.tls_addresses
+    pub fn tls_addresses(&self) -> Vec<SocketAddr> {
+        self.listeners.addresses(true)
     }
 
-    /// Uses the certificates of `options` for new connections; open connections stay.
+    /// Prepares other options: binds new addresses and checks new certificates. Nothing changes for any client.
     ///
     /// # Errors
-    /// The certificates cannot be used; the previous ones stay in use.
-    pub fn renew_certificates(&self, options: &Options) -> Result<(), ServerError> {
-        match (&self.authenticator, &options.tls) {
-            (Some(authenticator), Some(tls)) => Ok(authenticator.renew(&tls.identity)?),
-            _ => Ok(()),
+    /// An address cannot be bound, or the certificates cannot be used; everything is as before.
+    pub async fn prepare(&mut self, options: Options) -> Result<Change, ServerError> {
+        let before = self.state.options.load_full();
+        let requirements = match (&options.tls, &before.tls) {
+            (Some(tls), Some(before)) if self.authenticator.is_some() && tls.admits_like(before) => None,
+            (Some(tls), _) => {
+                let requirements = Requirements::new(tls);
+                Some(requirements.map_err(|fault| ServerError::Tls(ServerKind::ModbusTcp.title(), fault))?)
+            }
+            (None, _) => None,
+        };
+        Ok(Change {
+            requirements,
+            sockets: self.listeners.prepare(options.listener_specs()).await?,
+            options,
+        })
+    }
+
+    /// Forgets prepared options.
+    pub fn abort(&mut self, change: Change) {
+        self.listeners.abort(change.sockets);
+    }
+
+    /// Applies prepared options. Listeners that stay keep their connections, as far as the options allow them; their
+    /// rights are those of the new options from then on. TLS clients whose certificate is not admitted with the same
+    /// rights are disconnected.
+    pub fn commit(&mut self, change: Change) {
+        let Change {
+            options,
+            sockets,
+            requirements,
+        } = change;
+        match (&self.authenticator, requirements) {
+            (_, None) if options.tls.is_none() => self.authenticator = None,
+            (_, None) => {}
+            (Some(authenticator), Some(requirements)) => {
+                authenticator.renew(requirements);
+                tracing::info!("Modbus TCP: using the new certificates, revocations and roles");
+            }
+            (None, Some(requirements)) => self.authenticator = Some(Arc::new(TlsAuthenticator::new(requirements))),
         }
+        let options = Arc::new(options);
+        self.state.connections.set_limits(options.limits());
+        self.state.handshakes.set_limits(options.handshakes());
+        self.state.options.store(options.clone());
+        let (plant, state, own, tls) = (&self.plant, &self.state, &self.own, &self.authenticator);
+        let mut plain = options.listeners.iter().flat_map(|l| l.listen.iter().map(move |_| l));
+        let opened = &mut self.opened;
+        self.listeners.commit(sockets, |spec, open, cancel| {
+            let (policy, buses) = match (spec.tls, tls, &options.tls) {
+                (true, Some(authenticator), Some(tls)) => (
+                    Policy {
+                        allow: tls.allow.clone(),
+                        write: WriteAccess::ByCertificate(authenticator.clone()),
+                    },
+                    tls.buses.clone(),
+                ),
+                // The plain listeners are first and in the same order.
+                _ => plain.next().map_or_else(Policy::nobody, |l| {
+                    let write = WriteAccess::ByAddress(l.write.clone());
+                    let allow = l.allow.clone();
+                    (Policy { allow, write }, l.buses.clone())
+                }),
+            };
+            let runtime = if spec.tls { Handle::current() } else { own.clone() };
+            let admission = match open {
+                Some(admission) => {
+                    admission.update(policy, buses);
+                    admission.clone()
+                }
+                None => {
+                    *opened += 1;
+                    let view = PlantView::new(plant.clone(), buses);
+                    Arc::new(Admission::new(*opened, policy, view, state.clone(), cancel.clone()))
+                }
+            };
+            (admission, runtime)
+        });
     }
 
     /// Waits until all listeners and connections have ended, after the cancellation.
@@ -138,15 +277,22 @@ impl Server {
 /// What all connections share.
 #[derive(Debug)]
 struct ServerState {
-    options: Options,
+    options: ArcSwap<Options>,
     stats: Arc<NorthStats>,
     command_words: CommandWords,
+    connections: Arc<ConnectionLimit>,
+    /// TLS connections before they are admitted.
+    handshakes: Arc<ConnectionLimit>,
+    refusals: Refusals,
 }
 
 impl ServerState {
     fn new(options: Options, stats: Arc<NorthStats>) -> ServerState {
         ServerState {
-            options,
+            connections: ConnectionLimit::new(options.limits()),
+            handshakes: ConnectionLimit::new(options.handshakes()),
+            refusals: Refusals::new(ServerKind::ModbusTcp, stats.clone()),
+            options: ArcSwap::from_pointee(options),
             stats,
             command_words: CommandWords::default(),
         }
@@ -163,82 +309,30 @@ pub async fn start(
     stats: Arc<NorthStats>,
     cancel: CancellationToken,
 ) -> Result<Server, ServerError> {
-    let tasks = TaskTracker::new();
-    let opened = open(options, plant, stats, &cancel, &tasks).await;
+    let (tasks, cancel) = (TaskTracker::new(), cancel.child_token());
+    // The tasks, and with them the thread, end with the token.
+    tasks.spawn(cancel.clone().cancelled_owned());
     tasks.close();
-    opened
-}
-
-async fn open(
-    options: Options,
-    plant: SharedPlant,
-    stats: Arc<NorthStats>,
-    cancel: &CancellationToken,
-    tasks: &TaskTracker,
-) -> Result<Server, ServerError> {
-    let authenticator = options
-        .tls
-        .as_ref()
-        .map(TlsAuthenticator::new)
-        .transpose()?
-        .map(Arc::new);
-    raise_file_limit(options.max_connections);
-    let limit = ConnectionLimit::new(options.max_connections, options.max_connections_per_address);
-    let state = Arc::new(ServerState::new(options, stats));
-    let accept_loop = |section: &str, allow: &[IpNet], write: WriteAccess, buses: &Option<Vec<String>>| {
-        let handler = Arc::new(Admission {
-            section: section.to_string(),
-            allow: allow.to_vec(),
-            write,
-            view: Arc::new(PlantView::new(plant.clone(), buses.clone())),
-            state: state.clone(),
-            cancel: cancel.clone(),
-            logs: RefusalLogs::default(),
-        });
-        let limit = limit.clone();
-        move || AcceptLoop {
-            protocol: PROTOCOL,
-            handler: handler.clone(),
-            limit: limit.clone(),
-            tasks: tasks.clone(),
-            cancel: cancel.clone(),
-        }
+    let own = start_thread(&tasks)?;
+    let mut server = Server {
+        listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
+        authenticator: None,
+        state: Arc::new(ServerState::new(options.clone(), stats)),
+        plant,
+        own,
+        opened: 0,
+        tasks,
     };
-    let (own, here) = (start_thread(tasks)?, Handle::current());
-    let (mut loops, mut addresses, mut tls_addresses) = (Vec::new(), Vec::new(), Vec::new());
-    for listener in &state.options.listeners {
-        let write = WriteAccess::ByAddress(listener.write.clone());
-        let accept = accept_loop(&listener.section, &listener.allow, write, &listener.buses);
-        // A socket belongs to the runtime in which it is bound.
-        let Listener { listen, section, .. } = listener.clone();
-        let sockets = own.spawn(async move { bind(&listen, PROTOCOL, &section).await });
-        for (socket, address) in sockets.await.map_err(|error| ServerError::Thread(error.into()))?? {
-            addresses.push(address);
-            loops.push((socket, accept(), &own));
+    match server.prepare(options).await {
+        Ok(change) => {
+            server.commit(change);
+            Ok(server)
+        }
+        Err(error) => {
+            cancel.cancel();
+            Err(error)
         }
     }
-    if let (Some(tls), Some(authenticator)) = (&state.options.tls, &authenticator) {
-        let (section, write) = ("[modbus_tcp.tls]", WriteAccess::ByCertificate(authenticator.clone()));
-        let accept = accept_loop(section, &tls.allow, write, &tls.buses);
-        for (socket, address) in bind(&tls.listen, PROTOCOL, section).await? {
-            tls_addresses.push(address);
-            loops.push((socket, accept(), &here));
-        }
-    }
-    for (addresses, tls) in [(&addresses, false), (&tls_addresses, true)] {
-        for address in addresses {
-            tracing::info!(%address, tls, "Modbus TCP: listening");
-        }
-    }
-    for (socket, accept, runtime) in loops {
-        tasks.spawn_on(accept.run(socket), runtime);
-    }
-    Ok(Server {
-        addresses,
-        tls_addresses,
-        authenticator,
-        tasks: tasks.clone(),
-    })
 }
 
 /// Starts a thread that only serves clients without TLS, until all `tasks` have ended. Metrics and TLS handshakes,
@@ -261,28 +355,4 @@ fn start_thread(tasks: &TaskTracker) -> Result<Handle, ServerError> {
         .spawn(serve)
         .and_then(|_| receiver.recv().map_err(io::Error::other)?);
     runtime.map_err(ServerError::Thread)
-}
-
-/// Raises the limit of open files, which is often 1024 by default, as far as `connections` require.
-fn raise_file_limit(connections: usize) {
-    use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
-    let wanted = connections as u64 + OTHER_FILES;
-    let limit = getrlimit(Resource::Nofile);
-    if limit.current.is_none_or(|current| current >= wanted) {
-        return;
-    }
-    let reached = limit.maximum.map_or(wanted, |most| most.min(wanted));
-    let raised = Rlimit {
-        current: Some(reached),
-        maximum: limit.maximum,
-    };
-    let why = match setrlimit(Resource::Nofile, raised) {
-        Ok(()) if reached == wanted => return,
-        Ok(()) => "the hard limit is lower".to_string(),
-        Err(why) => why.to_string(),
-    };
-    tracing::warn!(
-        "Modbus TCP: {connections} connections require {wanted} open files, but the limit is {reached}: {why}; raise \
-         LimitNOFILE of the service or lower `max_connections` of [modbus_tcp]"
-    );
 }

@@ -54,8 +54,10 @@ impl Offline {
     pub fn receive(&mut self, bytes: &[u8], now: Instant) -> Vec<u8> {
         self.backlog.extend_from_slice(bytes);
         let mut answers = Vec::new();
-        while !self.closed {
-            if !self.dialogue.is_full() {
+        loop {
+            if self.closed {
+                self.backlog.clear();
+            } else if !self.dialogue.is_full() {
                 let space = self.dialogue.parts().0;
                 let count = self.backlog.len().min(space.len());
                 for (place, byte) in space.iter_mut().zip(self.backlog.drain(..count)) {
@@ -63,17 +65,17 @@ impl Offline {
                 }
                 self.dialogue.received(count);
             }
-            self.closed = self.dialogue.process(now).is_err();
+            self.closed = self.closed || self.dialogue.process(now).1.is_some();
             self.dialogue.collect(now);
             answers.append(&mut self.dialogue.output);
-            if self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
-                break;
+            if self.closed || self.dialogue.is_full() || (self.backlog.is_empty() && !self.dialogue.has_more()) {
+                return answers;
             }
         }
-        answers
     }
 
-    /// Whether a server would have closed the connection, because the input was not Modbus.
+    /// Whether the input was not Modbus: a server reads no more of it, and closes the connection when the requests
+    /// before it are answered.
     pub fn is_closed(&self) -> bool {
         self.closed
     }

@@ -6,19 +6,33 @@ use arc_swap::ArcSwap;
 
 use crate::plant::{BusHandle, DriveHandle, Plant, SharedPlant};
 
+/// Names of the visible buses; `None` for all.
+type VisibleBuses = Option<Vec<String>>;
+
 /// The part of the plant that the clients of one listener see.
 #[derive(Debug)]
 pub(super) struct PlantView {
     plant: SharedPlant,
-    /// Names of the visible buses; `None` for all.
-    buses: Option<Vec<String>>,
+    buses: ArcSwap<VisibleBuses>,
     routes: ArcSwap<Routes>,
 }
 
 impl PlantView {
     pub(super) fn new(plant: SharedPlant, buses: Option<Vec<String>>) -> PlantView {
-        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), buses.as_deref()));
-        PlantView { plant, buses, routes }
+        let buses = Arc::new(buses);
+        let routes = ArcSwap::from_pointee(Routes::new(plant.load_full(), buses.clone()));
+        PlantView {
+            plant,
+            buses: ArcSwap::new(buses),
+            routes,
+        }
+    }
+
+    /// Shows other buses from the next request of each client on.
+    pub(super) fn show(&self, buses: Option<Vec<String>>) {
+        if **self.buses.load() != buses {
+            self.buses.store(Arc::new(buses));
+        }
     }
 
     /// The routes of the current plant; after a reload, the first client that asks rebuilds them for all.
@@ -27,13 +41,13 @@ impl PlantView {
         if self.is_current(&routes) {
             return routes;
         }
-        let routes = Arc::new(Routes::new(self.plant.load_full(), self.buses.as_deref()));
+        let routes = Arc::new(Routes::new(self.plant.load_full(), self.buses.load_full()));
         self.routes.store(routes.clone());
         routes
     }
 
     pub(super) fn is_current(&self, routes: &Routes) -> bool {
-        Arc::ptr_eq(&self.plant.load(), &routes.plant)
+        Arc::ptr_eq(&self.plant.load(), &routes.plant) && Arc::ptr_eq(&self.buses.load(), &routes.buses)
     }
 }
 
@@ -41,6 +55,7 @@ impl PlantView {
 #[derive(Debug)]
 pub(super) struct Routes {
     pub(super) plant: Arc<Plant>,
+    buses: Arc<VisibleBuses>,
     drives: Vec<DriveHandle>,
     /// Index in `drives`.
     units: Vec<Option<u16>>,
@@ -49,8 +64,8 @@ pub(super) struct Routes {
 }
 
 impl Routes {
-    fn new(plant: Arc<Plant>, buses: Option<&[String]>) -> Routes {
-        let is_visible = |name: &String| buses.is_none_or(|buses| buses.contains(name));
+    fn new(plant: Arc<Plant>, buses: Arc<VisibleBuses>) -> Routes {
+        let is_visible = |name: &String| buses.as_ref().as_ref().is_none_or(|buses| buses.contains(name));
         let drives: Vec<DriveHandle> = plant.drives().filter(|d| is_visible(&d.image.spec.bus)).collect();
         let mut units = vec![None; usize::from(u8::MAX) + 1];
         for (index, drive) in (0u16..).zip(&drives) {
@@ -61,6 +76,7 @@ impl Routes {
         let visible = plant.buses.iter().map(|b| is_visible(&b.image.spec.name)).collect();
         Routes {
             plant,
+            buses,
             drives,
             units,
             visible,

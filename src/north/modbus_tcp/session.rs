@@ -241,7 +241,7 @@ impl ClientSession {
     }
 
     fn may_write(&self, drive: &DriveHandle) -> bool {
-        self.client.authority == Authority::Write && drive.image.spec.access == Access::Control
+        self.client.rights.authority() == Authority::Write && drive.image.spec.access == Access::Control
     }
 
     /// Unit 255: input registers, and the same as holding registers, since many clients read nothing else.
@@ -289,7 +289,9 @@ impl ClientSession {
             Ok(words) => Decision::Reply(request, Reply::Registers(words)),
             Err(Unavailable::Refused(code)) => code.into(),
             Err(Unavailable::Stale) => Exception::GATEWAY_TARGET.into(),
-            Err(Unavailable::NotPolled) if self.state.options.uncached == Uncached::Refuse => Exception::ADDRESS.into(),
+            Err(Unavailable::NotPolled) if self.state.options.load().uncached == Uncached::Refuse => {
+                Exception::ADDRESS.into()
+            }
             Err(Unavailable::NotPolled) => {
                 match read_parts(drive.bus.image.spec.protocol, &reading, table, start, count) {
                     Err(code) => code.into(),

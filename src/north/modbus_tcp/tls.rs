@@ -5,24 +5,25 @@ use std::io;
 use std::net::SocketAddr;
 use std::path::Path;
 use std::sync::Arc;
-use std::time::{Duration, SystemTime, UNIX_EPOCH};
+use std::time::{Duration, SystemTime};
 
-use arc_swap::ArcSwap;
 use ipnet::IpNet;
-use rustls::server::{NoServerSessionStorage, WebPkiClientVerifier};
+use rustls::server::danger::ClientCertVerifier;
+use rustls::server::{NoServerSessionStorage, VerifierBuilderError, WebPkiClientVerifier};
 use rustls::{RootCertStore, ServerConfig};
-use rustls_pki_types::{CertificateDer, PrivateKeyDer};
+use rustls_pki_types::CertificateDer;
 use tokio::net::TcpStream;
 use tokio_rustls::TlsAcceptor;
 use tokio_rustls::server::TlsStream;
 
-use super::certificate::{self, RoleError};
-use crate::north::pem::{self, PemError};
+use super::crl::{self, Crls};
+use super::open_clients::{CertificateGuard, OpenClients};
+use crate::north::certificate::{self, RoleError};
+use crate::north::identity::{FileProblem, IdentityFault, ServerIdentity, TlsFile, provider, validity};
+use crate::north::pem;
 
 /// Time limit of a handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
-/// How long before its expiry a certificate causes a warning.
-const SOON: Duration = Duration::from_secs(30 * 86_400);
 
 /// The TLS listener.
 #[derive(Debug, Clone, PartialEq)]
@@ -39,6 +40,13 @@ pub struct Tls {
     pub roles: BTreeMap<String, Role>,
 }
 
+impl Tls {
+    /// Whether both require the same of a client's certificate, show it the same and grant it the same.
+    pub(super) fn admits_like(&self, other: &Tls) -> bool {
+        (&self.identity, &self.roles) == (&other.identity, &other.roles)
+    }
+}
+
 /// The rights of a client.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Role {
@@ -48,66 +56,16 @@ pub enum Role {
     Control,
 }
 
-/// Certificates and key with the content of their files; equal while the content is.
+/// Certificates, key and revocations with the content of their files; equal while the content is.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Identity {
-    chain: Vec<CertificateDer<'static>>,
-    key: Arc<PrivateKeyDer<'static>>,
+    server: ServerIdentity,
     client_ca: Vec<CertificateDer<'static>>,
-}
-
-/// A file of an [`Identity`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum TlsFile {
-    /// The certificate of the server, followed by intermediate certificates.
-    Certificate,
-    /// Its private key.
-    Key,
-    /// The CA certificates that client certificates are verified against.
-    ClientCa,
-}
-
-/// A fault of one of the files, or a warning about it: what is wrong and what to do.
-#[derive(Debug, thiserror::Error)]
-#[error("{problem}")]
-pub struct IdentityFault {
-    /// The file.
-    pub file: TlsFile,
-    problem: IdentityProblem,
-}
-
-#[derive(Debug, thiserror::Error)]
-enum IdentityProblem {
-    #[error(transparent)]
-    Pem(#[from] PemError),
-    #[error("{0} contains data that is not a certificate; specify a PEM file")]
-    NotACertificate(String),
-    #[error("certificate `{name}` in {file} expired on {end}; renew it")]
-    Expired { name: String, file: String, end: String },
-    #[error("certificate `{name}` in {file} is not valid before {begin}; check the clock of this machine")]
-    NotYetValid { name: String, file: String, begin: String },
-    /// A warning: within 30 days.
-    #[error("certificate `{name}` in {file} expires on {end}; renew it")]
-    ExpiresSoon { name: String, file: String, end: String },
-    #[error("not a usable CA certificate: {0}; specify the PEM file of the CA")]
-    UnusableCa(String),
-    #[error("the key does not match the certificate; specify the key of the certificate")]
-    KeyMismatch,
-    #[error("certificate and key cannot be used: {0}; specify a certificate and its key in PEM format")]
-    Unusable(rustls::Error),
-}
-
-impl TlsFile {
-    fn fault(self, problem: impl Into<IdentityProblem>) -> IdentityFault {
-        IdentityFault {
-            file: self,
-            problem: problem.into(),
-        }
-    }
+    client_crl: Crls,
 }
 
 impl Identity {
-    /// Reads the three files and checks at `now` that they can be used together; returns warnings with it.
+    /// Reads the files and checks at `now` that they can be used together; returns warnings with them.
     ///
     /// # Errors
     /// All faults of the files.
@@ -115,25 +73,32 @@ impl Identity {
         certificate: &Path,
         key: &Path,
         client_ca: &Path,
+        client_crl: Option<&Path>,
         now: SystemTime,
     ) -> Result<(Identity, Vec<IdentityFault>), Vec<IdentityFault>> {
         let (mut errors, mut warnings) = (Vec::new(), Vec::new());
-        let chain = read_chain(certificate, now).map_err(|problem| errors.push(TlsFile::Certificate.fault(problem)));
-        let key = pem::private_key(key).map_err(|error| errors.push(TlsFile::Key.fault(error)));
+        let server = ServerIdentity::load(certificate, key, now).map_err(|faults| errors.extend(faults));
         let ca = pem::certificates(client_ca).map_err(|error| errors.push(TlsFile::ClientCa.fault(error)));
         // An expired CA is still a trust anchor (RFC 5280, 6.1.1), so it refuses nobody.
-        for anchor in ca.iter().flatten() {
-            let problem = check_validity(client_ca, anchor, now).unwrap_or_else(Some);
-            warnings.extend(problem.map(|problem| TlsFile::ClientCa.fault(problem)));
-        }
-        if let (Ok((chain, warning)), Ok(key), Ok(client_ca)) = (chain, key, ca) {
-            warnings.extend(warning.map(|problem| TlsFile::Certificate.fault(problem)));
+        let anchors = ca
+            .iter()
+            .flatten()
+            .filter_map(|anchor| validity(client_ca, anchor, now));
+        warnings.extend(anchors.map(|problem| TlsFile::ClientCa.fault(problem)));
+        let lists = client_crl.map(|file| crl::load(file, ca.as_deref().unwrap_or_default(), now));
+        let lists = lists
+            .transpose()
+            .map_err(|problem| errors.push(TlsFile::ClientCrl.fault(problem)));
+        if let (Ok((server, expiry)), Ok(client_ca), Ok(lists)) = (server, ca, lists) {
+            let (client_crl, doubts) = lists.unwrap_or_default();
+            warnings.extend(expiry);
+            warnings.extend(doubts.into_iter().map(|problem| TlsFile::ClientCrl.fault(problem)));
             let identity = Identity {
-                chain,
-                key: Arc::new(key),
+                server,
                 client_ca,
+                client_crl,
             };
-            match identity.server_config() {
+            match identity.verifier() {
                 Ok(_) => return Ok((identity, warnings)),
                 Err(fault) => errors.push(fault),
             }
@@ -141,77 +106,81 @@ impl Identity {
         Err(errors)
     }
 
-    /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, and a session
-    /// cannot outlive it.
-    fn server_config(&self) -> Result<Arc<ServerConfig>, IdentityFault> {
+    /// Verifies the certificates of clients. Once there are revocation lists, each CA in the chain of a client must
+    /// have one; a list remains in force when it is out of date.
+    fn verifier(&self) -> Result<Arc<dyn ClientCertVerifier>, IdentityFault> {
         let unusable_ca =
-            |error: &dyn std::fmt::Display| TlsFile::ClientCa.fault(IdentityProblem::UnusableCa(error.to_string()));
+            |error: &dyn std::fmt::Display| TlsFile::ClientCa.fault(FileProblem::UnusableCa(error.to_string()));
         let mut roots = RootCertStore::empty();
         for anchor in &self.client_ca {
             roots.add(anchor.clone()).map_err(|error| unusable_ca(&error))?;
         }
-        let provider = Arc::new(rustls::crypto::ring::default_provider());
-        let verifier = WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider.clone())
+        WebPkiClientVerifier::builder_with_provider(Arc::new(roots), provider())
+            .with_crls(self.client_crl.clone())
             .build()
-            .map_err(|error| unusable_ca(&error))?;
-        let unusable = |error: rustls::Error| match error {
-            rustls::Error::InconsistentKeys(_) => TlsFile::Key.fault(IdentityProblem::KeyMismatch),
-            error => TlsFile::Certificate.fault(IdentityProblem::Unusable(error)),
-        };
-        let mut config = ServerConfig::builder_with_provider(provider)
-            .with_safe_default_protocol_versions()
-            .map_err(unusable)?
-            .with_client_cert_verifier(verifier)
-            .with_single_cert(self.chain.clone(), self.key.clone_key())
-            .map_err(unusable)?;
+            .map_err(|error| match error {
+                VerifierBuilderError::InvalidCrl(error) => TlsFile::ClientCrl.fault(FileProblem::UnsupportedCrl(error)),
+                error => unusable_ca(&error),
+            })
+    }
+
+    /// The configuration for rustls. Sessions are not resumed: each connection presents its certificate, and a session
+    /// cannot outlive it.
+    fn server_config(&self, verifier: Arc<dyn ClientCertVerifier>) -> Result<Arc<ServerConfig>, IdentityFault> {
+        let mut config = self.server.server_config(Some(verifier))?;
         config.session_storage = Arc::new(NoServerSessionStorage {});
         config.send_tls13_tickets = 0;
         Ok(Arc::new(config))
     }
 }
 
-/// The certificates of the server, its own first, with a warning if that one expires soon.
-fn read_chain(
-    file: &Path,
-    now: SystemTime,
-) -> Result<(Vec<CertificateDer<'static>>, Option<IdentityProblem>), IdentityProblem> {
-    let chain = pem::certificates(file)?;
-    let warning = chain.first().map_or(Ok(None), |own| check_validity(file, own, now))?;
-    Ok((chain, warning))
+/// What the certificates of clients are held against.
+#[derive(Debug)]
+pub(super) struct Requirements {
+    config: Arc<ServerConfig>,
+    verifier: Arc<dyn ClientCertVerifier>,
+    roles: BTreeMap<String, Role>,
 }
 
-/// An error if the certificate is not valid at `now`, a warning if it expires soon.
-fn check_validity(
-    file: &Path,
-    der: &CertificateDer<'_>,
-    now: SystemTime,
-) -> Result<Option<IdentityProblem>, IdentityProblem> {
-    let file = file.display().to_string();
-    let Ok(certificate) = certificate::read(der) else {
-        return Err(IdentityProblem::NotACertificate(file));
-    };
-    let now = now.duration_since(UNIX_EPOCH).unwrap_or_default().as_secs();
-    let date = |seconds: u64| {
-        let time = UNIX_EPOCH.checked_add(Duration::from_secs(seconds.min(253_402_300_799)));
-        time.map_or_else(String::new, |time| humantime::format_rfc3339_seconds(time).to_string())
-    };
-    let (name, end) = (certificate.name, date(certificate.not_after));
-    if now > certificate.not_after {
-        return Err(IdentityProblem::Expired { name, file, end });
+impl Requirements {
+    /// Those of the configuration.
+    ///
+    /// # Errors
+    /// Its certificates cannot be used.
+    pub(super) fn new(tls: &Tls) -> Result<Requirements, IdentityFault> {
+        let verifier = tls.identity.verifier()?;
+        Ok(Requirements {
+            config: tls.identity.server_config(verifier.clone())?,
+            verifier,
+            roles: tls.roles.clone(),
+        })
     }
-    if now < certificate.not_before {
-        let begin = date(certificate.not_before);
-        return Err(IdentityProblem::NotYetValid { name, file, begin });
+
+    /// Whether the certificates of a client, its own first, are accepted at `now`.
+    ///
+    /// # Errors
+    /// Why they are not.
+    pub(super) fn check(&self, chain: &[CertificateDer<'_>], now: SystemTime) -> Result<(), rustls::Error> {
+        let Some((own, intermediates)) = chain.split_first() else {
+            return Err(rustls::Error::NoCertificatesPresented);
+        };
+        let since_1970 = now.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let now = rustls_pki_types::UnixTime::since_unix_epoch(since_1970);
+        self.verifier.verify_client_cert(own, intermediates, now).map(|_| ())
     }
-    let soon = certificate.not_after - now < SOON.as_secs();
-    Ok(soon.then_some(IdentityProblem::ExpiresSoon { name, file, end }))
+
+    /// Without a role, or with one that is not configured, a client may read.
+    pub(super) fn role(&self, name: Option<&str>) -> Role {
+        name.and_then(|name| self.roles.get(name))
+            .copied()
+            .unwrap_or(Role::Monitor)
+    }
 }
 
-/// Authenticates the clients of a listener; its certificates can be renewed while it serves.
+/// Authenticates the clients of a listener. Its certificates, revocations and roles can be renewed while it serves.
 #[derive(Debug)]
 pub(super) struct TlsAuthenticator {
-    config: ArcSwap<ServerConfig>,
-    roles: BTreeMap<String, Role>,
+    clients: Arc<OpenClients>,
 }
 
 /// A client whose certificate was verified.
@@ -219,6 +188,8 @@ pub(super) struct TlsAuthenticator {
 pub(super) struct AuthenticatedClient {
     pub(super) name: String,
     pub(super) role: Role,
+    /// For as long as the client is connected.
+    pub(super) certificate: CertificateGuard,
 }
 
 /// Why a client is refused.
@@ -230,53 +201,54 @@ pub(super) enum AuthenticationError {
     Handshake(#[from] io::Error),
     #[error(transparent)]
     Role(#[from] RoleError),
+    #[error("a reload during the handshake: {0}")]
+    Renewed(#[from] rustls::Error),
 }
 
 impl TlsAuthenticator {
-    pub(super) fn new(tls: &Tls) -> Result<TlsAuthenticator, IdentityFault> {
-        Ok(TlsAuthenticator {
-            config: ArcSwap::new(tls.identity.server_config()?),
-            roles: tls.roles.clone(),
-        })
+    pub(super) fn new(requirements: Requirements) -> TlsAuthenticator {
+        TlsAuthenticator {
+            clients: OpenClients::new(requirements),
+        }
     }
 
-    /// Uses another identity for new connections; open connections stay.
-    pub(super) fn renew(&self, identity: &Identity) -> Result<(), IdentityFault> {
-        self.config.store(identity.server_config()?);
-        Ok(())
+    /// Uses other certificates, revocations and roles. Clients that they do not admit, or admit with other rights, are
+    /// disconnected.
+    pub(super) fn renew(&self, requirements: Requirements) {
+        self.clients.renew(requirements, SystemTime::now());
     }
 
-    /// Performs the handshake and reads the role of the client.
+    /// Performs the handshake and reads the role of the client at `peer`.
     ///
     /// # Errors
     /// Why the client is refused.
     pub(super) async fn authenticate(
         &self,
         stream: TcpStream,
+        peer: SocketAddr,
     ) -> Result<(TlsStream<TcpStream>, AuthenticatedClient), AuthenticationError> {
-        let handshake = TlsAcceptor::from(self.config.load_full()).accept(stream);
+        let requirements = self.clients.requirements();
+        let handshake = TlsAcceptor::from(requirements.config.clone()).accept(stream);
         let stream = tokio::time::timeout(HANDSHAKE, handshake)
             .await
             .map_err(|_| AuthenticationError::Timeout)??;
-        let chain = stream.get_ref().1.peer_certificates();
-        let client = match chain.and_then(|chain| chain.first()).map(|der| certificate::read(der)) {
-            Some(Ok(certificate)) => AuthenticatedClient {
-                role: self.role(certificate.role?.as_deref()),
-                name: certificate.name,
-            },
+        let chain: Vec<CertificateDer<'static>> = match stream.get_ref().1.peer_certificates() {
+            Some(chain) => chain.iter().map(|der| der.clone().into_owned()).collect(),
+            None => Vec::new(),
+        };
+        let (name, role) = match chain.first().map(|der| certificate::read(der)) {
+            Some(Ok(certificate)) => (certificate.name, certificate.role?),
             // The verifier refuses clients without a certificate; one that only rustls can read grants no role.
-            Some(Err(_)) | None => AuthenticatedClient {
-                role: Role::Monitor,
-                name: "unreadable certificate".to_string(),
-            },
+            Some(Err(_)) | None => ("unreadable certificate".to_string(), None),
+        };
+        let (certificate, role) = self
+            .clients
+            .admit(&requirements, chain, role, format!("{name} at {peer}"))?;
+        let client = AuthenticatedClient {
+            name,
+            role,
+            certificate,
         };
         Ok((stream, client))
-    }
-
-    /// Without a role, or with one that is not configured, a client may read.
-    fn role(&self, name: Option<&str>) -> Role {
-        name.and_then(|name| self.roles.get(name))
-            .copied()
-            .unwrap_or(Role::Monitor)
     }
 }

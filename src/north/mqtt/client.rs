@@ -1,27 +1,28 @@
 //! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
-use std::collections::BTreeSet;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::v5::mqttbytes::v5::Publish;
+use rumqttc::PubAckReason;
+use tokio::sync::Notify;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
-use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 
-use super::commands::{Commands, FinishedCommand};
+use super::commands::{Commands, FinishedCommand, Rules};
+use super::complaints::{Complaints, Outages};
 use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
-use super::outbox::{Acknowledged, Message, Outbox};
+use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
 use super::payload::{self, Topics};
-use super::publisher::Publisher;
+use super::publisher::{Publisher, Update};
+use super::reply::ResponseTopics;
 use super::request::Incoming;
-use super::store::EventStore;
-use super::{Options, tls};
-use crate::event::Event;
-use crate::north::NorthStats;
+use super::store::{Loaded, LostCount, Store};
+use super::{Buffer, History, Options, tls};
+use crate::event::{BURST, Event, EventKind};
+use crate::north::{MqttLoss, NorthStats};
 use crate::plant::{Plant, SharedPlant};
 
 /// First and longest wait between two connection attempts.
@@ -32,12 +33,25 @@ const STABLE: Duration = Duration::from_secs(5);
 const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
 /// Time limit for the broker to answer the subscription.
 const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
-/// Maximum number of topics that are logged because the broker refuses messages on them.
-const REFUSED_LOGGED: usize = 100;
+/// Maximum time between two checks of the connection, the plant and the buffer.
+const CHECK: Duration = Duration::from_millis(25);
 /// Time for the orderly disconnect.
 const DISCONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 /// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
+/// Time for the disk to take the last messages.
+const LAST_WRITE: Duration = Duration::from_secs(1);
+/// Minimum time between two messages of the history, so that live values have the connection.
+const HISTORY_PACE: Duration = Duration::from_millis(50);
+/// Minimum time between two repairs of the status.
+const REPAIR: Duration = Duration::from_secs(1);
+/// What an event takes on disk, bytes, at most for all but the longest texts.
+const EVENT_BYTES: u64 = 512;
+/// Minimum time between two log lines about lost messages.
+const LOST_LOGGED: Duration = Duration::from_secs(60);
+/// Names of the files of the buffer.
+const EVENT_FILES: &str = "mqtt-events";
+const HISTORY_FILES: &str = "mqtt-history";
 
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
@@ -47,16 +61,18 @@ pub(super) async fn run(
     events: Receiver<Arc<Event>>,
     cancel: CancellationToken,
 ) {
-    let mut client = Client::new(options, plant, stats, events).await;
-    let mut ticks = tokio::time::interval(client.tick_interval());
-    ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+    let mut client = Client::new(options, plant, stats, events);
     loop {
+        let look_at = tokio::time::Instant::from_std(client.look_at);
         tokio::select! {
             () = cancel.cancelled() => break,
             event = client.events.recv() => client.on_event(event),
-            event = next(&mut client.link), if client.commands.has_room() => client.on_connection_event(event),
+            event = next(&mut client.link), if client.receives() => client.on_connection_event(event),
             ended = client.commands.finished() => client.on_ended(ended),
-            _ = ticks.tick() => client.on_tick().await,
+            loaded = client.store.next() => client.on_loaded(Kind::Event, loaded),
+            loaded = client.history.next() => client.on_loaded(Kind::History, loaded),
+            () = client.fresh.notified() => client.look(),
+            () = tokio::time::sleep_until(look_at) => client.on_time().await,
         }
         client.publish_waiting();
     }
@@ -103,38 +119,61 @@ struct Client {
     events: Receiver<Arc<Event>>,
     topics: Topics,
     publisher: Publisher,
+    /// Woken when a drive was updated.
+    fresh: Arc<Notify>,
+    /// When the publisher, and when everything else is looked at again at the latest.
+    look_at: Instant,
+    check_at: Instant,
     outbox: Outbox,
-    store: EventStore,
+    store: Store,
+    history: Store,
+    history_at: Instant,
     commands: Commands,
     link: BrokerLink,
     /// Wait before the next connection attempt.
     back_off: Duration,
-    /// Why there is no connection, as last logged.
-    last_error: Option<String>,
+    outages: Outages,
+    refused: Complaints,
     /// Number of events lost because they arrived too fast.
     missed: u64,
-    dropped_logged: u64,
-    /// Topics that were logged because the broker refuses messages on them.
-    refused_logged: BTreeSet<Arc<str>>,
+    /// How many lost messages were logged, and when.
+    lost_logged: (u64, Option<Instant>),
+    repaired: Option<Instant>,
 }
 
 impl Client {
-    async fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, events: Receiver<Arc<Event>>) -> Client {
+    fn new(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, events: Receiver<Arc<Event>>) -> Client {
         let observed = plant.load_full();
         let topics = Topics::new(&options.base, &observed.gateway);
-        let mut publisher = Publisher::new(topics.clone(), options.min_interval, options.max_interval);
+        let fresh = Arc::new(Notify::new());
+        let intervals = (options.min_interval, options.max_interval);
+        let mut publisher = Publisher::new(topics.clone(), intervals, options.telemetry, fresh.clone());
         publisher.adopt(&observed);
+        let rules = Rules {
+            responses: ResponseTopics::new(&options.base, &observed.gateway, options.response_topics.clone()),
+            require_id: options.require_id,
+        };
+        let delivery = Delivery {
+            telemetry: options.telemetry_qos,
+            events: options.event_qos,
+            expiry: options.expiry.and_then(|expiry| u32::try_from(expiry.as_secs()).ok()),
+        };
+        let (events_buffer, history_buffer) = buffers(&options);
+        let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
         Client {
-            store: EventStore::open(options.buffer.clone()).await,
-            commands: Commands::new(topics.clone()),
-            outbox: Outbox::default(),
+            store: Store::open(events_buffer, EVENT_FILES, count(MqttLoss::Event)),
+            history: Store::open(history_buffer, HISTORY_FILES, count(MqttLoss::History)),
+            history_at: now,
+            commands: Commands::new(topics.clone(), rules),
+            outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
             back_off: BACK_OFF.0,
-            last_error: None,
+            outages: Outages::default(),
+            refused: Complaints::default(),
             missed: 0,
-            dropped_logged: 0,
-            refused_logged: BTreeSet::new(),
+            lost_logged: (0, None),
+            repaired: None,
             options,
             plant,
             observed,
@@ -142,12 +181,15 @@ impl Client {
             events,
             topics,
             publisher,
+            fresh,
+            look_at: now,
+            check_at: now,
         }
     }
 
-    /// Short enough to keep `min_interval` accurately.
-    fn tick_interval(&self) -> Duration {
-        (self.options.min_interval / 4).clamp(Duration::from_millis(10), Duration::from_millis(25))
+    /// Whether another message from the broker may be taken: a result of it finds room.
+    fn receives(&self) -> bool {
+        self.commands.has_room() && self.outbox.has_room_for_results()
     }
 
     fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
@@ -171,8 +213,14 @@ impl Client {
         }
     }
 
+    /// Events in memory and on disk.
+    fn waiting_events(&self) -> u64 {
+        self.outbox.events() as u64 + self.store.waiting()
+    }
+
     fn missed(&mut self, lost: u64) {
         self.missed += lost;
+        self.stats.mqtt.lost(MqttLoss::Event, lost);
         tracing::error!(
             "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
             self.missed
@@ -180,20 +228,69 @@ impl Client {
     }
 
     fn store_event(&mut self, event: &Event) {
-        let Some((topic, payload)) = payload::event(&self.topics, event) else {
+        // Refusals have a part of the room only, so that they push out no other event.
+        if event.kind == EventKind::RefusedCommand && self.waiting_events() >= refusal_limit(&self.options) {
+            self.stats.mqtt.lost(MqttLoss::Event, 1);
             return;
-        };
-        self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
-        if let Some((topic, payload)) = payload::recording(&self.topics, event) {
-            self.store.push(Message::not_retained(topic, payload), &mut self.outbox);
         }
+        let (topics, payload) = payload::event(&self.topics, event, &self.observed);
+        for topic in topics {
+            self.keep(Kind::Event, Message::not_retained(topic, payload.clone()));
+        }
+        if let Some((topic, payload)) = payload::recording(&self.topics, event) {
+            self.keep(Kind::Event, Message::not_retained(topic, payload));
+        }
+    }
+
+    /// Gives a message to the store, and to the outbox if its turn has come.
+    fn keep(&mut self, kind: Kind, message: Message) {
+        let room = self.outbox.room(kind) > 0;
+        let store = if kind == Kind::Event {
+            &mut self.store
+        } else {
+            &mut self.history
+        };
+        if let Some((number, message)) = store.push(message, room) {
+            self.outbox.push(kind, message, number);
+        }
+    }
+
+    fn on_loaded(&mut self, kind: Kind, loaded: Loaded) {
+        let opened = matches!(loaded, Loaded::Opened { .. });
+        let store = if kind == Kind::Event {
+            &mut self.store
+        } else {
+            &mut self.history
+        };
+        let (messages, topics) = store.take(loaded);
+        for (number, message) in messages {
+            self.outbox.push(kind, message, Some(number));
+        }
+        if kind == Kind::Event && opened {
+            self.clear_old(topics);
+            self.remember_topics();
+        }
+    }
+
+    /// Clears the topics of earlier runs that are not published any more: drives that were removed, another base.
+    fn clear_old(&mut self, topics: Vec<String>) {
+        let status = self.topics.status();
+        let sound = |topic: &String| !topic.is_empty() && !topic.contains(['+', '#', '\0']) && *topic != status;
+        self.publisher.clear(topics.into_iter().filter(sound).map(Arc::from));
+    }
+
+    /// Keeps the retained topics for the next run, with those that are still to be cleared.
+    fn remember_topics(&self) {
+        let topics = self.publisher.all_topics().chain(self.publisher.vanished());
+        let topics = topics.map(|topic| topic.to_string());
+        self.store.remember(topics.chain([self.topics.status()]).collect());
     }
 
     fn on_connection_event(&mut self, event: ConnectionEvent) {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if !matches!(event, ConnectionEvent::Sent(_)) {
+        if !matches!(event, ConnectionEvent::Sent(_) | ConnectionEvent::Room) {
             session.last_packet = Instant::now();
         }
         match event {
@@ -216,33 +313,48 @@ impl Client {
             }
             ConnectionEvent::Acked(packet) => {
                 self.stats.mqtt.published.fetch_add(1, Ordering::Relaxed);
-                let acked = self.outbox.acked(packet);
-                self.done(acked);
+                let settled = self.outbox.acked(packet);
+                self.settled(settled);
             }
             ConnectionEvent::Refused(packet, why) => {
-                let acked = self.outbox.acked(packet);
-                if let Some(Acknowledged { topic, .. }) = &acked {
-                    self.log_refused(topic, &format!("the broker refuses it: {why}"));
-                }
-                self.done(acked);
+                let settled = self.outbox.acked(packet);
+                self.drop_refused(settled.as_ref(), &refusal(why));
+                self.settled(settled);
             }
-            ConnectionEvent::SetMessage(publish) => self.on_command(*publish),
-            ConnectionEvent::Alive => {}
+            ConnectionEvent::Message(message) => self.on_message(*message),
+            ConnectionEvent::Room | ConnectionEvent::Alive => {}
             ConnectionEvent::Lost(why) => self.lost(&why),
         }
     }
 
-    /// Logs once per topic and connection.
-    fn log_refused(&mut self, topic: &Arc<str>, why: &str) {
-        if self.refused_logged.len() < REFUSED_LOGGED && self.refused_logged.insert(topic.clone()) {
-            tracing::warn!("dropped a message on {topic}: {why}");
+    /// A message cannot be delivered: counted, and logged once a minute.
+    fn drop_refused(&mut self, settled: Option<&Settled>, why: &str) {
+        let Some(Settled { topic, kind }) = settled else { return };
+        match kind {
+            Some(Kind::Event) => self.stats.mqtt.lost(MqttLoss::Event, 1),
+            Some(Kind::Result) => self.stats.mqtt.lost(MqttLoss::Result, 1),
+            Some(Kind::History) => self.stats.mqtt.lost(MqttLoss::History, 1),
+            None => {}
+        }
+        if let Some(more) = self.refused.permit(Instant::now()) {
+            let root = self.topics.root();
+            tracing::warn!(
+                "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/# and to the \
+                 response topics in use{more}",
+                self.options.client_id
+            );
         }
     }
 
-    /// Removes the record of a message that left the outbox.
-    fn done(&mut self, acked: Option<Acknowledged>) {
-        if let Some(record) = acked.and_then(|a| a.record) {
-            self.store.acknowledge(record);
+    /// A message left the outbox.
+    fn settled(&mut self, settled: Option<Settled>) {
+        let Some(Settled { topic, kind }) = settled else { return };
+        match kind {
+            Some(Kind::Event) => self.store.acknowledge(self.outbox.oldest(Kind::Event)),
+            Some(Kind::History) => self.history.acknowledge(self.outbox.oldest(Kind::History)),
+            Some(Kind::Result) => {}
+            None if self.publisher.was_cleared(&topic) => self.remember_topics(),
+            None => {}
         }
     }
 
@@ -251,9 +363,7 @@ impl Client {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if !self.options.commands {
-            self.ready(limits, since);
-        } else if session.connection.subscribe(self.topics.set_filters()) {
+        if session.connection.subscribe(&self.topics, self.options.commands) {
             // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
@@ -269,11 +379,27 @@ impl Client {
         session.phase = Phase::Ready { limits, since };
         self.stats.mqtt.connected.store(true, Ordering::Relaxed);
         tracing::info!("connected to the broker at {}:{}", self.options.host, self.options.port);
-        self.last_error = None;
-        self.dropped_logged = self.dropped();
-        self.refused_logged.clear();
-        self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
+        if !limits.acknowledges || !limits.retains {
+            tracing::warn!(
+                "the broker lacks {}: messages may be lost, or are not there for later subscribers",
+                if limits.acknowledges {
+                    "retained messages"
+                } else {
+                    "QoS 1"
+                }
+            );
+        }
+        self.outages.end();
+        self.publish_online();
+        for update in self.publisher.recorded() {
+            self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
+        }
         self.publisher.restart();
+        self.look_at = since;
+    }
+
+    fn publish_online(&mut self) {
+        self.outbox.put_first(self.topics.status().into(), b"online".to_vec());
     }
 
     fn lost(&mut self, why: &str) {
@@ -293,10 +419,9 @@ impl Client {
         // Dropping the session aborts its task and closes the socket.
         self.link = BrokerLink::Disconnected { retry_at: now + wait };
         self.outbox.lost();
+        self.look_at = now;
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
-        if self.last_error.as_deref() == Some(why) {
-            tracing::debug!("no connection to the broker: {why}");
-        } else {
+        if self.outages.permit(why, now) {
             let (host, port) = (&self.options.host, self.options.port);
             let hint = if why.contains("SessionTakenOver") {
                 "; another client has the same `client_id`: give each gateway a name or a `client_id` of its own"
@@ -304,30 +429,34 @@ impl Client {
                 ""
             };
             tracing::warn!("no connection to the broker at {host}:{port}: {why}{hint}; reconnecting");
-            self.last_error = Some(why.to_string());
+        } else {
+            tracing::debug!("no connection to the broker: {why}");
         }
     }
 
-    fn on_command(&mut self, publish: Publish) {
-        let properties = publish.properties.unwrap_or_default();
-        let Ok(topic) = String::from_utf8(publish.topic.to_vec()) else {
-            return;
-        };
-        let incoming = Incoming {
-            topic,
-            payload: publish.payload.to_vec(),
-            retain: publish.retain,
-            dup: publish.dup,
-            packet: publish.pkid,
-            response_topic: properties.response_topic,
-            correlation: properties.correlation_data.map(|data| data.to_vec()),
-            expiry: properties.message_expiry_interval,
-        };
+    fn on_message(&mut self, message: Incoming) {
+        if message.topic == self.topics.status() {
+            return self.on_status(&message.payload);
+        }
         let plant = self.plant.load();
+        let crowded = |topic: &str| self.outbox.is_crowded(topic);
         if self.options.commands
-            && let Some(result) = self.commands.take(incoming, &plant, Instant::now(), SystemTime::now())
+            && let Some(result) = self
+                .commands
+                .take(message, &plant, crowded, Instant::now(), SystemTime::now())
         {
             self.outbox.push_result(result);
+        }
+    }
+
+    /// Somebody else published a status in the gateway's name, such as the will of its last connection.
+    fn on_status(&mut self, payload: &[u8]) {
+        let now = Instant::now();
+        let soon = |at: Instant| now.saturating_duration_since(at) < REPAIR;
+        let ready = matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }));
+        if payload != b"online" && ready && !self.repaired.is_some_and(soon) {
+            self.repaired = Some(now);
+            self.publish_online();
         }
     }
 
@@ -336,8 +465,43 @@ impl Client {
         self.outbox.push_result(result);
     }
 
-    async fn on_tick(&mut self) {
+    /// Looks at the drives that were updated.
+    fn look(&mut self) {
+        let (now, wall) = (Instant::now(), SystemTime::now());
+        let ready = matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }));
+        let next = match (ready, self.options.telemetry.history) {
+            (true, _) => {
+                for topic in self.publisher.cleared() {
+                    self.outbox.put_lasting(topic, Vec::new());
+                }
+                let (updates, next) = self.publisher.tick(now, wall);
+                for Update { topic, payload } in updates {
+                    self.outbox.put(topic, payload);
+                }
+                next
+            }
+            (false, History::Off) => now + CHECK,
+            (false, _) => {
+                let (updates, next) = self.publisher.record(now, wall);
+                for Update { topic, payload } in updates {
+                    self.keep(Kind::History, Message::not_retained(topic, payload));
+                }
+                next
+            }
+        };
+        self.look_at = next.min(self.check_at.max(now));
+    }
+
+    async fn on_time(&mut self) {
         let now = Instant::now();
+        if now >= self.check_at {
+            self.check_at = now + CHECK;
+            self.check(now).await;
+        }
+        self.look();
+    }
+
+    async fn check(&mut self, now: Instant) {
         self.update_plant();
         match &self.link {
             BrokerLink::Disconnected { retry_at } if now >= *retry_at => self.connect().await,
@@ -349,16 +513,13 @@ impl Client {
                 _ if now.saturating_duration_since(session.last_packet) > SILENCE => {
                     self.lost("the broker is silent");
                 }
-                Phase::Ready { .. } => {
-                    for update in self.publisher.tick(now, SystemTime::now()) {
-                        self.outbox.put(update.topic, update.payload);
-                    }
-                }
                 _ => {}
             },
         }
-        self.store.sync(now);
-        self.log_dropped();
+        // What the disk had no room for the last time.
+        self.store.acknowledge(self.outbox.oldest(Kind::Event));
+        self.history.acknowledge(self.outbox.oldest(Kind::History));
+        self.count_lost(now);
     }
 
     /// Observes the current plant, which a reload may have replaced.
@@ -374,6 +535,7 @@ impl Client {
         }
         self.publisher.adopt(&plant);
         self.observed = plant;
+        self.remember_topics();
     }
 
     async fn connect(&mut self) {
@@ -397,45 +559,66 @@ impl Client {
 
     /// Publishes from the outbox as far as the connection allows.
     fn publish_waiting(&mut self) {
-        self.store.refill(&mut self.outbox);
+        self.store.load(self.outbox.room(Kind::Event));
         if let BrokerLink::Open(BrokerSession {
-            connection,
             phase: Phase::Ready { limits, .. },
             ..
         }) = &self.link
         {
-            let most = limits.max_packet;
-            let mut oversized = Vec::new();
-            while let Some((key, message)) = self.outbox.next(limits.limit) {
-                if connection::packet_size(&message) > most {
-                    oversized.push(self.outbox.give_up(key));
-                } else if connection.publish(message) {
-                    self.outbox.mark_published(key);
-                } else {
-                    break;
-                }
-            }
-            for acked in oversized {
-                if let Some(Acknowledged { topic, .. }) = &acked {
-                    self.log_refused(topic, &format!("the broker accepts at most {most} bytes per packet"));
-                }
-                self.done(acked);
-            }
+            self.history.load(self.outbox.room(Kind::History));
+            self.publish(*limits);
         }
-        let waiting = self.outbox.waiting() as u64 + self.store.waiting();
+        let waiting = self.outbox.waiting() as u64 + self.store.waiting() + self.history.waiting();
         self.stats.mqtt.buffered.store(waiting, Ordering::Relaxed);
     }
 
-    fn dropped(&self) -> u64 {
-        self.outbox.dropped() + self.store.dropped()
+    fn publish(&mut self, limits: BrokerLimits) {
+        let now = Instant::now();
+        while let BrokerLink::Open(BrokerSession { connection, .. }) = &mut self.link
+            && let Some((key, message)) = self.outbox.next(limits.window, now >= self.history_at)
+        {
+            if connection::packet_size(&message) > limits.max_packet {
+                let settled = self.outbox.give_up(key);
+                let why = format!("the broker accepts at most {} bytes per packet", limits.max_packet);
+                self.drop_refused(settled.as_ref(), &why);
+                self.settled(settled);
+                continue;
+            }
+            let acknowledged = message.acknowledged && limits.acknowledges;
+            if !connection.publish(message, limits) {
+                break;
+            }
+            if matches!(key, Key::Queued(Kind::History, _)) {
+                self.history_at = now + HISTORY_PACE;
+            }
+            let settled = self.outbox.mark_published(key, acknowledged);
+            if settled.is_some() {
+                self.stats.mqtt.published.fetch_add(1, Ordering::Relaxed);
+            }
+            self.settled(settled);
+        }
     }
 
-    /// Logs once per connection outage.
-    fn log_dropped(&mut self) {
-        let dropped = self.dropped();
-        if dropped > self.dropped_logged && self.dropped_logged != u64::MAX {
-            tracing::warn!("the buffer is full or damaged: dropping the oldest events or results");
-            self.dropped_logged = u64::MAX;
+    /// Counts what the outbox lost, and logs it once a minute.
+    fn count_lost(&mut self, now: Instant) {
+        let lost = self.outbox.take_lost();
+        let counts = [
+            (MqttLoss::Event, lost.events),
+            (MqttLoss::Result, lost.results),
+            (MqttLoss::History, lost.history),
+        ];
+        for (kind, count) in counts {
+            self.stats.mqtt.lost(kind, count);
+        }
+        let total: u64 = self.stats.mqtt.losses().map(|(_, count)| count).sum();
+        let (logged, at) = self.lost_logged;
+        if total > logged && at.is_none_or(|at| now.saturating_duration_since(at) >= LOST_LOGGED) {
+            tracing::warn!(
+                "{} events, results or arrays of history were lost since the last such line: the buffer is full or \
+                 damaged, or the broker refuses them",
+                total - logged
+            );
+            self.lost_logged = (total, Some(now));
         }
     }
 
@@ -449,6 +632,13 @@ impl Client {
             tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
+        for update in self.publisher.recorded() {
+            self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
+        }
+        let close = async { tokio::join!(self.store.close(), self.history.close()) };
+        if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
+            tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");
+        }
     }
 
     async fn disconnect(&mut self, last_results: tokio::time::Instant) {
@@ -458,7 +648,7 @@ impl Client {
         let mut offline_queued = false;
         while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
             self.publish_waiting();
-            let quiet = self.commands.is_idle() && self.outbox.waiting() == 0;
+            let quiet = self.commands.is_idle() && self.outbox.urgent() == 0;
             if !offline_queued && (quiet || tokio::time::Instant::now() >= last_results) {
                 self.outbox.put_first(status.as_str().into(), b"offline".to_vec());
                 offline_queued = true;
@@ -468,9 +658,10 @@ impl Client {
                 break;
             }
             tokio::select! {
-                event = next(&mut self.link), if self.commands.has_room() => self.on_connection_event(event),
+                event = next(&mut self.link), if self.receives() => self.on_connection_event(event),
                 event = self.events.recv() => self.on_event(event),
                 ended = self.commands.finished() => self.on_ended(ended),
+                loaded = self.store.next() => self.on_loaded(Kind::Event, loaded),
                 () = tokio::time::sleep_until(last_results), if !offline_queued => {}
             }
         }
@@ -480,6 +671,34 @@ impl Client {
         {
             while !matches!(session.connection.next().await, ConnectionEvent::Lost(_)) {}
         }
+    }
+}
+
+/// The buffers of events and of history; with both, each has half.
+fn buffers(options: &Options) -> (Option<Buffer>, Option<Buffer>) {
+    match (options.buffer.clone(), options.telemetry.history) {
+        (None, _) => (None, None),
+        (buffer, History::Off) => (buffer, None),
+        (Some(Buffer { dir, max_bytes }), _) => {
+            let half = Buffer {
+                dir,
+                max_bytes: max_bytes / 2,
+            };
+            (Some(half.clone()), Some(half))
+        }
+    }
+}
+
+/// Refused commands are dropped while so many events wait: half of the room in memory, about half of that on disk.
+fn refusal_limit(options: &Options) -> u64 {
+    let on_disk = options.buffer.as_ref().map(|buffer| buffer.max_bytes / EVENT_BYTES / 4);
+    on_disk.unwrap_or(u64::MAX).min(BURST as u64 / 2)
+}
+
+fn refusal(why: PubAckReason) -> String {
+    match why {
+        PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
+        why => format!("the broker refuses it ({why:?})"),
     }
 }
 

@@ -1,19 +1,19 @@
 //! The set topics: turns a message into one command, and the answer to that command into one result. Time is an
 //! argument; a task only has to wait.
 
+mod memory;
+
 use std::collections::VecDeque;
 use std::future::poll_fn;
-use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant, SystemTime};
 
-use serde_json::Value as Json;
-
+use self::memory::{Memory, Repetition};
 use super::outbox::Message;
 use super::payload::Topics;
-use super::reply::Reply;
-use super::request::{self, Incoming, MAX_NAME, excerpt};
+use super::reply::{Reply, ResponseTopics};
+use super::request::{self, Id, Incoming, MAX_NAME, excerpt};
 use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
 use crate::document::nearest;
 use crate::drive::ModelPoint;
@@ -30,11 +30,6 @@ const CONFIRMING: QueueLimit = QueueLimit {
     most: 1024,
     bytes: 8 << 20,
 };
-/// Number of recent commands in which a repetition is recognised.
-const REMEMBERED: usize = 256;
-/// Time for which a command with an `id` is recognised when it is repeated.
-const REPLAYED: Duration = Duration::from_secs(60);
-
 /// Processes commands and returns their results.
 #[derive(Debug)]
 pub(super) struct Commands {
@@ -45,18 +40,24 @@ pub(super) struct Commands {
     waiting: PendingCommands,
     /// In the order of acknowledgement.
     confirming: PendingCommands,
-    hasher: RandomState,
-    /// Accepted commands, oldest first.
-    recent: VecDeque<RecentCommand>,
-    /// Number of commands accepted so far.
-    taken: u64,
+    memory: Memory,
+    rules: Rules,
+}
+
+/// What the configuration says about commands.
+#[derive(Debug, Clone)]
+pub(super) struct Rules {
+    /// Where results may go.
+    pub(super) responses: ResponseTopics,
+    /// Commands without an `id` are refused, except stops.
+    pub(super) require_id: bool,
 }
 
 /// A command that is not finished.
 #[derive(Debug)]
 struct PendingCommand {
     number: u64,
-    id: Option<Json>,
+    id: Option<Id>,
     reply: Reply,
     placed: Placed,
 }
@@ -65,37 +66,21 @@ struct PendingCommand {
 #[derive(Debug)]
 pub(super) struct FinishedCommand {
     number: u64,
-    id: Option<Json>,
+    id: Option<Id>,
     reply: Reply,
     answer: Answer,
     confirmed: Option<Duration>,
 }
 
-/// An accepted command.
-#[derive(Debug)]
-struct RecentCommand {
-    number: u64,
-    fingerprint: u64,
-    packet: u16,
-    /// Hash of topic and `id`, if it has one.
-    identity: Option<u64>,
-    /// Number of stops of the drive at that time.
-    stops: u64,
-    at: Instant,
-    /// `None` until it is finished.
-    result: Option<Message>,
-}
-
 impl Commands {
-    pub(super) fn new(topics: Topics) -> Commands {
+    pub(super) fn new(topics: Topics, rules: Rules) -> Commands {
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
             waiting: PendingCommands::default(),
             confirming: PendingCommands::default(),
-            hasher: RandomState::new(),
-            recent: VecDeque::new(),
-            taken: 0,
+            memory: Memory::default(),
+            rules,
         }
     }
 
@@ -106,13 +91,14 @@ impl Commands {
     }
 
     /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
-    /// otherwise its command is in the queue of the bus. A repeated command is answered with the previous result and
-    /// not executed again: one that the broker marks as repeated, or the same message with the same `id` within a
-    /// minute. A stop is always executed.
+    /// otherwise its command is in the queue of the bus. A repeated command is not executed again, but answered with the
+    /// previous result or refused; a stop is always executed. `crowded` says whether too many results wait on a topic: a
+    /// command that would be answered there is refused.
     pub(super) fn take(
         &mut self,
         incoming: Incoming,
         plant: &Plant,
+        crowded: impl Fn(&str) -> bool,
         now: Instant,
         time: SystemTime,
     ) -> Option<Message> {
@@ -120,8 +106,13 @@ impl Commands {
         if incoming.retain && incoming.payload.is_empty() {
             return None; // a retained message was cleared
         }
-        let reply = Reply::to(&incoming, self.topics.drive(target.drive, "result"), target.drive);
-        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, incoming.topic.as_str());
+        let result = self.topics.drive(target.drive, "result");
+        let reply = Reply::to(&incoming, result, target.drive, &self.rules.responses);
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let origin = Origin::of(self.client.clone(), SourceKind::Mqtt, who);
         let what = || excerpt(&incoming.payload);
         let Some(drive) = plant.drive(target.drive) else {
             let name = excerpt(target.drive.as_bytes());
@@ -131,36 +122,64 @@ impl Commands {
         };
         let profile = &drive.image.spec.profile;
         let request = request::read(&incoming, target.point, profile);
+        let refuse =
+            |refusal, id, origin| Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), None, time));
         let (points, expiry) = match request.order {
-            Err(refusal) => {
-                let answer = drive.refuse(&what(), refusal, origin, now);
-                return Some(reply.message(request.id, &answer, None, time));
-            }
+            Err(refusal) => return refuse(refusal, request.id, origin),
             Ok(order) => order,
         };
         let run = profile.model_index(ModelPoint::Run);
         let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
-        let fingerprint = self.fingerprint(&incoming);
-        let id = request.id.as_ref().map(Json::to_string);
-        let identity = id.map(|id| self.hasher.hash_one((&incoming.topic, id)));
-        if !stop && let Some(known) = self.repeated(&incoming, fingerprint, identity, now) {
-            if known.stops == drive.stops() || known.result.is_none() {
-                return known.result.clone(); // none yet: it is still to come
-            }
-            // The motor was stopped since: the previous result is no longer true, and a repetition would start it
-            // again.
-            let why = "it repeats an earlier command, but a stop was received since; send it with another `id`";
-            let answer = drive.refuse(&what(), Refusal::NotAllowed(why.to_string()), origin, now);
-            return Some(reply.message(request.id, &answer, None, time));
-        }
+        let print = self.memory.fingerprint(&incoming, request.id.as_ref().map(Id::text));
         let stops = drive.stops();
+        if !stop {
+            match self.memory.repeated(&incoming, print, stops, now) {
+                None => {}
+                Some(Repetition::Pending) => return None,
+                Some(Repetition::Answered(previous)) => return Some(reply.again(previous)),
+                Some(Repetition::Outdated(why)) => {
+                    let why = format!("it repeats an earlier command, {why}; send it with another `id`");
+                    return refuse(Refusal::NotAllowed(why), request.id, origin);
+                }
+            }
+            if let Err(why) = self.may_take(&reply, request.id.as_ref(), crowded, now) {
+                return refuse(Refusal::NotAllowed(why), request.id, origin);
+            }
+        }
+        let number = match stop {
+            true => 0,
+            false => self.memory.remember(&incoming, print, stops, now),
+        };
         let pending = PendingCommand {
-            number: self.remember(fingerprint, &incoming, identity, stops, now),
+            number,
             id: request.id,
-            reply,
             placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
+            reply,
         };
         self.follow(pending, time)
+    }
+
+    /// Whether a command that is no stop may be taken.
+    fn may_take(
+        &mut self,
+        reply: &Reply,
+        id: Option<&Id>,
+        crowded: impl Fn(&str) -> bool,
+        now: Instant,
+    ) -> Result<(), String> {
+        if id.is_none() && self.rules.require_id {
+            return Err("commands need an `id` here (mqtt.require_id), except stops; nothing was written".to_string());
+        }
+        if crowded(reply.topic()) {
+            let topic = excerpt(reply.topic().as_bytes());
+            return Err(format!(
+                "too many results wait for the broker on {topic}; wait for them; nothing was written"
+            ));
+        }
+        if id.is_some() && !self.memory.has_room(now) {
+            return Err("too many commands with an `id` within ten minutes; nothing was written".to_string());
+        }
+        Ok(())
     }
 
     /// Returns the result of a refused command; any other waits.
@@ -172,59 +191,6 @@ impl Commands {
                 None
             }
         }
-    }
-
-    fn fingerprint(&self, incoming: &Incoming) -> u64 {
-        let Incoming {
-            topic,
-            payload,
-            response_topic,
-            correlation,
-            ..
-        } = incoming;
-        self.hasher.hash_one((topic, payload, response_topic, correlation))
-    }
-
-    /// The command that a message repeats. An `id` that has been used for another command since does not count.
-    fn repeated(
-        &self,
-        incoming: &Incoming,
-        fingerprint: u64,
-        identity: Option<u64>,
-        now: Instant,
-    ) -> Option<&RecentCommand> {
-        let newest_first = || self.recent.iter().rev();
-        let same = |known: &&RecentCommand| known.fingerprint == fingerprint;
-        let marked = newest_first().find(|known| incoming.dup && known.packet == incoming.packet && same(known));
-        let by_id = || {
-            let last = newest_first().find(|known| identity.is_some() && known.identity == identity);
-            last.filter(|known| now.saturating_duration_since(known.at) < REPLAYED && same(known))
-        };
-        marked.or_else(by_id)
-    }
-
-    fn remember(
-        &mut self,
-        fingerprint: u64,
-        incoming: &Incoming,
-        identity: Option<u64>,
-        stops: u64,
-        now: Instant,
-    ) -> u64 {
-        if self.recent.len() == REMEMBERED {
-            self.recent.pop_front();
-        }
-        self.taken += 1;
-        self.recent.push_back(RecentCommand {
-            number: self.taken,
-            fingerprint,
-            packet: incoming.packet,
-            identity,
-            stops,
-            at: now,
-            result: None,
-        });
-        self.taken
     }
 
     /// The next command that finishes; pending while there is none. Cancel safe.
@@ -266,9 +232,7 @@ impl Commands {
         let message = finished
             .reply
             .message(finished.id, &finished.answer, finished.confirmed, time);
-        if let Some(known) = self.recent.iter_mut().find(|known| known.number == finished.number) {
-            known.result = Some(message.clone());
-        }
+        self.memory.finished(finished.number, &message);
         message
     }
 
@@ -291,7 +255,7 @@ impl PendingCommand {
 
     /// Number of bytes whose length the client controls.
     fn bytes(&self) -> usize {
-        self.reply.bytes() + self.id.as_ref().and_then(Json::as_str).map_or(0, str::len)
+        self.reply.bytes() + self.id.as_ref().map_or(0, |id| id.text().len())
     }
 }
 

@@ -1,71 +1,88 @@
 //! One connection to the broker: a rumqttc client, polled by its own task.
 //!
 //! Client and event loop are discarded after any error: the outbox is better at keeping what rumqttc would keep
-//! (messages in flight, a packet id collision). The polling task never publishes, and publishing never waits: it uses
-//! `try_publish` on a channel that always has room.
+//! (messages in flight). The polling task never publishes, and publishing never waits: what finds no room stays in the
+//! outbox until [`ConnectionEvent::Room`].
 
+use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
-use rumqttc::Outgoing;
-use rumqttc::v5::mqttbytes::QoS;
-use rumqttc::v5::mqttbytes::v5::{
-    ConnAck, ConnectProperties, ConnectReturnCode, Filter, LastWill, Packet, PubAckReason, Publish, PublishProperties,
-    SubscribeReasonCode,
+use rumqttc::mqttbytes::QoS;
+use rumqttc::mqttbytes::v5::Filter;
+use rumqttc::{
+    AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill,
+    MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties, RetainForwardRule, StateError,
+    SubscribeReasonCode, TlsConfiguration, Transport,
 };
-use rumqttc::v5::{AsyncClient, ConnectionError, Event, EventLoop, MqttOptions, StateError};
-use rumqttc::{NetworkOptions, TlsConfiguration, Transport};
 use rustls::ClientConfig;
 use tokio::sync::mpsc;
 use tokio::task::JoinHandle;
 
 use super::Options;
 use super::outbox::Message;
+use super::payload::Topics;
+use super::request::Incoming;
 
+/// Keep-alive interval, s.
+const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
-pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(10);
+pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
-const INFLIGHT: u16 = 100;
-/// Room for half of them, the subscription and the disconnect.
-const REQUESTS: usize = INFLIGHT as usize;
+pub(super) const INFLIGHT: u16 = 1000;
+/// Number of messages handed to rumqttc and not written to the socket yet.
+const REQUESTS: usize = 128;
+/// Messages written to the socket, or read from it, at a time.
+const BATCH: usize = 16;
 /// Number of events that the client has not processed; beyond it, polling pauses.
 const EVENTS: usize = 64;
-/// Maximum size of a packet from the broker; larger than any valid command, so that one that is too long gets an
-/// answer.
-const MAX_PACKET: u32 = 256 * 1024;
+/// Maximum size of a packet from the broker; much larger than any valid command, so that one that is too long gets an
+/// answer. Brokers drop larger ones without a word.
+const MAX_PACKET: u32 = 2 << 20;
 /// Number of unacknowledged commands that the broker may send.
 const RECEIVE_MAXIMUM: u16 = 64;
-/// Time limit for TCP, TLS and CONNACK, s.
-const CONNECT_TIMEOUT: u64 = 5;
+/// What the system buffers of sent messages: a result waits behind no more than that.
+const SEND_BUFFER: u32 = 256 << 10;
+/// Time limit for TCP, TLS and CONNACK.
+const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 
 /// An event of the connection.
 #[derive(Debug)]
 pub(super) enum ConnectionEvent {
     /// The broker accepted the connection.
     Connected(BrokerLimits),
-    /// The broker answered the subscription; with the reason if it refused part of it.
+    /// The broker answered the subscriptions; with the reason if it refused that of the set topics.
     Subscribed(Option<String>),
-    /// The oldest published message was sent with this packet id.
+    /// The oldest published message with an acknowledgement was sent with this packet id.
     Sent(u16),
     /// The broker acknowledged the message.
     Acked(u16),
-    /// The broker refused the message.
-    Refused(u16, String),
-    /// A message on a set topic.
-    SetMessage(Box<Publish>),
+    /// The broker refused the message; the connection goes on.
+    Refused(u16, PubAckReason),
+    /// A message on a topic that was subscribed to.
+    Message(Box<Incoming>),
+    /// There is room for further messages.
+    Room,
     /// Any other packet from the broker.
     Alive,
     /// The connection is lost, with the reason. The last event.
     Lost(String),
 }
 
-/// Limits that the broker sets.
+/// What the broker can do.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) struct BrokerLimits {
-    /// Number of unacknowledged messages: half the inflight window.
-    pub(super) limit: usize,
+    /// Number of unacknowledged messages.
+    pub(super) window: usize,
     /// Maximum packet size, bytes.
     pub(super) max_packet: usize,
+    /// Whether it acknowledges messages (QoS 1).
+    pub(super) acknowledges: bool,
+    /// Whether it keeps retained messages.
+    pub(super) retains: bool,
+    /// Number of topic aliases.
+    aliases: u16,
 }
 
 impl BrokerLimits {
@@ -74,8 +91,11 @@ impl BrokerLimits {
         let window = properties.and_then(|p| p.receive_max).unwrap_or(u16::MAX).min(INFLIGHT);
         let max_packet = properties.and_then(|p| p.max_packet_size).unwrap_or(u32::MAX);
         BrokerLimits {
-            limit: usize::from(window / 2).max(1),
+            window: usize::from(window).max(1),
             max_packet: usize::try_from(max_packet).unwrap_or(usize::MAX),
+            acknowledges: properties.and_then(|p| p.max_qos) != Some(0),
+            retains: properties.and_then(|p| p.retain_available) != Some(0),
+            aliases: properties.and_then(|p| p.topic_alias_max).unwrap_or_default(),
         }
     }
 }
@@ -85,7 +105,50 @@ impl BrokerLimits {
 pub(super) struct Connection {
     client: AsyncClient,
     event: mpsc::Receiver<ConnectionEvent>,
+    backlog: Arc<Backlog>,
+    aliases: Aliases,
     task: JoinHandle<()>,
+}
+
+/// Short names of topics, for telemetry that is published again and again: a topic gets one when it is published for the
+/// second time, as long as the broker has any.
+#[derive(Debug, Default)]
+struct Aliases {
+    /// With whether the broker knows it.
+    named: HashMap<Arc<str>, (u16, bool)>,
+    once: HashSet<Arc<str>>,
+}
+
+impl Aliases {
+    fn of(&mut self, topic: &Arc<str>, granted: u16) -> Option<(u16, bool)> {
+        if let Some(alias) = self.named.get(topic) {
+            return Some(*alias);
+        }
+        let next = u16::try_from(self.named.len() + 1).ok().filter(|next| *next <= granted);
+        let Some(next) = next else {
+            self.once = HashSet::new();
+            return None;
+        };
+        if self.once.insert(topic.clone()) {
+            return None;
+        }
+        self.named.insert(topic.clone(), (next, false));
+        Some((next, false))
+    }
+
+    fn announced(&mut self, topic: &str) {
+        if let Some((_, known)) = self.named.get_mut(topic) {
+            *known = true;
+        }
+    }
+}
+
+/// Messages that rumqttc has not written yet.
+#[derive(Debug, Default)]
+struct Backlog {
+    messages: AtomicUsize,
+    /// Whether the client waits for [`ConnectionEvent::Room`].
+    room_wanted: AtomicBool,
 }
 
 impl Drop for Connection {
@@ -97,10 +160,19 @@ impl Drop for Connection {
 impl Connection {
     /// Starts to connect; `will` is the topic of the last will `offline`.
     pub(super) fn open(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> Connection {
-        let (client, eventloop) = AsyncClient::new(mqtt_options(options, will, tls), REQUESTS);
+        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, will, tls))
+            .capacity(REQUESTS)
+            .build();
         let (sender, event) = mpsc::channel(EVENTS);
-        let task = tokio::spawn(poll(eventloop, sender));
-        Connection { client, event, task }
+        let backlog = Arc::<Backlog>::default();
+        let task = tokio::spawn(poll(eventloop, sender, backlog.clone()));
+        Connection {
+            client,
+            event,
+            backlog,
+            aliases: Aliases::default(),
+            task,
+        }
     }
 
     /// The next event. Cancel safe.
@@ -110,67 +182,96 @@ impl Connection {
         self.event.recv().await.unwrap_or_else(silent)
     }
 
-    /// Subscribes to all set topics. Retained messages are requested too, and stay marked even if they arrive during
-    /// the subscription, so that they can be refused.
-    pub(super) fn subscribe(&self, filters: [String; 2]) -> bool {
-        let filters = filters.map(|path| Filter {
+    /// Subscribes to the status that others publish in the gateway's name, and to all set topics if there are `commands`.
+    /// Retained messages on set topics are requested too, and stay marked even if they arrive during the subscription,
+    /// so that they can be refused.
+    pub(super) fn subscribe(&self, topics: &Topics, commands: bool) -> bool {
+        let set = |path| Filter {
             path,
             qos: QoS::AtLeastOnce,
             preserve_retain: true,
             ..Filter::default()
-        });
+        };
+        let status = Filter {
+            path: topics.status(),
+            qos: QoS::AtLeastOnce,
+            nolocal: true,
+            retain_forward_rule: RetainForwardRule::Never,
+            ..Filter::default()
+        };
+        let mut filters = vec![status];
+        if commands {
+            filters.extend(topics.set_filters().map(set));
+        }
         self.client.try_subscribe_many(filters).is_ok()
     }
 
-    /// Publishes a message; false if there is no room at the moment.
-    pub(super) fn publish(&self, message: Message) -> bool {
+    /// Publishes a message; false if there is no room until [`ConnectionEvent::Room`].
+    pub(super) fn publish(&mut self, message: Message, limits: BrokerLimits) -> bool {
+        let telemetry = message.retain && !message.payload.is_empty();
+        let alias = telemetry
+            .then(|| self.aliases.of(&message.topic, limits.aliases))
+            .flatten();
         let properties = PublishProperties {
+            topic_alias: alias.map(|(alias, _)| alias),
             correlation_data: message.correlation.map(Into::into),
+            message_expiry_interval: message.expiry,
             ..PublishProperties::default()
         };
-        let (topic, payload) = (message.topic.as_ref(), message.payload);
-        self.client
-            .try_publish_with_properties(topic, QoS::AtLeastOnce, message.retain, payload, properties)
-            .is_ok()
+        let qos = match message.acknowledged && limits.acknowledges {
+            true => QoS::AtLeastOnce,
+            false => QoS::AtMostOnce,
+        };
+        let retain = message.retain && limits.retains;
+        let known = alias.is_some_and(|(_, known)| known);
+        let topic = if known { "" } else { message.topic.as_ref() };
+        // Before the attempt: the event for the last message may come right after it.
+        self.backlog.room_wanted.store(true, Ordering::SeqCst);
+        let attempt = self
+            .client
+            .try_publish_with_properties(topic, qos, retain, message.payload, properties);
+        if attempt.is_ok() {
+            self.aliases.announced(&message.topic);
+            self.backlog.room_wanted.store(false, Ordering::SeqCst);
+            self.backlog.messages.fetch_add(1, Ordering::SeqCst);
+        }
+        attempt.is_ok()
     }
 
     /// Disconnects in order, so that the broker does not publish the last will.
     pub(super) fn disconnect(&self) -> bool {
-        self.client.try_disconnect().is_ok()
+        self.client.try_disconnect_now().is_ok()
     }
 }
 
 /// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
-    message.topic.len() + message.payload.len() + correlation + 16
-}
-
-/// Whether messages can be published on that topic.
-pub(super) fn is_topic(topic: &str) -> bool {
-    let long = u16::try_from(topic.len()).is_err();
-    !topic.is_empty() && !long && !topic.contains(['+', '#', '\0'])
+    message.topic.len() + message.payload.len() + correlation + 24
 }
 
 fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
     // rumqttc requires IPv6 addresses without brackets; TLS would take one with brackets for a name.
     let host = options.host.trim_start_matches('[').trim_end_matches(']');
-    let mut mqtt = MqttOptions::new(&options.client_id, host, options.port);
-    mqtt.set_keep_alive(KEEP_ALIVE)
-        .set_clean_start(true)
-        .set_connection_timeout(CONNECT_TIMEOUT)
-        .set_outgoing_inflight_upper_limit(INFLIGHT)
-        .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
+    let mut mqtt = MqttOptions::new(&options.client_id, (host, options.port));
     let mut properties = ConnectProperties::new();
     properties.max_packet_size = Some(MAX_PACKET);
     properties.receive_maximum = Some(RECEIVE_MAXIMUM);
     mqtt.set_connect_properties(properties);
+    mqtt.set_keep_alive(KEEP_ALIVE_S)
+        .set_clean_start(true)
+        .set_connect_timeout(CONNECT_TIMEOUT)
+        .set_max_request_batch(BATCH)
+        .set_read_batch_size(BATCH)
+        .set_outgoing_inflight_upper_limit(INFLIGHT)
+        .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
     if let Some(user) = &options.username {
         let password = options.password.as_ref().map_or("", |p| p.0.as_str());
-        mqtt.set_credentials(user, password);
+        mqtt.set_credentials(user, password.to_string());
     }
     let mut network = NetworkOptions::new();
     network.set_tcp_nodelay(true);
+    network.set_tcp_send_buffer_size(SEND_BUFFER);
     mqtt.set_network_options(network);
     if let Some(config) = tls {
         mqtt.set_transport(Transport::tls_with_config(TlsConfiguration::Rustls(config)));
@@ -179,9 +280,19 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
 }
 
 /// Polls until the first error and reports the events.
-async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>) {
+async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, backlog: Arc<Backlog>) {
     loop {
         let item = match eventloop.poll().await {
+            Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
+                let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
+                if left <= REQUESTS / 2
+                    && backlog.room_wanted.swap(false, Ordering::SeqCst)
+                    && event.send(ConnectionEvent::Room).await.is_err()
+                {
+                    return;
+                }
+                (packet != 0).then_some(ConnectionEvent::Sent(packet))
+            }
             Ok(event) => interpret(event),
             Err(error) => Some(ConnectionEvent::Lost(reason(&error))),
         };
@@ -198,25 +309,23 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
         Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
             let granted = |code: &SubscribeReasonCode| matches!(code, SubscribeReasonCode::Success(_));
-            let refused = ack.return_codes.iter().find(|code| !granted(code));
+            // The first is that of the status, which the gateway can do without.
+            let refused = ack.return_codes.iter().skip(1).find(|code| !granted(code));
             Some(ConnectionEvent::Subscribed(refused.map(|code| format!("{code:?}"))))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
             PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),
-            PubAckReason::NotAuthorized | PubAckReason::TopicNameInvalid | PubAckReason::PayloadFormatInvalid => {
-                ConnectionEvent::Refused(ack.pkid, format!("{:?}", ack.reason))
-            }
-            // The broker cannot accept it now: retry on a new connection.
-            other => ConnectionEvent::Lost(format!("the broker does not accept messages at the moment: {other:?}")),
+            why => ConnectionEvent::Refused(ack.pkid, why),
         }),
-        Event::Incoming(Packet::Publish(publish)) => Some(ConnectionEvent::SetMessage(Box::new(publish))),
+        Event::Incoming(Packet::Publish(publish)) => {
+            Incoming::of(publish).map(|message| ConnectionEvent::Message(Box::new(message)))
+        }
         Event::Incoming(_) => Some(ConnectionEvent::Alive),
-        Event::Outgoing(Outgoing::Publish(packet)) => Some(ConnectionEvent::Sent(packet)),
-        // A packet id was about to be used again before its acknowledgement, for which rumqttc could wait forever.
+        // A packet id was about to be used again before its acknowledgement.
         Event::Outgoing(Outgoing::AwaitAck(_)) => {
             Some(ConnectionEvent::Lost("the broker did not acknowledge a message".into()))
         }
-        Event::Outgoing(_) => None,
+        Event::Outgoing(_) | Event::Auth(_) => None,
     }
 }
 

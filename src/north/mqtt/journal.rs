@@ -1,155 +1,415 @@
-//! Keeps events on disk until the broker has acknowledged them, across restarts and crashes.
+//! Keeps messages on disk until the broker has acknowledged them, across restarts and crashes. Blocking: it runs on the
+//! thread of the [`store`](super::store).
 //!
-//! Segment files `mqtt-events-{number}.log` in one directory, each a sequence of records: state (`L` waiting, `A`
-//! acknowledged), length of the body (u32, little endian), CRC-32 of the body (u32, little endian), body: length of the
-//! topic (u16, little endian), topic, payload. Records are only appended; an acknowledgement overwrites the state byte.
-//! An incomplete or damaged record ends its segment. A segment whose records are all acknowledged is deleted (the last
-//! one: truncated); when the directory is full, the oldest segment is deleted.
+//! Segment files `{name}-{number}.log` in one directory, each a sequence of records ([`super::record`]): messages with
+//! ascending numbers, and marks up to which number all messages are acknowledged. Records are only appended. A segment
+//! whose messages are all acknowledged is deleted (the last one: truncated). When the buffer or the disk is full, the
+//! oldest segment is deleted. What is damaged is copied to `{name}-{number}-{offset}.damaged`; reading goes on at the next
+//! valid record.
+//!
+//! What cannot be written waits in memory behind what is on disk, so the order stays, and is written as soon as the disk
+//! takes it.
 
 use std::collections::VecDeque;
 use std::fs::{self, File, OpenOptions};
-use std::io;
+use std::io::{self, ErrorKind};
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
 
 use super::outbox::Message;
+use super::record::{self, Entry, Record};
 
-const PREFIX: &str = "mqtt-events-";
 const SUFFIX: &str = ".log";
-const LOCK: &str = "mqtt-events.lock";
-const WAITS: u8 = b'L';
-const ACKNOWLEDGED: u8 = b'A';
-const HEADER: usize = 9;
-/// Maximum length of a record; a longer one is damaged.
-const LONGEST: usize = 1 << 20;
-/// Number of segments in a full directory; the oldest one is dropped.
-const SEGMENTS: u64 = 8;
-
-/// Position of a record.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct RecordId {
-    segment: u64,
-    offset: u64,
-}
+const DAMAGED: &str = ".damaged";
+/// Largest and smallest size of a segment, bytes; between them a 64th of the buffer.
+const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
+/// Maximum number of messages that wait in memory because the disk does not take them.
+const UNWRITTEN: usize = crate::event::BURST;
+/// Files with damaged records that are kept.
+const QUARANTINED: usize = 16;
 
 #[derive(Debug)]
 struct Segment {
     number: u64,
     path: PathBuf,
     file: File,
-    /// End of the last complete record.
+    /// End of the last record.
     end: u64,
-    /// Number of records that are not acknowledged.
-    waiting: u64,
-    /// Position of the next record to be loaded, and the number of waiting records from there on.
-    cursor: u64,
-    unloaded: u64,
+    /// Up to here the records were loaded.
+    read: u64,
+    /// Number of its first and of its last message.
+    numbers: Option<(u64, u64)>,
 }
 
-/// The events on disk.
+/// The messages on disk, and behind them those in memory.
 #[derive(Debug)]
 pub(super) struct Journal {
-    dir: PathBuf,
-    max_bytes: u64,
+    /// `None`: everything stays in memory.
+    place: Option<Place>,
     segments: VecDeque<Segment>,
-    next_number: u64,
+    next_segment: u64,
+    /// Loaded from disk, not taken yet.
+    loaded: VecDeque<(u64, Message)>,
+    unwritten: VecDeque<(u64, Message)>,
+    /// The last number given to a message.
+    last: u64,
+    /// Up to here messages were loaded, taken or lost.
+    passed: u64,
+    /// Up to here all messages are acknowledged; the mark on disk may be older.
+    acknowledged: u64,
+    marked: u64,
     unsynced: bool,
-    dropped: u64,
+    lost: u64,
+    /// Of the gaps in the numbers that are still to be met, those that are counted already.
+    counted: u64,
+}
+
+#[derive(Debug)]
+struct Place {
+    dir: PathBuf,
+    /// First part of the names of the files.
+    name: &'static str,
+    max_bytes: u64,
     /// Locked while the journal is open, since two gateways would damage each other's files.
     _lock: File,
 }
 
 impl Journal {
-    /// Opens the journal in `dir`, which is created if necessary, and finds the waiting events.
+    /// A journal without a disk.
+    pub(super) fn in_memory() -> Journal {
+        Journal {
+            place: None,
+            segments: VecDeque::new(),
+            next_segment: 1,
+            loaded: VecDeque::new(),
+            unwritten: VecDeque::new(),
+            last: 0,
+            passed: 0,
+            acknowledged: 0,
+            marked: 0,
+            unsynced: false,
+            lost: 0,
+            counted: 0,
+        }
+    }
+
+    /// Opens the journal in `dir`, which is created if necessary, and finds the waiting messages.
     ///
     /// # Errors
     /// The directory cannot be used, or another process uses it (`WouldBlock`).
-    pub(super) fn open(dir: &Path, max_bytes: u64) -> io::Result<Journal> {
+    pub(super) fn open(dir: &Path, name: &'static str, max_bytes: u64) -> io::Result<Journal> {
         fs::create_dir_all(dir)?;
         let lock = OpenOptions::new()
             .create(true)
             .truncate(false)
             .write(true)
-            .open(dir.join(LOCK))?;
+            .open(dir.join(format!("{name}.lock")))?;
         flock(&lock, FlockOperation::NonBlockingLockExclusive).map_err(|_| {
             let text = "another process uses this directory; give each gateway its own";
-            io::Error::new(io::ErrorKind::WouldBlock, text)
+            io::Error::new(ErrorKind::WouldBlock, text)
         })?;
-        let mut found: Vec<(u64, PathBuf)> = Vec::new();
-        for entry in fs::read_dir(dir)? {
-            let path = entry?.path();
-            if let Some(number) = segment_number(&path) {
-                found.push((number, path));
-            }
-        }
-        found.sort();
         let mut journal = Journal {
-            dir: dir.to_path_buf(),
-            max_bytes,
-            segments: VecDeque::new(),
-            next_number: found.last().map_or(1, |(number, _)| number.saturating_add(1)),
-            unsynced: false,
-            dropped: 0,
-            _lock: lock,
+            place: Some(Place {
+                dir: dir.to_path_buf(),
+                name,
+                max_bytes,
+                _lock: lock,
+            }),
+            ..Journal::in_memory()
         };
-        for (number, path) in found {
-            let segment = Segment::scan(number, path)?;
-            if segment.waiting == 0 {
-                fs::remove_file(&segment.path)?;
-            } else {
-                journal.segments.push_back(segment);
-            }
+        for (number, path) in segments(dir, name)? {
+            journal.next_segment = number.saturating_add(1);
+            journal.adopt(number, path)?;
         }
+        journal.marked = journal.acknowledged;
+        // What is missing before the first message was lost or acknowledged in an earlier run.
+        let first = journal
+            .segments
+            .iter()
+            .find_map(|s| s.numbers)
+            .map_or(1, |(first, _)| first);
+        journal.passed = journal.acknowledged.max(first - 1).min(journal.last);
+        journal.remove_acknowledged()?;
         Ok(journal)
     }
 
-    /// Appends an event.
-    ///
-    /// # Errors
-    /// The event cannot be written, or exceeds the size of the buffer; the journal is unchanged.
-    pub(super) fn append(&mut self, message: &Message) -> io::Result<()> {
-        let record = encode(message)?;
-        let length = record.len() as u64;
-        if length > self.max_bytes {
-            return Err(io::Error::other("the event is larger than the buffer"));
-        }
-        let full = (self.max_bytes / SEGMENTS).max(1);
-        if self.segments.back().is_none_or(|s| s.end > 0 && s.end + length > full) {
-            self.begin_segment()?;
-        }
-        while self.bytes() + length > self.max_bytes && self.segments.len() > 1 {
-            if let Some(oldest) = self.segments.pop_front() {
-                self.dropped += oldest.unloaded;
-                fs::remove_file(&oldest.path)?;
+    /// Finds the records of a file that is there when the journal is opened.
+    fn adopt(&mut self, number: u64, path: PathBuf) -> io::Result<()> {
+        let file = OpenOptions::new().read(true).write(true).open(&path)?;
+        let bytes = fs::read(&path)?;
+        let mut numbers: Option<(u64, u64)> = None;
+        let mut end = 0;
+        for Record { entry, range } in record::records(&bytes).flatten() {
+            end = range.end as u64;
+            match entry {
+                Entry::Message(n, _) => numbers = Some((numbers.map_or(n, |(first, _)| first), n)),
+                Entry::Acknowledged(n) => self.acknowledged = self.acknowledged.max(n),
             }
         }
-        let Some(segment) = self.segments.back_mut() else {
-            return Err(io::Error::other("no segment"));
+        if end < bytes.len() as u64 {
+            // Nothing valid follows: what was being written when the process ended.
+            self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default());
+            self.lost += 1;
+            file.set_len(end)?;
+        }
+        self.last = self
+            .last
+            .max(numbers.map_or(0, |(_, last)| last))
+            .max(self.acknowledged);
+        self.segments.push_back(Segment {
+            number,
+            path,
+            file,
+            end,
+            read: 0,
+            numbers,
+        });
+        Ok(())
+    }
+
+    /// Number of the last message.
+    pub(super) fn last(&self) -> u64 {
+        self.last
+    }
+
+    /// Number of messages that wait to be taken.
+    pub(super) fn waiting(&self) -> u64 {
+        self.loaded.len() as u64 + (self.last - self.passed)
+    }
+
+    /// Number of the last message that was taken, or lost before the next one.
+    pub(super) fn through(&self) -> u64 {
+        self.loaded.front().map_or(self.passed, |(number, _)| number - 1)
+    }
+
+    /// Number of messages lost since the last call: the buffer was full, or they were damaged.
+    pub(super) fn take_lost(&mut self) -> u64 {
+        std::mem::take(&mut self.lost)
+    }
+
+    /// Appends a message; [`Journal::write`] writes it. One that is `taken` already is kept only until it is acknowledged.
+    pub(super) fn append(&mut self, message: Message, taken: bool) {
+        self.last += 1;
+        if taken {
+            self.passed = self.last;
+            if self.place.is_none() {
+                return;
+            }
+        }
+        if self.unwritten.len() == UNWRITTEN
+            && let Some((number, _)) = self.unwritten.pop_front()
+            && number > self.passed
+        {
+            self.lost += 1;
+            self.counted += 1;
+        }
+        self.unwritten.push_back((self.last, message));
+    }
+
+    /// Takes up to `most` messages in order, with their numbers.
+    pub(super) fn take(&mut self, most: usize) -> Vec<(u64, Message)> {
+        let mut taken = Vec::new();
+        while taken.len() < most {
+            if let Some(next) = self.loaded.pop_front() {
+                taken.push(next);
+            } else if !self.load() {
+                break;
+            }
+        }
+        if self.loaded.is_empty() {
+            let passed = self.passed;
+            let rest = self.unwritten.iter().filter(|(number, _)| *number > passed);
+            for (number, message) in rest.take(most - taken.len()).cloned().collect::<Vec<_>>() {
+                self.pass(number);
+                taken.push((number, message));
+            }
+        }
+        if self.place.is_none() {
+            self.unwritten.retain(|(number, _)| *number > self.passed);
+        }
+        taken
+    }
+
+    /// Loads the next segment with records that were not loaded; false if there is none.
+    fn load(&mut self) -> bool {
+        let Some(segment) = self.segments.iter_mut().find(|s| s.read < s.end) else {
+            return false;
         };
-        segment.file.write_all_at(&record, segment.end)?;
-        segment.end += length;
-        segment.waiting += 1;
-        segment.unloaded += 1;
+        let (from, end) = (std::mem::replace(&mut segment.read, segment.end), segment.end);
+        let (number, last) = (segment.number, segment.numbers.map_or(0, |(_, last)| last));
+        let mut bytes = vec![0; (end - from) as usize];
+        let read = segment.file.read_exact_at(&mut bytes, from);
+        if let Err(error) = read {
+            tracing::error!("{}: {error}; its messages are lost", segment.path.display());
+            bytes.clear();
+        }
+        for found in record::records(&bytes) {
+            match found {
+                Ok(Record { entry, .. }) => {
+                    if let Entry::Message(n, message) = entry
+                        && n > self.passed
+                    {
+                        self.pass(n);
+                        self.loaded.push_back((n, message));
+                    }
+                }
+                Err(range) => {
+                    self.quarantine(number, from + range.start as u64, bytes.get(range).unwrap_or_default());
+                }
+            }
+        }
+        self.pass_all(last);
+        true
+    }
+
+    /// What is not passed up to this number is lost.
+    fn pass_all(&mut self, last: u64) {
+        if last > self.passed {
+            self.pass(last);
+            self.lost += 1;
+        }
+    }
+
+    /// The next message is this one; those between are lost.
+    fn pass(&mut self, number: u64) {
+        if number <= self.passed {
+            return;
+        }
+        let gap = number - self.passed - 1;
+        let known = gap.min(self.counted);
+        self.counted -= known;
+        self.lost += gap - known;
+        self.passed = number;
+    }
+
+    /// All messages up to this number are acknowledged.
+    pub(super) fn acknowledge(&mut self, number: u64) {
+        self.acknowledged = self.acknowledged.max(number.min(self.last));
+    }
+
+    /// Writes what was appended and acknowledged.
+    ///
+    /// # Errors
+    /// The disk does not take it; it stays in memory, and the next call tries again.
+    pub(super) fn write(&mut self) -> io::Result<()> {
+        if self.place.is_none() {
+            return Ok(());
+        }
+        self.remove_acknowledged()?;
+        while let Some((number, _)) = self.unwritten.front() {
+            if *number <= self.acknowledged {
+                self.unwritten.pop_front();
+                continue;
+            }
+            match self.write_some() {
+                Err(error) if is_full(&error) && self.drop_oldest()? => {}
+                other => other?,
+            }
+        }
+        if self.marked < self.acknowledged && self.segments.iter().any(|s| s.end > 0) {
+            let (mark, acknowledged) = (record::mark(self.acknowledged), self.acknowledged);
+            match self.write_at_end(&mark) {
+                Ok(()) => self.marked = acknowledged,
+                // Its messages are delivered again after a restart; nothing is dropped for it.
+                Err(error) if is_full(&error) => {}
+                Err(error) => return Err(error),
+            }
+        }
+        Ok(())
+    }
+
+    /// Writes messages into the last segment, as many as fit.
+    fn write_some(&mut self) -> io::Result<()> {
+        let Some(place) = &self.place else { return Ok(()) };
+        let (max_bytes, full) = (place.max_bytes, segment_size(place.max_bytes));
+        let room = |s: &Segment| full.saturating_sub(s.end);
+        let first = self.unwritten.front().map_or(0, |(_, m)| record::length(m));
+        if self.segments.back().is_none_or(|s| s.end > 0 && room(s) < first) {
+            self.begin_segment()?;
+        }
+        let room = self.segments.back().map_or(0, room).max(first);
+        let mut bytes = Vec::new();
+        let mut count = 0;
+        for (number, message) in &self.unwritten {
+            if bytes.len() as u64 + record::length(message) > room {
+                break;
+            }
+            record::message(*number, message, &mut bytes);
+            count += 1;
+        }
+        while self.bytes() + bytes.len() as u64 > max_bytes && self.segments.len() > 1 {
+            self.drop_oldest()?;
+        }
+        self.write_at_end(&bytes)?;
+        let written: Vec<u64> = self.unwritten.drain(..count).map(|(number, _)| number).collect();
+        if let (Some(segment), Some(first), Some(last)) = (self.segments.back_mut(), written.first(), written.last()) {
+            segment.numbers = Some((segment.numbers.map_or(*first, |(first, _)| first), *last));
+            if *last <= self.passed {
+                segment.read = segment.end;
+            }
+        }
+        Ok(())
+    }
+
+    fn write_at_end(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let Some(segment) = self.segments.back_mut() else {
+            return Ok(());
+        };
+        segment.file.write_all_at(bytes, segment.end)?;
+        segment.end += bytes.len() as u64;
         self.unsynced = true;
         Ok(())
     }
 
     fn begin_segment(&mut self) -> io::Result<()> {
-        let number = self.next_number;
-        let path = self.dir.join(format!("{PREFIX}{number:012}{SUFFIX}"));
+        let Some(place) = &self.place else { return Ok(()) };
+        let number = self.next_segment;
+        let path = place.dir.join(format!("{}-{number:012}{SUFFIX}", place.name));
         let file = OpenOptions::new().read(true).write(true).create_new(true).open(&path)?;
-        self.next_number = number.saturating_add(1);
+        self.next_segment = number.saturating_add(1);
         self.segments.push_back(Segment {
             number,
             path,
             file,
             end: 0,
-            waiting: 0,
-            cursor: 0,
-            unloaded: 0,
+            read: 0,
+            numbers: None,
         });
+        Ok(())
+    }
+
+    /// Deletes the oldest segment with its messages; false if there is none.
+    fn drop_oldest(&mut self) -> io::Result<bool> {
+        let Some(oldest) = self.segments.pop_front() else {
+            return Ok(false);
+        };
+        if let Some((_, last)) = oldest.numbers {
+            self.pass_all(last);
+        }
+        fs::remove_file(&oldest.path)?;
+        Ok(true)
+    }
+
+    fn remove_acknowledged(&mut self) -> io::Result<()> {
+        let acknowledged = self.acknowledged;
+        let done = |s: &Segment| s.numbers.is_none_or(|(_, last)| last <= acknowledged);
+        while self.segments.len() > 1 && self.segments.front().is_some_and(done) {
+            if let Some(segment) = self.segments.pop_front() {
+                fs::remove_file(&segment.path)?;
+            }
+        }
+        if self.segments.len() == 1
+            && let Some(segment) = self.segments.back_mut()
+            && segment.end > 0
+            && done(segment)
+        {
+            segment.file.set_len(0)?;
+            (segment.end, segment.read, segment.numbers) = (0, 0, None);
+            // The numbers begin anew after a restart, and an old mark would be above them.
+            self.marked = acknowledged;
+        }
         Ok(())
     }
 
@@ -157,342 +417,71 @@ impl Journal {
         self.segments.iter().map(|s| s.end).sum()
     }
 
-    /// Loads the oldest waiting event that is not loaded yet.
-    pub(super) fn load(&mut self) -> Option<(RecordId, Message)> {
-        let segment = self.segments.iter_mut().find(|s| s.unloaded > 0)?;
-        match segment.load() {
-            Ok(Some(loaded)) => Some(loaded),
-            other => {
-                let lost = std::mem::take(&mut segment.unloaded);
-                segment.waiting = segment.waiting.saturating_sub(lost);
-                segment.cursor = segment.end;
-                self.dropped += lost;
-                tracing::warn!(
-                    file = %segment.path.display(),
-                    "{lost} buffered events are damaged and lost: {}",
-                    other.err().map_or_else(|| "a record is damaged".to_string(), |e| e.to_string())
-                );
-                None
-            }
-        }
-    }
-
-    /// Number of waiting events that are not loaded.
-    pub(super) fn unloaded(&self) -> u64 {
-        self.segments.iter().map(|s| s.unloaded).sum()
-    }
-
-    /// Number of events dropped because the buffer was full or damaged.
-    pub(super) fn dropped(&self) -> u64 {
-        self.dropped
-    }
-
-    /// Marks an event as acknowledged by the broker.
-    ///
-    /// # Errors
-    /// The mark cannot be written; the event is delivered again after a restart.
-    pub(super) fn acknowledge(&mut self, record: RecordId) -> io::Result<()> {
-        let Some(index) = self.segments.iter().position(|s| s.number == record.segment) else {
-            return Ok(()); // dropped in the meantime, because the buffer was full
-        };
-        let last = index + 1 == self.segments.len();
-        let Some(segment) = self.segments.get_mut(index) else {
-            return Ok(());
-        };
-        segment.file.write_all_at(&[ACKNOWLEDGED], record.offset)?;
-        segment.waiting = segment.waiting.saturating_sub(1);
-        if segment.waiting > 0 {
-            return Ok(());
-        }
-        if last {
-            segment.file.set_len(0)?;
-            (segment.end, segment.cursor) = (0, 0);
-            return Ok(());
-        }
-        if let Some(done) = self.segments.remove(index) {
-            fs::remove_file(&done.path)?;
-        }
-        Ok(())
-    }
-
     /// A file to be synced to disk, if anything was written since the last call.
-    pub(super) fn unsynced(&mut self) -> Option<File> {
+    pub(super) fn unsynced(&mut self) -> Option<&File> {
         std::mem::take(&mut self.unsynced)
-            .then(|| self.segments.back()?.file.try_clone().ok())
+            .then(|| self.segments.back().map(|s| &s.file))
             .flatten()
     }
-}
 
-impl Segment {
-    /// Finds the complete records of a segment and truncates the rest.
-    fn scan(number: u64, path: PathBuf) -> io::Result<Segment> {
-        let file = OpenOptions::new().read(true).write(true).open(&path)?;
-        let bytes = fs::read(&path)?;
-        let (mut end, mut waiting) = (0, 0);
-        while let Some(record) = bytes.get(end..).and_then(Record::decode) {
-            waiting += u64::from(record.waits);
-            end += record.length;
-        }
-        if end < bytes.len() {
-            tracing::warn!(file = %path.display(), "ignoring {} bytes of an incomplete or damaged record", bytes.len() - end);
-            file.set_len(end as u64)?;
-        }
-        Ok(Segment {
-            number,
-            path,
-            file,
-            end: end as u64,
-            waiting,
-            cursor: 0,
-            unloaded: waiting,
-        })
-    }
-
-    /// The next waiting record; `None` if a record is damaged.
-    fn load(&mut self) -> io::Result<Option<(RecordId, Message)>> {
-        while self.cursor < self.end {
-            let mut header = [0; HEADER];
-            self.file.read_exact_at(&mut header, self.cursor)?;
-            let Some(body) = body_length(&header) else {
-                return Ok(None);
-            };
-            let mut bytes = vec![0; HEADER + body];
-            self.file.read_exact_at(&mut bytes, self.cursor)?;
-            let Some(record) = Record::decode(&bytes) else {
-                return Ok(None);
-            };
-            let offset = self.cursor;
-            self.cursor += record.length as u64;
-            if record.waits {
-                self.unloaded -= 1;
-                let id = RecordId {
-                    segment: self.number,
-                    offset,
-                };
-                return Ok(Some((id, record.message)));
-            }
-        }
-        Ok(None)
+    /// Keeps a copy of bytes that are no records.
+    fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) {
+        let Some(Place { dir, name, .. }) = &self.place else {
+            return;
+        };
+        let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));
+        let kept = remove_old_quarantine(dir, name).and_then(|()| fs::write(&path, bytes));
+        let kept = kept.map_or_else(
+            |error| format!("they cannot be kept: {error}"),
+            |()| format!("kept in {}", path.display()),
+        );
+        tracing::warn!(
+            "{} bytes of {name} in {} are damaged; {kept}; the other records are read",
+            bytes.len(),
+            dir.display()
+        );
     }
 }
 
-struct Record {
-    waits: bool,
-    message: Message,
-    /// Length of the whole record, bytes.
-    length: usize,
+fn segment_size(max_bytes: u64) -> u64 {
+    (max_bytes / 64).clamp(SEGMENT.0, SEGMENT.1)
 }
 
-impl Record {
-    /// The record at the beginning of `bytes`, if it is complete and undamaged.
-    fn decode(bytes: &[u8]) -> Option<Record> {
-        let (header, rest) = bytes.split_first_chunk::<HEADER>()?;
-        let body = rest.get(..body_length(header)?)?;
-        let [state, _, _, _, _, c0, c1, c2, c3] = *header;
-        let waits = state == WAITS;
-        if !(waits || state == ACKNOWLEDGED) || crc32(body) != u32::from_le_bytes([c0, c1, c2, c3]) {
-            return None;
-        }
-        let (topic_length, rest) = body.split_first_chunk::<2>()?;
-        let (topic, payload) = rest.split_at_checked(usize::from(u16::from_le_bytes(*topic_length)))?;
-        Some(Record {
-            waits,
-            message: Message::not_retained(std::str::from_utf8(topic).ok()?, payload.to_vec()),
-            length: HEADER + body.len(),
-        })
+fn is_full(error: &io::Error) -> bool {
+    matches!(
+        error.kind(),
+        ErrorKind::StorageFull | ErrorKind::QuotaExceeded | ErrorKind::FileTooLarge
+    )
+}
+
+/// The segments in `dir`, oldest first.
+fn segments(dir: &Path, name: &str) -> io::Result<Vec<(u64, PathBuf)>> {
+    let mut found = Vec::new();
+    for entry in fs::read_dir(dir)? {
+        let path = entry?.path();
+        let text = path.file_name().and_then(|file| file.to_str()).unwrap_or_default();
+        let number = text.strip_prefix(name).and_then(|rest| rest.strip_prefix('-'));
+        let number = number.and_then(|rest| rest.strip_suffix(SUFFIX)?.parse().ok());
+        found.extend(number.map(|number| (number, path.clone())));
     }
+    found.sort();
+    Ok(found)
 }
 
-fn body_length(header: &[u8; HEADER]) -> Option<usize> {
-    let [_, l0, l1, l2, l3, ..] = *header;
-    let length = usize::try_from(u32::from_le_bytes([l0, l1, l2, l3])).ok()?;
-    (length <= LONGEST).then_some(length)
-}
-
-fn encode(message: &Message) -> io::Result<Vec<u8>> {
-    let too_long = || io::Error::other("the event is too long for the buffer");
-    let topic_length = u16::try_from(message.topic.len()).map_err(|_| too_long())?;
-    let mut body = topic_length.to_le_bytes().to_vec();
-    body.extend_from_slice(message.topic.as_bytes());
-    body.extend_from_slice(&message.payload);
-    if body.len() > LONGEST {
-        return Err(too_long());
-    }
-    let length = u32::try_from(body.len()).map_err(|_| too_long())?;
-    let mut record = vec![WAITS];
-    record.extend_from_slice(&length.to_le_bytes());
-    record.extend_from_slice(&crc32(&body).to_le_bytes());
-    record.extend_from_slice(&body);
-    Ok(record)
-}
-
-fn segment_number(path: &Path) -> Option<u64> {
-    let name = path.file_name()?.to_str()?;
-    name.strip_prefix(PREFIX)?.strip_suffix(SUFFIX)?.parse().ok()
-}
-
-/// CRC-32 (reflected polynomial 0xEDB88320, initial value and final XOR 0xFFFFFFFF), as in zip files.
-fn crc32(bytes: &[u8]) -> u32 {
-    let step = |crc: u32, _| {
-        if crc & 1 == 1 {
-            (crc >> 1) ^ 0xEDB8_8320
-        } else {
-            crc >> 1
+/// Makes room for one more file with damaged records.
+fn remove_old_quarantine(dir: &Path, name: &str) -> io::Result<()> {
+    let mut found: Vec<PathBuf> = Vec::new();
+    for entry in fs::read_dir(dir)? {
+        let path = entry?.path();
+        let text = path.file_name().and_then(|file| file.to_str()).unwrap_or_default();
+        if text.starts_with(name) && text.ends_with(DAMAGED) {
+            found.push(path);
         }
-    };
-    !bytes
-        .iter()
-        .fold(u32::MAX, |crc, byte| (0..8).fold(crc ^ u32::from(*byte), step))
+    }
+    found.sort();
+    let surplus = (found.len() + 1).saturating_sub(QUARANTINED);
+    found.iter().take(surplus).try_for_each(fs::remove_file)
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const BIG: u64 = 1 << 20;
-
-    fn event(n: usize) -> Message {
-        Message::not_retained("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
-    }
-
-    fn number(message: &Message) -> usize {
-        let text = std::str::from_utf8(&message.payload).unwrap();
-        text.trim_matches(|c: char| !c.is_ascii_digit()).parse().unwrap()
-    }
-
-    fn load_all(journal: &mut Journal) -> Vec<(RecordId, usize)> {
-        let mut loaded = Vec::new();
-        while journal.unloaded() > 0 {
-            loaded.extend(journal.load().map(|(record, message)| (record, number(&message))));
-        }
-        loaded
-    }
-
-    fn numbers(loaded: &[(RecordId, usize)]) -> Vec<usize> {
-        loaded.iter().map(|(_, n)| *n).collect()
-    }
-
-    fn segments(dir: &Path) -> Vec<PathBuf> {
-        let paths = fs::read_dir(dir).unwrap().map(|e| e.unwrap().path());
-        let mut found: Vec<_> = paths.filter(|p| segment_number(p).is_some()).collect();
-        found.sort();
-        found
-    }
-
-    #[test]
-    fn unacknowledged_events_survive_a_restart() {
-        let dir = tempfile::tempdir().unwrap();
-        let mut journal = Journal::open(dir.path(), BIG).unwrap();
-        (1..=4).for_each(|n| journal.append(&event(n)).unwrap());
-        let loaded = load_all(&mut journal);
-        assert_eq!(numbers(&loaded), [1, 2, 3, 4]);
-        journal.acknowledge(loaded[0].0).unwrap();
-        journal.acknowledge(loaded[2].0).unwrap();
-        drop(journal); // nothing is written at the end: the same as a killed process
-        let mut journal = Journal::open(dir.path(), BIG).unwrap();
-        journal.append(&event(5)).unwrap();
-        let (_, message) = journal.load().unwrap();
-        assert_eq!(message, event(2), "topic and payload as they were");
-        assert_eq!(numbers(&load_all(&mut journal)), [4, 5]);
-        assert_eq!(segments(dir.path()).len(), 1);
-    }
-
-    #[test]
-    fn a_journal_without_waiting_events_is_empty() {
-        let dir = tempfile::tempdir().unwrap();
-        let mut journal = Journal::open(dir.path(), BIG).unwrap();
-        for round in 0..3 {
-            journal.append(&event(round)).unwrap();
-            for (record, n) in load_all(&mut journal) {
-                assert_eq!(n, round);
-                journal.acknowledge(record).unwrap();
-            }
-            let path = segments(dir.path()).pop().unwrap();
-            assert_eq!(fs::metadata(path).unwrap().len(), 0);
-        }
-        drop(journal);
-        let journal = Journal::open(dir.path(), BIG).unwrap();
-        assert_eq!((journal.unloaded(), segments(dir.path()).len()), (0, 0));
-    }
-
-    #[test]
-    fn an_incomplete_or_damaged_tail_is_truncated() {
-        let whole = encode(&event(9)).unwrap();
-        let mut damaged = whole.clone();
-        damaged[HEADER + 4] ^= 1;
-        let mut endless = whole.clone();
-        endless[4] = 0xFF;
-        let tails = (1..whole.len()).map(|n| whole[..n].to_vec());
-        for tail in tails.chain([damaged, endless, vec![0; 4096], b"X".repeat(100)]) {
-            let dir = tempfile::tempdir().unwrap();
-            let mut journal = Journal::open(dir.path(), BIG).unwrap();
-            (1..=2).for_each(|n| journal.append(&event(n)).unwrap());
-            drop(journal);
-            let path = segments(dir.path()).pop().unwrap();
-            let mut bytes = fs::read(&path).unwrap();
-            bytes.extend_from_slice(&tail);
-            fs::write(&path, &bytes).unwrap();
-            let mut journal = Journal::open(dir.path(), BIG).unwrap();
-            journal.append(&event(3)).unwrap();
-            assert_eq!(numbers(&load_all(&mut journal)), [1, 2, 3]);
-        }
-    }
-
-    #[test]
-    fn a_full_buffer_drops_its_oldest_segment() {
-        let dir = tempfile::tempdir().unwrap();
-        let max = 4000;
-        let mut journal = Journal::open(dir.path(), max).unwrap();
-        for n in 0..1000 {
-            journal.append(&event(n)).unwrap();
-            assert!(journal.bytes() <= max);
-        }
-        let on_disk: u64 = segments(dir.path())
-            .iter()
-            .map(|p| fs::metadata(p).unwrap().len())
-            .sum();
-        assert!(on_disk <= max);
-        let loaded = load_all(&mut journal);
-        assert_eq!(journal.dropped() as usize + loaded.len(), 1000);
-        assert!(loaded.len() as u64 > max / 2 / encode(&event(999)).unwrap().len() as u64);
-        let first = 1000 - loaded.len();
-        assert_eq!(
-            numbers(&loaded),
-            (first..1000).collect::<Vec<_>>(),
-            "the newest, in order"
-        );
-        for (record, _) in loaded {
-            journal.acknowledge(record).unwrap();
-        }
-        assert_eq!((journal.bytes(), segments(dir.path()).len()), (0, 1));
-        assert!(journal.append(&Message::not_retained("t", vec![0; 5000])).is_err());
-    }
-
-    #[test]
-    fn an_acknowledgement_for_a_dropped_segment_is_ignored() {
-        let dir = tempfile::tempdir().unwrap();
-        let mut journal = Journal::open(dir.path(), 500).unwrap();
-        journal.append(&event(0)).unwrap();
-        let (record, _) = journal.load().unwrap();
-        (1..100).for_each(|n| journal.append(&event(n)).unwrap());
-        journal.acknowledge(record).unwrap();
-        assert_eq!(
-            journal.dropped() + journal.unloaded(),
-            99,
-            "the loaded one was not dropped"
-        );
-    }
-
-    #[test]
-    fn a_directory_belongs_to_one_process() {
-        let dir = tempfile::tempdir().unwrap();
-        let _journal = Journal::open(dir.path(), BIG).unwrap();
-        let error = Journal::open(dir.path(), BIG).unwrap_err();
-        assert!(error.to_string().contains("another process"), "{error}");
-    }
-
-    #[test]
-    fn crc_32_check_value() {
-        assert_eq!(crc32(b"123456789"), 0xCBF4_3926);
-    }
-}
+mod tests;

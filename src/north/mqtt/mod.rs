@@ -2,26 +2,31 @@
 //!
 //! ```text
 //! process image ──▶ publisher ──▶ ┌────────┐     connection        ┌────────┐
-//! events ──▶ journal (on disk) ─▶ │ outbox │ ──▶ (rumqttc, a task  │ broker │
+//! events, history ──▶ store ────▶ │ outbox │ ──▶ (rumqttc, a task  │ broker │
 //! results ──────────────────────▶ └────────┘     of its own) ────▶ └────────┘
+//!                       │ ▲                                            │
+//!               journal (a thread, on disk)                            │
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and in which
-//! order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps rumqttc,
-//! which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are sent again
-//! from the outbox.
+//! `payload`, `publisher`, `history`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
+//! in which order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps
+//! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
+//! sent again from the outbox.
 
 mod client;
 mod commands;
+mod complaints;
 mod connection;
 #[cfg(test)]
 mod fixture;
+mod history;
 mod journal;
 mod offline;
 mod outbox;
 mod payload;
 mod publisher;
+mod record;
 mod reply;
 mod request;
 mod store;
@@ -39,6 +44,7 @@ use super::NorthStats;
 use crate::plant::SharedPlant;
 
 pub use self::offline::{Offline, Published};
+pub use self::record::whole_records;
 pub use self::request::Incoming;
 pub(super) use self::request::resolve as point_value;
 
@@ -73,23 +79,79 @@ pub struct Options {
     pub identity: Option<(PathBuf, PathBuf)>,
     /// First level of all topics.
     pub base: String,
+    /// Which telemetry is published.
+    pub telemetry: Telemetry,
+    /// Quality of service of telemetry.
+    pub telemetry_qos: Qos,
+    /// Quality of service of events and history.
+    pub event_qos: Qos,
+    /// Time after which the broker drops telemetry; never if absent.
+    pub expiry: Option<Duration>,
     /// Minimum time between two publications of a topic.
     pub min_interval: Duration,
     /// Maximum time between two publications of a topic.
     pub max_interval: Duration,
     /// Whether the set topics are served.
     pub commands: bool,
-    /// Disk buffer for events while the broker is not connected; in memory only if absent.
+    /// Commands without an `id` are refused, except stops.
+    pub require_id: bool,
+    /// Filters of response topics that are allowed besides those outside of `base`.
+    pub response_topics: Vec<String>,
+    /// Disk buffer for events and history while the broker is not connected; in memory only if absent.
     pub buffer: Option<Buffer>,
 }
 
-/// Disk buffer for events.
+/// Which telemetry is published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Telemetry {
+    /// The state of each drive as one object.
+    pub state: bool,
+    /// Each point as a bare value.
+    pub points: bool,
+    /// Values of an outage, afterwards.
+    pub history: History,
+}
+
+/// Quality of service of published messages.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Qos {
+    /// 0: sent once, not acknowledged.
+    AtMostOnce,
+    /// 1: sent until it is acknowledged.
+    AtLeastOnce,
+}
+
+/// Which values of an outage are published afterwards.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum History {
+    /// None.
+    #[default]
+    Off,
+    /// Those that changed.
+    Changes,
+    /// Those of every sample.
+    All,
+}
+
+/// Disk buffer.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Buffer {
     /// Directory.
     pub dir: PathBuf,
     /// Maximum size on disk, bytes.
     pub max_bytes: u64,
+}
+
+impl Buffer {
+    /// The default in a service of systemd with a state directory; elsewhere there is none.
+    fn of_system() -> Option<Buffer> {
+        let dirs = std::env::var_os("STATE_DIRECTORY")?;
+        let dir = std::env::split_paths(&dirs).next()?;
+        Some(Buffer {
+            dir,
+            max_bytes: 64 << 20,
+        })
+    }
 }
 
 /// The running MQTT client.
@@ -108,7 +170,8 @@ impl Mqtt {
 
 /// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
 /// raised from now on are published, so start it before the buses.
-pub fn start(options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
+pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
+    options.buffer = options.buffer.or_else(Buffer::of_system);
     // Subscribed here and not in the task, so that no event after this call is missed.
     let events = plant.load().events.subscribe();
     Mqtt(tokio::spawn(client::run(options, plant, stats, events, cancel)))

@@ -3,9 +3,10 @@
 use std::collections::VecDeque;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::commands::Commands;
+use super::commands::{Commands, Rules};
 use super::outbox::Message;
 use super::payload::Topics;
+use super::reply::ResponseTopics;
 use super::request::Incoming;
 use crate::plant::SharedPlant;
 
@@ -45,10 +46,14 @@ pub struct Offline {
 impl Offline {
     /// A client that serves the set topics below `base`, at `now`, which is `time` on the calendar.
     pub fn new(base: &str, plant: SharedPlant, now: Instant, time: SystemTime) -> Offline {
-        let topics = Topics::new(base, &plant.load().gateway);
+        let gateway = plant.load().gateway.clone();
+        let rules = Rules {
+            responses: ResponseTopics::new(base, &gateway, Vec::new()),
+            require_id: false,
+        };
         Offline {
             plant,
-            commands: Commands::new(topics),
+            commands: Commands::new(Topics::new(base, &gateway), rules),
             held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),
@@ -83,7 +88,7 @@ impl Offline {
         while self.commands.has_room()
             && let Some(message) = self.held.pop_front()
         {
-            let result = self.commands.take(message, &plant, now, time);
+            let result = self.commands.take(message, &plant, |_| false, now, time);
             self.results.extend(result.map(Published::from));
         }
     }

@@ -1,41 +1,51 @@
 //! Decides what is sent next, and tracks what waits for its acknowledgement.
 //!
-//! Telemetry: only the latest value of a topic waits, and one message per topic is in flight. Events and results:
-//! bounded queues in order. An entry leaves only when it is acknowledged (PUBACK). At most `limit` messages are in
-//! flight: half the inflight window of the connection, so that no packet id is used twice at a time.
+//! Telemetry: only the latest value of a topic waits. Results, events and history: bounded queues in order, whose entries
+//! leave when they are acknowledged (PUBACK). Results, events and telemetry take turns, so that none starves another;
+//! history comes when nothing else waits. Only messages with an acknowledgement count towards the window of the broker;
+//! telemetry has none by default and passes when the window is full.
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::sync::Arc;
 
-use super::journal::RecordId;
+use super::Qos;
+use super::store::Number;
 
-/// Maximum number of waiting results, the same as that of commands, and their size in bytes; the oldest is dropped.
-const RESULTS: usize = 4096;
+/// Maximum number of waiting results and their size in bytes: beyond it, no more commands are received.
+const RESULTS: usize = 16_384;
 const RESULT_BYTES: usize = 32 << 20;
-/// Maximum number of events waiting in memory; with a buffer, the others wait on disk.
-const EVENTS: usize = crate::event::BURST;
-/// Maximum number of events loaded from disk at a time.
-const LOADED: usize = 64;
+/// Results that may wait on one topic; beyond it, commands that would be answered there are refused.
+const RESULTS_OF_TOPIC: usize = 2048;
+/// Maximum number of messages of a queue in memory; with a buffer, the others wait on disk.
+const KEPT: usize = crate::event::BURST;
+/// Maximum number of messages loaded from disk at a time: more than any window.
+const LOADED: usize = 1024;
 /// Number of lost connections after which a result is dropped: its response topic may be the cause.
 const RESULT_ATTEMPTS: u8 = 2;
 
-/// A message for the broker, QoS 1.
+/// A message for the broker.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) struct Message {
     pub(super) topic: Arc<str>,
     pub(super) payload: Vec<u8>,
     pub(super) retain: bool,
+    /// Whether the broker acknowledges it (QoS 1).
+    pub(super) acknowledged: bool,
+    /// The broker drops it after this time, s.
+    pub(super) expiry: Option<u32>,
     /// Correlation data of the request that this answers.
     pub(super) correlation: Option<Vec<u8>>,
 }
 
 impl Message {
-    /// A message that is not retained.
+    /// A message with QoS 1 that is not retained.
     pub(super) fn not_retained(topic: impl Into<Arc<str>>, payload: Vec<u8>) -> Message {
         Message {
             topic: topic.into(),
             payload,
             retain: false,
+            acknowledged: true,
+            expiry: None,
             correlation: None,
         }
     }
@@ -45,30 +55,51 @@ impl Message {
     }
 }
 
+/// The queues, in the order of their turns.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    /// Results of commands.
+    Result,
+    /// Events.
+    Event,
+    /// Values of an outage.
+    History,
+}
+
 /// Identifies an entry while its message is in flight.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub(super) enum Key {
     /// Telemetry of this topic.
     Latest(Arc<str>),
-    /// Result with this serial number.
-    Result(u64),
-    /// Event with this serial number.
-    Event(u64),
+    /// Entry of a queue, with this serial number.
+    Queued(Kind, u64),
 }
 
-/// An entry whose message was acknowledged.
+/// An entry that left the outbox.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Acknowledged {
+pub(super) struct Settled {
     /// Topic of the message.
     pub(super) topic: Arc<str>,
-    /// Its record on disk.
-    pub(super) record: Option<RecordId>,
+    /// Its queue; `None` for telemetry.
+    pub(super) kind: Option<Kind>,
+}
+
+/// How messages are published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Delivery {
+    pub(super) telemetry: Qos,
+    /// Of events and history.
+    pub(super) events: Qos,
+    /// Of telemetry, s.
+    pub(super) expiry: Option<u32>,
 }
 
 #[derive(Debug, Default)]
 struct Slot {
     /// The latest payload that is not published yet.
     waiting: Option<Vec<u8>>,
+    /// It must arrive and lasts: the status, and the end of a topic.
+    lasting: bool,
     in_flight: bool,
 }
 
@@ -76,19 +107,30 @@ struct Slot {
 struct Entry {
     serial: u64,
     message: Message,
-    record: Option<RecordId>,
+    number: Option<Number>,
     in_flight: bool,
     attempts: u8,
 }
 
-/// All messages that wait or are in flight.
+/// Messages in order.
 #[derive(Debug, Default)]
+struct Queue {
+    entries: VecDeque<Entry>,
+    bytes: usize,
+}
+
+/// All messages that wait or are in flight.
+#[derive(Debug)]
 pub(super) struct Outbox {
+    delivery: Delivery,
     latest: BTreeMap<Arc<str>, Slot>,
     /// Topics with a waiting payload, oldest change first.
     order: VecDeque<Arc<str>>,
-    results: VecDeque<Entry>,
-    events: VecDeque<Entry>,
+    results: Queue,
+    /// Waiting results by topic.
+    results_of: HashMap<Arc<str>, usize>,
+    events: Queue,
+    history: Queue,
     serial: u64,
     /// Published, packet id not known yet.
     published: VecDeque<Key>,
@@ -96,53 +138,158 @@ pub(super) struct Outbox {
     unacknowledged: HashMap<u16, Key>,
     /// The first topic of `order` is published before everything else.
     has_leader: bool,
-    /// Whether events come before telemetry next time.
-    events_turn: bool,
-    dropped: u64,
+    /// Whose turn it is: results, events or telemetry.
+    turn: usize,
+    lost: Lost,
+}
+
+/// Messages lost because too many waited, or because they broke connections.
+#[derive(Debug, Default, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Lost {
+    pub(super) results: u64,
+    pub(super) events: u64,
+    pub(super) history: u64,
 }
 
 impl Outbox {
+    pub(super) fn new(delivery: Delivery) -> Outbox {
+        Outbox {
+            delivery,
+            latest: BTreeMap::new(),
+            order: VecDeque::new(),
+            results: Queue::default(),
+            results_of: HashMap::new(),
+            events: Queue::default(),
+            history: Queue::default(),
+            serial: 0,
+            published: VecDeque::new(),
+            unacknowledged: HashMap::new(),
+            has_leader: false,
+            turn: 0,
+            lost: Lost::default(),
+        }
+    }
+
     /// Adds telemetry; replaces the waiting payload of the topic.
     pub(super) fn put(&mut self, topic: Arc<str>, payload: Vec<u8>) {
+        self.put_slot(topic, payload, false);
+    }
+
+    /// As [`Outbox::put`], for what must arrive and does not expire.
+    pub(super) fn put_lasting(&mut self, topic: Arc<str>, payload: Vec<u8>) {
+        self.put_slot(topic, payload, true);
+    }
+
+    fn put_slot(&mut self, topic: Arc<str>, payload: Vec<u8>, lasting: bool) {
         let slot = self.latest.entry(topic.clone()).or_default();
+        slot.lasting = lasting;
         if slot.waiting.replace(payload).is_none() {
             self.order.push_back(topic);
         }
     }
 
-    /// Adds telemetry that is published before everything else.
+    /// As [`Outbox::put_lasting`], published before everything else.
     pub(super) fn put_first(&mut self, topic: Arc<str>, payload: Vec<u8>) {
-        self.latest.entry(topic.clone()).or_default().waiting = Some(payload);
+        let slot = self.latest.entry(topic.clone()).or_default();
+        (slot.waiting, slot.lasting) = (Some(payload), true);
         self.order.retain(|t| *t != topic);
         self.order.push_front(topic);
         self.has_leader = true;
     }
 
-    /// Adds a result; if too many wait, the oldest is dropped.
+    /// Adds a result.
     pub(super) fn push_result(&mut self, message: Message) {
-        self.serial += 1;
-        let full = |results: &VecDeque<Entry>| {
-            let bytes = results.iter().map(|entry| entry.message.bytes());
-            results.len() >= RESULTS || bytes.sum::<usize>() >= RESULT_BYTES
+        *self.results_of.entry(message.topic.clone()).or_default() += 1;
+        self.push(Kind::Result, message, None);
+    }
+
+    /// Adds an event or history, with its number if it is on disk; if too many wait, the oldest is dropped.
+    pub(super) fn push(&mut self, kind: Kind, message: Message, number: Option<Number>) {
+        let message = match (kind, self.delivery.events) {
+            (Kind::Event | Kind::History, Qos::AtMostOnce) => Message {
+                acknowledged: false,
+                ..message
+            },
+            _ => message,
         };
-        self.dropped += push(&mut self.results, self.serial, message, None, full);
-    }
-
-    /// Adds an event, with its record if it is on disk; if too many wait, the oldest is dropped.
-    pub(super) fn push_event(&mut self, message: Message, record: Option<RecordId>) {
         self.serial += 1;
-        let full = |events: &VecDeque<Entry>| events.len() >= EVENTS;
-        self.dropped += push(&mut self.events, self.serial, message, record, full);
+        let serial = self.serial;
+        let queue = self.queue_mut(kind);
+        let full = kind != Kind::Result && queue.entries.len() >= KEPT;
+        if full {
+            // Entries in flight are dropped last: they have probably been delivered.
+            let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
+            queue.remove(victim);
+        }
+        queue.bytes += message.bytes();
+        queue.entries.push_back(Entry {
+            serial,
+            message,
+            number,
+            in_flight: false,
+            attempts: 0,
+        });
+        match kind {
+            Kind::Event => self.lost.events += u64::from(full),
+            Kind::History => self.lost.history += u64::from(full),
+            Kind::Result => {}
+        }
     }
 
-    /// Number of events that may be loaded from disk now.
-    pub(super) fn room(&self) -> usize {
-        LOADED.saturating_sub(self.events.len())
+    fn queue(&self, kind: Kind) -> &Queue {
+        match kind {
+            Kind::Result => &self.results,
+            Kind::Event => &self.events,
+            Kind::History => &self.history,
+        }
     }
 
-    /// Number of events and results that wait or are in flight.
+    fn queue_mut(&mut self, kind: Kind) -> &mut Queue {
+        match kind {
+            Kind::Result => &mut self.results,
+            Kind::Event => &mut self.events,
+            Kind::History => &mut self.history,
+        }
+    }
+
+    /// Whether another command may be received: a result of it finds room.
+    pub(super) fn has_room_for_results(&self) -> bool {
+        self.results.entries.len() < RESULTS && self.results.bytes < RESULT_BYTES
+    }
+
+    /// Whether so many results wait on that topic that commands answered there are refused.
+    pub(super) fn is_crowded(&self, topic: &str) -> bool {
+        self.results_of
+            .get(topic)
+            .is_some_and(|count| *count >= RESULTS_OF_TOPIC)
+    }
+
+    /// Number of messages of that kind that may be loaded from disk now.
+    pub(super) fn room(&self, kind: Kind) -> usize {
+        LOADED.saturating_sub(self.queue(kind).entries.len())
+    }
+
+    /// The first message of that kind that is not acknowledged and on disk.
+    pub(super) fn oldest(&self, kind: Kind) -> Option<Number> {
+        self.queue(kind).entries.iter().find_map(|entry| entry.number)
+    }
+
+    /// Number of events, results and history that wait or are in flight.
     pub(super) fn waiting(&self) -> usize {
-        self.results.len() + self.events.len()
+        [Kind::Result, Kind::Event, Kind::History]
+            .map(|kind| self.queue(kind).entries.len())
+            .iter()
+            .sum()
+    }
+
+    /// Number of events that wait or are in flight.
+    pub(super) fn events(&self) -> usize {
+        self.events.entries.len()
+    }
+
+    /// Number of results and events that wait or are in flight.
+    pub(super) fn urgent(&self) -> usize {
+        self.results.entries.len() + self.events.entries.len()
     }
 
     /// Whether telemetry of that topic waits or is in flight.
@@ -150,73 +297,81 @@ impl Outbox {
         self.latest.contains_key(topic)
     }
 
-    /// Number of events and results dropped because too many waited.
-    pub(super) fn dropped(&self) -> u64 {
-        self.dropped
+    /// What was lost since the last call.
+    pub(super) fn take_lost(&mut self) -> Lost {
+        std::mem::take(&mut self.lost)
     }
 
-    /// Number of messages in flight.
-    pub(super) fn in_flight(&self) -> usize {
+    /// Number of messages whose acknowledgement is awaited.
+    fn in_flight(&self) -> usize {
         self.published.len() + self.unacknowledged.len()
     }
 
-    /// The message to publish next: the leading one, then results, then events and telemetry alternately. It stays in
-    /// the outbox; confirm with [`Outbox::mark_published`] that it was published.
-    pub(super) fn next(&self, limit: usize) -> Option<(Key, Message)> {
-        if self.in_flight() >= limit {
-            return None;
+    /// The message to publish next; history only if it `may` come. It stays in the outbox; confirm with
+    /// [`Outbox::mark_published`] that it was published.
+    pub(super) fn next(&self, window: usize, may_history: bool) -> Option<(Key, Message)> {
+        let free = self.in_flight() < window;
+        if self.has_leader {
+            return self.next_latest(free);
         }
-        if self.has_leader
-            && let Some(leader) = self.next_latest()
-        {
-            return Some(leader);
-        }
-        next_entry(&self.results, Key::Result).or_else(|| {
-            let events = || next_entry(&self.events, Key::Event);
-            let latest = || self.next_latest();
-            if self.events_turn {
-                events().or_else(latest)
-            } else {
-                latest().or_else(events)
-            }
-        })
+        let of = |kind| self.queue(kind).next(kind, free);
+        let turns = (0..3).map(|step| (self.turn + step) % 3);
+        let next = turns.into_iter().find_map(|turn| match turn {
+            0 => of(Kind::Result),
+            1 => of(Kind::Event),
+            _ => self.next_latest(free),
+        });
+        next.or_else(|| may_history.then(|| of(Kind::History)).flatten())
     }
 
-    fn next_latest(&self) -> Option<(Key, Message)> {
+    fn next_latest(&self, free: bool) -> Option<(Key, Message)> {
         self.order.iter().find_map(|topic| {
             let slot = self.latest.get(topic).filter(|slot| !slot.in_flight)?;
+            let acknowledged = slot.lasting || self.delivery.telemetry == Qos::AtLeastOnce;
+            let payload = slot.waiting.as_ref().filter(|_| free || !acknowledged)?.clone();
+            let lasting = slot.lasting || payload.is_empty();
             let message = Message {
                 topic: topic.clone(),
-                payload: slot.waiting.clone()?,
+                payload,
                 retain: true,
+                acknowledged,
+                expiry: self.delivery.expiry.filter(|_| !lasting),
                 correlation: None,
             };
             Some((Key::Latest(topic.clone()), message))
         })
     }
 
-    /// The message of `key` was published on the connection.
-    pub(super) fn mark_published(&mut self, key: Key) {
+    /// The message of `key` was published on the connection; without an acknowledgement to come, its entry is removed.
+    pub(super) fn mark_published(&mut self, key: Key, acknowledged: bool) -> Option<Settled> {
         match &key {
             Key::Latest(topic) => {
                 if let Some(slot) = self.latest.get_mut(topic) {
-                    slot.waiting = None;
-                    slot.in_flight = true;
+                    (slot.waiting, slot.in_flight) = (None, true);
                 }
                 // At or near the front: only topics in flight come before it.
                 if let Some(place) = self.order.iter().position(|t| t == topic) {
                     self.order.remove(place);
                 }
                 self.has_leader = false;
-                self.events_turn = true;
+                self.turn = 0;
             }
-            Key::Result(serial) => mark(&mut self.results, *serial),
-            Key::Event(serial) => {
-                mark(&mut self.events, *serial);
-                self.events_turn = false;
+            Key::Queued(kind, serial) => {
+                if let Some(entry) = self.queue_mut(*kind).get_mut(*serial) {
+                    entry.in_flight = true;
+                }
+                match kind {
+                    Kind::Result => self.turn = 1,
+                    Kind::Event => self.turn = 2,
+                    Kind::History => {}
+                }
             }
         }
+        if !acknowledged {
+            return self.settle(key, None);
+        }
         self.published.push_back(key);
+        None
     }
 
     /// The connection assigned this packet id to the oldest published message.
@@ -235,12 +390,12 @@ impl Outbox {
     }
 
     /// The broker acknowledged a message; its entry is removed.
-    pub(super) fn acked(&mut self, packet: u16) -> Option<Acknowledged> {
+    pub(super) fn acked(&mut self, packet: u16) -> Option<Settled> {
         self.settle(self.unacknowledged.get(&packet).cloned()?, Some(packet))
     }
 
     /// Drops the message of `key`, which cannot be sent.
-    pub(super) fn give_up(&mut self, key: Key) -> Option<Acknowledged> {
+    pub(super) fn give_up(&mut self, key: Key) -> Option<Settled> {
         if let Key::Latest(topic) = &key {
             self.latest.get_mut(topic)?.waiting = None;
             self.order.retain(|t| t != topic);
@@ -248,7 +403,7 @@ impl Outbox {
         self.settle(key, None)
     }
 
-    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Acknowledged> {
+    fn settle(&mut self, key: Key, packet: Option<u16>) -> Option<Settled> {
         if let Some(packet) = packet {
             self.unacknowledged.remove(&packet);
         }
@@ -259,28 +414,52 @@ impl Outbox {
                 if slot.waiting.is_none() {
                     self.latest.remove(&topic);
                 }
-                Some(Acknowledged { topic, record: None })
+                Some(Settled { topic, kind: None })
             }
-            Key::Result(serial) => take(&mut self.results, serial),
-            Key::Event(serial) => take(&mut self.events, serial),
+            Key::Queued(kind, serial) => {
+                let queue = self.queue_mut(kind);
+                let place = queue.place(serial)?;
+                let topic = queue.remove(place)?.message.topic;
+                if kind == Kind::Result {
+                    self.forget_result(&topic);
+                }
+                Some(Settled {
+                    topic,
+                    kind: Some(kind),
+                })
+            }
         }
     }
 
-    /// The connection is lost. Events and results in flight wait again, in their order; telemetry is dropped, since the
-    /// process image has newer values.
+    fn forget_result(&mut self, topic: &Arc<str>) {
+        if let Some(count) = self.results_of.get_mut(topic) {
+            *count -= 1;
+            if *count == 0 {
+                self.results_of.remove(topic);
+            }
+        }
+    }
+
+    /// The connection is lost. What was in flight waits again, in its order; telemetry is dropped, since the process
+    /// image has newer values.
     pub(super) fn lost(&mut self) {
         self.latest.clear();
         self.order.clear();
         self.published.clear();
         self.unacknowledged.clear();
         self.has_leader = false;
-        for entry in self.results.iter_mut().chain(&mut self.events) {
-            entry.attempts = entry.attempts.saturating_add(u8::from(entry.in_flight));
-            entry.in_flight = false;
+        for queue in [&mut self.results, &mut self.events, &mut self.history] {
+            for entry in &mut queue.entries {
+                entry.attempts = entry.attempts.saturating_add(u8::from(entry.in_flight));
+                entry.in_flight = false;
+            }
         }
-        let before = self.results.len();
-        self.results.retain(|entry| entry.attempts < RESULT_ATTEMPTS);
-        self.dropped += (before - self.results.len()) as u64;
+        while let Some(place) = self.results.entries.iter().position(|e| e.attempts >= RESULT_ATTEMPTS) {
+            if let Some(entry) = self.results.remove(place) {
+                self.forget_result(&entry.message.topic);
+                self.lost.results += 1;
+            }
+        }
     }
 
     /// Stops sending telemetry.
@@ -293,202 +472,27 @@ impl Outbox {
     }
 }
 
-/// Appends an entry and returns the number of entries dropped to make room. Entries in flight are dropped last: they
-/// have probably been delivered.
-fn push(
-    queue: &mut VecDeque<Entry>,
-    serial: u64,
-    message: Message,
-    record: Option<RecordId>,
-    is_full: impl Fn(&VecDeque<Entry>) -> bool,
-) -> u64 {
-    let mut dropped = 0;
-    while is_full(queue) {
-        let victim = queue.iter().position(|e| !e.in_flight).unwrap_or(0);
-        queue.remove(victim);
-        dropped += 1;
+impl Queue {
+    fn next(&self, kind: Kind, free: bool) -> Option<(Key, Message)> {
+        let entry = self.entries.iter().find(|e| !e.in_flight)?;
+        let may = free || !entry.message.acknowledged;
+        may.then(|| (Key::Queued(kind, entry.serial), entry.message.clone()))
     }
-    queue.push_back(Entry {
-        serial,
-        message,
-        record,
-        in_flight: false,
-        attempts: 0,
-    });
-    dropped
-}
 
-fn next_entry(queue: &VecDeque<Entry>, key: fn(u64) -> Key) -> Option<(Key, Message)> {
-    let entry = queue.iter().find(|e| !e.in_flight)?;
-    Some((key(entry.serial), entry.message.clone()))
-}
-
-fn mark(queue: &mut VecDeque<Entry>, serial: u64) {
-    if let Some(entry) = queue.iter_mut().find(|e| e.serial == serial) {
-        entry.in_flight = true;
+    fn place(&self, serial: u64) -> Option<usize> {
+        self.entries.binary_search_by_key(&serial, |entry| entry.serial).ok()
     }
-}
 
-fn take(queue: &mut VecDeque<Entry>, serial: u64) -> Option<Acknowledged> {
-    let index = queue.iter().position(|e| e.serial == serial)?;
-    queue.remove(index).map(|entry| Acknowledged {
-        topic: entry.message.topic,
-        record: entry.record,
-    })
+    fn get_mut(&mut self, serial: u64) -> Option<&mut Entry> {
+        self.entries.get_mut(self.place(serial)?)
+    }
+
+    fn remove(&mut self, place: usize) -> Option<Entry> {
+        let entry = self.entries.remove(place)?;
+        self.bytes -= entry.message.bytes();
+        Some(entry)
+    }
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn topic(name: &str) -> Arc<str> {
-        Arc::from(name)
-    }
-
-    fn event(name: &str) -> Message {
-        Message::not_retained(name, Vec::new())
-    }
-
-    /// Publishes everything allowed; returns topics and payloads.
-    fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
-        let mut sent = Vec::new();
-        while let Some((key, message)) = outbox.next(limit) {
-            outbox.mark_published(key);
-            sent.push((message.topic.to_string(), message.payload));
-        }
-        sent
-    }
-
-    fn names(sent: &[(String, Vec<u8>)]) -> Vec<&str> {
-        sent.iter().map(|(t, _)| t.as_str()).collect()
-    }
-
-    #[test]
-    fn newest_telemetry_wins_and_one_message_per_topic_is_in_flight() {
-        let mut outbox = Outbox::default();
-        outbox.put(topic("a"), vec![1]);
-        outbox.put(topic("b"), vec![1]);
-        outbox.put(topic("a"), vec![2]);
-        assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![2]), ("b".into(), vec![1])]);
-        outbox.put(topic("a"), vec![3]);
-        outbox.put(topic("a"), vec![4]);
-        assert!(outbox.next(10).is_none(), "a is in flight");
-        outbox.numbered(1).unwrap();
-        outbox.numbered(2).unwrap();
-        assert!(outbox.acked(2).is_some(), "acknowledgements come in any order");
-        assert_eq!(outbox.acked(1).unwrap().topic.as_ref(), "a");
-        assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![4])]);
-        assert!(outbox.acked(77).is_none());
-    }
-
-    #[test]
-    fn the_limit_bounds_what_is_in_flight() {
-        let mut outbox = Outbox::default();
-        for i in 0..10 {
-            outbox.put(topic(&format!("t{i}")), Vec::new());
-            outbox.push_event(event("e"), None);
-        }
-        assert_eq!(drain(&mut outbox, 3).len(), 3);
-        assert_eq!(outbox.in_flight(), 3);
-        outbox.numbered(1).unwrap();
-        outbox.acked(1);
-        assert_eq!(drain(&mut outbox, 3).len(), 1);
-    }
-
-    #[test]
-    fn leader_then_results_then_events_and_telemetry_alternately() {
-        let mut outbox = Outbox::default();
-        for i in 1..=3 {
-            outbox.put(topic(&format!("t{i}")), Vec::new());
-            outbox.push_event(event(&format!("e{i}")), None);
-        }
-        outbox.push_result(event("r"));
-        outbox.put_first(topic("status"), Vec::new());
-        let sent = drain(&mut outbox, 100);
-        assert_eq!(names(&sent), ["status", "r", "e1", "t1", "e2", "t2", "e3", "t3"]);
-    }
-
-    #[test]
-    fn after_a_lost_connection_events_are_sent_again_in_order() {
-        let mut outbox = Outbox::default();
-        outbox.put(topic("t"), Vec::new());
-        for name in ["e1", "e2", "e3"] {
-            outbox.push_event(event(name), None);
-        }
-        assert_eq!(drain(&mut outbox, 3).len(), 3);
-        outbox.numbered(1).unwrap();
-        outbox.numbered(2).unwrap();
-        outbox.numbered(3).unwrap();
-        assert_eq!(outbox.acked(2).unwrap().topic.as_ref(), "e1");
-        outbox.lost();
-        assert_eq!(outbox.waiting(), 2);
-        assert_eq!(outbox.in_flight(), 0);
-        assert!(
-            outbox.acked(3).is_none(),
-            "an acknowledgement of the lost connection means nothing"
-        );
-        assert_eq!(names(&drain(&mut outbox, 10)), ["e2", "e3"]);
-    }
-
-    #[test]
-    fn a_result_that_breaks_connections_is_dropped() {
-        let mut outbox = Outbox::default();
-        outbox.push_result(event("bad"));
-        for _ in 0..2 {
-            assert_eq!(drain(&mut outbox, 10).len(), 1);
-            outbox.lost();
-        }
-        assert_eq!((outbox.waiting(), outbox.dropped()), (0, 1));
-    }
-
-    #[test]
-    fn queues_are_bounded_and_drop_the_oldest() {
-        let mut outbox = Outbox::default();
-        for i in 0..EVENTS + 2 {
-            outbox.push_event(event(&format!("e{i}")), None);
-            outbox.push_result(event("r"));
-        }
-        assert_eq!(outbox.waiting(), EVENTS + RESULTS);
-        assert_eq!(outbox.dropped(), 2 + (EVENTS + 2 - RESULTS) as u64);
-        for _ in 0..RESULTS {
-            let (key, _) = outbox.next(usize::MAX).unwrap();
-            outbox.give_up(key);
-        }
-        assert_eq!(outbox.next(1).unwrap().1.topic.as_ref(), "e2");
-    }
-
-    #[test]
-    fn results_are_bounded_by_size() {
-        let mut outbox = Outbox::default();
-        let long = Message {
-            correlation: Some(vec![0; 60_000]),
-            ..event("r")
-        };
-        for _ in 0..1000 {
-            outbox.push_result(long.clone());
-        }
-        assert_eq!(outbox.waiting(), RESULT_BYTES / 60_001 + 1);
-    }
-
-    #[test]
-    fn inconsistent_packet_ids_are_detected() {
-        let mut outbox = Outbox::default();
-        assert!(outbox.numbered(1).is_err());
-        for name in ["a", "b"] {
-            outbox.push_event(event(name), None);
-        }
-        drain(&mut outbox, 10);
-        assert!(outbox.numbered(1).is_ok());
-        assert!(outbox.numbered(1).is_err());
-    }
-
-    #[test]
-    fn messages_that_cannot_be_sent_are_dropped() {
-        let mut outbox = Outbox::default();
-        outbox.put(topic("big"), vec![0; 10]);
-        let (key, _) = outbox.next(1).unwrap();
-        outbox.give_up(key);
-        assert!(outbox.next(1).is_none());
-        assert!(!outbox.has_telemetry("big"));
-    }
-}
+mod tests;

@@ -1,4 +1,5 @@
-//! The topics and payloads.
+//! Names of the topics and content of the payloads. `publisher` decides which topics a drive has and when they are
+//! published.
 
 use std::time::{Duration, SystemTime};
 
@@ -6,11 +7,19 @@ use serde::ser::{Serialize, SerializeMap, Serializer};
 
 use crate::drive::{ModelPoint, Point, Profile, Quality, State, Value};
 use crate::event::Event;
-use crate::plant::BusHandle;
+use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
 /// Keys of the state object that are not points; a profile point of that name is omitted.
-const STATE_KEYS: [&str; 6] = ["state", "quality", "time", "age_ms", "fault_text", "point_quality"];
+const STATE_KEYS: [&str; 7] = [
+    "state",
+    "quality",
+    "time",
+    "age_ms",
+    "fault_text",
+    "point_quality",
+    "historical",
+];
 
 /// The topics of one gateway.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -31,6 +40,10 @@ impl Topics {
         Topics {
             root: format!("{base}/{gateway}"),
         }
+    }
+
+    pub(super) fn root(&self) -> &str {
+        &self.root
     }
 
     pub(super) fn status(&self) -> String {
@@ -114,11 +127,16 @@ pub(super) struct StateObject<'s> {
     pub(super) age: Option<Duration>,
     /// Time of day.
     pub(super) wall: SystemTime,
+    /// It is no longer current: part of the history.
+    pub(super) historical: bool,
 }
 
 impl Serialize for StateObject<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let mut map = serializer.serialize_map(None)?;
+        if self.historical {
+            map.serialize_entry("historical", &true)?;
+        }
         map.serialize_entry("state", &self.shown.state.map(State::name))?;
         map.serialize_entry("quality", self.shown.quality.name())?;
         let read_at = self.age.and_then(|age| self.wall.checked_sub(age));
@@ -262,12 +280,20 @@ pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTim
     object.to_string().into_bytes()
 }
 
-/// The event object; `None` for an event of a whole bus, which is part of the bus topic.
-pub(super) fn event(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
-    let drive = event.drive.as_deref()?;
+/// The event object and its topics: that of its drive, or those of all drives of its bus.
+pub(super) fn event(topics: &Topics, event: &Event, plant: &Plant) -> (Vec<String>, Vec<u8>) {
+    let drives = match &event.drive {
+        Some(drive) => vec![drive.clone()],
+        None => {
+            let bus = plant.buses.iter().find(|bus| bus.image.spec.name == event.bus);
+            let drives = bus.into_iter().flat_map(|bus| &bus.image.drives);
+            drives.map(|drive| drive.spec.name.clone()).collect()
+        }
+    };
+    let topic = |drive: &String| topics.drive(drive, "event");
     // Strings and numbers can always be serialized.
-    let payload = serde_json::to_vec(event).ok()?;
-    Some((topics.drive(drive, "event"), payload))
+    let payload = serde_json::to_vec(event).unwrap_or_default();
+    (drives.iter().map(topic).collect(), payload)
 }
 
 /// A recording that was made, if the event tells of one.
@@ -364,6 +390,7 @@ mod tests {
                 fault_text: String::new(),
                 age: None,
                 wall: SystemTime::UNIX_EPOCH,
+                historical: false,
             };
             serde_json::to_value(&object).unwrap()
         };
@@ -403,6 +430,7 @@ mod tests {
             fault_text: String::new(),
             age: None,
             wall: SystemTime::UNIX_EPOCH,
+            historical: false,
         };
         let object = serde_json::to_value(&object).unwrap();
         assert_eq!(
@@ -430,13 +458,16 @@ mod tests {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: Some(53),
+            count: None,
             text: "gone".to_string(),
             recording: None,
         };
-        let (topic, payload) = event(&topics, &object).unwrap();
-        assert_eq!(topic, "drivegate/hall/drive/p1/event");
+        let plant = super::super::fixture::plant(&["p1", "p2"]);
+        let (to, payload) = event(&topics, &object, &plant);
+        assert_eq!(to, ["drivegate/hall/drive/p1/event"]);
         let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
-        let expected = serde_json::json!({"id": 4, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
+        let boot = crate::event::boot();
+        let expected = serde_json::json!({"id": 4, "boot": boot, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
         assert_eq!(payload, expected);
         assert_eq!(recording(&topics, &object), None);
@@ -452,6 +483,7 @@ mod tests {
             "trigger": "fault", "summary": "fault 53"});
         assert_eq!(payload, expected);
         object.drive = None;
-        assert_eq!(event(&topics, &object), None);
+        let (to, _) = event(&topics, &object, &plant);
+        assert_eq!(to, ["drivegate/hall/drive/p1/event", "drivegate/hall/drive/p2/event"]);
     }
 }

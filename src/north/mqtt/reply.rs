@@ -3,13 +3,65 @@
 use std::time::{Duration, SystemTime};
 
 use serde::Serialize;
-use serde_json::Value as Json;
 
-use super::connection::is_topic;
 use super::outbox::Message;
 use super::payload;
-use super::request::Incoming;
+use super::request::{Id, Incoming};
 use crate::command::{Answer, CONFIRMED};
+
+/// Maximum number of levels of a response topic.
+const LEVELS: usize = 128;
+
+/// Which response topics results may go to.
+#[derive(Debug, Clone)]
+pub(super) struct ResponseTopics {
+    /// The gateway's own topics, `{base}/{gateway}`.
+    own: String,
+    /// Below it are those of other gateways.
+    base: String,
+    /// Filters of topics below `base` that are allowed all the same.
+    allowed: Vec<String>,
+}
+
+impl ResponseTopics {
+    pub(super) fn new(base: &str, gateway: &str, allowed: Vec<String>) -> ResponseTopics {
+        ResponseTopics {
+            own: format!("{base}/{gateway}"),
+            base: base.to_string(),
+            allowed,
+        }
+    }
+
+    fn allow(&self, topic: &str) -> bool {
+        let sound = !topic.is_empty()
+            && u16::try_from(topic.len()).is_ok()
+            && !topic.starts_with('$')
+            && !topic.contains(['+', '#', '\0'])
+            && topic.split('/').count() <= LEVELS;
+        let matches = || self.allowed.iter().any(|filter| matches(filter, topic));
+        sound && !is_below(topic, &self.own) && (!is_below(topic, &self.base) || matches())
+    }
+}
+
+/// Whether `topic` is `parent` or below it.
+fn is_below(topic: &str, parent: &str) -> bool {
+    let rest = topic.strip_prefix(parent);
+    rest.is_some_and(|rest| rest.is_empty() || rest.starts_with('/'))
+}
+
+/// Whether a topic matches a filter.
+fn matches(filter: &str, topic: &str) -> bool {
+    let mut levels = topic.split('/');
+    for wanted in filter.split('/') {
+        match (wanted, levels.next()) {
+            ("#", _) => return true,
+            ("+", Some(_)) => {}
+            (wanted, Some(level)) if wanted == level => {}
+            _ => return false,
+        }
+    }
+    levels.next().is_none()
+}
 
 /// Destination of a result.
 #[derive(Debug)]
@@ -21,7 +73,7 @@ pub(super) struct Reply {
 
 #[derive(Serialize)]
 struct ResultObject<'r> {
-    id: Option<Json>,
+    id: Option<&'r Id>,
     drive: &'r str,
     ok: bool,
     result: &'r str,
@@ -42,12 +94,25 @@ struct ErrorObject<'r> {
 
 impl Reply {
     /// The response topic of the request, or the result topic of the drive if it has none.
-    pub(super) fn to(incoming: &Incoming, result: String, drive: &str) -> Reply {
-        let asked = incoming.response_topic.clone().filter(|topic| is_topic(topic));
+    pub(super) fn to(incoming: &Incoming, result: String, drive: &str, allowed: &ResponseTopics) -> Reply {
+        let asked = incoming.response_topic.clone().filter(|topic| allowed.allow(topic));
         Reply {
             correlation: incoming.correlation.clone().filter(|_| asked.is_some()),
             topic: asked.unwrap_or(result),
             drive: drive.to_string(),
+        }
+    }
+
+    pub(super) fn topic(&self) -> &str {
+        &self.topic
+    }
+
+    /// The result of an earlier command, once more.
+    pub(super) fn again(&self, previous: Message) -> Message {
+        Message {
+            topic: self.topic.as_str().into(),
+            correlation: self.correlation.clone(),
+            ..previous
         }
     }
 
@@ -59,7 +124,7 @@ impl Reply {
     /// The one result: `confirmed` if a read showed the effect in time, else the answer of the bus.
     pub(super) fn message(
         &self,
-        id: Option<Json>,
+        id: Option<Id>,
         answer: &Answer,
         confirmed: Option<Duration>,
         time: SystemTime,
@@ -70,7 +135,7 @@ impl Reply {
         };
         let error = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
         let object = ResultObject {
-            id,
+            id: id.as_ref(),
             drive: &self.drive,
             ok: error.is_none(),
             result: code,
@@ -84,6 +149,55 @@ impl Reply {
         Message {
             correlation: self.correlation.clone(),
             ..Message::not_retained(self.topic.as_str(), payload)
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn response_topics_stay_away_from_those_of_gateways() {
+        let topics = ResponseTopics::new("plant/a", "hall", vec!["plant/a/answers/+".to_string()]);
+        for good in ["answers", "plant/b", "plant/ab/hall", "/x", "plant/a/answers/7", "a/$b"] {
+            assert!(topics.allow(good), "{good}");
+        }
+        let deep = vec!["a"; LEVELS + 1].join("/");
+        let long = "a".repeat(70_000);
+        for bad in [
+            "",
+            "a/+",
+            "#",
+            "a\0b",
+            "$SYS/x",
+            "$share/g/t",
+            "plant/a",
+            "plant/a/hall",
+            "plant/a/hall/drive/p1/set",
+            "plant/a/other/drive/p1/set",
+            "plant/a/answers",
+            "plant/a/answers/7/8",
+            &deep,
+            &long,
+        ] {
+            assert!(!topics.allow(bad), "{bad}");
+        }
+        let everything = ResponseTopics::new("plant/a", "hall", vec!["#".to_string()]);
+        assert!(everything.allow("plant/a/other/x") && !everything.allow("plant/a/hall/x"));
+    }
+
+    #[test]
+    fn filters_match_as_in_mqtt() {
+        for (filter, topic, expected) in [
+            ("a/#", "a", true),
+            ("a/#", "a/b/c", true),
+            ("a/+/c", "a/b/c", true),
+            ("a/+", "a", false),
+            ("a/+", "a/b/c", false),
+            ("a", "b", false),
+        ] {
+            assert_eq!(matches(filter, topic), expected, "{filter} {topic}");
         }
     }
 }

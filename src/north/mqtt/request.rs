@@ -5,8 +5,11 @@ use std::collections::BTreeSet;
 use std::fmt;
 use std::time::Duration;
 
+use rumqttc::Publish;
+use serde::Serialize;
 use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
+use serde_json::value::RawValue;
 
 use crate::command::{DEFAULT_EXPIRY, Refusal};
 use crate::document::nearest;
@@ -41,6 +44,66 @@ pub struct Incoming {
     pub correlation: Option<Vec<u8>>,
     /// Remaining life of the message, s.
     pub expiry: Option<u32>,
+    /// Who sent it, as its user property `who` says.
+    pub who: Option<String>,
+    /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
+    pub oversized: Option<usize>,
+}
+
+impl Incoming {
+    /// A message as it came; `None` if its topic is not UTF-8.
+    pub(super) fn of(publish: Publish) -> Option<Incoming> {
+        let properties = publish.properties.unwrap_or_default();
+        let who = properties.user_properties.into_iter().find(|(name, _)| name == "who");
+        let mut incoming = Incoming {
+            topic: String::from_utf8(publish.topic.to_vec()).ok()?,
+            payload: Vec::new(),
+            retain: publish.retain,
+            dup: publish.dup,
+            packet: publish.pkid,
+            response_topic: properties.response_topic,
+            correlation: properties.correlation_data.map(|data| data.to_vec()),
+            expiry: properties.message_expiry_interval,
+            who: who.map(|(_, who)| who),
+            oversized: None,
+        };
+        if publish.payload.len() <= MAX_PAYLOAD {
+            incoming.payload = publish.payload.to_vec();
+        } else {
+            let id = find_id(&publish.payload).map_or_else(|| "null".to_string(), |id| id.text().to_string());
+            incoming.payload = format!("{{\"id\":{id}}}").into_bytes();
+            incoming.oversized = Some(publish.payload.len());
+        }
+        Some(incoming)
+    }
+}
+
+/// The `id` of a command: a number or a string, returned as it was written.
+#[derive(Debug, Clone, Serialize)]
+#[serde(transparent)]
+pub(super) struct Id(Box<RawValue>);
+
+impl Id {
+    /// As it was written.
+    pub(super) fn text(&self) -> &str {
+        self.0.get()
+    }
+
+    fn of(value: Box<RawValue>) -> Option<Id> {
+        let text = value.get();
+        let sound = match text.chars().next()? {
+            '"' => serde_json::from_str::<String>(text).is_ok_and(|text| text.len() <= MAX_ID),
+            '-' | '0'..='9' => text.len() <= MAX_ID,
+            _ => false,
+        };
+        sound.then_some(Id(value))
+    }
+}
+
+impl PartialEq for Id {
+    fn eq(&self, other: &Id) -> bool {
+        self.text() == other.text()
+    }
 }
 
 /// The payload for messages: printable and short.
@@ -62,7 +125,7 @@ pub(super) fn excerpt(payload: &[u8]) -> String {
 #[derive(Debug, PartialEq)]
 pub(super) struct SetRequest {
     /// The `id`, also if the rest is refused.
-    pub(super) id: Option<Json>,
+    pub(super) id: Option<Id>,
     /// Points and expiry.
     pub(super) order: Result<(Points, Duration), Refusal>,
 }
@@ -80,12 +143,16 @@ pub(super) fn read(incoming: &Incoming, point: Option<&str>, profile: &Profile) 
 
 /// The `id` of a message, read before the rest, so that a client finds its request in the result whatever else is
 /// wrong. `None` if the payload is not JSON or contains several.
-pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Json> {
-    if point.is_some() {
-        return None;
+pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
+    match point {
+        Some(_) => None,
+        None => find_id(&incoming.payload),
     }
-    let Id(id) = serde_json::from_slice(&incoming.payload).ok()?;
-    id.filter(is_id)
+}
+
+fn find_id(payload: &[u8]) -> Option<Id> {
+    let OnlyId(id) = serde_json::from_slice(payload).ok()?;
+    Id::of(id?)
 }
 
 fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<(Points, Duration), Refusal> {
@@ -94,10 +161,10 @@ fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<
             "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
         ));
     }
-    if incoming.payload.len() > MAX_PAYLOAD {
+    let size = incoming.oversized.unwrap_or(incoming.payload.len());
+    if size > MAX_PAYLOAD {
         return Err(Refusal::BadValue(format!(
-            "the payload has {} bytes, {MAX_PAYLOAD} are allowed",
-            incoming.payload.len()
+            "the payload has {size} bytes, {MAX_PAYLOAD} are allowed"
         )));
     }
     let (points, expiry) = match point {
@@ -246,10 +313,10 @@ impl<'de> Visitor<'de> for FieldsVisitor {
 }
 
 /// The `id` of an object, if it has exactly one; other fields are ignored.
-struct Id(Option<Json>);
+struct OnlyId(Option<Box<RawValue>>);
 
-impl<'de> Deserialize<'de> for Id {
-    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Id, D::Error> {
+impl<'de> Deserialize<'de> for OnlyId {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<OnlyId, D::Error> {
         deserializer.deserialize_map(IdVisitor)
     }
 }
@@ -257,13 +324,13 @@ impl<'de> Deserialize<'de> for Id {
 struct IdVisitor;
 
 impl<'de> Visitor<'de> for IdVisitor {
-    type Value = Id;
+    type Value = OnlyId;
 
     fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str("a JSON object")
     }
 
-    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Id, A::Error> {
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<OnlyId, A::Error> {
         let mut found = Vec::new();
         while let Some(name) = map.next_key::<Cow<'de, str>>()? {
             if name == "id" && found.len() < 2 {
@@ -272,7 +339,7 @@ impl<'de> Visitor<'de> for IdVisitor {
                 map.next_value::<IgnoredAny>()?;
             }
         }
-        Ok(Id(found.pop().filter(|_| found.is_empty())))
+        Ok(OnlyId(found.pop().filter(|_| found.is_empty())))
     }
 }
 
@@ -303,6 +370,11 @@ mod tests {
         order.map(|(points, _)| points[0].1)
     }
 
+    /// The `id` of a request as JSON.
+    fn id_of(request: SetRequest) -> Option<Json> {
+        request.id.map(|id| serde_json::from_str(id.text()).unwrap())
+    }
+
     fn code(request: SetRequest) -> (&'static str, String) {
         let refusal = request.order.unwrap_err();
         (refusal.code(), refusal.to_string())
@@ -311,7 +383,7 @@ mod tests {
     #[test]
     fn an_object_is_one_order() {
         let request = set(r#"{"id": "a-1", "run": true, "speed_reference": 50.5, "expires_ms": 500}"#);
-        assert_eq!(request.id, Some("a-1".into()));
+        assert_eq!(request.id.as_ref().map(Id::text), Some("\"a-1\""));
         let (points, expiry) = request.order.unwrap();
         let index = |name| profile().point_index(name).unwrap();
         let expected = [
@@ -380,7 +452,6 @@ mod tests {
             (r#"{"id": 1, "id": 2}"#, Json::Null),
             (r#"{"id": [1], "run": 2}"#, Json::Null),
             (r#"{"id": null, "run": 2}"#, Json::Null),
-            (r#"{"id": 1e999}"#, Json::Null),
             (r#"{"id": 1, "run": NaN}"#, Json::Null),
             (r#"{"id": 1, "run": 2"#, Json::Null),
             (r#"{"id": 1, "run": 2} {}"#, Json::Null),
@@ -389,8 +460,8 @@ mod tests {
             (r#""id""#, Json::Null),
         ] {
             let request = set(payload);
-            assert_eq!(request.id.unwrap_or_default(), id, "{payload}");
             assert!(request.order.is_err(), "{payload}");
+            assert_eq!(id_of(request).unwrap_or_default(), id, "{payload}");
         }
         let long = |n| set(&format!(r#"{{"id": "{}", "sped": 1}}"#, "x".repeat(n))).id;
         assert!(long(MAX_ID).is_some() && long(MAX_ID + 1).is_none());
@@ -432,7 +503,7 @@ mod tests {
             ..message(r#"{"run": true, "id": 40}"#)
         };
         let refused = read(&retained, None, &profile());
-        assert_eq!(refused.id, Some(40.into()));
+        assert_eq!(refused.id.as_ref().map(Id::text), Some("40"));
         let (code_retained, text) = code(refused);
         assert_eq!(code_retained, "not_allowed");
         assert!(text.contains("retained"), "{text}");
@@ -451,7 +522,31 @@ mod tests {
         let big = format!(r#"{{"id": "{}"}}"#, "x".repeat(MAX_PAYLOAD));
         assert!(code(set(&big)).1.contains("65536 are allowed"));
         let padded = format!(r#"{{"pad": "{}", "id": 41}}"#, "x".repeat(MAX_PAYLOAD));
-        assert_eq!(set(&padded).id, Some(41.into()));
+        assert_eq!(id_of(set(&padded)), Some(41.into()));
+    }
+
+    #[test]
+    fn an_id_is_returned_as_it_was_written() {
+        for id in ["123456789012345678901234567890", "1.0", "-0", "1e999", r#""ä\u0062""#] {
+            let request = set(&format!(r#"{{"id": {id}, "run": 2}}"#));
+            assert_eq!(request.id.as_ref().map(Id::text), Some(id));
+            assert_eq!(serde_json::to_string(&request.id).unwrap(), id);
+        }
+    }
+
+    #[test]
+    fn of_a_payload_that_is_too_long_the_id_is_kept() {
+        let of = |payload: String| {
+            let publish = Publish::new("t", rumqttc::mqttbytes::QoS::AtLeastOnce, payload, None);
+            Incoming::of(publish).unwrap()
+        };
+        let padding = "x".repeat(300_000);
+        let incoming = of(format!(r#"{{"pad": "{padding}", "id": 41}}"#));
+        assert!(incoming.payload.len() < 100);
+        let refused = read(&incoming, None, &profile());
+        assert_eq!(refused.id.as_ref().map(Id::text), Some("41"));
+        assert!(code(refused).1.contains("the payload has 3000"));
+        assert!(read(&of(padding), None, &profile()).order.is_err());
     }
 
     #[test]

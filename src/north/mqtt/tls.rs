@@ -1,11 +1,11 @@
 //! TLS towards the broker.
 
-use std::path::Path;
 use std::sync::Arc;
 
-use rustls::{ClientConfig, RootCertStore};
+use rustls::ClientConfig;
 
 use super::Options;
+use crate::north::identity::{self, RootsError, provider};
 use crate::north::pem::{self, PemError};
 
 /// Why TLS towards the broker cannot be set up, and what to do.
@@ -13,12 +13,10 @@ use crate::north::pem::{self, PemError};
 pub(super) enum TlsConfigError {
     #[error(transparent)]
     Pem(#[from] PemError),
-    #[error("{file}: not a usable CA certificate: {cause}")]
-    UnusableCa { file: String, cause: rustls::Error },
+    #[error(transparent)]
+    Roots(#[from] RootsError),
     #[error("{file}: certificate and key cannot be used: {cause}")]
     UnusableIdentity { file: String, cause: rustls::Error },
-    #[error("the system has no CA certificates; install them or set mqtt.ca")]
-    NoSystemRoots,
     #[error("TLS: {0}")]
     Protocol(rustls::Error),
 }
@@ -31,11 +29,10 @@ pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig
     if !options.tls {
         return Ok(None);
     }
-    let provider = Arc::new(rustls::crypto::ring::default_provider());
-    let builder = ClientConfig::builder_with_provider(provider)
+    let builder = ClientConfig::builder_with_provider(provider())
         .with_safe_default_protocol_versions()
         .map_err(TlsConfigError::Protocol)?
-        .with_root_certificates(roots(options.ca.as_deref())?);
+        .with_root_certificates(identity::roots(options.ca.as_deref())?);
     let config = match &options.identity {
         None => builder.with_no_client_auth(),
         Some((certificate, key)) => builder
@@ -46,26 +43,4 @@ pub(super) fn client_config(options: &Options) -> Result<Option<Arc<ClientConfig
             })?,
     };
     Ok(Some(Arc::new(config)))
-}
-
-fn roots(ca: Option<&Path>) -> Result<RootCertStore, TlsConfigError> {
-    let mut store = RootCertStore::empty();
-    match ca {
-        Some(file) => {
-            for certificate in pem::certificates(file)? {
-                store.add(certificate).map_err(|cause| TlsConfigError::UnusableCa {
-                    file: file.display().to_string(),
-                    cause,
-                })?;
-            }
-        }
-        None => {
-            // One certificate of the system that rustls cannot parse must not disable TLS.
-            store.add_parsable_certificates(rustls_native_certs::load_native_certs().certs);
-            if store.is_empty() {
-                return Err(TlsConfigError::NoSystemRoots);
-            }
-        }
-    }
-    Ok(store)
 }

@@ -177,7 +177,7 @@ impl NxDrive {
             busy_until: SimTime::ZERO,
             heard: None,
         };
-        drive.refresh();
+        drive.refresh_output();
         drive
     }
 
@@ -328,7 +328,7 @@ impl Model for NxDrive {
         &mut self.body
     }
 
-    /// One update period: supervision, commands, motor, process data out.
+    /// One update period: supervision, commands, motor.
     fn step(&mut self, now: SimTime) {
         self.supervise(now);
         let command = self.take_over();
@@ -354,7 +354,10 @@ impl Model for NxDrive {
             &self.settings.motor,
             &self.options.load,
         );
-        self.refresh();
+    }
+
+    fn refresh(&mut self) {
+        self.refresh_output();
     }
 
     fn ready(&self) -> bool {
@@ -396,7 +399,7 @@ impl Model for NxDrive {
         let mut fresh = NxDrive::new(self.options.clone(), now);
         fresh.parameters = self.parameters.clone();
         fresh.settings = fresh.parameters.settings();
-        fresh.refresh();
+        fresh.refresh_output();
         *self = fresh;
     }
 

@@ -255,7 +255,7 @@ impl NxDrive {
     }
 
     /// Refreshes the process data out.
-    pub(super) fn refresh(&mut self) {
+    pub(super) fn refresh_output(&mut self) {
         let head = [self.status(), self.general_status(), signed(self.actual_speed())];
         let items = (parameters::OUT_SELECTION..).take(PROCESS_DATA - head.len());
         let items: Vec<u16> = items

@@ -34,7 +34,7 @@ impl Reply {
 
 /// Sends one request on a connection of its own and reads to its end.
 pub(crate) async fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Reply {
-    let head = format!("{method} {path} HTTP/1.1\r\nHost: test\r\nConnection: close\r\n{headers}\r\n");
+    let head = format!("{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n");
     raw(address, &head).await
 }
 
@@ -99,7 +99,7 @@ impl EventStream {
     pub(crate) async fn open(address: SocketAddr, path: &str, headers: &str) -> EventStream {
         let mut stream = TcpStream::connect(address).await.expect("a connection");
         // HTTP/1.0 keeps chunk sizes out of the lines.
-        let request = format!("GET {path} HTTP/1.0\r\nHost: test\r\n{headers}\r\n");
+        let request = format!("GET {path} HTTP/1.0\r\nHost: localhost\r\n{headers}\r\n");
         stream.write_all(request.as_bytes()).await.expect("sent");
         let mut lines = BufReader::new(stream).lines();
         let mut head = String::new();

@@ -1,8 +1,10 @@
 //! The HTTP interface against a hand-made plant, with plain clients, promtool, a real Prometheus and a
 //! real browser.
 
+mod access;
 mod client;
 mod interface;
+mod limits;
 mod metrics;
 mod page;
 mod plant;

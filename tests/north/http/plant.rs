@@ -147,6 +147,7 @@ pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
         bus: "line1".to_string(),
         drive: Some(drive.to_string()),
         fault_code: (kind == EventKind::Fault).then_some(7),
+        count: None,
         text: text.to_string(),
         recording: None,
     }
@@ -210,6 +211,7 @@ pub(crate) fn stats() -> Arc<NorthStats> {
 /// A served plant.
 pub(crate) struct Server {
     pub(crate) shared: SharedPlant,
+    pub(crate) stats: Arc<NorthStats>,
     pub(crate) cancel: CancellationToken,
     pub(crate) address: SocketAddr,
     pub(crate) http: Http,
@@ -217,18 +219,30 @@ pub(crate) struct Server {
 
 impl Server {
     pub(crate) async fn of(plant: Plant) -> Server {
+        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
+        Server::with(plant, Options::at(listen)).await
+    }
+
+    pub(crate) async fn with(plant: Plant, options: Options) -> Server {
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let cancel = CancellationToken::new();
-        let listen = SocketAddr::from(([127, 0, 0, 1], 0));
-        let http = http::start(Options { listen }, shared.clone(), stats(), cancel.clone())
+        let stats = stats();
+        let http = http::start(options, shared.clone(), stats.clone(), cancel.clone())
             .await
             .expect("it starts");
         Server {
             shared,
+            stats,
             cancel,
-            address: http.address(),
+            address: http.address().expect("an address"),
             http,
         }
+    }
+
+    /// Reloads other options.
+    pub(crate) async fn reload(&mut self, options: Options) {
+        let change = self.http.prepare(options).await.expect("it is possible");
+        self.http.commit(change);
     }
 
     pub(crate) fn plant(&self) -> Arc<Plant> {

@@ -3,7 +3,7 @@
 use std::time::{Duration, UNIX_EPOCH};
 
 use drivegate::event::EventKind;
-use drivegate::north::http::MAX_LISTENERS;
+use drivegate::north::http::MAX_LISTENERS_PER_ADDRESS;
 use drivegate::process_image::{Direction, FrameRecord};
 use serde_json::json;
 use tokio::time::timeout;
@@ -226,7 +226,7 @@ async fn a_slow_listener_is_told_what_it_lost() {
 async fn listeners_are_bounded_and_places_come_back() {
     let server = served().await;
     let mut open = Vec::new();
-    for _ in 0..MAX_LISTENERS {
+    for _ in 0..MAX_LISTENERS_PER_ADDRESS {
         open.push(
             EventStream::open(server.address, "/api/v1/trace", "")
                 .await

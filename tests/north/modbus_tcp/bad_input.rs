@@ -41,6 +41,31 @@ async fn what_came_before_a_bad_header_is_answered() {
     rig.end().await;
 }
 
+/// The requests before it are answered even if the bus takes its time, and whatever follows behind the bad header.
+#[tokio::test]
+async fn a_write_before_a_bad_header_is_executed_and_answered() {
+    let rig = Rig::new().await;
+    rig.buses[0].pause(true);
+    let mut client = rig.client().await;
+    let write = words(6, &[0x8101, 5000]);
+    let mut bytes = frame(7, 1, &write);
+    bytes.extend_from_slice(&[0, 8, 0, 0, 0, 0]);
+    bytes.extend_from_slice(&[0xAA; 3000]);
+    client.send(&bytes).await;
+    until("it waits for the bus", || rig.buses[0].waiting() == 1).await;
+    client.send(&frame(9, 1, &write)).await;
+    rig.buses[0].pause(false);
+    assert_eq!(client.answer().await, Some((7, 1, write)));
+    assert!(client.is_closed().await);
+    assert_eq!(
+        rig.buses[0].orders().len(),
+        1,
+        "nothing behind the bad header is executed"
+    );
+    until("it is gone", || rig.stats.modbus_tcp.connections() == 0).await;
+    rig.end().await;
+}
+
 #[tokio::test]
 async fn half_frames_and_silence_hold_nobody_up() {
     let rig = Rig::new().await;

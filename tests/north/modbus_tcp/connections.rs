@@ -4,7 +4,7 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 
 use arc_swap::ArcSwap;
-use drivegate::north::modbus_tcp;
+use drivegate::north::modbus_tcp::{self, Uncached};
 use tokio::net::TcpListener;
 use tokio_util::sync::CancellationToken;
 
@@ -77,7 +77,7 @@ async fn several_listeners_share_one_server() {
     ];
     let rig = Rig::with(options).await;
     for address in rig.server.addresses() {
-        let mut client = Client::connect(*address).await;
+        let mut client = Client::connect(address).await;
         assert_eq!(client.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
     }
     rig.end().await;
@@ -198,5 +198,109 @@ async fn each_listener_has_its_own_rights_and_buses() {
         registers(4, &[1]),
         "line2 is the first bus now"
     );
+    rig.end().await;
+}
+
+/// The last word that a client may write; the first that it may not.
+const WRITE: [u16; 2] = [0x8101, 5000];
+
+async fn may_write(client: &mut Client) -> bool {
+    let request = words(6, &WRITE);
+    client.ask(1, &request).await == request
+}
+
+#[tokio::test]
+async fn an_operator_gets_in_whoever_else_is_connected() {
+    let mut options = options();
+    (options.max_connections, options.max_connections_per_address) = (64, 16);
+    options.listeners[0].write = vec!["127.0.0.2/32".parse().unwrap()];
+    let rig = Rig::with(options).await;
+    let mut open = Vec::new();
+    for n in 0..1000u16 {
+        // Some are silent, some have asked, some are in the middle of a frame; from one address, then from many.
+        let from = if n < 500 { 1 } else { 3 + (n % 200) as u8 };
+        let mut client = Client::connect_from([127, 0, 0, from], rig.address()).await;
+        match n % 3 {
+            0 => {}
+            1 => client.send(&frame(1, 1, &words(3, &[2102, 1]))).await,
+            _ => client.send(&[0, 1, 0]).await,
+        }
+        open.push(client);
+        if n % 8 == 0 {
+            let mut operator = Client::connect_from([127, 0, 0, 2], rig.address()).await;
+            assert!(may_write(&mut operator).await, "with {n} others");
+        }
+    }
+    let mut operators = Vec::new();
+    for _ in 0..8 {
+        operators.push(Client::connect_from([127, 0, 0, 2], rig.address()).await);
+    }
+    for _ in 0..100 {
+        open.push(Client::connect_from([127, 0, 0, 1], rig.address()).await);
+    }
+    for operator in &mut operators {
+        assert!(may_write(operator).await, "silent as it was, nobody took its place");
+    }
+    assert!(rig.stats.modbus_tcp.connections() <= 64);
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn a_reload_changes_rights_and_closes_only_who_is_no_longer_allowed() {
+    let mut options = options();
+    options.listeners[0].write = vec!["127.0.0.2/32".parse().unwrap()];
+    let mut rig = Rig::with(options.clone()).await;
+    let mut clients = Vec::new();
+    for from in 1..=3 {
+        let mut client = Client::connect_from([127, 0, 0, from], rig.address()).await;
+        assert_eq!(may_write(&mut client).await, from == 2);
+        clients.push(client);
+    }
+    options.listeners[0].write = vec!["127.0.0.1/32".parse().unwrap()];
+    options.listeners[0].allow = ["127.0.0.1/32", "127.0.0.2/32"].map(|net| net.parse().unwrap()).into();
+    (options.max_connections, options.uncached) = (2, Uncached::Refuse);
+    rig.reload(options.clone()).await.unwrap();
+    assert!(clients[2].is_closed().await, "no longer in `allow`");
+    assert!(may_write(&mut clients[0]).await, "has the right from now on");
+    assert_eq!(clients[1].ask(1, &words(6, &WRITE)).await, [0x86, 1], "has lost it");
+    assert_eq!(clients[1].ask(1, &words(3, &[500, 1])).await, [0x83, 2], "not polled");
+    assert!(
+        Client::connect_from([127, 0, 0, 3], rig.address())
+            .await
+            .is_closed()
+            .await
+    );
+    let address = rig.address();
+    options.listeners[0].buses = Some(vec!["line2".to_string()]);
+    rig.reload(options).await.unwrap();
+    assert_eq!(rig.address(), address);
+    assert_eq!(
+        clients[1].ask(1, &words(3, &[2102, 1])).await,
+        [0x83, 0x0A],
+        "its bus is no longer shown"
+    );
+    rig.end().await;
+}
+
+#[tokio::test]
+async fn a_reload_that_cannot_bind_changes_nothing() {
+    let mut rig = Rig::new().await;
+    let (mut client, address) = (rig.client().await, rig.address());
+    assert!(may_write(&mut client).await);
+    let taken = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let mut refused = options();
+    refused.listeners[0].allow = Vec::new();
+    refused.listeners[0].listen.push(taken.local_addr().unwrap());
+    let why = rig.reload(refused).await.unwrap_err().to_string();
+    assert!(why.contains("Address already in use"), "{why}");
+    assert!(may_write(&mut client).await);
+    assert!(may_write(&mut rig.client().await).await);
+    // Another address replaces the first one: who is connected there is disconnected.
+    let mut moved = options();
+    moved.listeners[0].listen = vec![SocketAddr::from(([127, 0, 0, 5], 0))];
+    rig.reload(moved).await.unwrap();
+    assert!(client.is_closed().await);
+    assert!(tokio::net::TcpStream::connect(address).await.is_err());
+    assert!(may_write(&mut rig.client().await).await);
     rig.end().await;
 }

@@ -10,6 +10,7 @@ mod map;
 mod offline;
 mod peers;
 mod requests;
+mod revocation;
 mod rig;
 mod second_opinion;
 mod tls;

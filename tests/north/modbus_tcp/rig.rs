@@ -10,8 +10,8 @@ use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Command, CommandQueue, Order, Outcome};
 use drivegate::drive::profile::{Profile, Profiles};
-use drivegate::north::NorthStats;
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
+use drivegate::north::{NorthStats, ServerError};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveImage, DriveSpec, LeaseAction, Link, Supervision};
 use rustix::event::{PollFd, PollFlags, poll};
@@ -172,7 +172,7 @@ pub(crate) fn options() -> Options {
         listeners: vec![listener()],
         tls: None,
         max_connections: 64,
-        max_connections_per_address: None,
+        max_connections_per_address: 1000,
         idle_timeout: None,
         uncached: Uncached::Forward,
     }
@@ -307,6 +307,13 @@ impl Rig {
             cancel,
             server,
         }
+    }
+
+    /// Applies other options as a reload does.
+    pub(crate) async fn reload(&mut self, options: Options) -> Result<(), ServerError> {
+        let change = self.server.prepare(options).await?;
+        self.server.commit(change);
+        Ok(())
     }
 
     pub(crate) fn address(&self) -> SocketAddr {

@@ -15,7 +15,7 @@ use drivegate::command::{Order, Outcome};
 use drivegate::drive::Value;
 use drivegate::event::{Event, EventKind};
 use drivegate::north::NorthStats;
-use drivegate::north::mqtt::{self, Mqtt, Options};
+use drivegate::north::mqtt::{self, History, Mqtt, Options, Qos, Telemetry};
 use drivegate::plant::{Plant, SharedPlant};
 use drivegate::process_image::{Access, DriveSpec, Link};
 use tempfile::TempDir;
@@ -447,6 +447,7 @@ impl Gateway {
             bus: "line1".to_string(),
             drive: Some(drive.to_string()),
             fault_code: None,
+            count: None,
             text: text.to_string(),
             recording: None,
         });
@@ -493,6 +494,7 @@ impl Gateway {
 async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
     loop {
         let now = Instant::now();
+        plant.load().report_refusals(now);
         for bus in &plant.load().buses {
             while let Some(command) = take_next(&bus.queue, now) {
                 let drive = &bus.image.drives[command.drive];
@@ -552,9 +554,19 @@ pub(crate) fn options(port: u16) -> Options {
         ca: None,
         identity: None,
         base: "drivegate".to_string(),
+        telemetry: Telemetry {
+            state: true,
+            points: true,
+            history: History::Off,
+        },
+        telemetry_qos: Qos::AtMostOnce,
+        event_qos: Qos::AtLeastOnce,
+        expiry: None,
         min_interval: Duration::from_millis(40),
         max_interval: Duration::from_secs(60),
         commands: true,
+        require_id: false,
+        response_topics: Vec::new(),
         buffer: None,
     }
 }

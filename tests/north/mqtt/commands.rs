@@ -230,8 +230,6 @@ fn what_is_wrong_is_refused_and_told_and_nothing_is_written() {
             "only monitored",
         ),
     ] {
-        // At most ten refusals a second are published for each drive.
-        std::thread::sleep(Duration::from_millis(110));
         let result = bench.result(topic, payload, &[]);
         assert_eq!(result["ok"], false);
         assert_eq!(result["error"]["code"], code, "{payload}: {result}");
@@ -336,5 +334,42 @@ fn many_commands_are_all_answered() {
     assert_eq!(ids, (0..200).collect::<Vec<_>>());
     let done = results.iter().filter(|r| r.json()["ok"] == true).count();
     assert_eq!(bench.gateway.ordered().len(), done, "one order for each that was taken");
+    bench.gateway.stop();
+}
+
+#[test]
+fn a_flood_of_refused_commands_is_answered_to_the_last() {
+    let broker = Broker::with("allow_anonymous true\nmax_queued_messages 0\n");
+    let watcher = Watcher::new(&broker, RESULT);
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    gateway.wait_connected(true);
+    let payloads: Vec<String> = (0..8000).map(|n| format!("{{\"id\": {n}, \"sped\": 1}}")).collect();
+    let payloads: Vec<&str> = payloads.iter().map(String::as_str).collect();
+    broker.publish_all(SET, &payloads);
+    let results = watcher.wait_count(RESULT, 8000);
+    let ids: Vec<u64> = results.iter().map(|r| r.json()["id"].as_u64().unwrap()).collect();
+    assert_eq!(ids, (0..8000).collect::<Vec<_>>());
+    gateway.stop();
+}
+
+#[test]
+fn ids_and_commands_that_are_too_large_come_back() {
+    let bench = bench();
+    let big = "123456789012345678901234567890";
+    bench
+        .broker
+        .publish(SET, &format!("{{\"id\": {big}, \"sped\": 1}}"), &[]);
+    let seen = bench.watcher.wait("the result", |m| m.topic == RESULT);
+    assert!(seen.payload.contains(&format!("\"id\":{big},")), "{seen:?}");
+    bench.watcher.clear();
+    let file = bench.broker.dir.path().join("large");
+    std::fs::write(&file, format!("{{\"id\": 77, \"pad\": \"{}\"}}", "x".repeat(1 << 20))).unwrap();
+    let arguments = ["-q", "1", "-t", SET, "-f", file.to_str().unwrap()];
+    assert!(bench.broker.run("mosquitto_pub", &arguments).status.success());
+    let result = bench.watcher.wait("the result", |m| m.topic == RESULT).json();
+    assert_eq!(
+        (&result["id"], &result["error"]["code"]),
+        (&77.into(), &"bad_value".into())
+    );
     bench.gateway.stop();
 }

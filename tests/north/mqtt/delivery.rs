@@ -1,9 +1,9 @@
 //! Brokers that go away and come back.
 
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
 use drivegate::event::EventKind;
-use drivegate::north::mqtt::Buffer;
+use drivegate::north::mqtt::{Buffer, History};
 use tempfile::TempDir;
 
 use super::bench::*;
@@ -171,9 +171,57 @@ fn buffered_events_survive_a_killed_gateway() {
     assert_eq!(events.iter().map(time).collect::<Vec<_>>(), reported);
     wait_for("the buffer to be empty", || (gateway.buffered() == 0).then_some(()));
     gateway.stop();
-    let bytes = |entry: std::io::Result<std::fs::DirEntry>| entry.unwrap().metadata().unwrap().len();
+    let bytes = |entry: std::io::Result<std::fs::DirEntry>| {
+        let entry = entry.unwrap();
+        let log = entry.file_name().to_str().unwrap().ends_with(".log");
+        if log { entry.metadata().unwrap().len() } else { 0 }
+    };
     let left: u64 = std::fs::read_dir(dir.path().join("events")).unwrap().map(bytes).sum();
     assert_eq!(left, 0);
+}
+
+#[test]
+fn the_values_of_an_outage_come_afterwards() {
+    let broker = Broker::start();
+    let line = CutLine::to(broker.port);
+    let watcher = Watcher::new(&broker, "drivegate/#");
+    let dir = TempDir::new().unwrap();
+    let mut options = options(line.port);
+    options.telemetry.history = History::Changes;
+    options.min_interval = Duration::ZERO;
+    options.buffer = Some(Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    });
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    watcher.wait_payload("drivegate/hall/status", "online");
+    line.cut();
+    gateway.wait_connected(false);
+    watcher.clear();
+    for value in 3000..3120 {
+        gateway.read("p1", value);
+        // Two arrays are full, and kept.
+        wait_for("the value to be recorded", || {
+            std::thread::sleep(Duration::from_millis(3));
+            Some(())
+        });
+    }
+    line.mend();
+    let values = || -> Vec<f64> {
+        let arrays = watcher.payloads("drivegate/hall/drive/p1/history");
+        let entries = arrays.iter().flat_map(|array| {
+            let entries: Vec<serde_json::Value> = serde_json::from_str(array).unwrap();
+            entries
+        });
+        let value = |entry: serde_json::Value| {
+            assert!(entry["historical"] == true && entry["time"].is_string());
+            entry["output_frequency"].as_f64().unwrap()
+        };
+        entries.map(value).collect()
+    };
+    wait_for("the last value", || (values().last() == Some(&31.19)).then_some(()));
+    assert!(values().is_sorted() && values().len() > 50);
+    gateway.stop();
 }
 
 #[test]

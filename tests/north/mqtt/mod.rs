@@ -3,5 +3,6 @@
 mod bench;
 mod commands;
 mod delivery;
+mod hostile;
 mod telemetry;
 mod tls;

@@ -1,10 +1,12 @@
 //! What is published, and how.
 
 use std::sync::Arc;
-use std::time::SystemTime;
+use std::time::{Duration, SystemTime};
 
-use drivegate::event::EventKind;
+use drivegate::event::{Event, EventKind};
+use drivegate::north::mqtt::{Buffer, Qos};
 use drivegate::process_image::Link;
+use tempfile::TempDir;
 
 use super::bench::*;
 
@@ -30,7 +32,7 @@ fn all_topics_are_there_retained() {
         assert!(seen.retain, "{topic}");
     }
     let state = late.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
-    assert!(state.retain && state.qos == 1);
+    assert!(state.retain && state.qos == 0);
     let state = state.json();
     assert_eq!(
         (&state["state"], &state["quality"]),
@@ -99,6 +101,7 @@ fn events_pass_through_and_are_not_retained() {
         (&event["event"], &event["drive"], &event["bus"]),
         (&"fault".into(), &"p1".into(), &"line1".into())
     );
+    assert_eq!(event["boot"].as_str().unwrap().len(), 16);
     assert_eq!(event["time"], humantime::format_rfc3339_millis(time).to_string());
     assert_eq!(event["text"], "fault 53: fieldbus fault");
     assert_eq!(broker.retained(topic), None);
@@ -137,6 +140,91 @@ fn a_clean_stop_says_offline_once_and_soon() {
 #[test]
 fn stopping_without_a_broker_does_not_wait() {
     let gateway = Gateway::start(options(free_port()), plant(&["p1"]));
+    gateway.stop();
+}
+
+#[test]
+fn telemetry_expires_and_the_status_does_not() {
+    let broker = Broker::start();
+    let mut options = options(broker.port);
+    options.expiry = Some(Duration::from_secs(300));
+    options.telemetry_qos = Qos::AtLeastOnce;
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    let late = Watcher::new(&broker, "drivegate/#");
+    late.wait("the state", |m| {
+        m.topic == "drivegate/hall/drive/p1/state" && m.qos == 1
+    });
+    let expiry = |topic: &str| {
+        let arguments = ["-t", topic, "-F", "%E", "-W", "2", "-C", "1", "--retained-only"];
+        let output = broker.run("mosquitto_sub", &arguments);
+        String::from_utf8(output.stdout).unwrap().trim().to_string()
+    };
+    let state: u32 = expiry("drivegate/hall/drive/p1/state").parse().unwrap();
+    assert!((100..=300).contains(&state), "{state}");
+    assert_eq!(expiry("drivegate/hall/status").parse::<u32>().unwrap_or_default(), 0);
+    gateway.stop();
+}
+
+#[test]
+fn a_false_status_is_repaired() {
+    let broker = Broker::start();
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    let watcher = Watcher::new(&broker, "drivegate/hall/status");
+    watcher.wait_payload("drivegate/hall/status", "online");
+    broker.publish("drivegate/hall/status", "offline", &["-r"]);
+    wait_for("the status to be repaired", || {
+        let all = watcher.payloads("drivegate/hall/status");
+        (all.iter().rposition(|s| s == "online") > all.iter().rposition(|s| s == "offline")).then_some(())
+    });
+    assert_eq!(broker.retained("drivegate/hall/status").as_deref(), Some("online"));
+    gateway.stop();
+}
+
+#[test]
+fn bus_events_reach_the_topics_of_its_drives() {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "drivegate/#");
+    let gateway = Gateway::start(options(broker.port), plant(&["p1", "p2"]));
+    gateway.wait_connected(true);
+    gateway.plant.load().events.publish(Event {
+        id: 0,
+        time: SystemTime::now(),
+        kind: EventKind::BusDown,
+        bus: "line1".to_string(),
+        drive: None,
+        fault_code: None,
+        count: None,
+        text: "unplugged".to_string(),
+        recording: None,
+    });
+    for drive in ["p1", "p2"] {
+        let topic = format!("drivegate/hall/drive/{drive}/event");
+        let event = watcher.wait("the event", |m| m.topic == topic).json();
+        assert_eq!(event["event"], "bus_down");
+    }
+    gateway.stop();
+}
+
+#[test]
+fn after_a_new_name_the_old_topics_are_cleared() {
+    let broker = Broker::start();
+    let dir = TempDir::new().unwrap();
+    let mut options = options(broker.port);
+    options.buffer = Some(Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    });
+    let gateway = Gateway::start(options.clone(), plant(&["p1"]));
+    let watcher = Watcher::new(&broker, "#");
+    watcher.wait("the state", |m| m.topic == "drivegate/hall/drive/p1/state");
+    gateway.stop();
+    options.base = "plant".to_string();
+    let gateway = Gateway::start(options, plant(&["p1"]));
+    for topic in ["status", "drive/p1/state", "drive/p1/point/running", "bus/line1"] {
+        watcher.wait_payload(&format!("drivegate/hall/{topic}"), "");
+    }
+    watcher.wait("the new state", |m| m.topic == "plant/hall/drive/p1/state");
+    assert_eq!(broker.retained("drivegate/#"), None);
     gateway.stop();
 }
 

@@ -2,6 +2,9 @@
 
 use super::*;
 
+/// How much longer a client waits whose order was answered at once.
+const TURNED_AWAY: Duration = Duration::from_millis(40);
+
 impl World {
     pub(super) fn act(&mut self, index: usize) {
         let now = self.now;
@@ -92,7 +95,8 @@ impl World {
                 self.plain(index, bus, drive, wish, ms(2_000));
             }
             Habit::Operates => self.operate(index, bus, drive),
-            Habit::Floods | Habit::Crowds if self.clients[index].open > 200 => {}
+            // The queue is full: one that is turned away is enough now and then.
+            Habit::Floods | Habit::Crowds if self.clients[index].open > CAPACITY && self.dice.chance(0.95) => {}
             Habit::Crowds => {
                 let wishes = [
                     Wish::RunAtReference,
@@ -117,7 +121,9 @@ impl World {
                 } else {
                     Wish::of(&mut self.dice)
                 };
-                let expiry = [ms(2_000), ms(2_000), ms(400), ms(60)][self.dice.within(0..=3) as usize];
+                // One that is over soon may run out while the line falls silent before it.
+                let short = ms(self.dice.within(3..=80));
+                let expiry = [ms(2_000), ms(2_000), ms(400), short][self.dice.within(0..=3) as usize];
                 self.plain(index, bus, drive, wish, expiry);
                 if self.dice.chance(0.1) {
                     self.heartbeat(bus, drive);
@@ -197,7 +203,6 @@ impl World {
 
     /// The order is in the queue, or was answered at once.
     pub(super) fn accepted(&mut self, id: usize, unique: Option<Unique>) {
-        self.records[id].unique = unique;
         let Record {
             bus,
             drive,
@@ -205,6 +210,10 @@ impl World {
             expires,
             ..
         } = self.records[id];
+        if let Some(unique) = &unique {
+            self.truths[bus][drive].uniques.insert(unique.clone(), id);
+        }
+        self.records[id].unique = unique;
         if self.records[id].answer.is_none() {
             let truth = &mut self.truths[bus][drive];
             if wish.is_stop() {
@@ -215,6 +224,13 @@ impl World {
             self.open.entry((bus, drive)).or_default().push(id);
         }
         self.buses[bus].command_came(self.now);
+    }
+
+    /// Its order was answered at once: it waits a moment.
+    fn turned_away(&mut self, client: usize) {
+        if !self.scenario.floods {
+            self.clients[client].next += TURNED_AWAY;
+        }
     }
 
     pub(super) fn plain(&mut self, client: usize, bus: usize, drive: usize, wish: Wish, expiry: Duration) {
@@ -233,10 +249,12 @@ impl World {
         self.replaced();
         if let Some(answer) = placed.answer() {
             self.answered(id, answer.outcome.code(), Some(&answer.outcome));
+            self.turned_away(client);
         }
         self.accepted(id, unique);
         if let Way::Plain(waiting) = &mut self.clients[client].way {
-            waiting.push((id, placed));
+            let is_read = self.records[id].read.is_some();
+            waiting.push(Waiting { id, placed, is_read });
         }
         self.clients[client].open += usize::from(self.records[id].answer.is_none());
     }
@@ -315,12 +333,39 @@ impl World {
             }
             self.clients[client].open += 1;
             self.replaced();
-            self.collect_client(client);
+            self.collect_client(client, true);
             self.accepted(id, unique);
         }
     }
 
+    /// A client hangs up in the middle of a request, and is back: what it ordered is carried out all the same.
+    fn hang_up(&mut self, client: usize) {
+        let now = self.now;
+        let Way::ModbusTcp(offline, open, _) = &mut self.clients[client].way else {
+            return;
+        };
+        **offline = offline.beside(address(client as u8, client as u16), None, Authority::Write);
+        let given_up = std::mem::take(open);
+        self.clients[client].open = 0;
+        self.note(move || format!("client {client} hangs up"));
+        for id in given_up.into_values() {
+            let Record {
+                bus, drive, expires, ..
+            } = self.records[id];
+            self.records[id].answer = Some(("given up".to_string(), now));
+            let truth = &mut self.truths[bus][drive];
+            truth.repeated_until = truth.repeated_until.max(Some(expires + LAST_STEPS));
+            if let Some(open) = self.open.get_mut(&(bus, drive)) {
+                open.retain(|open| *open != id);
+            }
+        }
+        self.open.retain(|_, open| !open.is_empty());
+    }
+
     pub(super) fn by_modbus_tcp(&mut self, client: usize, bus: usize, drive: usize) {
+        if self.dice.chance(0.03) {
+            self.hang_up(client);
+        }
         match self.dice.within(0..=5) {
             0 => self.write_word(client, bus, drive, 0x8100, 1, Wish::Run),
             1 | 2 => self.write_word(client, bus, drive, 0x8100, 0, Wish::Stop),
@@ -345,6 +390,9 @@ impl World {
         self.clients[client].open += 1;
         self.replaced();
         self.take_answers(client, &bytes);
+        if self.records[id].answer.is_some() {
+            self.turned_away(client);
+        }
         self.accepted(id, None);
     }
 }

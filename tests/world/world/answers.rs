@@ -5,7 +5,15 @@ use super::*;
 impl World {
     pub(super) fn collect(&mut self) {
         for client in 0..self.clients.len() {
-            self.collect_client(client);
+            self.collect_client(client, true);
+        }
+    }
+
+    /// The same after a step: those who wait for a write are only asked when one was answered.
+    pub(super) fn collect_news(&mut self) {
+        let before = std::mem::replace(&mut self.answered, self.writes.seconds().count);
+        for client in 0..self.clients.len() {
+            self.collect_client(client, self.answered != before);
         }
     }
 
@@ -20,12 +28,12 @@ impl World {
         let just_replaced = |record: &&mut Record| {
             let answer = record.answer.as_ref();
             !record.succeeded
-                && record.wish.is_reference()
+                && newest.wish.replaces(record.wish)
                 && answer.is_some_and(|(code, at)| code == "replaced" && *at == now)
         };
         let recent = before.iter_mut().rev().take(1_000);
         let mut replaced = recent.filter(of_drive).filter(just_replaced);
-        if newest.wish.is_reference()
+        if newest.wish.replaces(newest.wish)
             && let Some(older) = replaced.next()
         {
             older.succeeded = true;
@@ -33,17 +41,17 @@ impl World {
         }
     }
 
-    pub(super) fn collect_client(&mut self, client: usize) {
+    pub(super) fn collect_client(&mut self, client: usize, writes: bool) {
         let now = self.now;
         match &mut self.clients[client].way {
             Way::Plain(waiting) => {
                 let mut answered = Vec::new();
-                waiting.retain_mut(|(id, placed)| match placed.answer() {
-                    Some(answer) => {
-                        answered.push((*id, answer));
-                        false
-                    }
-                    None => true,
+                waiting.retain_mut(|Waiting { id, placed, is_read }| {
+                    let asked = writes || *is_read;
+                    let answer = asked.then(|| placed.answer()).flatten();
+                    let waits = answer.is_none();
+                    answered.extend(answer.map(|answer| (*id, answer)));
+                    waits
                 });
                 for (id, answer) in answered {
                     if self.records[id].answer.is_none() {
@@ -64,6 +72,7 @@ impl World {
                     self.clients[client].open = self.clients[client].open.saturating_sub(1);
                 }
             }
+            Way::ModbusTcp(_, open, _) if open.is_empty() || !writes => {}
             Way::ModbusTcp(offline, ..) => {
                 let bytes = offline.receive(&[], now);
                 self.take_answers(client, &bytes);
@@ -108,7 +117,7 @@ impl World {
         self.note(move || format!("order {id} is answered {text}"));
         assert!(self.records[id].answer.is_none(), "order {id} was answered twice");
         self.records[id].answer = Some((code.to_string(), now));
-        let record = self.records[id].clone();
+        let record = &self.records[id];
         if let Some(open) = self.open.get_mut(&(record.bus, record.drive)) {
             open.retain(|open| *open != id);
             if open.is_empty() {
@@ -160,24 +169,25 @@ impl World {
             "a stop was refused because the drive was away: it is the probe"
         );
         match code {
-            "acknowledged" | "confirmed" => self.check_done(id, &record, code, outcome),
-            "expired" => self.check_expired(id, &record),
+            "acknowledged" | "confirmed" => self.check_done(id, record, code, outcome),
+            "expired" => self.check_expired(id, record),
             _ => {}
         }
-        if code == "confirmed" && record.wish == Wish::Stop {
-            self.check_stands(id, &record);
+        if code == "confirmed" && self.records[id].wish == Wish::Stop {
+            self.check_stands(id);
         }
         self.figures.confirmed += u64::from(code == "confirmed");
     }
 
     /// A confirmed stop: the motor stands, or is near zero speed.
-    pub(super) fn check_stands(&mut self, id: usize, record: &Record) {
+    pub(super) fn check_stands(&mut self, id: usize) {
+        let record = &self.records[id];
         let (sim, troubled) = (
             self.now - self.began,
             self.truths[record.bus][record.drive].is_troubled(record.accepted),
         );
         let bus = &mut self.buses[record.bus];
-        let late = bus.line.is_late();
+        let late = bus.late;
         let Some(drive) = bus.wire.slaves().drive(record.drive as u8 + 1) else {
             return;
         };
@@ -223,10 +233,11 @@ impl World {
         if record.wish == Wish::Converted && profile.name != "vacon-cx" {
             self.check_converted(id, record);
         }
-        if let Some(unique) = record.unique.as_ref().filter(|_| !n2 && profile.name != "vacon-cx") {
+        let shows = record.wish == Wish::Parameter || (!n2 && profile.name != "vacon-cx");
+        if let Some(unique) = record.unique.as_ref().filter(|_| shows) {
             let wrote = |did: &RequestPdu, _: Option<&Vec<u16>>| sets(did, unique);
             let has = |did: &RequestPdu, words: Option<&Vec<u16>>| has_already(did, words, unique);
-            let done = truth.did(since, wrote) || truth.did(since, has);
+            let done = truth.did(since, wrote) || truth.did(since, has) || truth.was_set_last(unique);
             assert!(done, "order {id}: {code}, but the drive did not take it");
         }
     }

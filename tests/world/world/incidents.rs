@@ -63,6 +63,7 @@ impl World {
                 self.away[bus] = Some(until);
                 self.buses[bus].set_open(false, now);
                 befell(&mut self.truths[bus], &all);
+                self.collect();
                 "the port goes"
             }
             1 => {

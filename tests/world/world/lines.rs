@@ -24,7 +24,7 @@ impl World {
             "a request came before the line was silent"
         );
         // Behind a late reply that stood for the present one, that is still to come: nobody can know.
-        if !self.buses[index].line.is_late() {
+        if !self.buses[index].late {
             assert_eq!(statistics.collisions, 0, "a request met a reply");
             assert_eq!(statistics.provoked_overlaps, 0, "a request met noise");
         }
@@ -193,11 +193,7 @@ impl World {
         if waiting.into_iter().any(is_converted) {
             return;
         }
-        let mine = |record: &Record| {
-            record.bus == bus && record.drive == drive && record.unique.as_ref().is_some_and(|unique| sets(pdu, unique))
-        };
-        // The last order with these words: they come again after some thousands.
-        let Some(id) = self.records.iter().rposition(mine) else {
+        let Some(id) = self.truths[bus][drive].order_of(pdu) else {
             return;
         };
         let record = &mut self.records[id];
@@ -257,7 +253,7 @@ impl World {
             .map(|i| snapshot.word(table, start + i).unwrap_or(0))
             .collect();
         // Simulated late replies may overtake each other, which those of a drive do not.
-        let slack = if self.buses[bus].line.is_late() {
+        let slack = if self.buses[bus].late {
             Duration::from_secs(1)
         } else {
             Duration::ZERO

@@ -1,7 +1,8 @@
 //! The status page: one document with its style and its script, all served by this server.
 //!
 //! The script shows the JSON interface live. Without scripts the page has the tables rendered here and reloads every
-//! few seconds.
+//! few seconds. A column has its heading in `index.html` and its cells in `page.js`; those without scripts are in
+//! `COLUMNS`.
 
 use std::fmt::{self, Write as _};
 use std::time::Instant;

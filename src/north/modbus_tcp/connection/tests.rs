@@ -3,6 +3,7 @@ use std::sync::Arc;
 use arc_swap::ArcSwap;
 use tokio::io::DuplexStream;
 use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
 
 use super::super::client::Client;
 use super::super::routes::PlantView;
@@ -10,6 +11,7 @@ use super::super::{Options, ServerState, Uncached};
 use super::*;
 use crate::command::Authority;
 use crate::north::NorthStats;
+use crate::north::connection_limit::{ConnectionLimit, Limits, Newcomer};
 use crate::plant::Plant;
 
 /// Read input register 0 of unit 255 in a plant without a bus: answered at once with 02.
@@ -21,6 +23,7 @@ struct Bench {
     server: JoinHandle<()>,
     stats: Arc<NorthStats>,
     cancel: CancellationToken,
+    place: Arc<Place>,
 }
 
 /// A connection over a pipe that holds `pipe` bytes each way.
@@ -33,7 +36,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         listeners: Vec::new(),
         tls: None,
         max_connections: 1,
-        max_connections_per_address: None,
+        max_connections_per_address: 1,
         idle_timeout: None,
         uncached: Uncached::Refuse,
     };
@@ -52,12 +55,23 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
     let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
     let (client, end) = tokio::io::duplex(pipe);
     let cancel = CancellationToken::new();
-    let server = tokio::spawn(serve(end, session, idle_timeout, cancel.clone()));
+    let limit = ConnectionLimit::new(Limits::new(1, 1));
+    let newcomer = Newcomer {
+        address: [127, 0, 0, 1].into(),
+        listener: 0,
+        cancel: &cancel,
+    };
+    let (permit, _) = limit
+        .acquire(newcomer, Instant::now().into_std(), || Some(Authority::ReadOnly))
+        .unwrap();
+    let place = permit.place().clone();
+    let server = tokio::spawn(async move { serve(end, session, idle_timeout, permit.place()).await });
     Bench {
         client,
         server,
         stats,
         cancel,
+        place,
     }
 }
 
@@ -195,6 +209,21 @@ async fn an_idle_client_is_disconnected() {
     let begin = Instant::now();
     assert_eq!(bench.rest().await, b"");
     assert_eq!(begin.elapsed(), timeout);
+    bench.server.await.unwrap();
+    assert_eq!(bench.stats.modbus_tcp.connections(), 0);
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_connection_is_in_use_once_it_has_asked_and_ends_when_its_place_is_taken() {
+    let mut bench = bench(1024);
+    bench.send(&REQUEST[..5]).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert!(!bench.place.is_in_use());
+    bench.send(&REQUEST[5..]).await;
+    assert_eq!(bench.receive(9).await, ANSWER);
+    assert!(bench.place.is_in_use());
+    bench.place.close(CloseReason::Displaced);
+    assert_eq!(bench.rest().await, b"");
     bench.server.await.unwrap();
     assert_eq!(bench.stats.modbus_tcp.connections(), 0);
 }

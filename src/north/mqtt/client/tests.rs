@@ -1,6 +1,6 @@
 use arc_swap::ArcSwap;
 
-use super::super::{Buffer, fixture};
+use super::super::{Buffer, Qos, Telemetry, fixture};
 use super::*;
 use crate::event::{BURST, EventKind};
 
@@ -15,9 +15,19 @@ fn options(buffer: Option<Buffer>) -> Options {
         ca: None,
         identity: None,
         base: "drivegate".to_string(),
+        telemetry: Telemetry {
+            state: true,
+            points: true,
+            history: History::Off,
+        },
+        telemetry_qos: Qos::AtMostOnce,
+        event_qos: Qos::AtLeastOnce,
+        expiry: None,
         min_interval: Duration::from_millis(100),
         max_interval: Duration::from_secs(60),
         commands: true,
+        require_id: false,
+        response_topics: Vec::new(),
         buffer,
     }
 }
@@ -25,7 +35,7 @@ fn options(buffer: Option<Buffer>) -> Options {
 async fn client(buffer: Option<Buffer>) -> Client {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    Client::new(options(buffer), plant, Arc::default(), events).await
+    Client::new(options(buffer), plant, Arc::default(), events)
 }
 
 /// Raises events while the client is busy, then lets it receive them.
@@ -38,6 +48,7 @@ async fn burst(client: &mut Client, count: usize) {
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: None,
+            count: None,
             text: format!("event {n}"),
             recording: None,
         });
@@ -50,12 +61,15 @@ async fn burst(client: &mut Client, count: usize) {
 async fn a_busy_client_loses_no_event_of_a_burst() {
     let mut client = client(None).await;
     burst(&mut client, 1000).await;
-    assert_eq!((client.outbox.waiting(), client.missed, client.dropped()), (1000, 0, 0));
-    let (_, first) = client.outbox.next(1).unwrap();
+    assert_eq!(
+        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
+        (1000, 0, 0)
+    );
+    let (_, first) = client.outbox.next(1, true).unwrap();
     assert!(first.payload.windows(8).any(|w| w == b"event 0\""));
     burst(&mut client, BURST - 1000).await;
     assert_eq!(
-        (client.outbox.waiting(), client.missed, client.dropped()),
+        (client.outbox.waiting(), client.missed, client.outbox.take_lost().events),
         (BURST, 0, 0)
     );
 }
@@ -77,4 +91,55 @@ async fn lost_events_are_counted() {
     let mut client = client(None).await;
     burst(&mut client, BURST + 10).await;
     assert_eq!((client.outbox.waiting(), client.missed), (BURST, 10));
+}
+
+/// A fault, then refusals, more than there is room for; events that wait then, and events lost.
+async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) -> (u64, u64) {
+    burst(client, 1).await;
+    for n in 0..refusals {
+        let event = Event {
+            id: 0,
+            time: SystemTime::UNIX_EPOCH,
+            kind: EventKind::RefusedCommand,
+            bus: "line1".to_string(),
+            drive: Some("p1".to_string()),
+            fault_code: None,
+            count: Some(1),
+            text: format!("refused {n}"),
+            recording: None,
+        };
+        client.on_event(Ok(Arc::new(event)));
+    }
+    let (_, lost) = client.stats.mqtt.losses().next().unwrap();
+    (client.waiting_events(), lost)
+}
+
+#[tokio::test]
+async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
+    let (half, refusals) = (BURST as u64 / 2, BURST as u64);
+    let mut in_memory = client(None).await;
+    assert_eq!(
+        a_fault_and_a_flood(&mut in_memory, BURST).await,
+        (half, refusals - (half - 1))
+    );
+    burst(&mut in_memory, BURST / 2).await;
+    assert_eq!(
+        in_memory.waiting_events(),
+        BURST as u64,
+        "events of drives have the rest"
+    );
+    let (_, first) = in_memory.outbox.next(1, true).unwrap();
+    assert!(
+        first.payload.windows(8).any(|w| w == b"event 0\""),
+        "the fault is there"
+    );
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 64 << 10,
+    };
+    assert_eq!(
+        a_fault_and_a_flood(&mut client(Some(buffer)).await, 1000).await,
+        (32, 969)
+    );
 }

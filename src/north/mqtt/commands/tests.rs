@@ -1,4 +1,7 @@
+use serde_json::Value as Json;
+
 use super::super::fixture;
+use super::memory::REMEMBERED;
 use super::*;
 use crate::codec::Reply as BusReply;
 use crate::command::{Outcome, Receipt, Urgency};
@@ -16,7 +19,7 @@ impl Bench {
         fixture::read(&plant, "p1", 1, 0, Instant::now());
         Bench {
             events: plant.events.subscribe(),
-            commands: Commands::new(Topics::new("drivegate", "hall")),
+            commands: Commands::new(Topics::new("drivegate", "hall"), rules(false)),
             now: Instant::now(),
             plant,
         }
@@ -24,7 +27,7 @@ impl Bench {
 
     fn take(&mut self, incoming: Incoming) -> Option<Message> {
         self.commands
-            .take(incoming, &self.plant, self.now, SystemTime::UNIX_EPOCH)
+            .take(incoming, &self.plant, |_| false, self.now, SystemTime::UNIX_EPOCH)
     }
 
     fn queued(&self) -> usize {
@@ -48,6 +51,13 @@ impl Bench {
     fn acknowledge(&mut self) -> Json {
         drop(self.take_order().unwrap());
         self.finished().unwrap()
+    }
+}
+
+fn rules(require_id: bool) -> Rules {
+    Rules {
+        responses: ResponseTopics::new("drivegate", "hall", Vec::new()),
+        require_id,
     }
 }
 
@@ -181,22 +191,40 @@ fn a_repetition_gets_the_previous_result() {
         ..first.clone()
     };
     assert_eq!(json(&bench.take(again.clone()).unwrap()), result);
-    // Another command with the same id, and the same one a minute later, are new commands.
+    let elsewhere = Incoming {
+        response_topic: Some("other".to_string()),
+        correlation: Some(vec![1]),
+        ..again.clone()
+    };
+    let to_other = bench.take(elsewhere).unwrap();
     assert_eq!(
-        bench.take(set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#)),
-        None
+        (to_other.topic.as_ref(), to_other.correlation.as_deref()),
+        ("other", Some(&[1][..]))
     );
+    assert_eq!(json(&to_other), result);
+    // Another payload with the same id is a new command; the first one is still not executed again.
+    let other = set("p1/set", r#"{"id": 1, "run": true, "reverse": true}"#);
+    assert_eq!(bench.take(other.clone()), None);
     bench.acknowledge();
-    assert_eq!(
-        bench.take(again.clone()),
-        None,
-        "the id was used for something else since"
-    );
+    for _ in 0..2 {
+        let refused = json(&bench.take(again.clone()).unwrap());
+        assert_eq!(refused["error"]["code"], "not_allowed", "{refused}");
+        assert!(bench.take(other.clone()).is_some());
+        bench.now += REMEMBERED / 3;
+    }
+    assert_eq!(bench.queued(), 0);
+    bench.now += REMEMBERED;
+    assert_eq!(bench.take(again.clone()), None, "ten minutes later it is a new command");
     bench.acknowledge();
-    assert!(bench.take(again.clone()).is_some());
-    bench.now += REPLAYED;
-    assert_eq!(bench.take(again), None);
+    bench.now += REMEMBERED;
+    let long = Incoming {
+        expiry: Some(3600),
+        ..again
+    };
+    assert_eq!(bench.take(long.clone()), None);
     bench.acknowledge();
+    bench.now += 2 * REMEMBERED;
+    assert!(bench.take(long).is_some(), "it is remembered until it expires");
     // Without an id only the mark of the broker shows a repetition.
     let bare = set("p1/set", r#"{"speed_reference": 5}"#);
     for _ in 0..2 {
@@ -366,4 +394,84 @@ fn a_repetition_after_a_stop_is_refused() {
     let again = json(&bench.take(Incoming { dup: true, ..run }).expect("an answer at once"));
     assert_eq!(again["error"]["code"], "not_allowed", "{again}");
     assert_eq!(bench.queued(), 0);
+}
+
+#[test]
+fn a_loop_of_old_commands_starts_nothing() {
+    let mut bench = Bench::new();
+    let starts: Vec<_> = (0..5000)
+        .map(|n| set("p1/set", &format!(r#"{{"id": {n}, "run": true}}"#)))
+        .collect();
+    for start in &starts {
+        assert_eq!(bench.take(start.clone()), None);
+        bench.acknowledge();
+    }
+    for start in &starts {
+        assert!(bench.take(start.clone()).is_some());
+    }
+    assert_eq!(bench.queued(), 0);
+}
+
+#[test]
+fn a_repetition_to_another_address_is_answered_there_though_the_result_is_to_come() {
+    let mut bench = Bench::new();
+    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
+    assert_eq!(bench.take(run.clone()), None);
+    let elsewhere = Incoming {
+        response_topic: Some("other".to_string()),
+        ..run
+    };
+    let refused = bench.take(elsewhere).unwrap();
+    assert_eq!(refused.topic.as_ref(), "other");
+    assert_eq!(json(&refused)["error"]["code"], "not_allowed");
+}
+
+#[test]
+fn where_an_id_is_required_only_stops_do_without() {
+    let mut bench = Bench::new();
+    bench.commands.rules.require_id = true;
+    for (topic, payload) in [("p1/set", r#"{"run": true}"#), ("p1/set/run", "1")] {
+        let refused = json(&bench.take(set(topic, payload)).unwrap());
+        assert_eq!(refused["error"]["code"], "not_allowed");
+    }
+    for (topic, payload) in [
+        ("p1/set", r#"{"run": false}"#),
+        ("p1/set/run", "0"),
+        ("p1/set", r#"{"id": 1, "run": true}"#),
+    ] {
+        assert_eq!(bench.take(set(topic, payload)), None);
+        bench.acknowledge();
+    }
+}
+
+#[test]
+fn commands_whose_results_find_no_room_are_refused_and_stops_are_not() {
+    let mut bench = Bench::new();
+    let mut crowded = |payload: &str| {
+        let crowded = |topic: &str| topic == "drivegate/hall/drive/p1/result";
+        let incoming = set("p1/set", payload);
+        bench
+            .commands
+            .take(incoming, &bench.plant, crowded, bench.now, SystemTime::UNIX_EPOCH)
+    };
+    assert!(
+        json(&crowded(r#"{"run": true}"#).unwrap())["error"]["message"]
+            .as_str()
+            .unwrap()
+            .contains("results")
+    );
+    assert_eq!(crowded(r#"{"run": false}"#), None);
+}
+
+#[test]
+fn the_audit_names_the_client_that_the_broker_names() {
+    let mut bench = Bench::new();
+    let run = Incoming {
+        who: Some("alice\n".to_string()),
+        ..set("p1/set/run", "1")
+    };
+    assert_eq!(bench.take(run), None);
+    let command = bench.plant.buses[0].queue.lock().pop(Urgency::Read, bench.now).unwrap();
+    assert_eq!(command.ticket.origin().who, "alice\\n");
+    assert_eq!(command.ticket.client(), "mqtt");
 }

@@ -3,7 +3,7 @@
 use super::writer::{packet, variable};
 use super::*;
 use proptest::prelude::*;
-use rumqttc::v5::mqttbytes::v5::{Packet, PubAck};
+use rumqttc::{Packet, PubAck};
 
 const VERSIONS: [Version; 2] = [Version::V311, Version::V5];
 

@@ -2,7 +2,7 @@
 //!
 //! Trust is decided by rustls: a client's certificate is read here after its chain and its signature were verified.
 
-use x509_cert::Certificate;
+use x509_cert::certificate::{Certificate, TbsCertificate};
 use x509_cert::der::asn1::{ObjectIdentifier, Utf8StringRef};
 use x509_cert::der::{self, Decode, Tag, Tagged};
 use x509_cert::name::Name;
@@ -49,14 +49,23 @@ pub(super) enum RoleError {
 pub(super) fn read(der: &[u8]) -> der::Result<CertificateSummary> {
     let certificate = Certificate::from_der(der)?;
     let certificate = certificate.tbs_certificate();
-    let serial = || format!("serial {}", hex(certificate.serial_number().as_bytes()));
     let validity = certificate.validity();
     Ok(CertificateSummary {
-        name: common_name(certificate.subject()).unwrap_or_else(serial),
+        name: name_of(certificate),
         not_before: validity.not_before.to_unix_duration().as_secs(),
         not_after: validity.not_after.to_unix_duration().as_secs(),
         role: role(certificate.extensions().map_or(&[], Vec::as_slice)),
     })
+}
+
+/// The name of the certificate's subject for messages, printable.
+pub(super) fn subject_name(certificate: &Certificate) -> String {
+    name_of(certificate.tbs_certificate())
+}
+
+fn name_of(certificate: &TbsCertificate) -> String {
+    let serial = || format!("serial {}", hex(certificate.serial_number().as_bytes()));
+    common_name(certificate.subject()).unwrap_or_else(serial)
 }
 
 fn role(extensions: &[x509_cert::ext::Extension]) -> Result<Option<String>, RoleError> {

@@ -1,0 +1,19 @@
+//! A client certificate: trust was decided before, the role in it grants authority.
+//!
+//! Input: the certificate in DER.
+
+use drivegate::north::modbus_tcp::certificate_role;
+
+pub(crate) fn run(data: &[u8]) {
+    let Some(role) = certificate_role(data) else { return };
+    // DER has one form only: nothing may follow, and nothing may be cut.
+    let mut longer = data.to_vec();
+    longer.push(0);
+    assert_eq!(certificate_role(&longer), None);
+    assert_eq!(certificate_role(&data[..data.len() - 1]), None);
+    if let Ok(Some(role)) = role {
+        assert!(role.len() <= 256);
+        let bytes = role.as_bytes();
+        assert!(bytes.is_empty() || data.windows(bytes.len()).any(|part| part == bytes));
+    }
+}

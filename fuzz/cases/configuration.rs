@@ -1,0 +1,20 @@
+//! A configuration file.
+//!
+//! Input: the file; what is not UTF-8 is replaced.
+
+use drivegate::config::Settings;
+
+pub(crate) fn run(data: &[u8]) {
+    let text = String::from_utf8_lossy(data);
+    // It would name files and devices of this machine.
+    if ["password_file", "profile_dirs", "certificate", "key", "ca=", "ca =", "\"ca\""].iter().any(|word| text.contains(word)) {
+        return;
+    }
+    let loaded = Settings::parse("fuzz.toml", &text, std::iter::empty());
+    assert_eq!(loaded.settings.is_some(), loaded.errors.is_empty());
+    for problem in loaded.errors.iter().chain(&loaded.warnings) {
+        assert!(!problem.to_string().is_empty());
+    }
+    let again = Settings::parse("fuzz.toml", &text, std::iter::empty());
+    assert_eq!(loaded.settings, again.settings);
+}

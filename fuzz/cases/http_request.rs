@@ -1,0 +1,27 @@
+//! Path and query of an HTTP request.
+//!
+//! Input: both, as they stand in the head of the request.
+
+use std::sync::{Arc, LazyLock};
+
+use arc_swap::ArcSwap;
+use drivegate::north::http::Offline;
+use drivegate::plant::Plant;
+
+static SERVER: LazyLock<Offline> = LazyLock::new(|| {
+    let plant = Plant {
+        gateway: "fuzz".to_string(),
+        stale_after: std::time::Duration::from_secs(1),
+        buses: Vec::new(),
+        events: Default::default(),
+        writes: Default::default(),
+        recordings: Default::default(),
+    };
+    Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
+});
+
+pub(crate) fn run(data: &[u8]) {
+    // Hyper refuses what is no target of a request.
+    let Some(status) = SERVER.get(data) else { return };
+    assert!([200, 400, 404].contains(&status), "{status}");
+}

@@ -1,0 +1,13 @@
+//! A file of the MQTT buffer, as a crash or a bad disk may leave it.
+//!
+//! Input: the file.
+
+use drivegate::north::mqtt::whole_records;
+
+pub(crate) fn run(data: &[u8]) {
+    let (records, bytes) = whole_records(data);
+    assert!(bytes <= data.len() && records * 21 <= bytes);
+    // What is whole stays whole, whatever precedes it.
+    let more = [&[0; 9][..], data].concat();
+    assert_eq!(whole_records(&more), (records, bytes));
+}

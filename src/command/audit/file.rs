@@ -1,0 +1,420 @@
+//! The audit file: a thread that writes records behind two bounded queues, one for commands that were sent. Nobody waits
+//! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost.
+
+use std::collections::VecDeque;
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Read, Seek, SeekFrom, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant, SystemTime};
+
+use rustix::fs::{FlockOperation, flock};
+use tokio::sync::watch;
+
+use super::AuditRecord;
+use super::chain::{self, Chain, Entry, Hash, Tail};
+
+/// Records that wait for the disk: of commands that were sent, and others.
+const WAITING: (usize, usize) = (8192, 1024);
+/// Time after which written records survive a power failure, and after which a disk that failed is tried again.
+const SYNC: Duration = Duration::from_secs(1);
+/// Interval at which the hash of the last line is logged.
+const HASH_LOGGED: Duration = Duration::from_secs(60);
+/// Files that share `max_bytes`.
+const FILES: u64 = 8;
+/// Longest end of a file that is searched for its last entry, bytes.
+const LONGEST_TAIL: u64 = 64 << 20;
+
+/// Where the audit is written.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct AuditFileOptions {
+    /// The current file; older ones have `.1` to `.7` after its name.
+    pub path: PathBuf,
+    /// Size of all of them, bytes.
+    pub max_bytes: u64,
+}
+
+/// The way to the thread that writes.
+#[derive(Debug)]
+pub struct AuditFile {
+    options: AuditFileOptions,
+    shared: Arc<Shared>,
+    ended: watch::Receiver<()>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    queues: Mutex<Queues>,
+    wake: Condvar,
+}
+
+#[derive(Debug, Default)]
+struct Queues {
+    sent: VecDeque<Arc<AuditRecord>>,
+    unsent: VecDeque<Arc<AuditRecord>>,
+    /// Since the start: sent, unsent.
+    lost: (u64, u64),
+    end: bool,
+}
+
+impl Shared {
+    fn queues(&self) -> MutexGuard<'_, Queues> {
+        self.queues.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// The record that is written next; those of commands that were sent first.
+    fn next(&self) -> Option<(Arc<AuditRecord>, bool)> {
+        let mut queues = self.queues();
+        let sent = queues.sent.pop_front().map(|record| (record, true));
+        sent.or_else(|| queues.unsent.pop_front().map(|record| (record, false)))
+    }
+
+    fn put_back(&self, record: Arc<AuditRecord>, sent: bool) {
+        let mut queues = self.queues();
+        let queue = if sent { &mut queues.sent } else { &mut queues.unsent };
+        queue.push_front(record);
+    }
+
+    /// Waits until there is something to write, at most until `deadline`; whether the end was asked for.
+    fn wait(&self, deadline: Instant, for_records: bool) -> bool {
+        let mut queues = self.queues();
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let ready = for_records && !(queues.sent.is_empty() && queues.unsent.is_empty());
+            if queues.end || ready || left.is_zero() {
+                return queues.end;
+            }
+            let waited = self.wake.wait_timeout(queues, left);
+            queues = waited.map_or_else(|poisoned| poisoned.into_inner().0, |(queues, _)| queues);
+        }
+    }
+}
+
+impl AuditFile {
+    /// Starts the thread that writes.
+    ///
+    /// # Errors
+    /// The system does not provide a thread.
+    pub fn start(options: AuditFileOptions) -> io::Result<AuditFile> {
+        let shared = Arc::<Shared>::default();
+        let (end, ended) = watch::channel(());
+        let writer = Writer::new(options.clone(), shared.clone());
+        std::thread::Builder::new().name("audit".to_string()).spawn(move || {
+            writer.run();
+            drop(end);
+        })?;
+        Ok(AuditFile { options, shared, ended })
+    }
+
+    /// Where it writes.
+    pub fn options(&self) -> &AuditFileOptions {
+        &self.options
+    }
+
+    /// Takes a record; never waits for the disk.
+    pub(super) fn push(&self, record: Arc<AuditRecord>, sent: bool) {
+        let mut queues = self.shared.queues();
+        let Queues {
+            sent: first,
+            unsent,
+            lost,
+            ..
+        } = &mut *queues;
+        let (queue, room, lost) = match sent {
+            true => (first, WAITING.0, &mut lost.0),
+            false => (unsent, WAITING.1, &mut lost.1),
+        };
+        match queue.len() < room {
+            true => queue.push_back(record),
+            false => *lost += 1,
+        }
+        self.shared.wake.notify_one();
+    }
+
+    /// Records that were lost since the start: of commands that were sent, and others.
+    pub fn lost(&self) -> (u64, u64) {
+        self.shared.queues().lost
+    }
+
+    /// Writes what waits, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait
+    /// with a limit.
+    pub async fn stop(&self) {
+        self.shared.queues().end = true;
+        self.shared.wake.notify_one();
+        let mut ended = self.ended.clone();
+        while ended.changed().await.is_ok() {}
+    }
+}
+
+/// The open file.
+#[derive(Debug)]
+struct Open {
+    file: File,
+    bytes: u64,
+}
+
+#[derive(Debug)]
+struct Writer {
+    options: AuditFileOptions,
+    shared: Arc<Shared>,
+    open: Option<Open>,
+    /// `None` until the file was opened once.
+    chain: Option<Chain>,
+    /// Logged once, until a write succeeds.
+    failing: bool,
+    unsynced: bool,
+    /// Losses that the file has.
+    recorded: (u64, u64),
+    logged: (Option<Hash>, Instant),
+}
+
+impl Writer {
+    fn new(options: AuditFileOptions, shared: Arc<Shared>) -> Writer {
+        Writer {
+            options,
+            shared,
+            open: None,
+            chain: None,
+            failing: false,
+            unsynced: false,
+            recorded: (0, 0),
+            logged: (None, Instant::now()),
+        }
+    }
+
+    fn run(mut self) {
+        let mut tick = Instant::now();
+        loop {
+            let end = self.shared.wait(tick, !self.failing);
+            let due = end || Instant::now() >= tick;
+            if due {
+                tick = Instant::now() + SYNC;
+            }
+            let done = self.work(due);
+            self.report(done, end);
+            if end {
+                return;
+            }
+        }
+    }
+
+    /// Writes what waits; `due` is once a second.
+    fn work(&mut self, due: bool) -> io::Result<()> {
+        if due && self.is_replaced() {
+            self.open = None;
+        }
+        while let Some((record, sent)) = self.shared.next() {
+            let entry = if sent {
+                Entry::Sent(&record)
+            } else {
+                Entry::NotSent(&record)
+            };
+            if let Err(error) = self.write(&entry) {
+                self.shared.put_back(record, sent);
+                return Err(error);
+            }
+        }
+        if !due {
+            return Ok(());
+        }
+        let lost = self.shared.queues().lost;
+        let (sent, not_sent) = (lost.0 - self.recorded.0, lost.1 - self.recorded.1);
+        if sent + not_sent > 0 {
+            let time = SystemTime::now();
+            self.write(&Entry::Lost { time, sent, not_sent })?;
+            self.recorded = lost;
+            tracing::warn!(
+                "audit file: {sent} records of commands that were sent and {not_sent} others were lost; the log has them"
+            );
+        }
+        if self.open.is_none() {
+            self.open = Some(self.open()?);
+        }
+        if let Some(open) = self.open.as_ref().filter(|_| self.unsynced) {
+            open.file.sync_data()?;
+            self.unsynced = false;
+        }
+        Ok(())
+    }
+
+    /// Logs a failure once, its end, and now and then the hash of the last line.
+    fn report(&mut self, done: io::Result<()>, end: bool) {
+        let path = self.options.path.display();
+        match done {
+            Ok(()) if std::mem::replace(&mut self.failing, false) => {
+                tracing::warn!("audit file: {path} is written again");
+            }
+            Ok(()) => {}
+            Err(error) => {
+                self.open = None;
+                if !std::mem::replace(&mut self.failing, true) {
+                    tracing::error!(
+                        "audit file: cannot write {path}: {error}; commands are carried out all the same and are in the log; \
+                         {} records wait in memory; check [audit] and the disk",
+                        WAITING.0
+                    );
+                }
+                if end {
+                    let queues = self.shared.queues();
+                    let (sent, others) = (queues.sent.len(), queues.unsent.len());
+                    tracing::error!(
+                        "audit file: {sent} records of commands that were sent and {others} others are not written"
+                    );
+                }
+            }
+        }
+        let hash = self.chain.filter(|chain| chain.seq > 0).map(|chain| chain.last);
+        if hash != self.logged.0 && (self.logged.0.is_none() || end || self.logged.1.elapsed() >= HASH_LOGGED) {
+            self.logged = (hash, Instant::now());
+            if let Some(Chain { seq, last }) = self.chain {
+                tracing::info!(target: "audit", file = %path, seq, hash = %last, "last line of the audit file");
+            }
+        }
+    }
+
+    fn write(&mut self, entry: &Entry<'_>) -> io::Result<()> {
+        let mut open = match self.open.take() {
+            Some(open) => open,
+            None => self.open()?,
+        };
+        let chain = self.chain.unwrap_or_default();
+        let (line, after) = chain.line(entry)?;
+        if open.bytes > 0 && open.bytes + line.len() as u64 > self.options.max_bytes / FILES {
+            open = self.rotate(open)?;
+        }
+        if let Err(error) = open.file.write_all(&line) {
+            // A part of the line may be there. If it cannot be removed, it is named when the file is opened again.
+            let _ = open.file.set_len(open.bytes);
+            return Err(error);
+        }
+        open.bytes += line.len() as u64;
+        self.open = Some(open);
+        self.chain = Some(after);
+        self.unsynced = true;
+        Ok(())
+    }
+
+    fn numbered(&self, number: u64) -> PathBuf {
+        let mut name = self.options.path.clone().into_os_string();
+        name.push(format!(".{number}"));
+        name.into()
+    }
+
+    /// Begins a new file and removes the oldest one.
+    fn rotate(&mut self, full: Open) -> io::Result<Open> {
+        full.file.sync_data()?;
+        for number in (1..FILES - 1).rev() {
+            ignore_missing(fs::rename(self.numbered(number), self.numbered(number + 1)))?;
+        }
+        ignore_missing(fs::rename(&self.options.path, self.numbered(1)))?;
+        self.open()
+    }
+
+    /// Whether the file was moved, removed or replaced by another.
+    fn is_replaced(&self) -> bool {
+        let Some(open) = &self.open else { return false };
+        let same = |there: fs::Metadata| {
+            let own = open.file.metadata().ok()?;
+            Some((own.dev(), own.ino()) == (there.dev(), there.ino()))
+        };
+        fs::metadata(&self.options.path).ok().and_then(same) != Some(true)
+    }
+
+    /// Opens the file and finds the end of the chain: in it, or, if it is empty, in memory or in the file before.
+    fn open(&mut self) -> io::Result<Open> {
+        let path = &self.options.path;
+        if let Some(dir) = path.parent() {
+            fs::create_dir_all(dir)?;
+        }
+        let mut file = OpenOptions::new()
+            .read(true)
+            .append(true)
+            .create(true)
+            .mode(0o640)
+            .open(path)?;
+        flock(&file, FlockOperation::NonBlockingLockExclusive)
+            .map_err(|_| io::Error::other("another process writes it; give each gateway its own"))?;
+        let bytes = file.metadata()?.len();
+        let found = read_tail(&mut file, bytes)?;
+        let before = match (found, self.chain) {
+            (Some(tail), _) => Some(tail.chain),
+            (None, Some(chain)) => Some(chain),
+            (None, None) => last_of(&self.numbered(1))?,
+        };
+        self.chain = Some(before.unwrap_or_default());
+        let (fragment, ended) = match found {
+            Some(tail) => (tail.fragment, tail.ended),
+            None => only_fragment(&mut file, bytes)?,
+        };
+        let mut open = Open { file, bytes };
+        if open.bytes > 0 && !ended {
+            open.file.write_all(b"\n")?;
+            open.bytes += 1;
+        }
+        if let Some((bytes, sha256)) = fragment {
+            tracing::warn!(
+                "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
+                path.display()
+            );
+            let time = SystemTime::now();
+            self.open = Some(open);
+            self.write(&Entry::Fragment { time, bytes, sha256 })?;
+            return self.open.take().ok_or_else(|| io::Error::other("closed"));
+        }
+        Ok(open)
+    }
+}
+
+fn ignore_missing(done: io::Result<()>) -> io::Result<()> {
+    match done {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        done => done,
+    }
+}
+
+/// The end of the chain in a file that may not be there.
+fn last_of(path: &Path) -> io::Result<Option<Chain>> {
+    match File::open(path) {
+        Ok(mut file) => {
+            let bytes = file.metadata()?.len();
+            Ok(read_tail(&mut file, bytes)?.map(|tail| tail.chain))
+        }
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(None),
+        Err(error) => Err(error),
+    }
+}
+
+/// The end of a file of `bytes` bytes; `None` if it has no entry.
+fn read_tail(file: &mut File, bytes: u64) -> io::Result<Option<Tail>> {
+    let mut length = 64 << 10;
+    loop {
+        let is_whole = length >= bytes;
+        let window = read_end(file, bytes, length)?;
+        match chain::tail(&window, is_whole) {
+            None if !is_whole && length < LONGEST_TAIL => length *= 2,
+            found => return Ok(found),
+        }
+    }
+}
+
+fn read_end(file: &mut File, bytes: u64, length: u64) -> io::Result<Vec<u8>> {
+    let mut window = Vec::new();
+    file.seek(SeekFrom::Start(bytes.saturating_sub(length)))?;
+    file.take(length.min(bytes)).read_to_end(&mut window)?;
+    Ok(window)
+}
+
+/// A file without any entry: the rest of its first line, or not an audit file.
+fn only_fragment(file: &mut File, bytes: u64) -> io::Result<(Option<(u64, Hash)>, bool)> {
+    let window = read_end(file, bytes, LONGEST_TAIL)?;
+    if bytes > LONGEST_TAIL || window.iter().filter(|byte| **byte == b'\n').count() > 1 {
+        return Err(io::Error::other(
+            "it is not an audit file; move it away or name another",
+        ));
+    }
+    Ok(chain::fragment(&window))
+}
+
+#[cfg(test)]
+mod tests;

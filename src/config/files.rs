@@ -1,0 +1,82 @@
+//! What files of certificates and secrets lead to: errors, and warnings about who can read them and when they expire.
+
+use std::os::unix::fs::PermissionsExt;
+use std::path::Path;
+use std::time::SystemTime;
+
+use crate::document::{Finding, Reader};
+use crate::north::{IdentityFault, TlsFile, certificate_warnings};
+
+/// Permissions of users who are neither owner nor in the group: to read, and to write.
+const OTHERS: u32 = 0o006;
+
+/// Warns if every user of this machine can read or replace a file with a secret, which the `key` of the configuration
+/// names.
+pub(super) fn warn_of_readers(reader: &Reader<'_>, key: &str, path: &Path) {
+    // A file that cannot be read is reported by who reads it.
+    let Ok(metadata) = std::fs::metadata(path) else { return };
+    let mode = metadata.permissions().mode() & 0o777;
+    if metadata.is_file() && mode & OTHERS != 0 {
+        let shown = path.display();
+        reader.warning(
+            key,
+            format!("{shown} holds a secret, and every user of this machine may read or write it (mode {mode:04o})"),
+            format!("chmod o-rw {shown}"),
+        );
+    }
+}
+
+/// A file that the configuration names cannot be read.
+pub(super) fn cannot_read(path: &Path, error: &std::io::Error) -> Finding {
+    Finding::new(
+        format!("cannot read {}: {error}", path.display()),
+        "check the path and its permissions",
+    )
+}
+
+/// Reports what is wrong with the files of an identity at the key of each, by `name`.
+pub(super) fn reported<T>(
+    reader: &Reader<'_>,
+    loaded: Result<(T, Vec<IdentityFault>), Vec<IdentityFault>>,
+    name: impl Fn(TlsFile) -> &'static str,
+) -> Option<T> {
+    match loaded {
+        Ok((identity, warnings)) => {
+            for fault in &warnings {
+                let text = fault.to_string();
+                let (what, remedy) = parts(&text);
+                reader.warning(name(fault.file), what, remedy);
+            }
+            Some(identity)
+        }
+        Err(errors) => {
+            for fault in &errors {
+                let text = fault.to_string();
+                let (what, remedy) = parts(&text);
+                reader.problem(name(fault.file), what, remedy);
+            }
+            None
+        }
+    }
+}
+
+/// Warns of certificates in a PEM file that have expired or will soon; reports a file without certificates.
+pub(super) fn check_certificates(reader: &Reader<'_>, key: &str, path: &Path) {
+    match certificate_warnings(path, SystemTime::now()) {
+        Ok(warnings) => {
+            for text in &warnings {
+                let (what, remedy) = parts(text);
+                reader.warning(key, what, remedy);
+            }
+        }
+        Err(text) => {
+            let (what, remedy) = parts(&text);
+            reader.problem(key, what, remedy);
+        }
+    }
+}
+
+/// Faults of files are `what; what to do`.
+fn parts(text: &str) -> (&str, &str) {
+    text.rsplit_once("; ").unwrap_or((text, ""))
+}

@@ -1,0 +1,95 @@
+//! Keeps the last items of many sources so that no source pushes out those of others.
+
+use std::cmp::Reverse;
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+
+/// At most so many items, numbered by the caller in rising order. When it is full, a new one takes the place of the oldest
+/// one of the source that has most; of its own source if that has as many.
+#[derive(Debug)]
+pub struct FairRing<K, T> {
+    capacity: usize,
+    kept: usize,
+    sources: BTreeMap<K, VecDeque<(u64, T)>>,
+    /// Number of items, number of the oldest, source: the largest share is last, with the oldest items if there are several.
+    shares: BTreeSet<(usize, Reverse<u64>, K)>,
+}
+
+impl<K: Ord + Clone, T> FairRing<K, T> {
+    /// An empty ring for `capacity` items.
+    pub fn new(capacity: usize) -> FairRing<K, T> {
+        FairRing {
+            capacity,
+            kept: 0,
+            sources: BTreeMap::new(),
+            shares: BTreeSet::new(),
+        }
+    }
+
+    /// Keeps an item of `source`.
+    pub fn push(&mut self, source: K, number: u64, item: T) {
+        if self.kept >= self.capacity {
+            let largest = self.shares.last().map(|(share, _, of)| (*share, of.clone()));
+            let own = self.sources.get(&source).map_or(0, VecDeque::len);
+            if let Some((share, of)) = largest {
+                let from = if own >= share { source.clone() } else { of };
+                self.change(from, VecDeque::pop_front);
+                self.kept -= 1;
+            }
+        }
+        self.change(source, |items| items.push_back((number, item)));
+        self.kept += 1;
+    }
+
+    fn change<R>(&mut self, source: K, change: impl FnOnce(&mut VecDeque<(u64, T)>) -> R) {
+        let mut items = self.sources.remove(&source).unwrap_or_default();
+        if let Some((oldest, _)) = items.front() {
+            self.shares.remove(&(items.len(), Reverse(*oldest), source.clone()));
+        }
+        change(&mut items);
+        if let Some((oldest, _)) = items.front() {
+            self.shares.insert((items.len(), Reverse(*oldest), source.clone()));
+            self.sources.insert(source, items);
+        }
+    }
+
+    /// All that are kept, with their numbers, source by source.
+    pub fn iter(&self) -> impl Iterator<Item = &(u64, T)> {
+        self.sources.values().flatten()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn numbers(ring: &FairRing<&str, ()>, source: &str) -> Vec<u64> {
+        let items = ring.sources.get(source).into_iter().flatten();
+        items.map(|(number, ())| *number).collect()
+    }
+
+    #[test]
+    fn a_flood_pushes_out_its_own() {
+        let mut ring = FairRing::new(100);
+        (0..50).for_each(|n| ring.push("quiet", n, ()));
+        (50..10_000).for_each(|n| ring.push("flood", n, ()));
+        assert_eq!(numbers(&ring, "quiet"), (0..50).collect::<Vec<_>>());
+        assert_eq!(numbers(&ring, "flood"), (9950..10_000).collect::<Vec<_>>());
+        assert_eq!(ring.iter().count(), 100);
+        (10_000..10_010).for_each(|n| ring.push("third", n, ()));
+        assert_eq!(numbers(&ring, "third").len(), 10);
+        assert_eq!((numbers(&ring, "quiet").len(), numbers(&ring, "flood").len()), (45, 45));
+    }
+
+    #[test]
+    fn sources_with_one_item_each_leave_in_their_order() {
+        let mut ring = FairRing::new(3);
+        ["d", "a", "c", "b", "e"]
+            .iter()
+            .enumerate()
+            .for_each(|(n, source)| ring.push(*source, n as u64, ()));
+        let mut kept: Vec<u64> = ring.iter().map(|(number, ())| *number).collect();
+        kept.sort_unstable();
+        assert_eq!(kept, [2, 3, 4]);
+        assert_eq!(ring.sources.len(), 3, "a source without items is forgotten");
+    }
+}

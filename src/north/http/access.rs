@@ -1,0 +1,128 @@
+//! Whether a request is answered: the host it is meant for, then the token of its sender. Pure.
+
+use std::net::IpAddr;
+
+use axum::Json;
+use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
+use axum::http::{StatusCode, Uri};
+use axum::response::{IntoResponse, Response};
+
+use super::api::ErrorReply;
+use super::hosts::{Host, Hosts};
+use super::tokens::{Scope, Tokens};
+
+/// Who is answered.
+#[derive(Debug, PartialEq)]
+pub(super) struct Access {
+    pub(super) hosts: Hosts,
+    /// `None`: everybody.
+    pub(super) tokens: Option<Tokens>,
+}
+
+/// Why a request is not answered.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub(super) enum AccessError {
+    #[error("the request has no `Host` header, or more than one")]
+    HostCount,
+    #[error("the `Host` header is not a host name or an address")]
+    BadHost,
+    #[error("this gateway does not go by the name in the `Host` header; add it to `hosts` of [http]")]
+    OtherHost,
+    #[error("a token is required: send `Authorization: Bearer …` with one of tokens_file")]
+    NoToken,
+    #[error("the token is not in tokens_file")]
+    UnknownToken,
+    #[error("the token lacks the scope `{}`", .0.name())]
+    MissingScope(Scope),
+}
+
+impl Access {
+    /// Whether a request on a connection to the address `local` of this machine may be answered.
+    ///
+    /// # Errors
+    /// Why not.
+    pub(super) fn check(&self, uri: &Uri, headers: &HeaderMap, local: IpAddr) -> Result<(), AccessError> {
+        self.check_host(uri, headers, local)?;
+        let (Some(tokens), Some(scope)) = (&self.tokens, scope(uri.path())) else {
+            return Ok(());
+        };
+        let token = tokens.find(bearer(headers)?).ok_or(AccessError::UnknownToken)?;
+        match token.scopes.contains(&scope) {
+            true => Ok(()),
+            false => Err(AccessError::MissingScope(scope)),
+        }
+    }
+
+    fn check_host(&self, uri: &Uri, headers: &HeaderMap, local: IpAddr) -> Result<(), AccessError> {
+        let mut hosts = headers.get_all(header::HOST).iter();
+        let (Some(host), None) = (hosts.next(), hosts.next()) else {
+            return Err(AccessError::HostCount);
+        };
+        let host = host.to_str().map_err(|_| AccessError::BadHost)?;
+        // A request to a proxy names the host in its first line too, and that one counts (RFC 9112, 3.2.2).
+        for text in [Some(host), uri.authority().map(|authority| authority.as_str())]
+            .into_iter()
+            .flatten()
+        {
+            let host = Host::parse(text).ok_or(AccessError::BadHost)?;
+            if !self.hosts.contain(&host, local) {
+                return Err(AccessError::OtherHost);
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What a token must permit for this path; `None` where no token is needed, so that supervisors can ask.
+fn scope(path: &str) -> Option<Scope> {
+    match path {
+        "/healthz" | "/readyz" => None,
+        "/metrics" => Some(Scope::Metrics),
+        _ => Some(Scope::Read),
+    }
+}
+
+/// The token that a request carries.
+fn bearer(headers: &HeaderMap) -> Result<&str, AccessError> {
+    let mut given = headers.get_all(header::AUTHORIZATION).iter();
+    let (Some(given), None) = (given.next(), given.next()) else {
+        return Err(AccessError::NoToken);
+    };
+    let (scheme, token) = given
+        .to_str()
+        .ok()
+        .and_then(|text| text.split_once(' '))
+        .ok_or(AccessError::NoToken)?;
+    match scheme.eq_ignore_ascii_case("bearer") {
+        true => Ok(token.trim()),
+        false => Err(AccessError::NoToken),
+    }
+}
+
+impl IntoResponse for AccessError {
+    fn into_response(self) -> Response {
+        let (status, challenge) = match &self {
+            AccessError::HostCount | AccessError::BadHost => (StatusCode::BAD_REQUEST, None),
+            AccessError::OtherHost => (StatusCode::MISDIRECTED_REQUEST, None),
+            AccessError::NoToken => (StatusCode::UNAUTHORIZED, Some("Bearer realm=\"drivegate\"")),
+            AccessError::UnknownToken => (
+                StatusCode::UNAUTHORIZED,
+                Some("Bearer realm=\"drivegate\", error=\"invalid_token\""),
+            ),
+            AccessError::MissingScope(_) => (
+                StatusCode::FORBIDDEN,
+                Some("Bearer realm=\"drivegate\", error=\"insufficient_scope\""),
+            ),
+        };
+        let error = ErrorReply {
+            error: self.to_string(),
+            known: Vec::new(),
+        };
+        let mut response = (status, Json(error)).into_response();
+        const CHALLENGE: HeaderName = header::WWW_AUTHENTICATE;
+        response
+            .headers_mut()
+            .extend(challenge.map(|text| (CHALLENGE, HeaderValue::from_static(text))));
+        response
+    }
+}

@@ -1,0 +1,75 @@
+//! The routes without a socket, for the fuzzer.
+
+use std::net::{IpAddr, Ipv4Addr};
+use std::sync::Arc;
+use std::{fmt, io};
+
+use axum::Router;
+use axum::body::Body;
+use hyper::service::Service;
+use hyper::{Request, Uri, header};
+use hyper_util::service::TowerToHyperService;
+use tokio::runtime::{Builder, Runtime};
+use tokio_util::sync::CancellationToken;
+
+use super::Coverage;
+use super::access::Access;
+use super::hosts::Hosts;
+use super::routes::{self, Client, Reached};
+use crate::plant::SharedPlant;
+
+/// An HTTP server without its socket.
+pub struct Offline {
+    service: TowerToHyperService<Router>,
+    runtime: Runtime,
+    client: Client,
+    reached: Reached,
+}
+
+impl fmt::Debug for Offline {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("Offline")
+    }
+}
+
+impl Offline {
+    /// A server of that plant.
+    ///
+    /// # Errors
+    /// The system does not provide what a timer needs.
+    pub fn new(plant: SharedPlant) -> io::Result<Offline> {
+        let router = routes::router(plant, Default::default(), CancellationToken::new());
+        let service = TowerToHyperService::new(router);
+        let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
+        let reached = Reached {
+            address,
+            peer: (address, 0).into(),
+            access: Arc::new(Access {
+                hosts: Hosts::new("", &[]),
+                tokens: None,
+            }),
+            refusals: Arc::default(),
+        };
+        let client = Client {
+            address,
+            coverage: Coverage::Everything,
+        };
+        let runtime = Builder::new_current_thread().enable_time().build()?;
+        Ok(Offline {
+            service,
+            runtime,
+            client,
+            reached,
+        })
+    }
+
+    /// The status of the answer to a GET of `target`, path and query; `None` if it is no target of a request.
+    pub fn get(&self, target: &[u8]) -> Option<u16> {
+        let uri = Uri::try_from(target).ok().filter(|uri| uri.path().starts_with('/'))?;
+        let request = Request::get(uri).header(header::HOST, "127.0.0.1");
+        let request = request.extension(self.client).extension(self.reached.clone());
+        let request = request.body(Body::empty()).ok()?;
+        let response = self.runtime.block_on(self.service.call(request)).ok()?;
+        Some(response.status().as_u16())
+    }
+}

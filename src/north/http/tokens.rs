@@ -1,0 +1,265 @@
+//! Access tokens of the HTTP server: what a token file says, and whom it admits.
+//!
+//! A token is 256 random bits, so its SHA-256 can be neither inverted nor guessed, and the file holds nothing secret.
+//! Argon2 and the like are for passwords, which people choose.
+
+use std::fmt;
+use std::str::FromStr;
+
+use ring::digest::{SHA256, digest};
+use ring::rand::{SecureRandom, SystemRandom};
+use subtle::ConstantTimeEq;
+
+/// Bytes of a token and of its hash.
+const BYTES: usize = 32;
+/// Prefix of a hash in the file.
+const ALGORITHM: &str = "sha256:";
+/// Most tokens of a file.
+const MOST: usize = 1000;
+
+/// What a token permits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Scope {
+    /// The status page and the JSON interface.
+    Read,
+    /// `/metrics`.
+    Metrics,
+    /// Commands over HTTP, which this version does not have.
+    Control,
+}
+
+impl Scope {
+    /// All scopes.
+    pub const ALL: [Scope; 3] = [Scope::Read, Scope::Metrics, Scope::Control];
+
+    /// Its name in the file.
+    pub fn name(self) -> &'static str {
+        match self {
+            Scope::Read => "read",
+            Scope::Metrics => "metrics",
+            Scope::Control => "control",
+        }
+    }
+}
+
+impl FromStr for Scope {
+    type Err = TokenError;
+
+    fn from_str(text: &str) -> Result<Scope, TokenError> {
+        let known = Scope::ALL.into_iter().find(|scope| scope.name() == text);
+        known.ok_or_else(|| TokenError::Scope(text.to_string()))
+    }
+}
+
+/// A line of the file: who may do what. Displayed as that line.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Token {
+    /// Unique in the file.
+    pub name: String,
+    /// At least one.
+    pub scopes: Vec<Scope>,
+    hash: [u8; BYTES],
+}
+
+/// Why a line is not a token.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum TokenError {
+    /// Not three words.
+    #[error("not `name scopes hash`")]
+    Form,
+    /// A name of other characters, or a long one.
+    #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
+    Name(String),
+    /// A name that another line has.
+    #[error("there are two tokens named `{0}`")]
+    Repeated(String),
+    /// An unknown scope.
+    #[error("`{0}` is not a scope; there are read, metrics and control")]
+    Scope(String),
+    /// Not `sha256:` and 64 hexadecimal digits.
+    #[error("the hash is not `sha256:` and 64 hexadecimal digits")]
+    Hash,
+    /// More lines than any plant needs.
+    #[error("there are more than {MOST} tokens")]
+    Many,
+}
+
+impl Token {
+    /// A new token, and the secret that its bearer sends: 64 hexadecimal digits, stored nowhere.
+    ///
+    /// # Errors
+    /// The name is not one, or the system has no random numbers.
+    pub fn generate(name: &str, scopes: Vec<Scope>) -> Result<(Token, String), TokenError> {
+        let mut bytes = [0; BYTES];
+        SystemRandom::new().fill(&mut bytes).map_err(|_| TokenError::Hash)?;
+        let secret = hex(&bytes);
+        let token = Token {
+            name: check_name(name)?,
+            scopes,
+            hash: hash(&secret),
+        };
+        Ok((token, secret))
+    }
+}
+
+impl fmt::Display for Token {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let scopes: Vec<&str> = self.scopes.iter().map(|scope| scope.name()).collect();
+        write!(f, "{} {} {ALGORITHM}{}", self.name, scopes.join(","), hex(&self.hash))
+    }
+}
+
+impl FromStr for Token {
+    type Err = TokenError;
+
+    fn from_str(line: &str) -> Result<Token, TokenError> {
+        let mut words = line.split_whitespace();
+        let (Some(name), Some(scopes), Some(hash), None) = (words.next(), words.next(), words.next(), words.next())
+        else {
+            return Err(TokenError::Form);
+        };
+        Ok(Token {
+            name: check_name(name)?,
+            scopes: scopes.split(',').map(str::parse).collect::<Result<_, _>>()?,
+            hash: hash.strip_prefix(ALGORITHM).and_then(unhex).ok_or(TokenError::Hash)?,
+        })
+    }
+}
+
+/// The tokens of a file.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Tokens(Vec<Token>);
+
+impl Tokens {
+    /// Reads the text of a file: a token a line; empty lines and lines that begin with `#` are ignored.
+    ///
+    /// # Errors
+    /// The first bad line, counted from 1, and why.
+    pub fn parse(text: &str) -> Result<Tokens, (usize, TokenError)> {
+        let mut tokens: Vec<Token> = Vec::new();
+        for (line, text) in (1..).zip(text.lines()) {
+            let text = text.trim();
+            if text.is_empty() || text.starts_with('#') {
+                continue;
+            }
+            let token: Token = text.parse().map_err(|error| (line, error))?;
+            if tokens.iter().any(|other| other.name == token.name) {
+                return Err((line, TokenError::Repeated(token.name)));
+            }
+            if tokens.len() >= MOST {
+                return Err((line, TokenError::Many));
+            }
+            tokens.push(token);
+        }
+        Ok(Tokens(tokens))
+    }
+
+    /// All of them, in the order of the file.
+    pub fn list(&self) -> &[Token] {
+        &self.0
+    }
+
+    /// The token whose secret this is. The time that this takes depends on the number of tokens only.
+    pub(super) fn find(&self, secret: &str) -> Option<&Token> {
+        let hash = hash(secret);
+        let mut found = None;
+        for token in &self.0 {
+            if bool::from(token.hash.ct_eq(&hash)) {
+                found = Some(token);
+            }
+        }
+        found
+    }
+}
+
+fn check_name(name: &str) -> Result<String, TokenError> {
+    let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
+    match !name.is_empty() && name.len() <= 64 && name.chars().all(sound) {
+        true => Ok(name.to_string()),
+        false => Err(TokenError::Name(name.chars().take(64).collect())),
+    }
+}
+
+fn hash(secret: &str) -> [u8; BYTES] {
+    let mut bytes = [0; BYTES];
+    // Both have the length of a SHA-256.
+    bytes.copy_from_slice(digest(&SHA256, secret.as_bytes()).as_ref());
+    bytes
+}
+
+fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+fn unhex(text: &str) -> Option<[u8; BYTES]> {
+    if text.len() != 2 * BYTES || !text.bytes().all(|byte| byte.is_ascii_hexdigit()) {
+        return None;
+    }
+    let mut bytes = [0; BYTES];
+    for (byte, digits) in bytes.iter_mut().zip(text.as_bytes().chunks(2)) {
+        *byte = u8::from_str_radix(std::str::from_utf8(digits).ok()?, 16).ok()?;
+    }
+    Some(bytes)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn the_hash_is_that_of_other_programs() {
+        // printf %s open-sesame | sha256sum
+        let line = "op read sha256:d7ecdf25eaf3deba0f2628771dbdd22d4138ab6cf38f91ed02a2ca0dec7c8ab7";
+        let tokens = Tokens::parse(line).unwrap();
+        assert_eq!(tokens.find("open-sesame").map(|token| token.name.as_str()), Some("op"));
+        for wrong in ["open-sesam", "open-sesame ", "Open-sesame", "", line] {
+            assert_eq!(tokens.find(wrong), None, "{wrong}");
+        }
+    }
+
+    #[test]
+    fn a_generated_token_is_found_again() {
+        let (one, secret) = Token::generate("grafana", vec![Scope::Metrics, Scope::Read]).unwrap();
+        let (two, other) = Token::generate("hmi", vec![Scope::Read]).unwrap();
+        assert!(secret != other && secret.len() == 64);
+        let text = format!("# tokens\n\n{one}\r\n  {two}\n");
+        assert!(!text.contains(&secret), "the file holds no secret");
+        let tokens = Tokens::parse(&text).unwrap();
+        assert_eq!(tokens.list(), [one, two.clone()]);
+        assert_eq!(tokens.find(&other), Some(&two));
+        assert!(Token::generate("a b", vec![]).is_err());
+    }
+
+    #[test]
+    fn bad_lines() {
+        let hash = format!("sha256:{}", "0".repeat(64));
+        for (text, line, error) in [
+            ("a read".to_string(), 1, TokenError::Form),
+            (format!("a read {hash} x"), 1, TokenError::Form),
+            (format!("a read write {hash}"), 1, TokenError::Form),
+            (format!("#\na/b read {hash}"), 2, TokenError::Name("a/b".to_string())),
+            (format!("a write {hash}"), 1, TokenError::Scope("write".to_string())),
+            (format!("a read, {hash}"), 1, TokenError::Scope(String::new())),
+            (format!("a read {}", &hash[7..]), 1, TokenError::Hash),
+            (format!("a read {hash}0"), 1, TokenError::Hash),
+            (format!("a read sha256:{}", "ä".repeat(32)), 1, TokenError::Hash),
+            (
+                format!("a read {hash}\na metrics {hash}"),
+                2,
+                TokenError::Repeated("a".to_string()),
+            ),
+        ] {
+            assert_eq!(Tokens::parse(&text), Err((line, error)), "{text}");
+        }
+        let many: String = (0..=MOST).map(|i| format!("t{i} read {hash}\n")).collect();
+        assert_eq!(Tokens::parse(&many), Err((MOST + 1, TokenError::Many)));
+    }
+
+    proptest! {
+        #[test]
+        fn any_text(text in "\\PC{0,200}") {
+            let _ = Tokens::parse(&text);
+        }
+    }
+}

@@ -1,0 +1,226 @@
+use std::collections::VecDeque;
+use std::sync::Mutex;
+
+use tokio::io::AsyncReadExt;
+use tokio::sync::mpsc;
+
+use super::*;
+
+/// Fails a number of times, then accepts.
+struct Failing(Vec<io::Error>, TcpListener);
+
+impl Accept for Failing {
+    async fn accept(&mut self) -> io::Result<(TcpStream, SocketAddr)> {
+        match self.0.pop() {
+            Some(error) => Err(error),
+            None => self.1.accept().await,
+        }
+    }
+}
+
+/// Has one place.
+struct Recorder {
+    events: mpsc::UnboundedSender<&'static str>,
+    taken: Mutex<bool>,
+}
+
+impl ConnectionHandler for Recorder {
+    type Permit = ();
+
+    fn admit(&self, client: IpAddr) -> Option<()> {
+        assert!(client.is_loopback());
+        let taken = std::mem::replace(&mut *self.taken.lock().unwrap(), true);
+        if taken {
+            self.events.send("refused").unwrap();
+        }
+        (!taken).then_some(())
+    }
+
+    async fn serve(self: Arc<Self>, mut stream: TcpStream, _: SocketAddr, (): ()) {
+        self.events.send("served").unwrap();
+        // Until the client closes.
+        let _ = stream.read(&mut [0]).await;
+        *self.taken.lock().unwrap() = false;
+        self.events.send("ended").unwrap();
+    }
+}
+
+struct Bench {
+    events: mpsc::UnboundedReceiver<&'static str>,
+    handler: Arc<Recorder>,
+    stats: Arc<NorthStats>,
+    stop: CancellationToken,
+}
+
+impl Bench {
+    fn new() -> Bench {
+        let (sender, events) = mpsc::unbounded_channel();
+        let handler = Arc::new(Recorder {
+            events: sender,
+            taken: Mutex::default(),
+        });
+        Bench {
+            events,
+            handler,
+            stats: Arc::default(),
+            stop: CancellationToken::new(),
+        }
+    }
+
+    fn accept_loop(&self, address: SocketAddr) -> AcceptLoop<Recorder> {
+        AcceptLoop {
+            server: ServerKind::Http,
+            address,
+            handler: self.handler.clone(),
+            stats: self.stats.clone(),
+            tasks: TaskTracker::new(),
+            stop: self.stop.clone(),
+        }
+    }
+
+    fn listeners(&self) -> Listeners<Recorder> {
+        Listeners::new(
+            ServerKind::Http,
+            self.stats.clone(),
+            TaskTracker::new(),
+            self.stop.clone(),
+        )
+    }
+
+    async fn next(&mut self) -> &'static str {
+        self.events.recv().await.unwrap()
+    }
+}
+
+#[tokio::test(start_paused = true)]
+async fn accept_errors_do_not_end_a_server() {
+    let socket = TcpListener::bind("127.0.0.1:0").await.unwrap();
+    let address = socket.local_addr().unwrap();
+    let mut bench = Bench::new();
+    let errors = [
+        io::ErrorKind::Other,
+        io::ErrorKind::ConnectionAborted,
+        io::ErrorKind::OutOfMemory,
+    ];
+    let socket = Failing(errors.map(io::Error::from).into(), socket);
+    let never = || -> io::Result<Failing> { panic!("the socket is not lost") };
+    let server = tokio::spawn(bench.accept_loop(address).run(Some(socket), never));
+    let first = TcpStream::connect(address).await.unwrap();
+    assert_eq!(bench.next().await, "served");
+    let _second = TcpStream::connect(address).await.unwrap();
+    assert_eq!(bench.next().await, "refused");
+    drop(first);
+    assert_eq!(bench.next().await, "ended");
+    let _third = TcpStream::connect(address).await.unwrap();
+    assert_eq!(bench.next().await, "served", "the place is free again");
+    bench.stop.cancel();
+    server.await.unwrap();
+}
+
+#[tokio::test(start_paused = true)]
+async fn a_lost_socket_is_bound_again_and_reported_meanwhile() {
+    let mut bench = Bench::new();
+    let [first, second] = [(); 2].map(|()| bind("127.0.0.1:0".parse().unwrap()).unwrap());
+    let address = second.local_addr().unwrap();
+    let lost = io::Error::from_raw_os_error(rustix::io::Errno::INVAL.raw_os_error());
+    let first = Failing(vec![lost], TcpListener::from_std(first).unwrap());
+    let taken = || Err(io::Error::from(io::ErrorKind::AddrInUse));
+    let second = Failing(Vec::new(), TcpListener::from_std(second).unwrap());
+    let attempts = Mutex::new(VecDeque::from([taken(), taken(), Ok(second)]));
+    let stats = bench.stats.clone();
+    let seen = Arc::new(Mutex::new(Vec::new()));
+    let rebind = {
+        let (stats, seen) = (stats.clone(), seen.clone());
+        move || {
+            seen.lock().unwrap().extend(stats.lost_listeners.reasons());
+            attempts.lock().unwrap().pop_front().unwrap()
+        }
+    };
+    let server = tokio::spawn(bench.accept_loop(address).run(Some(first), rebind));
+    let _client = TcpStream::connect(address).await.unwrap();
+    assert_eq!(bench.next().await, "served");
+    assert_eq!(stats.lost_listeners.reasons(), Vec::<String>::new());
+    let seen = std::mem::take(&mut *seen.lock().unwrap());
+    assert_eq!(seen.len(), 3, "{seen:?}");
+    assert!(
+        seen[0].starts_with(&format!("HTTP does not listen on {address}: Invalid argument")),
+        "{seen:?}"
+    );
+    assert!(seen[2].contains("in use"), "{seen:?}");
+    bench.stop.cancel();
+    server.await.unwrap();
+}
+
+/// Listens on these addresses from now on.
+async fn reload(
+    listeners: &mut Listeners<Recorder>,
+    handler: &Arc<Recorder>,
+    addresses: &[SocketAddr],
+) -> Result<(), ServerError> {
+    let new = listeners.prepare(specs(addresses)).await?;
+    listeners.commit(new, |_, _, _| (handler.clone(), Handle::current()));
+    Ok(())
+}
+
+fn specs(addresses: &[SocketAddr]) -> Vec<ListenerSpec> {
+    let spec = |address: &SocketAddr| ListenerSpec {
+        address: *address,
+        tls: false,
+        section: "[http]".to_string(),
+    };
+    addresses.iter().map(spec).collect()
+}
+
+fn free_address() -> SocketAddr {
+    bind("127.0.0.1:0".parse().unwrap()).unwrap().local_addr().unwrap()
+}
+
+#[tokio::test]
+async fn sockets_stay_while_they_are_wanted() {
+    let mut bench = Bench::new();
+    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let [stays, goes, comes] = [(); 3].map(|()| free_address());
+    reload(&mut listeners, &handler, &[stays, goes]).await.unwrap();
+    let client = TcpStream::connect(stays).await.unwrap();
+    assert_eq!(bench.next().await, "served");
+    reload(&mut listeners, &handler, &[comes, stays]).await.unwrap();
+    assert_eq!(listeners.addresses(false), [comes, stays]);
+    let _refused = TcpStream::connect(comes).await.unwrap();
+    assert_eq!(bench.next().await, "refused", "the first client is still there");
+    until_closed(goes).await;
+    let taken = std::net::TcpListener::bind(goes).unwrap();
+    let error = reload(&mut listeners, &handler, &[stays, goes]).await.unwrap_err();
+    assert!(error.to_string().contains("Address already in use"), "{error}");
+    assert_eq!(listeners.addresses(false), [comes, stays], "nothing has changed");
+    drop((taken, client));
+    assert_eq!(bench.next().await, "ended");
+    bench.stop.cancel();
+}
+
+#[tokio::test]
+async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
+    let bench = Bench::new();
+    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let narrow = free_address();
+    let wide = SocketAddr::new([0, 0, 0, 0].into(), narrow.port());
+    reload(&mut listeners, &handler, &[narrow]).await.unwrap();
+    reload(&mut listeners, &handler, &[wide]).await.unwrap();
+    assert_eq!(listeners.addresses(false), [wide]);
+    reload(&mut listeners, &handler, &[narrow]).await.unwrap();
+    assert_eq!(listeners.addresses(false), [narrow]);
+    // The second address is taken, so the first is as before.
+    let taken = std::net::TcpListener::bind("127.0.0.1:0").unwrap();
+    let refused = [wide, taken.local_addr().unwrap()];
+    reload(&mut listeners, &handler, &refused).await.unwrap_err();
+    assert_eq!(listeners.addresses(false), [narrow]);
+    TcpStream::connect(narrow).await.unwrap();
+    bench.stop.cancel();
+}
+
+async fn until_closed(address: SocketAddr) {
+    let deadline = Instant::now() + Duration::from_secs(60);
+    while TcpStream::connect(address).await.is_ok() {
+        assert!(Instant::now() < deadline, "{address} is still open");
+        tokio::time::sleep(Duration::from_millis(2)).await;
+    }
+}

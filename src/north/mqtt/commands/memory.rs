@@ -1,0 +1,197 @@
+//! Which commands were taken, so that a repetition is recognised. Time is an argument.
+
+use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::hash::{BuildHasher, RandomState};
+use std::time::{Duration, Instant};
+
+use super::super::outbox::Message;
+use super::super::request::Incoming;
+
+/// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
+const RECENT: usize = 1024;
+/// Least time for which a command with an `id` is remembered.
+pub(super) const REMEMBERED: Duration = Duration::from_secs(600);
+/// Longest time, whatever the expiry of its message.
+const LONGEST: Duration = Duration::from_secs(86_400);
+/// Maximum number of commands with an `id` that are remembered.
+const MOST: usize = 1 << 18;
+
+/// The commands that were taken.
+#[derive(Debug, Default)]
+pub(super) struct Memory {
+    hasher: RandomState,
+    /// Oldest first.
+    recent: VecDeque<Recent>,
+    /// By topic, `id` and payload.
+    known: HashMap<u64, Known>,
+    /// The same by the time until which they are remembered.
+    ends: BTreeMap<(Instant, u64), u64>,
+    /// The last command by topic and `id`.
+    last_of: HashMap<u64, u64>,
+    /// Number of commands taken so far.
+    taken: u64,
+}
+
+#[derive(Debug)]
+struct Recent {
+    number: u64,
+    packet: u16,
+    fingerprint: u64,
+    stops: u64,
+    answer_to: u64,
+    /// `None` until it is finished.
+    result: Option<Message>,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Known {
+    number: u64,
+    stops: u64,
+    /// Hash of topic and `id`.
+    identity: u64,
+    /// Hash of where its result goes.
+    answer_to: u64,
+}
+
+/// What is known of a message.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Fingerprint {
+    /// Of everything but the packet id.
+    whole: u64,
+    /// Hash of topic and `id`, if it has one; and with the payload.
+    identity: Option<(u64, u64)>,
+    answer_to: u64,
+}
+
+/// What a message repeats.
+#[derive(Debug, PartialEq)]
+pub(super) enum Repetition {
+    /// A command whose result is the same now.
+    Answered(Message),
+    /// A command whose result is still to come, to the same address.
+    Pending,
+    /// A command whose result does not answer this message, and why.
+    Outdated(&'static str),
+}
+
+impl Memory {
+    /// The fingerprint of a message with this `id`.
+    pub(super) fn fingerprint(&self, incoming: &Incoming, id: Option<&str>) -> Fingerprint {
+        let Incoming {
+            topic,
+            payload,
+            response_topic,
+            correlation,
+            ..
+        } = incoming;
+        let answer_to = self.hasher.hash_one((response_topic, correlation));
+        let identity = id.map(|id| self.hasher.hash_one((topic, id)));
+        Fingerprint {
+            whole: self.hasher.hash_one((topic, payload, answer_to)),
+            identity: identity.map(|identity| (identity, self.hasher.hash_one((identity, payload)))),
+            answer_to,
+        }
+    }
+
+    /// The command that a message repeats: one that the broker marks as repeated, or the same topic, payload and `id`.
+    /// `stops` is the number of stops of the drive now.
+    pub(super) fn repeated(
+        &mut self,
+        incoming: &Incoming,
+        print: Fingerprint,
+        stops: u64,
+        now: Instant,
+    ) -> Option<Repetition> {
+        self.forget(now);
+        let marked =
+            |known: &&Recent| incoming.dup && known.packet == incoming.packet && known.fingerprint == print.whole;
+        let by_id = print
+            .identity
+            .and_then(|(_, content)| self.known.get(&content).copied());
+        let by_mark = || {
+            let recent = self.recent.iter().rev().find(marked)?;
+            Some(Known {
+                number: recent.number,
+                stops: recent.stops,
+                identity: 0,
+                answer_to: recent.answer_to,
+            })
+        };
+        let known = by_id.or_else(by_mark)?;
+        let recent = self.recent.iter().find(|recent| recent.number == known.number);
+        let result = recent.map(|recent| &recent.result);
+        if result == Some(&None) && known.answer_to == print.answer_to {
+            return Some(Repetition::Pending);
+        }
+        if known.stops != stops {
+            return Some(Repetition::Outdated("but a stop was received since"));
+        }
+        if let Some(last) = self.last_of.get(&known.identity)
+            && *last != known.number
+        {
+            return Some(Repetition::Outdated("but its `id` was used for another command since"));
+        }
+        Some(match result {
+            Some(Some(result)) => Repetition::Answered(result.clone()),
+            Some(None) => Repetition::Outdated("whose result is still to come"),
+            None => Repetition::Outdated("whose result is no longer known"),
+        })
+    }
+
+    /// Whether another command with an `id` can be remembered.
+    pub(super) fn has_room(&mut self, now: Instant) -> bool {
+        self.forget(now);
+        self.known.len() < MOST
+    }
+
+    fn forget(&mut self, now: Instant) {
+        while let Some(end) = self.ends.first_entry().filter(|end| end.key().0 <= now) {
+            if let Some(known) = self.known.remove(&end.remove())
+                && self.last_of.get(&known.identity) == Some(&known.number)
+            {
+                self.last_of.remove(&known.identity);
+            }
+        }
+    }
+
+    /// Remembers a command that is taken at `now`; returns its number.
+    pub(super) fn remember(&mut self, incoming: &Incoming, print: Fingerprint, stops: u64, now: Instant) -> u64 {
+        self.taken += 1;
+        let number = self.taken;
+        if self.recent.len() == RECENT {
+            self.recent.pop_front();
+        }
+        self.recent.push_back(Recent {
+            number,
+            packet: incoming.packet,
+            fingerprint: print.whole,
+            stops,
+            answer_to: print.answer_to,
+            result: None,
+        });
+        if let Some((identity, content)) = print.identity {
+            let expiry = Duration::from_secs(incoming.expiry.unwrap_or_default().into());
+            let until = now + expiry.clamp(REMEMBERED, LONGEST);
+            let known = Known {
+                number,
+                stops,
+                identity,
+                answer_to: print.answer_to,
+            };
+            self.known.insert(content, known);
+            self.ends.insert((until, number), content);
+            self.last_of.insert(identity, number);
+        }
+        number
+    }
+
+    /// Keeps the result of a command.
+    pub(super) fn finished(&mut self, number: u64, result: &Message) {
+        // Numbers ascend without gaps.
+        let first = self.recent.front().map_or(0, |recent| recent.number);
+        let place = number.checked_sub(first).and_then(|place| usize::try_from(place).ok());
+        if let Some(recent) = place.and_then(|place| self.recent.get_mut(place)) {
+            recent.result = Some(result.clone());
+        }
+    }
+}

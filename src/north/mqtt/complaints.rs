@@ -1,0 +1,91 @@
+//! How often the same trouble is logged. Time is an argument.
+
+use std::collections::HashMap;
+use std::time::{Duration, Instant};
+
+/// Minimum time between two lines about refused messages.
+const REFUSED: Duration = Duration::from_secs(60);
+/// Minimum time between two lines with the same reason for having no connection.
+const SAME_REASON: Duration = Duration::from_secs(3600);
+/// Number of reasons that are told apart.
+const REASONS: usize = 16;
+
+/// One line a minute, and how many were left out.
+#[derive(Debug, Default)]
+pub(super) struct Complaints {
+    last: Option<Instant>,
+    omitted: u64,
+}
+
+impl Complaints {
+    /// `None` if nothing is logged now, otherwise what to add about those left out.
+    pub(super) fn permit(&mut self, now: Instant) -> Option<String> {
+        if self
+            .last
+            .is_some_and(|last| now.saturating_duration_since(last) < REFUSED)
+        {
+            self.omitted += 1;
+            return None;
+        }
+        self.last = Some(now);
+        Some(match std::mem::take(&mut self.omitted) {
+            0 => String::new(),
+            omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
+        })
+    }
+}
+
+/// Why there is no connection: each reason once, and again after an hour or a connection.
+#[derive(Debug, Default)]
+pub(super) struct Outages(HashMap<String, Instant>);
+
+impl Outages {
+    /// Whether to log this reason now. Reasons that differ only in numbers, such as the time of day, are the same.
+    pub(super) fn permit(&mut self, why: &str, now: Instant) -> bool {
+        let reason: String = why.chars().filter(|c| !c.is_ascii_digit()).collect();
+        let recent = |at: &Instant| now.saturating_duration_since(*at) < SAME_REASON;
+        if self.0.get(&reason).is_some_and(recent) {
+            return false;
+        }
+        if self.0.len() >= REASONS {
+            self.0.clear();
+        }
+        self.0.insert(reason, now);
+        true
+    }
+
+    /// There is a connection. A certificate that is about to expire may connect now and then, and is not logged each time.
+    pub(super) fn end(&mut self) {
+        self.0.retain(|reason, _| reason.contains("certificate"));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_line_a_minute_counts_the_others() {
+        let (mut complaints, now) = (Complaints::default(), Instant::now());
+        assert_eq!(complaints.permit(now), Some(String::new()));
+        assert_eq!(complaints.permit(now + REFUSED / 2), None);
+        assert!(complaints.permit(now + REFUSED).unwrap().contains("1 more"));
+    }
+
+    #[test]
+    fn an_expired_certificate_is_logged_once_an_hour() {
+        let (mut outages, now) = (Outages::default(), Instant::now());
+        let why = |n: u64| format!("invalid peer certificate: expired: verified at {n}, not after 17");
+        assert!(outages.permit(&why(1), now));
+        for second in 1..3600 {
+            assert!(!outages.permit(&why(second), now + Duration::from_secs(second)));
+            assert_eq!(
+                outages.permit("refused", now + Duration::from_secs(second)),
+                second == 1
+            );
+        }
+        assert!(outages.permit(&why(2), now + SAME_REASON));
+        outages.end();
+        assert!(outages.permit("refused", now + Duration::from_secs(1)));
+    }
+}

@@ -1,0 +1,92 @@
+//! Values of a drive while the broker is away: collected into JSON arrays, which are sent afterwards. Time is an argument.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::History;
+use super::payload::StateContent;
+use super::publisher::Update;
+
+/// An array is complete with so many entries or bytes, or so long after its first entry.
+const ENTRIES: usize = 50;
+const BYTES: usize = 32 << 10;
+const COMPLETE: Duration = Duration::from_secs(10);
+
+/// Collects the values of one drive.
+#[derive(Debug)]
+pub(super) struct Recorder {
+    topic: Arc<str>,
+    last: Option<(StateContent, Instant)>,
+    /// Entries of the array that is being filled, and when it was begun.
+    entries: usize,
+    array: Vec<u8>,
+    begun: Option<Instant>,
+}
+
+impl Recorder {
+    pub(super) fn new(topic: Arc<str>) -> Recorder {
+        Recorder {
+            topic,
+            last: None,
+            entries: 0,
+            array: Vec::new(),
+            begun: None,
+        }
+    }
+
+    /// Records what a drive shows: when it changed, or with [`History::All`] when it is `fresh`; at most once in `min`.
+    /// Returns how long to wait if it is too early.
+    pub(super) fn record(
+        &mut self,
+        mode: History,
+        min: Duration,
+        shown: StateContent,
+        fresh: bool,
+        render: impl FnOnce(&StateContent) -> Option<Vec<u8>>,
+        now: Instant,
+    ) -> Option<Duration> {
+        let changed = self.last.as_ref().is_none_or(|(last, _)| *last != shown);
+        let wanted = match mode {
+            History::Off => false,
+            History::Changes => changed,
+            History::All => changed || fresh,
+        };
+        if !wanted {
+            return None;
+        }
+        let since = self.last.as_ref().map(|(_, at)| now.saturating_duration_since(*at));
+        if let Some(early) = since
+            .and_then(|since| min.checked_sub(since))
+            .filter(|early| !early.is_zero())
+        {
+            return Some(early);
+        }
+        if let Some(entry) = render(&shown) {
+            self.array.push(if self.entries == 0 { b'[' } else { b',' });
+            self.array.extend(entry);
+            self.entries += 1;
+            self.begun.get_or_insert(now);
+        }
+        self.last = Some((shown, now));
+        None
+    }
+
+    /// The array, if it is complete.
+    pub(super) fn ripe(&mut self, now: Instant) -> Option<Update> {
+        let old = |begun| now.saturating_duration_since(begun) >= COMPLETE;
+        let complete = self.entries >= ENTRIES || self.array.len() >= BYTES || self.begun.is_some_and(old);
+        complete.then(|| self.take()).flatten()
+    }
+
+    /// The array, as far as it goes.
+    pub(super) fn take(&mut self) -> Option<Update> {
+        self.begun.take()?;
+        self.entries = 0;
+        let mut payload = std::mem::take(&mut self.array);
+        payload.push(b']');
+        Some(Update {
+            topic: self.topic.clone(),
+            payload,
+        })
+    }
+}

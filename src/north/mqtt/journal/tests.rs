@@ -1,0 +1,252 @@
+use super::*;
+
+const BIG: u64 = 64 << 20;
+
+fn event(n: usize) -> Message {
+    Message::not_retained("b/hall/drive/p1/event", format!("{{\"n\":{n}}}").into_bytes())
+}
+
+fn number(message: &Message) -> usize {
+    let text = std::str::from_utf8(&message.payload).unwrap();
+    text.trim_matches(|c: char| !c.is_ascii_digit()).parse().unwrap()
+}
+
+fn open(dir: &Path, max: u64) -> Journal {
+    Journal::open(dir, "mqtt-events", max).unwrap()
+}
+
+fn append(journal: &mut Journal, range: std::ops::Range<usize>) {
+    for n in range {
+        journal.append(event(n), false);
+        journal.write().unwrap();
+    }
+}
+
+fn take_all(journal: &mut Journal) -> Vec<(u64, usize)> {
+    let taken = journal.take(usize::MAX);
+    taken.iter().map(|(id, message)| (*id, number(message))).collect()
+}
+
+fn numbers(taken: &[(u64, usize)]) -> Vec<usize> {
+    taken.iter().map(|(_, n)| *n).collect()
+}
+
+fn files(dir: &Path, ending: &str) -> Vec<PathBuf> {
+    let paths = fs::read_dir(dir).unwrap().map(|e| e.unwrap().path());
+    let mut found: Vec<_> = paths.filter(|p| p.to_str().unwrap().ends_with(ending)).collect();
+    found.sort();
+    found
+}
+
+#[test]
+fn unacknowledged_messages_survive_a_restart() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut journal = open(dir.path(), BIG);
+    append(&mut journal, 1..5);
+    assert_eq!(numbers(&take_all(&mut journal)), [1, 2, 3, 4]);
+    journal.acknowledge(2);
+    journal.write().unwrap();
+    drop(journal); // nothing is written at the end: the same as a killed process
+    let mut journal = open(dir.path(), BIG);
+    append(&mut journal, 5..6);
+    assert_eq!(journal.waiting(), 3);
+    let (_, message) = journal.take(1).pop().unwrap();
+    assert_eq!(message, event(3), "topic and payload as they were");
+    assert_eq!(numbers(&take_all(&mut journal)), [4, 5]);
+    assert_eq!((files(dir.path(), SUFFIX).len(), journal.take_lost()), (1, 0));
+}
+
+#[test]
+fn an_acknowledged_journal_is_empty_and_forgets_its_numbers() {
+    let dir = tempfile::tempdir().unwrap();
+    for round in 0..3 {
+        let mut journal = open(dir.path(), BIG);
+        append(&mut journal, 0..100);
+        let taken = take_all(&mut journal);
+        assert_eq!((taken.len(), journal.take_lost()), (100, 0), "round {round}");
+        journal.acknowledge(journal.last());
+        journal.write().unwrap();
+        let path = files(dir.path(), SUFFIX).pop().unwrap();
+        assert_eq!(fs::metadata(path).unwrap().len(), 0);
+        append(&mut journal, 100..101);
+        drop(journal);
+        let mut journal = open(dir.path(), BIG);
+        assert_eq!(numbers(&take_all(&mut journal)), [100]);
+        assert_eq!(journal.take_lost(), 0);
+        journal.acknowledge(journal.last());
+        journal.write().unwrap();
+    }
+}
+
+#[test]
+fn a_message_that_was_taken_at_once_is_kept_until_it_is_acknowledged() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut journal = open(dir.path(), BIG);
+    journal.append(event(1), true);
+    journal.append(event(2), true);
+    journal.write().unwrap();
+    assert_eq!((journal.waiting(), take_all(&mut journal).len()), (0, 0));
+    append(&mut journal, 3..4);
+    assert_eq!(numbers(&take_all(&mut journal)), [3]);
+    drop(journal);
+    assert_eq!(numbers(&take_all(&mut open(dir.path(), BIG))), [1, 2, 3]);
+}
+
+#[test]
+fn what_is_acknowledged_before_it_is_written_is_not_written() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut journal = open(dir.path(), BIG);
+    journal.append(event(1), true);
+    journal.acknowledge(1);
+    journal.write().unwrap();
+    assert_eq!(journal.bytes(), 0);
+}
+
+#[test]
+fn an_incomplete_tail_is_kept_aside() {
+    for tail in [b"X".repeat(100), vec![0; 4096], {
+        let mut bytes = Vec::new();
+        record::message(9, &event(9), &mut bytes);
+        bytes[..30].to_vec()
+    }] {
+        let dir = tempfile::tempdir().unwrap();
+        append(&mut open(dir.path(), BIG), 1..3);
+        let path = files(dir.path(), SUFFIX).pop().unwrap();
+        let mut bytes = fs::read(&path).unwrap();
+        bytes.extend_from_slice(&tail);
+        fs::write(&path, &bytes).unwrap();
+        let mut journal = open(dir.path(), BIG);
+        append(&mut journal, 3..4);
+        assert_eq!(numbers(&take_all(&mut journal)), [1, 2, 3]);
+        let kept = files(dir.path(), DAMAGED).pop().unwrap();
+        assert_eq!(fs::read(kept).unwrap(), tail);
+        assert_eq!(journal.take_lost(), 1);
+    }
+}
+
+#[test]
+fn one_flipped_bit_costs_one_message() {
+    let dir = tempfile::tempdir().unwrap();
+    append(&mut open(dir.path(), BIG), 0..1000);
+    let path = files(dir.path(), SUFFIX).remove(0);
+    let mut bytes = fs::read(&path).unwrap();
+    let middle = bytes.len() / 2;
+    bytes[middle] ^= 4;
+    fs::write(&path, &bytes).unwrap();
+    let mut journal = open(dir.path(), BIG);
+    assert_eq!(take_all(&mut journal).len(), 999);
+    assert_eq!((journal.take_lost(), files(dir.path(), DAMAGED).len()), (1, 1));
+    assert!(fs::metadata(&files(dir.path(), DAMAGED)[0]).unwrap().len() < 100);
+}
+
+#[test]
+fn the_files_of_damage_are_few() {
+    let dir = tempfile::tempdir().unwrap();
+    for round in 0..2 * QUARANTINED {
+        append(&mut open(dir.path(), BIG), 0..1);
+        let path = files(dir.path(), SUFFIX).remove(0);
+        let mut bytes = fs::read(&path).unwrap();
+        bytes.resize(bytes.len() + round + 1, 7);
+        fs::write(&path, &bytes).unwrap();
+    }
+    open(dir.path(), BIG);
+    assert_eq!(files(dir.path(), DAMAGED).len(), QUARANTINED);
+}
+
+#[test]
+fn a_full_buffer_drops_its_oldest_segment() {
+    let dir = tempfile::tempdir().unwrap();
+    let max = 64 << 10;
+    let mut journal = open(dir.path(), max);
+    for n in 0..5000 {
+        append(&mut journal, n..n + 1);
+        assert!(journal.bytes() <= max);
+    }
+    let on_disk = files(dir.path(), SUFFIX);
+    let on_disk: u64 = on_disk.iter().map(|p| fs::metadata(p).unwrap().len()).sum();
+    assert!(on_disk <= max);
+    let lost = journal.take_lost() as usize;
+    let taken = take_all(&mut journal);
+    assert_eq!((lost + taken.len(), journal.take_lost()), (5000, 0));
+    assert_eq!(
+        numbers(&taken),
+        (lost..5000).collect::<Vec<_>>(),
+        "the newest, in order"
+    );
+    assert!(journal.bytes() > max * 9 / 10);
+    journal.acknowledge(journal.last());
+    journal.write().unwrap();
+    assert_eq!((journal.bytes(), files(dir.path(), SUFFIX).len()), (0, 1));
+}
+
+#[test]
+fn a_disk_that_takes_nothing_leaves_the_order_alone() {
+    let dir = tempfile::tempdir().unwrap();
+    let inner = dir.path().join("buffer");
+    let mut journal = open(&inner, 256 << 10);
+    append(&mut journal, 0..100);
+    // A new segment cannot be created, and the last one has no room.
+    let moved = dir.path().join("moved");
+    fs::rename(&inner, &moved).unwrap();
+    for n in 100..400 {
+        journal.append(event(n), false);
+        let _ = journal.write();
+    }
+    assert!(journal.write().is_err() && !journal.unwritten.is_empty());
+    let first = journal.take(150);
+    assert!(first.iter().map(|(_, m)| number(m)).eq(0..150));
+    fs::rename(&moved, &inner).unwrap();
+    journal.write().unwrap();
+    assert!(journal.unwritten.is_empty());
+    append(&mut journal, 400..410);
+    assert_eq!(numbers(&take_all(&mut journal)), (150..410).collect::<Vec<_>>());
+    drop(journal);
+    let mut journal = open(&inner, 256 << 10);
+    assert_eq!(numbers(&take_all(&mut journal)), (0..410).collect::<Vec<_>>());
+    assert_eq!(journal.take_lost(), 0);
+}
+
+#[test]
+fn messages_beyond_the_memory_are_lost_and_counted_once() {
+    let dir = tempfile::tempdir().unwrap();
+    let inner = dir.path().join("buffer");
+    let mut journal = open(&inner, 256 << 10);
+    append(&mut journal, 0..100);
+    let moved = dir.path().join("moved");
+    fs::rename(&inner, &moved).unwrap();
+    let many = UNWRITTEN + 1000;
+    for n in 100..many {
+        journal.append(event(n), false);
+        if n % 100 == 0 {
+            let _ = journal.write();
+        }
+    }
+    let lost = journal.take_lost() as usize;
+    assert!(lost > 0);
+    let taken = take_all(&mut journal);
+    assert_eq!((taken.len() + lost, journal.take_lost()), (many, 0));
+    assert!(taken.is_sorted());
+}
+
+#[test]
+fn without_a_disk_messages_wait_in_memory() {
+    let mut journal = Journal::in_memory();
+    append(&mut journal, 0..10);
+    assert_eq!(journal.waiting(), 10);
+    assert_eq!(numbers(&take_all(&mut journal)), (0..10).collect::<Vec<_>>());
+    assert_eq!((journal.waiting(), journal.unwritten.len()), (0, 0));
+    for n in 0..UNWRITTEN + 5 {
+        journal.append(event(n), false);
+    }
+    assert_eq!((journal.take_lost(), take_all(&mut journal).len()), (5, UNWRITTEN));
+    assert_eq!(journal.take_lost(), 0);
+}
+
+#[test]
+fn a_directory_belongs_to_one_process() {
+    let dir = tempfile::tempdir().unwrap();
+    let _journal = open(dir.path(), BIG);
+    let error = Journal::open(dir.path(), "mqtt-events", BIG).unwrap_err();
+    assert!(error.to_string().contains("another process"), "{error}");
+    Journal::open(dir.path(), "mqtt-history", BIG).unwrap();
+}

@@ -1,0 +1,202 @@
+use super::*;
+
+/// Telemetry with acknowledgements.
+fn outbox() -> Outbox {
+    Outbox::new(Delivery {
+        telemetry: Qos::AtLeastOnce,
+        events: Qos::AtLeastOnce,
+        expiry: Some(300),
+    })
+}
+
+fn topic(name: &str) -> Arc<str> {
+    Arc::from(name)
+}
+
+fn event(name: &str) -> Message {
+    Message::not_retained(name, Vec::new())
+}
+
+/// Publishes everything allowed; returns topics and payloads.
+fn drain(outbox: &mut Outbox, limit: usize) -> Vec<(String, Vec<u8>)> {
+    let mut sent = Vec::new();
+    while let Some((key, message)) = outbox.next(limit, true) {
+        outbox.mark_published(key, message.acknowledged);
+        sent.push((message.topic.to_string(), message.payload));
+    }
+    sent
+}
+
+fn names(sent: &[(String, Vec<u8>)]) -> Vec<&str> {
+    sent.iter().map(|(t, _)| t.as_str()).collect()
+}
+
+#[test]
+fn newest_telemetry_wins_and_one_message_per_topic_is_in_flight() {
+    let mut outbox = outbox();
+    outbox.put(topic("a"), vec![1]);
+    outbox.put(topic("b"), vec![1]);
+    outbox.put(topic("a"), vec![2]);
+    assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![2]), ("b".into(), vec![1])]);
+    outbox.put(topic("a"), vec![3]);
+    outbox.put(topic("a"), vec![4]);
+    assert!(outbox.next(10, true).is_none(), "a is in flight");
+    outbox.numbered(1).unwrap();
+    outbox.numbered(2).unwrap();
+    assert!(outbox.acked(2).is_some(), "acknowledgements come in any order");
+    assert_eq!(outbox.acked(1).unwrap().topic.as_ref(), "a");
+    assert_eq!(drain(&mut outbox, 10), [("a".into(), vec![4])]);
+    assert!(outbox.acked(77).is_none());
+}
+
+#[test]
+fn the_limit_bounds_what_is_in_flight() {
+    let mut outbox = outbox();
+    for i in 0..10 {
+        outbox.put(topic(&format!("t{i}")), Vec::new());
+        outbox.push(Kind::Event, event("e"), None);
+    }
+    assert_eq!(drain(&mut outbox, 3).len(), 3);
+    assert_eq!(outbox.in_flight(), 3);
+    outbox.numbered(1).unwrap();
+    outbox.acked(1);
+    assert_eq!(drain(&mut outbox, 3).len(), 1);
+}
+
+#[test]
+fn leader_first_then_results_events_and_telemetry_in_turn() {
+    let mut outbox = outbox();
+    for i in 1..=3 {
+        outbox.put(topic(&format!("t{i}")), Vec::new());
+        outbox.push(Kind::Event, event(&format!("e{i}")), None);
+        outbox.push(Kind::History, event(&format!("h{i}")), None);
+    }
+    outbox.push_result(event("r1"));
+    outbox.push_result(event("r2"));
+    outbox.put_first(topic("status"), Vec::new());
+    assert!(outbox.next(0, true).is_none());
+    let sent = drain(&mut outbox, 100);
+    let order = [
+        "status", "r1", "e1", "t1", "r2", "e2", "t2", "e3", "t3", "h1", "h2", "h3",
+    ];
+    assert_eq!(names(&sent), order);
+    outbox.push(Kind::History, event("h4"), None);
+    assert!(outbox.next(100, false).is_none(), "the history has its pace");
+}
+
+#[test]
+fn after_a_lost_connection_events_are_sent_again_in_order() {
+    let mut outbox = outbox();
+    outbox.put(topic("t"), Vec::new());
+    for name in ["e1", "e2", "e3"] {
+        outbox.push(Kind::Event, event(name), None);
+    }
+    assert_eq!(drain(&mut outbox, 3).len(), 3);
+    outbox.numbered(1).unwrap();
+    outbox.numbered(2).unwrap();
+    outbox.numbered(3).unwrap();
+    assert_eq!(outbox.acked(1).unwrap().topic.as_ref(), "e1");
+    outbox.lost();
+    assert_eq!(outbox.waiting(), 2);
+    assert_eq!(outbox.in_flight(), 0);
+    assert!(
+        outbox.acked(3).is_none(),
+        "an acknowledgement of the lost connection means nothing"
+    );
+    assert_eq!(names(&drain(&mut outbox, 10)), ["e2", "e3"]);
+}
+
+#[test]
+fn a_result_that_breaks_connections_is_dropped() {
+    let mut outbox = outbox();
+    outbox.push_result(event("bad"));
+    for _ in 0..2 {
+        assert_eq!(drain(&mut outbox, 10).len(), 1);
+        outbox.lost();
+    }
+    assert_eq!((outbox.waiting(), outbox.take_lost().results), (0, 1));
+}
+
+#[test]
+fn queues_are_bounded_and_drop_the_oldest() {
+    let mut outbox = outbox();
+    for i in 0..KEPT + 2 {
+        outbox.push(Kind::Event, event(&format!("e{i}")), None);
+    }
+    assert_eq!((outbox.waiting(), outbox.take_lost().events), (KEPT, 2));
+    assert_eq!(outbox.next(1, true).unwrap().1.topic.as_ref(), "e2");
+}
+
+#[test]
+fn results_are_never_dropped_but_no_more_commands_are_received() {
+    let mut outbox = outbox();
+    for i in 0..RESULTS {
+        assert!(outbox.has_room_for_results());
+        assert_eq!(outbox.is_crowded("r"), i >= RESULTS_OF_TOPIC);
+        outbox.push_result(event("r"));
+    }
+    assert!(!outbox.has_room_for_results() && !outbox.is_crowded("other"));
+    assert_eq!(drain(&mut outbox, usize::MAX).len(), RESULTS);
+    (1..=1000).for_each(|packet| outbox.numbered(packet).unwrap());
+    (1..=1000).for_each(|packet| assert!(outbox.acked(packet).is_some()));
+    assert!(outbox.has_room_for_results());
+    let mut outbox = self::outbox();
+    let long = Message {
+        correlation: Some(vec![0; 60_000]),
+        ..event("r")
+    };
+    while outbox.has_room_for_results() {
+        outbox.push_result(long.clone());
+    }
+    assert_eq!(outbox.waiting(), RESULT_BYTES / 60_001 + 1);
+}
+
+#[test]
+fn telemetry_without_acknowledgement_passes_a_full_window() {
+    let mut outbox = Outbox::new(Delivery {
+        telemetry: Qos::AtMostOnce,
+        events: Qos::AtLeastOnce,
+        expiry: Some(300),
+    });
+    for name in ["e1", "e2"] {
+        outbox.push(Kind::Event, event(name), Some(7));
+    }
+    outbox.put(topic("t"), vec![1]);
+    outbox.put_lasting(topic("gone"), Vec::new());
+    let sent = drain(&mut outbox, 1);
+    assert_eq!(names(&sent), ["e1", "t"]);
+    outbox.put(topic("t"), vec![2]);
+    let (key, message) = outbox.next(1, true).unwrap();
+    assert_eq!(
+        (message.acknowledged, message.expiry, message.retain),
+        (false, Some(300), true)
+    );
+    assert!(outbox.mark_published(key, false).is_some());
+    assert_eq!(outbox.oldest(Kind::Event), Some(7));
+    outbox.numbered(1).unwrap();
+    outbox.acked(1);
+    let (_, message) = outbox.next(1, true).unwrap();
+    assert!(message.acknowledged && message.expiry.is_none());
+}
+
+#[test]
+fn inconsistent_packet_ids_are_detected() {
+    let mut outbox = outbox();
+    assert!(outbox.numbered(1).is_err());
+    for name in ["a", "b"] {
+        outbox.push(Kind::Event, event(name), None);
+    }
+    drain(&mut outbox, 10);
+    assert!(outbox.numbered(1).is_ok());
+    assert!(outbox.numbered(1).is_err());
+}
+
+#[test]
+fn messages_that_cannot_be_sent_are_dropped() {
+    let mut outbox = outbox();
+    outbox.put(topic("big"), vec![0; 10]);
+    let (key, _) = outbox.next(1, true).unwrap();
+    outbox.give_up(key);
+    assert!(outbox.next(1, true).is_none());
+    assert!(!outbox.has_telemetry("big"));
+}

@@ -1,0 +1,129 @@
+use super::*;
+
+fn count() -> LostCount {
+    LostCount(Arc::default(), MqttLoss::Event)
+}
+
+fn lost(count: &LostCount) -> u64 {
+    count.0.mqtt.losses().map(|(_, count)| count).sum()
+}
+
+fn event(n: usize) -> Message {
+    Message::not_retained("e", n.to_string().into_bytes())
+}
+
+/// A store whose disk does nothing until the test wants it.
+fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, LostCount) {
+    let (jobs, todo) = sync_channel(JOBS);
+    let (report, loaded) = mpsc::channel(4);
+    let lost = count();
+    let store = Store {
+        disk: Some(Disk {
+            lost: lost.clone(),
+            jobs,
+            loaded,
+            ended: tokio::sync::oneshot::channel().1,
+        }),
+        ..Store::default()
+    };
+    (store, todo, report, lost)
+}
+
+fn opened(waiting: u64) -> Loaded {
+    Loaded::Opened {
+        waiting,
+        topics: Vec::new(),
+    }
+}
+
+#[test]
+fn a_disk_that_hangs_delays_nothing() {
+    let (mut store, todo, _report, lost) = stalled();
+    store.take(opened(0));
+    for n in 0..JOBS {
+        let (number, message) = store.push(event(n), true).expect("it is sent at once");
+        assert_eq!((number, message), (Some(n as Number + 1), event(n)));
+    }
+    let (number, _) = store.push(event(JOBS), true).unwrap();
+    assert_eq!(number, None, "sent, though nothing keeps it");
+    assert_eq!((store.push(event(0), false), self::lost(&lost)), (None, 1), "counted");
+    assert_eq!(todo.try_iter().count(), JOBS);
+}
+
+#[test]
+fn messages_wait_behind_those_on_disk() {
+    let (mut store, todo, _report, _) = stalled();
+    assert_eq!(store.push(event(1), true), None, "what is on disk is not known yet");
+    store.take(opened(2));
+    assert_eq!((store.push(event(2), true), store.waiting()), (None, 4));
+    store.load(100);
+    store.load(100);
+    let jobs: Vec<Job> = todo.try_iter().collect();
+    assert!(matches!(
+        jobs[..],
+        [Job::Append(_, false), Job::Append(_, false), Job::Load(100)]
+    ));
+    let messages = (-1..=2).map(|n| (n, event(9))).collect();
+    let (loaded, _) = store.take(Loaded::Messages { messages, through: 2 });
+    assert_eq!((loaded.len(), store.waiting()), (4, 0));
+    assert_eq!(store.push(event(3), true).unwrap().0, Some(3));
+    store.acknowledge(Some(2));
+    store.acknowledge(Some(2));
+    store.acknowledge(None);
+    let told = todo.try_iter().filter_map(|job| match job {
+        Job::Acknowledge(number) => Some(number),
+        _ => None,
+    });
+    assert_eq!(told.collect::<Vec<_>>(), [1, 3]);
+}
+
+#[tokio::test]
+async fn what_is_not_acknowledged_is_there_in_the_next_run() {
+    let dir = tempfile::tempdir().unwrap();
+    let buffer = Buffer {
+        dir: dir.path().to_path_buf(),
+        max_bytes: 1 << 20,
+    };
+    let mut store = Store::open(Some(buffer.clone()), "mqtt-events", count());
+    for n in 0..10 {
+        store.push(event(n), false);
+    }
+    let report = store.next().await;
+    store.take(report);
+    store.load(4);
+    let report = store.next().await;
+    assert_eq!(store.take(report).0.len(), 4);
+    store.acknowledge(Some(3));
+    store.remember(vec!["a/b".to_string(), "c".to_string()]);
+    store.close().await;
+
+    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    let report = store.next().await;
+    let (_, topics) = store.take(report);
+    assert_eq!(topics, ["a/b", "c"]);
+    assert_eq!(store.waiting(), 8);
+    store.push(event(10), true);
+    store.load(100);
+    let report = store.next().await;
+    let (messages, _) = store.take(report);
+    let numbers: Vec<Number> = messages.iter().map(|(number, _)| *number).collect();
+    assert_eq!(numbers, (-7..=1).collect::<Vec<_>>());
+    assert_eq!(messages[0].1, event(2));
+    assert_eq!(store.push(event(11), true).unwrap().0, Some(2));
+}
+
+#[tokio::test]
+async fn a_directory_that_cannot_be_used_leaves_messages_in_memory() {
+    let buffer = Buffer {
+        dir: "/proc/drivegate".into(),
+        max_bytes: 1 << 20,
+    };
+    let mut store = Store::open(Some(buffer), "mqtt-events", count());
+    store.push(event(0), true);
+    let report = store.next().await;
+    store.take(report);
+    store.load(10);
+    let report = store.next().await;
+    assert_eq!(store.take(report).0, [(1, event(0))]);
+    assert_eq!(store.push(event(1), true).unwrap().0, Some(2));
+}

@@ -1,0 +1,371 @@
+//! A broker that refuses, limits and takes over: what it does to one topic or connection, the gateway survives.
+
+use std::collections::HashMap;
+use std::io::{Read, Write};
+use std::net::{TcpListener, TcpStream};
+use std::sync::{Arc, Mutex};
+
+use drivegate::event::EventKind;
+
+use super::bench::*;
+
+const EVENT: &str = "drivegate/hall/drive/p1/event";
+const STATE: &str = "drivegate/hall/drive/p1/state";
+
+/// What the broker does.
+#[derive(Clone, Default)]
+struct Manners {
+    /// Properties of its CONNACK.
+    properties: Vec<u8>,
+    /// Topics below this get this reason code.
+    refused: Option<(&'static str, u8)>,
+    /// It writes each byte on its own.
+    piecemeal: bool,
+    /// It acknowledges two messages at a time, the later one first.
+    backwards: bool,
+    /// The first connection ends with this DISCONNECT after the first event.
+    farewell: Option<Vec<u8>>,
+}
+
+#[derive(Default)]
+struct Seen {
+    /// Topic, QoS, retain flag and payload.
+    messages: Vec<(String, u8, bool, Vec<u8>)>,
+    connections: usize,
+    most_in_flight: usize,
+    longest: usize,
+    by_alias: usize,
+}
+
+struct Hostile {
+    port: u16,
+    seen: Arc<Mutex<Seen>>,
+}
+
+impl Hostile {
+    fn start(manners: Manners) -> Hostile {
+        let listener = TcpListener::bind("127.0.0.1:0").unwrap();
+        let port = listener.local_addr().unwrap().port();
+        let seen: Arc<Mutex<Seen>> = Arc::default();
+        let shared = seen.clone();
+        // It ends with the process.
+        std::thread::spawn(move || {
+            for stream in listener.incoming().map_while(Result::ok) {
+                let first = {
+                    let mut seen = shared.lock().unwrap();
+                    seen.connections += 1;
+                    seen.connections == 1
+                };
+                let (manners, seen) = (manners.clone(), shared.clone());
+                std::thread::spawn(move || Session::new(stream, manners, seen, first).run());
+            }
+        });
+        Hostile { port, seen }
+    }
+
+    fn has(&self, which: impl Fn(&(String, u8, bool, Vec<u8>)) -> bool) -> Option<()> {
+        self.seen.lock().unwrap().messages.iter().any(which).then_some(())
+    }
+
+    fn events(&self) -> Vec<String> {
+        let seen = self.seen.lock().unwrap();
+        let events = seen.messages.iter().filter(|(topic, ..)| topic == EVENT);
+        let text = |payload: &[u8]| {
+            let json: serde_json::Value = serde_json::from_slice(payload).unwrap();
+            json["text"].as_str().unwrap().to_string()
+        };
+        events.map(|(.., payload)| text(payload)).collect()
+    }
+}
+
+struct Session {
+    stream: TcpStream,
+    manners: Manners,
+    seen: Arc<Mutex<Seen>>,
+    first: bool,
+    aliases: HashMap<u16, String>,
+    /// Packet ids to acknowledge, with their reason codes.
+    owed: Vec<(u16, u8)>,
+}
+
+fn number(bytes: &[u8]) -> usize {
+    usize::from(u16::from_be_bytes([bytes[0], bytes[1]]))
+}
+
+impl Session {
+    fn new(stream: TcpStream, manners: Manners, seen: Arc<Mutex<Seen>>, first: bool) -> Session {
+        Session {
+            stream,
+            manners,
+            seen,
+            first,
+            aliases: HashMap::new(),
+            owed: Vec::new(),
+        }
+    }
+
+    fn send(&mut self, kind: u8, body: &[u8]) -> Option<()> {
+        let packet = [&[kind, u8::try_from(body.len()).unwrap()][..], body].concat();
+        if !self.manners.piecemeal {
+            return self.stream.write_all(&packet).ok();
+        }
+        packet.iter().try_for_each(|byte| self.stream.write_all(&[*byte]).ok())
+    }
+
+    fn packet(&mut self) -> Option<(u8, Vec<u8>)> {
+        let mut byte = [0];
+        self.stream.read_exact(&mut byte).ok()?;
+        let kind = byte[0];
+        let (mut length, mut shift) = (0, 0);
+        loop {
+            self.stream.read_exact(&mut byte).ok()?;
+            length |= usize::from(byte[0] & 0x7F) << shift;
+            shift += 7;
+            if byte[0] & 0x80 == 0 {
+                break;
+            }
+        }
+        let mut body = vec![0; length];
+        self.stream.read_exact(&mut body).ok()?;
+        let mut seen = self.seen.lock().unwrap();
+        seen.longest = seen.longest.max(length + 5);
+        Some((kind, body))
+    }
+
+    fn run(mut self) -> Option<()> {
+        self.stream.set_nodelay(true).unwrap();
+        loop {
+            let (kind, body) = self.packet()?;
+            match kind >> 4 {
+                1 => {
+                    let properties = self.manners.properties.clone();
+                    let body = [&[0, 0, u8::try_from(properties.len()).unwrap()][..], &properties].concat();
+                    self.send(0x20, &body)?;
+                }
+                8 => {
+                    // Packet id, properties (none), then filters with a byte of options each.
+                    let (mut rest, mut codes) = (&body[3..], Vec::new());
+                    while rest.len() > 2 {
+                        rest = &rest[number(rest) + 3..];
+                        codes.push(1);
+                    }
+                    self.send(0x90, &[&body[..2], &[0], &codes].concat())?;
+                }
+                3 => self.publish(kind, &body)?,
+                12 => self.send(0xD0, &[])?,
+                14 => return None,
+                _ => {}
+            }
+        }
+    }
+
+    fn publish(&mut self, kind: u8, body: &[u8]) -> Option<()> {
+        let (qos, retain) = (kind >> 1 & 3, kind & 1 == 1);
+        let (topic, mut rest) = body[2..].split_at(number(body));
+        let mut topic = String::from_utf8(topic.to_vec()).unwrap();
+        let mut packet = 0;
+        if qos > 0 {
+            packet = number(rest) as u16;
+            rest = &rest[2..];
+        }
+        let (mut properties, payload) = rest[1..].split_at(usize::from(rest[0]));
+        while let Some((property, value)) = properties.split_first() {
+            let length = match property {
+                0x02 => 4,
+                0x23 => {
+                    let alias = number(value) as u16;
+                    if topic.is_empty() {
+                        topic = self.aliases[&alias].clone();
+                        self.seen.lock().unwrap().by_alias += 1;
+                    }
+                    self.aliases.insert(alias, topic.clone());
+                    2
+                }
+                other => panic!("unexpected property {other}"),
+            };
+            properties = &value[length..];
+        }
+        let is_event = topic == EVENT;
+        self.seen
+            .lock()
+            .unwrap()
+            .messages
+            .push((topic.clone(), qos, retain, payload.to_vec()));
+        if is_event
+            && self.first
+            && let Some(farewell) = self.manners.farewell.clone()
+        {
+            self.send(0xE0, &farewell);
+            return None;
+        }
+        if qos == 0 {
+            return Some(());
+        }
+        let code = self
+            .manners
+            .refused
+            .filter(|(below, _)| topic.starts_with(below))
+            .map_or(0, |(_, code)| code);
+        self.owed.push((packet, code));
+        let in_flight = self.owed.len();
+        let mut seen = self.seen.lock().unwrap();
+        seen.most_in_flight = seen.most_in_flight.max(in_flight);
+        drop(seen);
+        if self.manners.backwards && is_event && in_flight < 2 {
+            return Some(());
+        }
+        while let Some((packet, code)) = self.owed.pop() {
+            let packet = packet.to_be_bytes();
+            self.send(0x40, &[packet[0], packet[1], code, 0])?;
+        }
+        Some(())
+    }
+}
+
+/// Publishes `count` events; they, the state and the status arrive.
+fn serves(broker: &Hostile, gateway: &Gateway, count: usize) {
+    wait_for("the status", || {
+        broker.has(|(topic, .., payload)| topic == "drivegate/hall/status" && payload == b"online")
+    });
+    let texts: Vec<String> = (0..count).map(|n| format!("event {n}")).collect();
+    for text in &texts {
+        gateway.publish_event("p1", EventKind::Fault, text);
+    }
+    wait_for("the events", || (broker.events().len() >= count).then_some(()));
+    let mut events = broker.events();
+    events.dedup();
+    assert_eq!(events, texts);
+    wait_for("the buffer to be empty", || (gateway.buffered() == 0).then_some(()));
+}
+
+#[test]
+fn odd_brokers_are_served() {
+    let window = |n: u16| [&[0x21][..], &n.to_be_bytes()].concat();
+    let cases: [(&str, Manners); 7] = [
+        (
+            "receive maximum 1",
+            Manners {
+                properties: window(1),
+                ..Manners::default()
+            },
+        ),
+        (
+            "receive maximum 20, acknowledged backwards",
+            Manners {
+                properties: window(20),
+                backwards: true,
+                ..Manners::default()
+            },
+        ),
+        (
+            "QoS 0 only",
+            Manners {
+                properties: vec![0x24, 0],
+                ..Manners::default()
+            },
+        ),
+        (
+            "no retained messages",
+            Manners {
+                properties: vec![0x25, 0],
+                ..Manners::default()
+            },
+        ),
+        (
+            "topic aliases",
+            Manners {
+                properties: vec![0x22, 0, 5],
+                ..Manners::default()
+            },
+        ),
+        (
+            "packets in single bytes",
+            Manners {
+                piecemeal: true,
+                ..Manners::default()
+            },
+        ),
+        (
+            "the points refused",
+            Manners {
+                refused: Some(("drivegate/hall/drive/p1/point", 0x87)),
+                ..Manners::default()
+            },
+        ),
+    ];
+    for (name, manners) in cases {
+        let broker = Hostile::start(manners);
+        let mut options = options(broker.port);
+        options.telemetry_qos = drivegate::north::mqtt::Qos::AtLeastOnce;
+        let gateway = Gateway::start(options, plant(&["p1"]));
+        serves(&broker, &gateway, 40);
+        for value in 0..10 {
+            gateway.read("p1", 4000 + value);
+            let text = format!("{}", f64::from(4000 + value) / 100.0);
+            wait_for("the new value", || {
+                broker.has(|(topic, .., payload)| topic == STATE && String::from_utf8_lossy(payload).contains(&text))
+            });
+        }
+        let seen = broker.seen.lock().unwrap();
+        assert_eq!(seen.connections, 1, "{name}");
+        match name {
+            "receive maximum 1" => assert_eq!(seen.most_in_flight, 1),
+            "QoS 0 only" => assert!(seen.messages.iter().all(|(_, qos, ..)| *qos == 0)),
+            "no retained messages" => assert!(seen.messages.iter().all(|(.., retain, _)| !retain)),
+            "topic aliases" => assert!(seen.by_alias > 0),
+            _ => {}
+        }
+        drop(seen);
+        gateway.stop();
+    }
+}
+
+#[test]
+fn refused_messages_concern_their_topic() {
+    for code in [0x80, 0x83, 0x87, 0x90, 0x91, 0x97, 0x99] {
+        let broker = Hostile::start(Manners {
+            refused: Some((EVENT, code)),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        serves(&broker, &gateway, 20);
+        let lost = || gateway.stats.mqtt.losses().map(|(_, count)| count).sum::<u64>();
+        wait_for("the loss to be counted", || (lost() == 20).then_some(()));
+        assert_eq!(broker.seen.lock().unwrap().connections, 1, "{code:02X}");
+        assert!(gateway.connected());
+        gateway.stop();
+    }
+}
+
+#[test]
+fn packets_beyond_the_limit_are_not_sent() {
+    let broker = Hostile::start(Manners {
+        properties: vec![0x27, 0, 0, 1, 0],
+        ..Manners::default()
+    });
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    serves(&broker, &gateway, 5);
+    wait_for("a point", || {
+        broker.has(|(topic, ..)| topic.ends_with("point/output_frequency"))
+    });
+    let seen = broker.seen.lock().unwrap();
+    assert!(seen.longest <= 256, "{}", seen.longest);
+    assert!(seen.messages.iter().all(|(topic, ..)| topic != STATE));
+    drop(seen);
+    gateway.stop();
+}
+
+#[test]
+fn a_session_taken_over_loses_no_event() {
+    // DISCONNECT: session taken over, server shutting down, quota exceeded, and none at all.
+    for farewell in [vec![0x8E, 0], vec![0x8B, 0], vec![0x97, 0], vec![0xFF; 40]] {
+        let broker = Hostile::start(Manners {
+            farewell: Some(farewell),
+            ..Manners::default()
+        });
+        let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+        serves(&broker, &gateway, 20);
+        assert!(broker.seen.lock().unwrap().connections > 1);
+        gateway.stop();
+    }
+}
