@@ -362,7 +362,9 @@ fn what_mqtt_publishes_and_accepts() {
     let pair = |key| format!("url = \"mqtts://b\"\ncertificate = \"{dir}/gateway.crt\"\nkey = \"{dir}/{key}.key\"");
     assert!(mqtt(&pair("gateway")).0.is_some());
     assert!(
-        mqtt(&pair("other")).1.contains("the key does not match the certificate"),
+        mqtt(&pair("other"))
+            .1
+            .contains("the key does not match the certificate"),
         "{:?}",
         mqtt(&pair("other"))
     );
