@@ -153,6 +153,7 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
         buses: vec![bus],
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     })
 }
 
@@ -236,6 +237,7 @@ fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<(f64, f64), B
             fault_code: None,
             count: None,
             text: n.to_string(),
+            recording: None,
         });
     };
     let mut trips = Vec::new();

@@ -16,6 +16,7 @@ use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
+use crate::history::{RecorderTask, Recordings};
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
@@ -39,6 +40,9 @@ pub enum StartError {
     /// The system does not provide a thread or a file descriptor for the bus of that name.
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
+    /// The system does not provide a thread for the recorder.
+    #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
+    Recorder(std::io::Error),
 }
 
 /// A running gateway.
@@ -54,6 +58,8 @@ pub struct Daemon {
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
+    recordings: Arc<Recordings>,
+    recorder: Option<RecorderTask>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     /// Beats of the bus threads at the last check, by bus.
@@ -70,12 +76,14 @@ impl Daemon {
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let recordings = Arc::new(Recordings::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
             buses: Vec::new(),
             events: events.clone(),
             writes: writes.clone(),
+            recordings: recordings.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
@@ -89,6 +97,8 @@ impl Daemon {
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
             local: ServerSlot::default(),
+            recordings,
+            recorder: None,
             reporter: report_refusals(shared),
             beats: BTreeMap::new(),
         };
@@ -96,6 +106,7 @@ impl Daemon {
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
+        daemon.apply_recorder(&settings)?;
         daemon.replace_buses(&settings, prepared);
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -143,12 +154,17 @@ impl Daemon {
     /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
-    /// A bus or a server cannot start. Everything runs as before.
+    /// A bus or a server cannot start: everything runs as before. Or a changed recorder cannot: everything else runs as
+    /// before, without a recorder.
     pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
         let settings = file_limit::fit(settings);
         // Everything that can fail comes before anything that runs is stopped for good.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
+        if let Err(error) = self.apply_recorder(&settings) {
+            self.abort_servers(servers).await;
+            return Err(error);
+        }
         self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared);
         self.apply_mqtt(&settings).await?;
@@ -214,7 +230,11 @@ impl Daemon {
             buses: kept.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
+            recordings: self.recordings.clone(),
         }));
+        if let Some(recorder) = &self.recorder {
+            recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
+        }
         self.buses = kept;
     }
 
@@ -234,6 +254,22 @@ impl Daemon {
         .map_err(failed)
     }
 
+    /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
+    fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
+        if self.recorder.is_some() && self.settings.recordings == settings.recordings {
+            return Ok(());
+        }
+        if let Some(recorder) = self.recorder.take() {
+            recorder.stop();
+        }
+        if settings.recordings.max_count > 0 {
+            let (recordings, events) = (self.recordings.clone(), self.events.clone());
+            let started = RecorderTask::start(settings.recordings.clone(), recordings, events, &self.writes);
+            self.recorder = Some(started.map_err(StartError::Recorder)?);
+        }
+        Ok(())
+    }
+
     /// Prepares the servers that listen on the network: all of them or none.
     async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let (plant, stats) = (&self.plant, &self.stats);
@@ -246,6 +282,11 @@ impl Daemon {
                 Err(error)
             }
         }
+    }
+
+    async fn abort_servers(&mut self, (modbus_tcp, http): PreparedServers) {
+        self.modbus_tcp.abort(modbus_tcp).await;
+        self.http.abort(http).await;
     }
 
     async fn commit_servers(&mut self, (modbus_tcp, http): PreparedServers) {
@@ -299,9 +340,13 @@ impl Daemon {
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
+        let recorder = self.recorder.take();
         let stopped = tokio::task::spawn_blocking(move || {
             for (_, task) in buses {
                 task.stop();
+            }
+            if let Some(recorder) = recorder {
+                recorder.stop();
             }
         });
         within(STOP_BUSES, "buses", async {

@@ -58,6 +58,8 @@ pub enum EventKind {
     BusUp,
     /// The port of a bus was lost or cannot be opened.
     BusDown,
+    /// A recording was made, or lost.
+    Recording,
 }
 
 impl EventKind {
@@ -80,7 +82,8 @@ impl EventKind {
             | EventKind::ControlPlace
             | EventKind::Restarted
             | EventKind::RefusedCommand
-            | EventKind::BusUp => false,
+            | EventKind::BusUp
+            | EventKind::Recording => false,
         }
     }
 
@@ -104,6 +107,7 @@ impl EventKind {
             EventKind::NotConfirmed => "not_confirmed",
             EventKind::BusUp => "bus_up",
             EventKind::BusDown => "bus_down",
+            EventKind::Recording => "recording",
         }
     }
 }
@@ -133,6 +137,20 @@ pub struct Event {
     pub count: Option<u64>,
     /// For people.
     pub text: String,
+    /// The recording that was made.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub recording: Option<RecordingMade>,
+}
+
+/// A recording that was made.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct RecordingMade {
+    /// Its id.
+    pub id: String,
+    /// What made it.
+    pub trigger: &'static str,
+    /// What it shows, for people.
+    pub summary: String,
 }
 
 /// The name of this run of the process, different at every start: with it, the number of an event is unique.
@@ -246,6 +264,7 @@ impl Events {
             fault_code: None,
             count: None,
             text: refused.text,
+            recording: None,
         };
         let mut store = self.store();
         let passed = store
@@ -303,6 +322,7 @@ mod tests {
             fault_code: None,
             count: None,
             text,
+            recording: None,
         }
     }
 

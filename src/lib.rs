@@ -25,6 +25,7 @@
 //! - [`event`]: what happened, published once.
 //! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
+//! - [`history`]: the trip recorder: what was read and sent before and after a fault, kept on disk.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
 //! - [`bus`]: one exchange ([`bus::transaction`]), which poll is next ([`bus::schedule`]), all decisions about drives and
@@ -56,6 +57,7 @@ pub mod daemon;
 pub mod document;
 pub mod drive;
 pub mod event;
+pub mod history;
 pub mod line;
 pub mod north;
 pub mod plant;

@@ -15,6 +15,7 @@ use crate::command::{
 };
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Events, RefusedCommand};
+use crate::history::Recordings;
 use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::placed::Placed;
@@ -44,6 +45,8 @@ pub struct Plant {
     pub events: Events,
     /// Counters of commands.
     pub writes: Arc<WriteStats>,
+    /// What the recorder has kept.
+    pub recordings: Arc<Recordings>,
 }
 
 /// One drive and the way to it.

@@ -18,6 +18,7 @@ mod gateway {
     mod drive_access;
     mod local_socket;
     mod operators;
+    mod recordings;
     mod reload;
     mod restart;
     mod slow_log;

@@ -155,6 +155,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         }],
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     };
     let poll = move || {
         for (drive, value) in drives.iter().cycle().zip((0..=u16::MAX).cycle()) {

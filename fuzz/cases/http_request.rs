@@ -15,6 +15,7 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         buses: Vec::new(),
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     };
     Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")
 });

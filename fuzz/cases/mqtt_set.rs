@@ -52,6 +52,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     }))
 });
 

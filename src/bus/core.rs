@@ -244,7 +244,11 @@ impl BusCore {
 
     fn report_all(&mut self, news: &[News], now: Instant) {
         for one in news {
-            self.report.apply(one, now);
+            if let Some(drive) = self.report.apply(one, now)
+                && self.bus.image.tape.is_on()
+            {
+                self.master.fault_came(drive, now);
+            }
         }
     }
 }

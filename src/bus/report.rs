@@ -11,7 +11,9 @@ use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request};
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
-use crate::process_image::{Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot};
+use crate::process_image::{
+    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, Taped, TapedRead,
+};
 
 /// The load of the line is reckoned over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
@@ -73,8 +75,8 @@ impl Report {
         }
     }
 
-    /// Applies one piece of news.
-    pub(super) fn apply(&mut self, news: &News, now: Instant) {
+    /// Applies one piece of news. The drive in which it shows a new fault, if it does.
+    pub(super) fn apply(&mut self, news: &News, now: Instant) -> Option<usize> {
         match news {
             News::FastRound(cycle) => self.fast_round(*cycle),
             News::SlowRound(cycle) => self.slow_round(*cycle),
@@ -108,11 +110,11 @@ impl Report {
             }
             News::RunsUnsupervised(drive, adopted) => self.runs_unsupervised(*drive, *adopted),
         }
-        if let News::Read { drive, .. } = news {
-            self.look_at_fault(*drive, now);
-            self.look_at_state(*drive, now);
-            self.look_at_own_response(*drive, now);
-        }
+        let News::Read { drive, .. } = news else { return None };
+        let new_fault = self.look_at_fault(*drive, now);
+        self.look_at_state(*drive, now);
+        self.look_at_own_response(*drive, now);
+        new_fault.then_some(*drive)
     }
 
     fn drive(&self, index: usize) -> Option<Arc<DriveImage>> {
@@ -139,6 +141,7 @@ impl Report {
             fault_code,
             count: None,
             text,
+            recording: None,
         });
     }
 
@@ -146,6 +149,15 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
+        self.image.tape.append(|| {
+            let read = TapedRead {
+                at,
+                table: read.table,
+                start: read.start,
+                words: words.into(),
+            };
+            Taped::Read(index, read)
+        });
         drive.update(|snapshot: &mut Snapshot| {
             snapshot.store(read.table, read.start, words, at);
             if read.class == PollClass::Fast {
@@ -315,12 +327,12 @@ impl Report {
         });
     }
 
-    /// Faults that came or went with the last poll.
-    fn look_at_fault(&mut self, index: usize, now: Instant) {
-        let Some(drive) = self.drive(index) else { return };
+    /// Faults that came or went with the last poll. Whether one came.
+    fn look_at_fault(&mut self, index: usize, now: Instant) -> bool {
+        let Some(drive) = self.drive(index) else { return false };
         let reading = drive.reading(now, RECENT);
         let Some(fault) = reading.model(ModelPoint::Fault).good() else {
-            return;
+            return false;
         };
         let shown = reading.model(ModelPoint::FaultCode);
         let code = match shown.good() {
@@ -330,12 +342,12 @@ impl Report {
         // A code that was read before the fault came, in a request of its own, is not that of the fault.
         let before_the_fault = shown.at < reading.model(ModelPoint::Fault).at;
         if fault.as_bool() && code == 0 && shown.good().is_some() && before_the_fault {
-            return;
+            return false;
         }
         let active = fault.as_bool().then_some(code);
         match self.faults.get_mut(index) {
             Some(before) if *before != active => *before = active,
-            _ => return,
+            _ => return false,
         }
         match active {
             Some(code) => self.drive_event(index, EventKind::Fault, Some(code), |name| {
@@ -345,6 +357,7 @@ impl Report {
                 format!("the fault of drive {name} is gone")
             }),
         }
+        active.is_some()
     }
 
     /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
@@ -391,7 +404,7 @@ impl Report {
         });
     }
 
-    /// Looks at an exchange for whoever listens to the frames; `None` while nobody does. The request was given to the
+    /// Looks at an exchange for the recorder and for whoever listens to the frames; `None` while nobody does. The request was given to the
     /// line at `began`, which had been silent since `quiet_since`.
     pub(super) fn tap(
         &self,
@@ -401,7 +414,7 @@ impl Report {
         quiet_since: Instant,
         began: Instant,
     ) -> Option<Tap> {
-        if !self.image.trace.wanted() {
+        if !self.image.trace.wanted() && !self.image.tape.is_on() {
             return None;
         }
         let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);

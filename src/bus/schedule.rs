@@ -162,6 +162,7 @@ impl Schedule {
             items: plan
                 .reads
                 .iter()
+                .chain(&plan.on_fault)
                 .map(|read| Item::new(*read, *read, cost(index, read), now))
                 .collect(),
         });
@@ -357,9 +358,26 @@ impl Schedule {
         let Some(drive) = self.drives.get_mut(drive) else {
             return;
         };
-        for item in drive.items.iter_mut().filter(|item| !item.refused) {
+        let again = |item: &&mut Item| !item.refused && item.read.class != PollClass::Fault;
+        for item in drive.items.iter_mut().filter(again) {
             item.wanted = true;
             item.due = item.due.min(now);
+        }
+    }
+
+    /// A fault came up in a drive: what its profile names for that, and the slow reads that cover more of it, are due at
+    /// once. They take no more of the line than slow reads have anyway.
+    pub fn fault_came(&mut self, drive: usize, covers: impl Fn(&PlannedRead) -> bool, now: Instant) {
+        let items = self.drives.get_mut(drive).map(|drive| drive.items.iter_mut());
+        for item in items.into_iter().flatten() {
+            match item.read.class {
+                PollClass::Fault => {
+                    (item.wanted, item.refused, item.failures) = (true, false, 0);
+                    item.due = now;
+                }
+                PollClass::Slow if covers(&item.read) && !item.refused => item.due = item.due.min(now),
+                _ => {}
+            }
         }
     }
 
@@ -370,7 +388,7 @@ impl Schedule {
             .into_iter()
             .flatten()
             .filter(|item| !item.refused && item.failures == 0);
-        if let Some(item) = sound.find(|item| item.read.class != PollClass::Fast) {
+        if let Some(item) = sound.find(|item| !matches!(item.read.class, PollClass::Fast | PollClass::Fault)) {
             item.wanted = true;
             item.due = item.due.min(now);
         }

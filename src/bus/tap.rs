@@ -1,4 +1,4 @@
-//! The frames of a line, for whoever listens: what was sent, what came back, when, and what it means.
+//! The frames of a line, for the recorder and for whoever listens: what was sent, what came back, when, and what it means.
 //!
 //! Time on the wire is reckoned from the bytes: a driver may hand a reply over byte by byte, or whole when its last byte
 //! is there.
@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::transaction::Ended;
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
-use crate::process_image::{BusImage, Direction, FrameRecord};
+use crate::process_image::{BusImage, Direction, FrameRecord, Taped, TapedFrame, Verdict};
 
 /// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
 const KEPT: usize = 2048;
@@ -18,6 +18,7 @@ const KEPT: usize = 2048;
 #[derive(Debug)]
 pub(super) struct Tap {
     image: Arc<BusImage>,
+    index: usize,
     drive: Option<String>,
     request: Request,
     frame: Vec<u8>,
@@ -31,6 +32,7 @@ impl Tap {
         let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
         Tap {
             image,
+            index,
             drive,
             request,
             hearing: Hearing::new(format, began + format.chars(frame.len())),
@@ -40,6 +42,7 @@ impl Tap {
 
     /// Publishes the request.
     pub(super) fn sent(&self, quiet_since: Instant, began: Instant) {
+        self.tape(&self.frame, Verdict::Sent, began);
         self.image.trace.publish(|| FrameRecord {
             time: time_of_day(began),
             gap: Some(began.saturating_duration_since(quiet_since)),
@@ -58,6 +61,10 @@ impl Tap {
 
     /// Publishes what came back, a record for each frame.
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
+        self.tape(&self.hearing.bytes, taped(ended), now);
+        if !self.image.trace.wanted() {
+            return;
+        }
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
         let parts = describe::parts(protocol, &self.request, &self.frame, &self.hearing.bytes, answered);
@@ -81,6 +88,10 @@ impl Tap {
         }
     }
 
+    fn tape(&self, bytes: &[u8], verdict: Verdict, at: Instant) {
+        self.image.tape.append(|| frame(Some(self.index), bytes, verdict, at));
+    }
+
     fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {
         self.image.trace.publish(|| FrameRecord {
             time: time_of_day(at),
@@ -94,8 +105,29 @@ impl Tap {
     }
 }
 
+fn frame(drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) -> Taped {
+    Taped::Frame(TapedFrame {
+        at,
+        drive,
+        verdict,
+        bytes: bytes.into(),
+    })
+}
+
+fn taped(ended: &Ended) -> Verdict {
+    match ended {
+        Ended::Reply(Reply::Exception(_)) => Verdict::Exception,
+        Ended::Reply(_) => Verdict::Ok,
+        Ended::Silent => Verdict::Timeout,
+        Ended::Corrupt(_) => Verdict::Corrupt,
+    }
+}
+
 /// Publishes bytes that came between two exchanges.
 pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
+    image
+        .tape
+        .append(|| frame(None, bytes.get(..KEPT).unwrap_or(bytes), Verdict::Foreign, now));
     image.trace.publish(|| {
         let mut hearing = Hearing::new(image.spec.format, quiet_since);
         hearing.add(bytes, now);

@@ -11,6 +11,8 @@ use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::document::Problem;
+use crate::history::RecorderOptions;
+use crate::history::budget::Budget;
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
@@ -46,6 +48,8 @@ struct Bus<'a> {
     /// What the stops take at shutdown when all drives answer, and when none does.
     shutdown_ms: f64,
     shutdown_worst_ms: f64,
+    /// Memory that the recorder takes at most.
+    recorder_bytes: usize,
     requests: Vec<Request<'a>>,
 }
 
@@ -78,18 +82,19 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 fn json(loaded: &Loaded) -> String {
-    let buses = loaded.settings.iter().flat_map(|settings| &settings.buses);
+    let settings = loaded.settings.iter();
+    let buses = settings.flat_map(|settings| settings.buses.iter().map(|bus| bus_report(bus, &settings.recordings)));
     let report = Report {
         ok: loaded.settings.is_some(),
         errors: &loaded.errors,
         warnings: &loaded.warnings,
-        buses: buses.map(bus_report).collect(),
+        buses: buses.collect(),
     };
     // Only maps with keys that are not strings fail, and there are none.
     serde_json::to_string_pretty(&report).unwrap_or_default() + "\n"
 }
 
-fn bus_report(bus: &BusSettings) -> Bus<'_> {
+fn bus_report<'a>(bus: &'a BusSettings, recorder: &RecorderOptions) -> Bus<'a> {
     let (prediction, shutdown) = (bus.predict(), bus.shutdown_time());
     let request = |request: &PredictedRequest| Request {
         drive: drive_name(bus, request),
@@ -106,6 +111,7 @@ fn bus_report(bus: &BusSettings) -> Bus<'_> {
         slow_cycle_ms: prediction.slow_cycle.map(milliseconds),
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
+        recorder_bytes: Budget::of(&bus.spec, &bus.drives, recorder).total(),
         requests: prediction.requests.iter().map(request).collect(),
     }
 }
@@ -121,7 +127,7 @@ fn milliseconds(time: Duration) -> f64 {
 fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     let mut text = String::new();
     for bus in &settings.buses {
-        text += &bus_text(bus);
+        text += &bus_text(bus, &settings.recordings);
         text.push('\n');
     }
     let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
@@ -145,7 +151,7 @@ fn counted(count: usize, one: &str, many: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { many })
 }
 
-fn bus_text(bus: &BusSettings) -> String {
+fn bus_text(bus: &BusSettings, recorder: &RecorderOptions) -> String {
     let spec = &bus.spec;
     let there = spec.port.contains("://") || Path::new(&spec.port).exists();
     let mut text = format!(
@@ -173,8 +179,7 @@ fn bus_text(bus: &BusSettings) -> String {
     (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
-    text += &summary(bus, &prediction);
-    text
+    text + &summary(bus, &prediction) + &memory(bus, recorder)
 }
 
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
@@ -194,6 +199,22 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)
         + &format!("  line load   {:.1} %{wanted}\n", prediction.load * 100.0)
         + &shutdown(bus)
+}
+
+/// Memory of the recorder; empty where it is off.
+fn memory(bus: &BusSettings, recorder: &RecorderOptions) -> String {
+    let budget = Budget::of(&bus.spec, &bus.drives, recorder);
+    if budget.total() == 0 {
+        return String::new();
+    }
+    let kilobytes = |bytes: usize| bytes.div_ceil(1000);
+    let drive = budget.samples.iter().max().map_or(0, |samples| samples + budget.notes);
+    format!(
+        "  recorder    {} kB of memory at most: {} kB a drive, {} kB for the line\n",
+        kilobytes(budget.total()),
+        kilobytes(drive),
+        kilobytes(budget.frames)
+    )
 }
 
 /// Duration of the stops at shutdown; empty where there are none.

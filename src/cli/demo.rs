@@ -148,7 +148,14 @@ async fn demo(args: &Args) -> Result<(), String> {
     cancel.cancel();
     broker.stop().await;
     lines.into_iter().for_each(SimulatedBus::stop);
+    // There is none while nothing was recorded.
+    let _ = std::fs::remove_dir_all(state_dir());
     Ok(())
+}
+
+/// Where the recordings of this demo are while it runs.
+fn state_dir() -> std::path::PathBuf {
+    std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id()))
 }
 
 /// Addresses of the three north sides.
@@ -238,7 +245,10 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
 fn configuration(ports: &[String], sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
     // The demo has no configuration file, which `read` and `write` would need to find its drives.
-    let mut text = "[gateway]\nname = \"demo\"\nsocket = \"\"\n".to_string();
+    let mut text = format!(
+        "[gateway]\nname = \"demo\"\nsocket = \"\"\nstate_dir = \"{}\"\n",
+        state_dir().display()
+    );
     let mut unit = 0;
     for (line, port) in LINES.iter().zip(ports) {
         let DemoLine { name, baud, format, .. } = line;
@@ -297,6 +307,7 @@ Look
   {program} watch --url http://{http}
   curl -s http://{http}/metrics | grep output_frequency
   curl -s http://{http}/api/v1/drives/pump-1
+  curl -s http://{http}/api/v1/recordings             what happened before each fault
   mosquitto_sub -h 127.0.0.1 -p {mqtt} -v -t 'drivegate/#'
   mbpoll -m tcp -p {modbus} -a 1 -0 -r 32768 -c 19 -1 127.0.0.1          common model of pump-1 (unit 1)
   mbpoll -m tcp -p {modbus} -a 1 -0 -r 2100 -c 11 -1 127.0.0.1           its own registers, IDs 2101 to 2111

@@ -83,6 +83,15 @@ impl Target {
         Expected::new(&self.settings.gateway, &self.bus.spec, &self.spec)
     }
 
+    /// Sends the request to the running gateway.
+    ///
+    /// # Errors
+    /// Why there is no outcome, as a message.
+    pub(super) fn ask_gateway(&self, request: &Request) -> Result<Outcome, String> {
+        let asked = super::runtime()?.block_on(gateway::ask(self, request))?;
+        asked.map_err(|not_found| format!("{}; the local socket; start the gateway", not_found.0))
+    }
+
     /// Sends the request to the running gateway or, where there is none, carries it out on the line.
     ///
     /// # Errors

@@ -145,6 +145,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         buses: settings.buses.iter().map(bus).collect::<io::Result<_>>()?,
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     })
 }
 

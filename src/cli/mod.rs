@@ -14,6 +14,8 @@ mod map;
 mod printable;
 mod profiles;
 mod read;
+mod record;
+mod recordings;
 mod reload;
 mod report;
 mod run;
@@ -76,6 +78,8 @@ commands! {
     Scan => scan,
     Read => read,
     Write => write,
+    Record => record,
+    Recordings => recordings,
     Watch => watch,
     Trace => trace,
     Simulate => simulate,

@@ -140,6 +140,13 @@ fn show(profile: &Profile) -> String {
             "simulator",
             profile.simulator.clone().unwrap_or_else(|| "none".to_string()),
         ),
+        (
+            "on a fault",
+            match on_fault(profile) {
+                names if names.is_empty() => String::new(),
+                names => format!("{} are read for the recording", names.join(", ")),
+            },
+        ),
     ]
     .into_iter()
     .filter(|(_, value)| !value.is_empty())
@@ -176,6 +183,12 @@ fn assumptions(profile: &Profile) -> String {
         ]);
     }
     report::lines(&table)
+}
+
+/// Points that a drive with a new fault is asked for.
+fn on_fault(profile: &Profile) -> Vec<&str> {
+    let points = profile.on_fault.iter().filter_map(|index| profile.points.get(*index));
+    points.map(|point| point.name.as_str()).collect()
 }
 
 fn points(profile: &Profile) -> String {

@@ -10,11 +10,15 @@ use super::{EXIT_FAILED, printable};
 use crate::config::Loaded;
 use crate::document::{Finding, Problem, parse_duration};
 
-/// Prints the lines of `text` to stdout.
+/// Prints the lines of `text`, harmless for a terminal, to stdout.
 pub(super) fn print(text: &str) -> ExitCode {
+    print_bytes(printable::lines(text).as_bytes())
+}
+
+/// Writes `bytes` to stdout as they are.
+pub(super) fn print_bytes(bytes: &[u8]) -> ExitCode {
     let mut stdout = io::stdout().lock();
-    let text = printable::lines(text);
-    match stdout.write_all(text.as_bytes()).and_then(|()| stdout.flush()) {
+    match stdout.write_all(bytes).and_then(|()| stdout.flush()) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) if error.kind() == io::ErrorKind::BrokenPipe => ExitCode::SUCCESS,
         Err(why) => {
@@ -62,16 +66,16 @@ fn line(kind: &str, message: &str) {
 }
 
 /// A table without a frame, as wide as the terminal at most.
-pub(super) fn table<const N: usize>(header: [&str; N]) -> TextTable {
+pub(super) fn table<T: AsRef<str>>(header: impl IntoIterator<Item = T>) -> TextTable {
     let mut table = Table::new();
     table.load_preset(presets::NOTHING);
     table.set_style(TableComponent::HeaderLines, '─');
     table.set_content_arrangement(ContentArrangement::Dynamic);
-    table.set_header(header);
+    table.set_header(header.into_iter().map(|cell| printable::line(cell.as_ref())));
     TextTable(table)
 }
 
-/// A table whose cells are each one line of text.
+/// A table whose header and cells are each one line of text.
 pub(super) struct TextTable(Table);
 
 impl TextTable {

@@ -4,7 +4,7 @@
 //! [`Protocol::decode`] takes that request. Nothing can go stale between two exchanges.
 
 pub mod ascii;
-mod checksum;
+pub(crate) mod checksum;
 pub mod describe;
 pub mod modbus;
 pub mod n2;

@@ -6,11 +6,12 @@
 pub mod chain;
 mod file;
 
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwapOption;
 use serde::{Serialize, Serializer};
+use tokio::sync::broadcast;
 
 use crate::drive::Value;
 use crate::event::{FairRing, RefusalLimit};
@@ -138,7 +139,12 @@ impl AuditRecord {
 pub struct Audit {
     records: Mutex<Records>,
     file: ArcSwapOption<AuditFile>,
+    /// For whoever wants each record as it comes.
+    sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
 }
+
+/// Records that a listener may be behind.
+const IN_FLIGHT: usize = 4096;
 
 #[derive(Debug)]
 struct Records {
@@ -172,6 +178,11 @@ impl Audit {
     /// The file, if there is one.
     pub fn file(&self) -> Option<Arc<AuditFile>> {
         self.file.load_full()
+    }
+
+    /// Hears all records from now on; a listener that is 4,096 behind loses the oldest.
+    pub fn subscribe(&self) -> broadcast::Receiver<Arc<AuditRecord>> {
+        self.sender.get_or_init(|| broadcast::channel(IN_FLIGHT).0).subscribe()
     }
 
     /// Takes the record of a command that is finished at `now`. Refusals of one client are counted after the first of a
@@ -213,6 +224,10 @@ impl Audit {
         let number = records.number;
         let ring = if sent { &mut records.sent } else { &mut records.unsent };
         ring.push(record.share.clone(), number, record.clone());
+        if let Some(sender) = self.sender.get() {
+            // The last listener may have gone.
+            let _ = sender.send(record.clone());
+        }
         if let Some(file) = &*self.file.load() {
             file.push(record, sent);
         }

@@ -5,13 +5,13 @@ use std::ops::RangeInclusive;
 use std::sync::Arc;
 
 use super::key::{Key, Number};
-use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION};
+use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
 use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
-use crate::process_image::{Access, DriveSpec, LeaseAction, OnShutdown, Supervision};
+use crate::process_image::{Access, DriveSpec, LeaseAction, OnShutdown, PointTrigger, Supervision, TriggerLimit};
 
 /// Points that a message names.
 const MOST_NAMED: usize = 4;
@@ -53,6 +53,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let supervision = read_supervision(reader, profile.as_deref(), &limits);
     let on_shutdown = DRIVE.on_shutdown.get(reader);
     let turnaround = DRIVE.turnaround.read(reader);
+    let triggers = read_triggers(reader, profile.as_deref());
     reader.finish();
     let spec = match (&name, address, unit, profile) {
         (Some((name, _)), Some(address), Some(unit), Some(profile)) => Some(DriveSpec {
@@ -67,6 +68,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             supervision,
             on_shutdown,
             frequency_range,
+            triggers,
         }),
         _ => None,
     };
@@ -164,6 +166,67 @@ pub(crate) fn unknown_profile(name: &str, profiles: &Profiles, some_broken: bool
         format!("unknown profile `{name}`"),
         format!("{near}known profiles: {}{broken}", known.join(", ")),
     )
+}
+
+/// `[[bus.drive.trigger]]`: values that make a recording.
+fn read_triggers(reader: &Reader<'_>, profile: Option<&Profile>) -> Vec<PointTrigger> {
+    let tables = DRIVE.trigger.tables(reader);
+    let triggers = tables.iter().filter_map(|table| {
+        let trigger = read_trigger(table, profile);
+        table.finish();
+        trigger
+    });
+    triggers.collect()
+}
+
+fn read_trigger(table: &Reader<'_>, profile: Option<&Profile>) -> Option<PointTrigger> {
+    let name = TRIGGER.point.read(table)?;
+    let hold = TRIGGER.r#for.get(table);
+    let limit = match (TRIGGER.above.written(table), TRIGGER.below.written(table)) {
+        (Some(limit), None) => Some(TriggerLimit::Above(limit)),
+        (None, Some(limit)) => Some(TriggerLimit::Below(limit)),
+        (None, None) if table.has(TRIGGER.above.name) || table.has(TRIGGER.below.name) => None,
+        _ => {
+            table.problem(
+                TRIGGER.above.name,
+                "a trigger has either `above` or `below`",
+                "write one of them; for both, write two triggers",
+            );
+            None
+        }
+    };
+    let profile = profile?;
+    let point = table.accept(TRIGGER.point.name, trigger_point(&name, profile))?;
+    Some(PointTrigger {
+        point,
+        limit: limit?,
+        hold,
+    })
+}
+
+/// A number that is read without being asked for.
+fn trigger_point(name: &str, profile: &Profile) -> Result<usize, Finding> {
+    let plan = Plan::of(profile);
+    let is_number = |index: usize| {
+        let point = profile.points.get(index);
+        point.is_some_and(|point| point.kind() != Kind::Bool) && plan.shows(profile, index)
+    };
+    let index = profile.point_index(name);
+    index.filter(|index| is_number(*index)).ok_or_else(|| {
+        let names = (0..).zip(&profile.points).filter(|(index, _)| is_number(*index));
+        let near = nearest(name, names.map(|(_, point)| point.name.as_str()));
+        let remedy = near.map(|near| format!("did you mean `{near}`?"));
+        let list = || {
+            format!(
+                "`drivegate profiles show {}` lists the points and their classes",
+                profile.name
+            )
+        };
+        Finding::new(
+            format!("profile `{}` has no number `{name}` that is polled", profile.name),
+            remedy.unwrap_or_else(list),
+        )
+    })
 }
 
 fn read_frequencies(reader: &Reader<'_>) -> Option<RangeInclusive<f64>> {

@@ -239,6 +239,23 @@ impl Form<bool> for Flag {
     }
 }
 
+/// A number.
+pub(super) struct Figure;
+
+impl Form<f64> for Figure {
+    fn read(&self, reader: &Reader<'_>, key: &str) -> Option<f64> {
+        reader.optional(key)
+    }
+
+    fn schema(&self) -> Value {
+        json!({ "type": "number" })
+    }
+
+    fn range(&self) -> String {
+        "a number".to_string()
+    }
+}
+
 /// A whole number of the range; one outside it may have a message of its own.
 pub(super) struct Number(pub(super) RangeInclusive<i64>, pub(super) Option<(i64, &'static str)>);
 

@@ -9,11 +9,11 @@ use ipnet::IpNet;
 use serde_json::{Value, json};
 
 use super::key::{
-    DURATION, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
+    DURATION, Figure, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
 };
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
-use super::{bus, modbus_tcp, mqtt, north, values};
+use super::{bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::Rs485;
@@ -32,7 +32,7 @@ macro_rules! keys {
 
         pub(super) const $constant: $table = $table {
             $($key: Key {
-                name: stringify!($key),
+                name: key_name(stringify!($key)),
                 form: &$form,
                 default: keys!(@ $kind $($default)?),
                 meaning: concat!($($meaning),+),
@@ -44,7 +44,7 @@ macro_rules! keys {
             pub(super) fn schema() -> Value {
                 let required = |default: &Preset| matches!(default, Preset::Required);
                 table(concat!($($about),+), vec![
-                    $((stringify!($key), required(&$constant.$key.default), $constant.$key.schema()),)*
+                    $((key_name(stringify!($key)), required(&$constant.$key.default), $constant.$key.schema()),)*
                 ])
             }
         }
@@ -59,6 +59,14 @@ macro_rules! keys {
     (@ required) => { Preset::Required };
     (@ or $words:expr) => { Preset::Words($words) };
     (@ default $value:expr) => { Preset::Value(stringify!($value)) };
+}
+
+/// The name of a key whose field is a keyword of Rust is written as `r#name`.
+const fn key_name(field: &'static str) -> &'static str {
+    match field.as_bytes() {
+        [b'r', b'#', ..] => field.split_at(2).1,
+        _ => field,
+    }
 }
 
 const MILLISECOND: Duration = Duration::from_millis(1);
@@ -140,6 +148,8 @@ keys! {
         http: Present = Own { schema: Http::schema, range: "[http]" }, or "not started";
         /// File of all commands; not written without this section.
         audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
+        /// What the recorder keeps.
+        recordings: Present = Own { schema: Recordings::schema, range: "[recordings]" }, or "the defaults";
         /// What is logged.
         log: Present = Own { schema: Log::schema, range: "[log]" }, or "the defaults";
     }
@@ -152,8 +162,8 @@ keys! {
         /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps.
-        state_dir: PathBuf = PATH, default "/var/lib/drivegate";
+        /// Directory of what the gateway keeps: [recordings](recordings.md), and the [audit file](commands.md#the-audit-file).
+        state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
         profile_dirs: Vec<PathBuf> = List { parse: values::path, empty: None, range: "directories" }, or "none";
@@ -236,6 +246,20 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
+        /// Values that make a [recording](recordings.md), beside faults.
+        trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
+    }
+
+    /// A value that makes a recording: `above` or `below` a limit, for a time.
+    TRIGGER: Trigger {
+        /// A number of the drive that is polled.
+        point: String = Text("^[a-z][a-z0-9_]*$", "the name of a point"), required;
+        /// The value must be above this, in the point's unit.
+        above: f64 = Figure, or "none";
+        /// The value must be below this, in the point's unit.
+        below: f64 = Figure, or "none";
+        /// For how long without interruption.
+        r#for: Duration = Time(Duration::ZERO..=HOUR), default "0s";
     }
 
     /// Lease of the drive: if it expires while the drive runs, the action is executed once. Not a safety function.
@@ -443,6 +467,22 @@ keys! {
         max_bytes: u64 = Parsed {
             parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
         }, default "64MiB";
+    }
+
+    /// What the recorder keeps: [recordings](recordings.md) of the time around faults.
+    RECORDINGS: Recordings {
+        /// How much is kept from before the trigger.
+        before: Duration = Time(Duration::from_secs(1)..=Duration::from_secs(600)), default "30s";
+        /// How long the recording goes on after it.
+        after: Duration = Time(Duration::ZERO..=Duration::from_secs(600)), default "10s";
+        /// Maximum size of all recordings on disk.
+        max_bytes: u64 = Parsed {
+            parse: recordings::parse_size_limit, words: &[], pattern: SIZE, range: "\"1MiB\" to \"1024GiB\"",
+        }, default "256MiB";
+        /// Maximum number of recordings; 0: nothing is recorded.
+        max_count: usize = Number(0..=100_000, None), default 200;
+        /// Whether a warning of a drive makes a recording, too.
+        warnings: bool = Flag, default false;
     }
 
     /// What is logged.

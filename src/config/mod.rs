@@ -12,6 +12,7 @@ mod log;
 mod modbus_tcp;
 mod mqtt;
 mod north;
+mod recordings;
 mod shutdown;
 mod unique;
 mod values;
@@ -31,11 +32,14 @@ use crate::bus::predict::{self, Prediction};
 use crate::command::AuditFileOptions;
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
+use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
 use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
+/// Where the gateway keeps its state unless it is told otherwise.
+const STATE_DIR: &str = "/var/lib/drivegate";
 /// Prefix of environment variables: `DRIVEGATE__MQTT__PASSWORD`.
 pub(crate) const ENVIRONMENT: &str = "DRIVEGATE";
 
@@ -46,6 +50,10 @@ pub struct Settings {
     pub gateway: String,
     /// Where `drivegate read` and `drivegate write` reach the gateway.
     pub socket: SocketPath,
+    /// Directory of what the gateway keeps.
+    pub state_dir: PathBuf,
+    /// What the recorder keeps.
+    pub recordings: RecorderOptions,
     /// Directories of the user's profiles.
     pub profile_dirs: Vec<PathBuf>,
     /// Built-in profiles and the user's.
@@ -144,7 +152,7 @@ fn not_text(name: &str) -> Problem {
 /// The outcome, and every key the loader knows.
 fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>) -> (Loaded, Vec<String>) {
     let mut document = Document::parse(path.display().to_string(), source);
-    for section in [ROOT.gateway.name, ROOT.log.name] {
+    for section in [ROOT.gateway.name, ROOT.recordings.name, ROOT.log.name] {
         document.ensure_section(section);
     }
     let (variables, broken): (Vec<_>, Vec<_>) = env
@@ -205,6 +213,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .audit
         .table(reader)
         .map(|table| log::read_audit(&table, &state_dir));
+    let recordings = ROOT.recordings.table(reader);
+    let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
@@ -219,6 +229,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     Some(Settings {
         gateway: name?,
         socket,
+        state_dir,
+        recordings: recordings?,
         profile_dirs,
         profiles,
         stale_after: match &modbus_tcp {
@@ -289,7 +301,7 @@ impl Default for Gateway {
         Gateway {
             name: None,
             socket: SocketPath::Default,
-            state_dir: PathBuf::new(),
+            state_dir: default_state_dir(),
             profile_dirs: Vec::new(),
             profiles: Profiles::built_in(),
             errors: Vec::new(),
@@ -304,7 +316,8 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
         Some(path) => SocketPath::At(values::resolved(base, path)),
     };
-    let state_dir = values::resolved(base, GATEWAY.state_dir.get(reader));
+    let state_dir = GATEWAY.state_dir.written(reader);
+    let state_dir = state_dir.map_or_else(default_state_dir, |dir| values::resolved(base, dir));
     let mut profiles = Profiles::built_in();
     let mut errors = Vec::new();
     let dirs = GATEWAY.profile_dirs.get(reader);
@@ -327,6 +340,15 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         profile_dirs,
         profiles,
         errors,
+    }
+}
+
+/// The state directory of the systemd unit, else the usual one.
+fn default_state_dir() -> PathBuf {
+    let given = std::env::var("STATE_DIRECTORY").unwrap_or_default();
+    match given.split(':').next() {
+        Some(dir) if !dir.is_empty() => PathBuf::from(dir),
+        _ => PathBuf::from(STATE_DIR),
     }
 }
 

@@ -4,6 +4,7 @@ use std::path::Path;
 use std::sync::LazyLock;
 
 use super::*;
+use crate::process_image::TriggerLimit;
 
 mod files;
 mod listeners;
@@ -48,6 +49,9 @@ certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
 [audit]
 [log]
+[[bus.drive.trigger]]
+point = "motor_current"
+above = 120.0
 "#;
 
 fn load(source: &str) -> (Loaded, Vec<String>) {
@@ -293,6 +297,25 @@ fn every_family_can_be_supervised() {
             );
         }
     }
+}
+
+#[test]
+fn the_recorder_keeps_its_files_in_the_state_directory() {
+    let all = settings(&FULL.replace("name = \"g\"", "name = \"g\"\nstate_dir = \"state\""));
+    assert_eq!(all.recordings.dir, Path::new("/etc/drivegate/state/recordings"));
+    assert_eq!(
+        (all.recordings.before.as_secs(), all.recordings.after.as_secs()),
+        (30, 10)
+    );
+    assert_eq!((all.recordings.max_bytes, all.recordings.max_count), (256 << 20, 200));
+    let trigger = &all.buses[0].drives[0].triggers[0];
+    assert_eq!(trigger.limit, TriggerLimit::Above(120.0));
+    assert_eq!(trigger.hold, Duration::ZERO);
+    let elsewhere = settings("[gateway]\nname = \"g\"\nstate_dir = \"/srv\"\n[recordings]\nmax_count = 0\n");
+    assert_eq!(
+        (elsewhere.recordings.max_count, elsewhere.state_dir.as_path()),
+        (0, Path::new("/srv"))
+    );
 }
 
 #[test]

@@ -361,6 +361,7 @@ mod tests {
             buses: Vec::new(),
             events: Default::default(),
             writes: Default::default(),
+            recordings: Default::default(),
         };
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }

@@ -44,6 +44,8 @@ impl PlannedRead {
 pub struct Plan {
     /// In the order class, table, address.
     pub reads: Vec<PlannedRead>,
+    /// What a drive with a new fault is asked for, as far as no fast read has it: once a fault, among its slow reads.
+    pub on_fault: Vec<PlannedRead>,
 }
 
 impl Plan {
@@ -66,7 +68,15 @@ impl Plan {
             }
             reads.extend(merged);
         }
-        Plan { reads }
+        let on_fault = profile.on_fault.iter().filter_map(|index| profile.points.get(*index));
+        let on_fault: BTreeSet<Piece> = on_fault
+            .filter(|point| point.class == PollClass::Never)
+            .filter_map(|point| point.raw())
+            .filter(|raw| raw.addresses().any(|a| !taken.contains(&(raw.table, a))))
+            .map(|raw| (raw.table, raw.address, raw.form.items()))
+            .collect();
+        let on_fault = merge(profile, PollClass::Fault, &on_fault);
+        Plan { reads, on_fault }
     }
 
     /// Whether these requests read a point of that profile: everything it is in or derived from.

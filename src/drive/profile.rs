@@ -52,6 +52,8 @@ pub struct Profile {
     pub ranges: Vec<AddressRange>,
     /// All points, in the order of the file.
     pub points: Vec<Point>,
+    /// Points that a drive with a new fault is asked for at once.
+    pub on_fault: Vec<usize>,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
     /// Index of each model point in `points`.
@@ -130,6 +132,8 @@ pub enum PollClass {
     Slow,
     /// When the drive comes online.
     Once,
+    /// Once after a fault came up: see [`Profile::on_fault`].
+    Fault,
     /// Never by itself.
     Never,
 }
@@ -141,6 +145,7 @@ impl PollClass {
             PollClass::Fast => "fast",
             PollClass::Slow => "slow",
             PollClass::Once => "once",
+            PollClass::Fault => "fault",
             PollClass::Never => "never",
         }
     }

@@ -5,10 +5,12 @@
 
 mod health;
 mod snapshot;
+mod tape;
 mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
 pub use snapshot::{Link, Reading, Snapshot, Unavailable};
+pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
 use std::collections::BTreeMap;
@@ -90,6 +92,28 @@ pub struct DriveSpec {
     pub turnaround: Duration,
     /// Minimum and maximum frequency, Hz, where the drive's own parameters cannot be read.
     pub frequency_range: Option<RangeInclusive<f64>>,
+    /// Values beside faults at which a recording is made.
+    pub triggers: Vec<PointTrigger>,
+}
+
+/// A value that makes a recording when it holds for a time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PointTrigger {
+    /// Index of the point in the profile.
+    pub point: usize,
+    /// The limit.
+    pub limit: TriggerLimit,
+    /// For how long without interruption.
+    pub hold: Duration,
+}
+
+/// The side of a limit that triggers.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TriggerLimit {
+    /// Values above it.
+    Above(f64),
+    /// Values below it.
+    Below(f64),
 }
 
 /// A bus as configured.
@@ -285,6 +309,8 @@ pub struct BusImage {
     pub slow_cycles: Histogram,
     /// The frames on the line, for whoever listens.
     pub trace: Trace,
+    /// What is read and what is on the line, for the recorder.
+    pub tape: Tape,
     health: Mutex<BusHealth>,
 }
 
@@ -298,6 +324,7 @@ impl BusImage {
             fast_cycles: Histogram::new(),
             slow_cycles: Histogram::new(),
             trace: Trace::default(),
+            tape: Tape::default(),
             health: Mutex::new(BusHealth::default()),
         }
     }
@@ -352,6 +379,7 @@ impl DriveSpec {
             supervision: None,
             on_shutdown: OnShutdown::Hold,
             frequency_range: None,
+            triggers: Vec::new(),
         }
     }
 

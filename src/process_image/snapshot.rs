@@ -191,7 +191,7 @@ impl Reading<'_> {
         match class {
             PollClass::Fast => Some(self.stale_after),
             PollClass::Slow => Some(self.stale_after + 2 * self.slow_cycle),
-            PollClass::Once | PollClass::Never => None,
+            PollClass::Once | PollClass::Fault | PollClass::Never => None,
         }
     }
 

@@ -167,6 +167,7 @@ fn the_report_of_a_sound_configuration() {
             "fast_cycle_ms",
             "load_ratio",
             "name",
+            "recorder_bytes",
             "requests",
             "shutdown_ms",
             "shutdown_worst_ms",

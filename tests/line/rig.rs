@@ -118,6 +118,7 @@ impl Rig {
             buses: vec![handle],
             events: events.clone(),
             writes,
+            recordings: Default::default(),
         };
         Rig {
             plant,

@@ -52,6 +52,7 @@ pub(crate) fn plant(gateway: &str, stale_after: Duration, buses: Vec<BusHandle>)
         buses,
         events: Events::default(),
         writes: Arc::default(),
+        recordings: Default::default(),
     }
 }
 

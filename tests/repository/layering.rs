@@ -9,13 +9,14 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 15] = [
+const ROOMS: [&str; 16] = [
     "document",
     "codec",
     "drive",
     "event",
     "process_image",
     "command",
+    "history",
     "plant",
     "line",
     "bus",

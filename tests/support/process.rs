@@ -100,7 +100,8 @@ pub(crate) fn drivegate(arguments: &[&str]) -> Command {
     command
         .args(arguments)
         .env_remove("RUNTIME_DIRECTORY")
-        .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"));
+        .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"))
+        .env("STATE_DIRECTORY", concat!(env!("CARGO_TARGET_TMPDIR"), "/state"));
     command
 }
 

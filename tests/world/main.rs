@@ -26,6 +26,7 @@ mod n2;
 mod one_bus;
 mod orders;
 mod prediction;
+mod recorder;
 mod rig;
 mod scenario;
 mod situations;

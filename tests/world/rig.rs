@@ -100,6 +100,7 @@ impl Rig {
             buses: vec![bus.handle.clone()],
             events,
             writes,
+            recordings: Default::default(),
         };
         Rig { bus, now, plant }
     }
@@ -167,6 +168,7 @@ impl Rig {
             buses: self.plant.buses.clone(),
             events: self.plant.events.clone(),
             writes: self.plant.writes.clone(),
+            recordings: Default::default(),
         }))
     }
 

@@ -243,5 +243,6 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         buses: buses.iter().map(|bus| bus.handle.clone()).collect(),
         events: events.clone(),
         writes: writes.clone(),
+        recordings: Default::default(),
     }
 }

@@ -11,7 +11,7 @@ use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{Command, Outcome, Urgency, written};
-use crate::drive::{Point, Raw};
+use crate::drive::{PlannedRead, Point, Raw};
 
 /// First wait before a stop is tried again at a drive that did not answer one.
 const STOP_AGAIN: Duration = Duration::from_millis(500);
@@ -35,6 +35,21 @@ impl Master {
             }
         }
         news
+    }
+
+    /// A fault came up in a drive: it is asked for what its profile names for that.
+    pub fn fault_came(&mut self, drive: usize, now: Instant) {
+        let Some(image) = self.bus.image.drives.get(drive) else {
+            return;
+        };
+        let profile = &image.spec.profile;
+        let points = profile
+            .on_fault
+            .iter()
+            .filter_map(|index| profile.points.get(*index)?.raw());
+        let wanted: Vec<_> = points.map(|raw| (raw.table, raw.address)).collect();
+        let covers = |read: &PlannedRead| wanted.iter().any(|(table, address)| read.covers(*table, *address));
+        self.schedule.fault_came(drive, covers, now);
     }
 
     /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
@@ -273,7 +288,7 @@ impl Master {
     /// What was written is read back soon.
     fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
         if let Some((table, items)) = written(&step.pdu) {
-            let covers = |read: &crate::drive::PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
+            let covers = |read: &PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
             self.schedule.refresh(index, covers, now);
         }
     }

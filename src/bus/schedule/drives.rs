@@ -26,7 +26,7 @@ pub(super) struct Item {
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
-    /// A read of the once class that is still to be done.
+    /// A read of the once class, or one that a fault asks for, that is still to be done.
     pub(super) wanted: bool,
     /// Never answered so far.
     pub(super) unread: bool,
@@ -78,8 +78,8 @@ impl Item {
             refused: false,
             refusals: 0,
             failures: 0,
-            wanted: true,
-            unread: true,
+            wanted: read.class != PollClass::Fault,
+            unread: read.class != PollClass::Fault,
             asked: None,
             whole_again: None,
         }
@@ -88,7 +88,7 @@ impl Item {
     pub(super) fn is_slow(&self) -> bool {
         match self.read.class {
             PollClass::Slow => true,
-            PollClass::Once => self.wanted,
+            PollClass::Once | PollClass::Fault => self.wanted,
             PollClass::Fast | PollClass::Never => false,
         }
     }
@@ -128,7 +128,7 @@ impl DriveSchedule {
                 false => Change::Unavailable(read, exception),
             };
             item.refused = true;
-            item.wanted = true;
+            item.wanted = item.read.class != PollClass::Fault;
             item.due = now + (REFUSED_PAUSE.0 * (1 << item.refusals.min(5))).min(REFUSED_PAUSE.1);
             item.refusals = item.refusals.saturating_add(1);
             let origin = item.origin;
@@ -138,6 +138,7 @@ impl DriveSchedule {
         let (origin, cost) = (item.origin, item.cost);
         let mut halves = [Item::new(low, origin, cost, now), Item::new(high, origin, cost, now)];
         for half in &mut halves {
+            half.wanted = true;
             half.whole_again = Some(now + REFUSED_PAUSE.1);
         }
         self.items.splice(index..=index, halves);

@@ -29,7 +29,7 @@ impl Schedule {
                 self.round_due = self.round_due.min(now);
             }
             for item in &mut drive.items {
-                item.wanted = true;
+                item.wanted = item.read.class != PollClass::Fault;
                 item.due = now;
                 item.failures = 0;
             }
@@ -45,7 +45,7 @@ impl Schedule {
                 // The bad point is sound again: it is read with its neighbours.
                 item.whole_again = Some(now);
             }
-            item.wanted = item.read.class != PollClass::Once;
+            item.wanted = !matches!(item.read.class, PollClass::Once | PollClass::Fault);
             if item.read.class == PollClass::Slow {
                 let next = item.due + slow;
                 // Read before its time because a command asked for it, it is due a whole cycle later.

@@ -27,7 +27,10 @@ fn plan() -> Plan {
         read(PollClass::Slow, 2000, 3),
         read(PollClass::Once, 100, 4),
     ];
-    Plan { reads }
+    Plan {
+        reads,
+        ..Plan::default()
+    }
 }
 
 /// A line in virtual time: every exchange takes `COST`, a dead drive ten times that.
@@ -218,4 +221,60 @@ fn a_dear_slow_poll_gets_its_turn_on_a_saturated_slow_line() {
     }
     // They ask for nearly three lines and get a third of one.
     assert!((65..=75).contains(&slow), "{slow} slow polls in 300 s");
+}
+
+#[test]
+fn what_a_fault_asks_for_is_read_once_a_fault_and_takes_no_more_than_the_slow_share() {
+    let plan = Plan {
+        on_fault: vec![read(PollClass::Fault, 98, 1), read(PollClass::Fault, 200, 1)],
+        ..plan()
+    };
+    let now = Instant::now();
+    let cadence = Cadence {
+        fast: Duration::from_millis(10),
+        slow: Duration::from_secs(1),
+        retries: 1,
+    };
+    let plans: Vec<&Plan> = (0..32).map(|_| &plan).collect();
+    let mut schedule = Schedule::new(cadence, &plans, |_, _| COST, now);
+    let mut at = now;
+    // Polls by class, and drives of which each read of a fault was made.
+    let mut pass = |schedule: &mut Schedule, time: Duration| {
+        let (until, mut polls, mut asked) = (at + time, BTreeMap::new(), Vec::new());
+        while at < until {
+            match schedule.next(at, None) {
+                Decision::Idle(until) => at = until,
+                Decision::Command(_) => unreachable!(),
+                Decision::Poll(poll) => {
+                    at += COST;
+                    *polls.entry(poll.read.class).or_insert(0) += 1;
+                    if poll.read.class == PollClass::Fault {
+                        asked.push((poll.read.start, poll.drive));
+                    }
+                    schedule.poll_done(&poll, Polled::Ok, COST, at);
+                }
+            }
+        }
+        (at, polls, asked)
+    };
+    let (_, _, asked) = pass(&mut schedule, Duration::from_secs(60));
+    assert_eq!(asked, [], "never without a fault");
+    let (at, before, _) = pass(&mut schedule, Duration::from_secs(60));
+    (0..32).for_each(|drive| schedule.fault_came(drive, |read| read.start == 2000, at));
+    let (at, after, mut asked) = pass(&mut schedule, Duration::from_secs(60));
+    asked.sort_unstable();
+    let each: Vec<(u16, usize)> = [98, 200]
+        .into_iter()
+        .flat_map(|start| (0..32).map(move |d| (start, d)))
+        .collect();
+    assert_eq!(asked, each);
+    let fast = |polls: &BTreeMap<PollClass, i32>| polls[&PollClass::Fast];
+    assert!(
+        (fast(&before) - fast(&after)).abs() * 100 <= fast(&before),
+        "{before:?} {after:?}"
+    );
+    schedule.fault_came(5, |_| false, at);
+    schedule.read_again(5, at);
+    let (_, _, asked) = pass(&mut schedule, Duration::from_secs(60));
+    assert_eq!(asked.len(), 2, "the next fault asks again");
 }

@@ -87,7 +87,7 @@ async fn exchange(mut stream: UnixStream, request: &Request) -> io::Result<Respo
 
 fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
     let remedy = match request {
-        Request::Read(_) => "try again",
+        Request::Read(_) | Request::Record(_) => "try again",
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };
     format!("the gateway did not answer: {error}; {}; {remedy}", path.display())
@@ -96,6 +96,7 @@ fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
 fn refused(path: &Path, code: FailureCode, message: &str) -> String {
     let remedy = match code {
         FailureCode::Busy => "try again",
+        FailureCode::NotRecorded => "set max_count of [recordings] above 0 and reload",
         FailureCode::OtherConfiguration | FailureCode::UnknownDrive | FailureCode::UnknownPoint => {
             "the gateway there runs with another configuration: reload it, or name its file by --config"
         }

@@ -33,6 +33,7 @@ fn plant() -> Plant {
         buses: vec![BusHandle { image, queue }],
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     }
 }
 

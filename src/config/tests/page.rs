@@ -9,6 +9,7 @@ fn with_tables(page: &str) -> String {
         ("[[bus]]", "Bus"),
         ("[[bus.drive]]", "Drive"),
         ("[bus.drive.supervision]", "Supervision"),
+        ("[[bus.drive.trigger]]", "Trigger"),
         ("[modbus_tcp]", "ModbusTcp"),
         ("[[modbus_tcp.listener]]", "Listener"),
         ("[modbus_tcp.tls]", "Tls"),
@@ -18,6 +19,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.buffer]", "Buffer"),
         ("[http]", "Http"),
         ("[audit]", "AuditTable"),
+        ("[recordings]", "Recordings"),
         ("[log]", "Log"),
     ];
     let mut page = page.to_string();

@@ -65,7 +65,14 @@ pub(super) fn change_points(document: &mut Document) {
         change(points, line, node.value, &mut mistakes);
     }
     if let Some((_, line, node)) = removed {
+        let names: Vec<String> = texts(&node.value).map(str::to_string).collect();
         remove(points, line, node.value, &mut mistakes);
+        // What the base reads on a fault goes with the point.
+        if let Some((.., on_fault)) = entries.iter_mut().find(|(key, ..)| key == "on_fault")
+            && let Raw::Array(list) = &mut on_fault.value
+        {
+            list.retain(|node| !matches!(&node.value, Raw::Text(name) if names.contains(name)));
+        }
     }
     document.set_root(root);
     for (key, line, Finding { what, remedy }) in mistakes {
@@ -111,6 +118,18 @@ fn remove(points: &mut Vec<Node>, line: Option<usize>, names: Raw, mistakes: &mu
             mistakes.push((key(), node.line().or(line), unknown(name, points)));
         }
     }
+}
+
+/// The texts of a list.
+fn texts(list: &Raw) -> impl Iterator<Item = &str> {
+    let nodes = match list {
+        Raw::Array(nodes) => nodes.as_slice(),
+        _ => &[],
+    };
+    nodes.iter().filter_map(|node| match &node.value {
+        Raw::Text(text) => Some(text.as_str()),
+        _ => None,
+    })
 }
 
 fn unknown(name: &str, points: &[Node]) -> Finding {

@@ -17,7 +17,7 @@ use std::sync::LazyLock;
 use std::time::Duration;
 
 use super::model::ModelPoint;
-use super::profile::{AddressRange, FaultText, Point, Profile, Profiles};
+use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::Protocol;
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
@@ -241,6 +241,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         input_is_holding,
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
+        on_fault: read_on_fault(reader, &points),
         ranges,
         points,
         faults,
@@ -250,6 +251,26 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     reader.finish();
     name.map(|_| profile)
+}
+
+/// `on_fault`: points that are read at once when a fault comes up; of a derived one, those that it is made of.
+fn read_on_fault(reader: &Reader<'_>, points: &[Point]) -> Vec<usize> {
+    let names: Vec<String> = reader.or("on_fault", Vec::new());
+    let mut found = Vec::new();
+    for name in names {
+        let index = points.iter().position(|point| point.name == name);
+        match index.map(|index| (index, points.get(index).map(|point| &point.source))) {
+            Some((_, Some(Source::Derived(derived)))) => found.extend(derived.rests_on()),
+            Some((index, _)) => found.push(index),
+            None => {
+                let near = document::nearest(&name, points.iter().map(|point| point.name.as_str()));
+                let near = near.map(|near| format!("did you mean `{near}`?"));
+                let remedy = near.unwrap_or_else(|| "name points of the profile".to_string());
+                reader.problem("on_fault", format!("there is no point `{name}`"), remedy);
+            }
+        }
+    }
+    found
 }
 
 /// The base of this profile; the files are merged by now, so only an unknown name is left to report.

@@ -486,3 +486,39 @@ fn mistakes_of_identify() {
         assert!(all.contains(wanted), "{wanted} is missing in\n{all}");
     }
 }
+
+#[test]
+fn points_for_faults_are_read_by_their_registers() {
+    let source = |names: &str| format!("name = \"p\"\nbase = \"vacon-nx\"\non_fault = [{names}]\n");
+    let profile = Profile::parse("p", &source("\"fault_code_id99\", \"heatsink_temperature\""), false).unwrap();
+    let names: Vec<&str> = profile
+        .on_fault
+        .iter()
+        .map(|i| profile.points[*i].name.as_str())
+        .collect();
+    assert_eq!(names, ["fault_code_id99", "heatsink_temperature"]);
+    // What is polled anyway needs no read of its own.
+    let plan = crate::drive::Plan::of(&profile);
+    assert_eq!(
+        plan.on_fault
+            .iter()
+            .map(|read| (read.start, read.count))
+            .collect::<Vec<_>>(),
+        [(98, 1)]
+    );
+    // A derived point is read by what it is made of; what is removed is not read.
+    let derived = Profile::parse("p", &source("\"frequency_reference\""), false).unwrap();
+    let names: Vec<&str> = derived
+        .on_fault
+        .iter()
+        .map(|i| derived.points[*i].name.as_str())
+        .collect();
+    assert!(names.contains(&"speed_reference"), "{names:?}");
+    let removed = "name = \"p\"\nbase = \"vacon-nx\"\nremove = [\"motor_temperature\"]\n";
+    let names = |profile: &Profile| profile.on_fault.len();
+    let nx = Profiles::built_in();
+    let all = names(nx.get("vacon-nx").unwrap());
+    assert_eq!(names(&Profile::parse("p", removed, false).unwrap()), all - 1);
+    let all = mistakes("p", &source("\"fault_code_id9\""));
+    assert!(all.contains("p:3, on_fault; did you mean `fault_code_id99`?"), "{all}");
+}

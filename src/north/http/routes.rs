@@ -18,6 +18,7 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
 use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
+use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics};
@@ -34,6 +35,8 @@ pub(super) struct AppState {
     /// Large replies are rendered one at a time: a client that asks for them without end has its turns like all others,
     /// and `/healthz` does not wait for it.
     rendering: Semaphore,
+    /// The permit for reading a recording: what waits for the disk holds up nothing else.
+    files: Semaphore,
 }
 
 impl AppState {
@@ -69,6 +72,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         cancel,
         listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
         rendering: Semaphore::new(1),
+        files: Semaphore::new(1),
     });
     Router::new()
         .route("/", get(status_page))
@@ -88,6 +92,8 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/audit", get(audit))
+        .route("/api/v1/recordings", get(recordings))
+        .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/trace", get(streams::trace))
         .fallback(unknown)
@@ -237,6 +243,39 @@ async fn audit(State(app): State<Arc<AppState>>) -> Response {
     let _turn = app.turn().await;
     let records = app.plant.load().writes.audit().recent();
     Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+}
+
+/// The recordings, oldest first.
+async fn recordings(State(app): State<Arc<AppState>>) -> Response {
+    let _turn = app.turn().await;
+    let entries = app.plant.load().recordings.list();
+    Json(entries.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+}
+
+/// One recording with all its samples and frames.
+async fn recording(State(app): State<Arc<AppState>>, Path(id): Path<String>) -> Response {
+    let recordings = app.plant.load().recordings.clone();
+    // Files are read and converted away from the tasks of other clients, one at a time.
+    let Ok(_permit) = app.files.acquire().await else {
+        return StatusCode::SERVICE_UNAVAILABLE.into_response();
+    };
+    let wanted = id.clone();
+    let read = tokio::task::spawn_blocking(move || {
+        let json = |recording| export::json(&recording).to_string();
+        recordings.read(&wanted).map(|read| read.map(json))
+    });
+    match read.await {
+        Ok(Some(Ok(json))) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
+        Ok(Some(Err(error))) => {
+            let error = api::ErrorReply {
+                error: error.to_string(),
+                known: Vec::new(),
+            };
+            (StatusCode::INTERNAL_SERVER_ERROR, Json(error)).into_response()
+        }
+        Ok(None) => not_found(format!("there is no recording `{id}`"), Vec::new()),
+        Err(_) => StatusCode::INTERNAL_SERVER_ERROR.into_response(),
+    }
 }
 
 async fn unknown(uri: Uri) -> Response {

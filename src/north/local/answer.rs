@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 use serde_json::Value as Json;
 
 use super::protocol::{
-    Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, Request, Setting, WriteOutcome,
-    WriteRequest, port_of,
+    Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, RecordOutcome, RecordRequest,
+    Request, Setting, WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
@@ -27,6 +27,7 @@ pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome
     let answered = match request {
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
+        Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
     };
     answered.unwrap_or_else(Outcome::Error)
 }
@@ -230,6 +231,18 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
     };
     let answer = placed.answered().await;
     Ok(WriteOutcome::new(&answer, placed.confirmed().await))
+}
+
+async fn record(request: &RecordRequest, plant: &Plant, origin: &Origin) -> Result<RecordOutcome, Failure> {
+    let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
+    let name = &drive.image.spec.name;
+    match plant.recordings.record(name, &origin.who).await {
+        Ok((id, after)) => Ok(RecordOutcome {
+            id,
+            after_s: after.as_secs_f64(),
+        }),
+        Err(why) => Err(Failure::new(FailureCode::NotRecorded, why.to_string())),
+    }
 }
 
 /// The point and its value: as over MQTT, and the text of an enumeration too.

@@ -4,6 +4,8 @@
 //! {"v":1,"read":{"drive":"pump-1","points":["output_frequency"]}}
 //! {"v":1,"gateway":"plant","read":{"points":[{"point":"output_frequency","value":25.0,"unit":"Hz","quality":"good"}]}}
 //! {"v":1,"write":{"drive":"pump-1","points":[{"point":"run","value":false}]}}
+//! {"v":1,"record":{"drive":"pump-1"}}
+//! {"v":1,"gateway":"plant","record":{"id":"20260302T074012.118Z-pump-1","after_s":10.0}}
 //! {"v":1,"gateway":"plant","write":{"ok":true,"result":"confirmed","message":"…","latency_ms":9.1,"confirmed_ms":31.4}}
 //! ```
 
@@ -32,6 +34,19 @@ pub enum Request {
     Read(ReadRequest),
     /// Points of one drive set as one command.
     Write(WriteRequest),
+    /// A recording of one drive.
+    Record(RecordRequest),
+}
+
+/// A recording of one drive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecordRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
 }
 
 /// Points of one drive.
@@ -127,6 +142,8 @@ pub enum Outcome {
     Read(ReadOutcome),
     /// The command was carried out, or refused.
     Write(WriteOutcome),
+    /// A recording goes on.
+    Record(RecordOutcome),
     /// Nothing was read or written.
     Error(Failure),
 }
@@ -139,6 +156,15 @@ impl Outcome {
             _ => "the response does not fit the request; the local socket; restart the gateway".to_string(),
         }
     }
+}
+
+/// A recording that goes on.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RecordOutcome {
+    /// Its id.
+    pub id: String,
+    /// Time until it is complete, s.
+    pub after_s: f64,
 }
 
 /// The points that were asked for.
@@ -237,6 +263,8 @@ pub enum FailureCode {
     UnknownDrive,
     /// The drive has no point of that name.
     UnknownPoint,
+    /// Nothing is recorded.
+    NotRecorded,
     /// The client's port is none of this gateway's.
     OtherGateway,
     /// The gateway owns the client's port and runs with another configuration.

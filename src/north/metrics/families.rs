@@ -7,6 +7,7 @@ use std::time::Instant;
 use super::model::MODEL;
 use super::process;
 use crate::drive::{PollClass, State};
+use crate::history::TriggerKind;
 use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
@@ -74,6 +75,7 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Fa
     drives(plant, now, &mut all);
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
+    recordings(plant, &mut all);
     north(stats, &mut all);
     all.push(build(plant));
     process(&process::read(), &mut all);
@@ -262,6 +264,20 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
         }
     }
     all.push(lost);
+}
+
+fn recordings(plant: &Plant, all: &mut Vec<Family>) {
+    let mut made = Family::new(
+        Kind::Counter,
+        "drivegate_recordings_total",
+        "Recordings made since the start, by what made them.",
+    );
+    let counts = plant.recordings.made();
+    for kind in TriggerKind::ALL {
+        let count = counts.get(&kind).copied().unwrap_or_default();
+        made.add(vec![("trigger", kind.name().to_string())], SeriesValue::Count(count));
+    }
+    all.push(made);
 }
 
 fn north(stats: &NorthStats, all: &mut Vec<Family>) {

@@ -191,6 +191,7 @@ mod tests {
             buses: vec![bus],
             events: Events::default(),
             writes: Arc::new(WriteStats::default()),
+            recordings: Default::default(),
         }
     }
 

@@ -237,6 +237,9 @@ impl Client {
         for topic in topics {
             self.keep(Kind::Event, Message::not_retained(topic, payload.clone()));
         }
+        if let Some((topic, payload)) = payload::recording(&self.topics, event) {
+            self.keep(Kind::Event, Message::not_retained(topic, payload));
+        }
     }
 
     /// Gives a message to the store, and to the outbox if its turn has come.

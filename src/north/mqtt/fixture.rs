@@ -39,6 +39,7 @@ pub(super) fn plant(drives: &[&str]) -> Plant {
         buses: vec![bus],
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     }
 }
 

@@ -296,6 +296,15 @@ pub(super) fn event(topics: &Topics, event: &Event, plant: &Plant) -> (Vec<Strin
     (drives.iter().map(topic).collect(), payload)
 }
 
+/// A recording that was made, if the event tells of one.
+pub(super) fn recording(topics: &Topics, event: &Event) -> Option<(String, Vec<u8>)> {
+    let (drive, made) = (event.drive.as_deref()?, event.recording.as_ref()?);
+    let payload = serde_json::json!({
+        "id": made.id, "time": rfc3339(event.time), "trigger": made.trigger, "summary": made.summary,
+    });
+    Some((topics.drive(drive, "recording"), payload.to_string().into_bytes()))
+}
+
 /// RFC 3339, UTC, milliseconds.
 pub(super) fn rfc3339(time: SystemTime) -> String {
     humantime::format_rfc3339_millis(time).to_string()
@@ -451,6 +460,7 @@ mod tests {
             fault_code: Some(53),
             count: None,
             text: "gone".to_string(),
+            recording: None,
         };
         let plant = super::super::fixture::plant(&["p1", "p2"]);
         let (to, payload) = event(&topics, &object, &plant);
@@ -459,6 +469,18 @@ mod tests {
         let boot = crate::event::boot();
         let expected = serde_json::json!({"id": 4, "boot": boot, "time": "2023-11-14T22:13:20.001Z", "event": "fault_end",
             "bus": "line1", "drive": "p1", "fault_code": 53, "text": "gone"});
+        assert_eq!(payload, expected);
+        assert_eq!(recording(&topics, &object), None);
+        object.recording = Some(crate::event::RecordingMade {
+            id: "20231114T221320.001Z-p1".to_string(),
+            trigger: "fault",
+            summary: "fault 53".to_string(),
+        });
+        let (topic, payload) = recording(&topics, &object).unwrap();
+        assert_eq!(topic, "drivegate/hall/drive/p1/recording");
+        let payload: serde_json::Value = serde_json::from_slice(&payload).unwrap();
+        let expected = serde_json::json!({"id": "20231114T221320.001Z-p1", "time": "2023-11-14T22:13:20.001Z",
+            "trigger": "fault", "summary": "fault 53"});
         assert_eq!(payload, expected);
         object.drive = None;
         let (to, _) = event(&topics, &object, &plant);

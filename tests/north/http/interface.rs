@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 use super::client::{get, raw, request};
 use super::plant::{self, HOLDING, STALE_AFTER, Server};
 
-const PLACES: [&str; 13] = [
+const PLACES: [&str; 14] = [
     "/",
     "/assets/style.css",
     "/assets/page.js",
@@ -30,6 +30,7 @@ const PLACES: [&str; 13] = [
     "/api/v1/drives/pump-1",
     "/api/v1/buses",
     "/api/v1/audit",
+    "/api/v1/recordings",
     "/api/v1/events",
     "/api/v1/trace",
 ];

@@ -149,6 +149,7 @@ pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
         fault_code: (kind == EventKind::Fault).then_some(7),
         count: None,
         text: text.to_string(),
+        recording: None,
     }
 }
 

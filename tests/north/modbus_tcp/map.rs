@@ -69,6 +69,7 @@ fn plant(settings: &Settings) -> Plant {
         buses: buses.collect(),
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     }
 }
 

@@ -449,6 +449,7 @@ impl Gateway {
             fault_code: None,
             count: None,
             text: text.to_string(),
+            recording: None,
         });
         time
     }

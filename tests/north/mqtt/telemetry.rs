@@ -195,6 +195,7 @@ fn bus_events_reach_the_topics_of_its_drives() {
         fault_code: None,
         count: None,
         text: "unplugged".to_string(),
+        recording: None,
     });
     for drive in ["p1", "p2"] {
         let topic = format!("drivegate/hall/drive/{drive}/event");

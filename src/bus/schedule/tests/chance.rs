@@ -51,7 +51,10 @@ fn plan_of(reads: &[(u8, u16)]) -> Plan {
     // As the planner puts them: the fast ones first. Each drive has one.
     reads.push(read(PollClass::Fast, 0, 11));
     reads.sort();
-    Plan { reads }
+    Plan {
+        reads,
+        ..Plan::default()
+    }
 }
 
 const DEADLINE: Duration = Duration::from_millis(110);

@@ -46,6 +46,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         buses: Vec::new(),
         events: Default::default(),
         writes: Default::default(),
+        recordings: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
     let state = ServerState::new(options, stats.clone());

@@ -50,6 +50,7 @@ async fn burst(client: &mut Client, count: usize) {
             fault_code: None,
             count: None,
             text: format!("event {n}"),
+            recording: None,
         });
     }
     let received = client.events.recv().await;
@@ -105,6 +106,7 @@ async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) -> (u64, u64)
             fault_code: None,
             count: Some(1),
             text: format!("refused {n}"),
+            recording: None,
         };
         client.on_event(Ok(Arc::new(event)));
     }

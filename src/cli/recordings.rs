@@ -1,0 +1,182 @@
+//! `drivegate recordings`: what the recorder has kept.
+
+mod show;
+
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, report};
+use crate::config::{Settings, environment};
+use crate::document::nearest;
+use crate::history::{Entry, Recording, export, pcapng, store};
+
+/// Lists, shows and exports recordings.
+///
+/// Reads the files of the gateway, which need not run. A recording is named by its id, or by the path of its file.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  drivegate recordings
+  drivegate recordings show 20260302T074012.118Z-pump-1
+  drivegate recordings export 20260302T074012.118Z-pump-1 --csv > trip.csv
+  drivegate recordings export 20260302T074012.118Z-pump-1 --pcap --output trip.pcapng")]
+pub(super) struct Args {
+    /// Configuration file; its state_dir has the recordings.
+    #[arg(long = "config", value_name = "FILE", default_value = DEFAULT_CONFIG, global = true)]
+    config: PathBuf,
+    /// Directory with recordings, in place of that of the configuration.
+    #[arg(long, value_name = "DIR", global = true)]
+    dir: Option<PathBuf>,
+    #[command(subcommand)]
+    action: Option<Action>,
+}
+
+#[derive(Debug, clap::Subcommand)]
+enum Action {
+    /// Lists the recordings, oldest first.
+    #[command(after_help = "Example:\n  drivegate recordings list --json")]
+    List {
+        /// JSON instead of a table.
+        #[arg(long)]
+        json: bool,
+    },
+    /// Shows a recording.
+    #[command(after_help = "Example:\n  drivegate recordings show 20260302T074012.118Z-pump-1")]
+    Show {
+        /// Id, or path of the file.
+        id: String,
+    },
+    /// Writes a recording in another form.
+    #[command(after_help = "Example:\n  drivegate recordings export 20260302T074012.118Z-pump-1 --csv > trip.csv")]
+    Export(Export),
+}
+
+#[derive(Debug, clap::Args)]
+#[command(group = clap::ArgGroup::new("form").required(true).args(["csv", "json", "pcap"]))]
+struct Export {
+    /// Id, or path of the file.
+    id: String,
+    /// The samples: a line for each, a column for each point.
+    #[arg(long)]
+    csv: bool,
+    /// All of it as one JSON object.
+    #[arg(long)]
+    json: bool,
+    /// The frames of the line as pcapng, each with a comment.
+    #[arg(long)]
+    pcap: bool,
+    /// File to write [default: the standard output].
+    #[arg(long, short, value_name = "FILE")]
+    output: Option<PathBuf>,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    let done = match &args.action {
+        None => list(args, false),
+        Some(Action::List { json }) => list(args, *json),
+        Some(Action::Show { id }) => open(args, id).map(|recording| report::print(&show::text(&recording))),
+        Some(Action::Export(form)) => open(args, &form.id).and_then(|recording| export(form, &recording)),
+    };
+    done.unwrap_or_else(|code| code)
+}
+
+fn failed(message: &str) -> ExitCode {
+    report::error(message);
+    ExitCode::from(EXIT_FAILED)
+}
+
+/// The directory of the recordings.
+fn directory(args: &Args) -> Result<PathBuf, ExitCode> {
+    if let Some(dir) = &args.dir {
+        return Ok(dir.clone());
+    }
+    let loaded = Settings::load(&args.config, environment());
+    report::errors(&loaded.errors);
+    let settings = loaded.settings.ok_or(ExitCode::from(EXIT_CONFIG))?;
+    Ok(settings.recordings.dir)
+}
+
+fn entries(dir: &Path) -> Result<Vec<Entry>, ExitCode> {
+    let unreadable = |error| {
+        failed(&format!(
+            "cannot read the recordings: {error}; {}; use sudo",
+            dir.display()
+        ))
+    };
+    let (entries, faults) = store::list(dir).map_err(unreadable)?;
+    for fault in faults {
+        report::note(&fault.to_string());
+    }
+    Ok(entries)
+}
+
+fn list(args: &Args, json: bool) -> Result<ExitCode, ExitCode> {
+    let dir = directory(args)?;
+    let entries = entries(&dir)?;
+    if json {
+        let text = serde_json::to_string_pretty(&entries).unwrap_or_default();
+        return Ok(report::print(&(text + "\n")));
+    }
+    if entries.is_empty() {
+        report::note(&format!("no recordings in {}", dir.display()));
+        return Ok(ExitCode::SUCCESS);
+    }
+    let mut table = report::table(["id", "trigger", "kB", "summary"]);
+    for entry in entries {
+        table.add_row([
+            entry.id,
+            entry.trigger.name().to_string(),
+            entry.bytes.div_ceil(1000).to_string(),
+            entry.summary,
+        ]);
+    }
+    Ok(report::print(&report::lines(&table)))
+}
+
+fn open(args: &Args, id: &str) -> Result<Recording, ExitCode> {
+    let path = match id.contains('/') || Path::new(id).is_file() {
+        true => PathBuf::from(id),
+        false => {
+            let dir = directory(args)?;
+            let path = store::path_of(&dir, id);
+            if !path.is_file() {
+                return Err(unknown(&dir, id));
+            }
+            path
+        }
+    };
+    let unreadable = |error| failed(&format!("{error}; name a recording of `drivegate recordings list`"));
+    store::read(&path).map_err(unreadable)
+}
+
+fn unknown(dir: &Path, id: &str) -> ExitCode {
+    let entries = match entries(dir) {
+        Ok(entries) => entries,
+        Err(code) => return code,
+    };
+    let remedy = match nearest(id, entries.iter().map(|entry| entry.id.as_str())) {
+        Some(near) => format!("did you mean `{near}`?"),
+        None => "`drivegate recordings list` lists them".to_string(),
+    };
+    failed(&format!("there is no recording `{id}`; {}; {remedy}", dir.display()))
+}
+
+fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
+    let bytes = match form {
+        Export { csv: true, .. } => export::csv(recording).into_bytes(),
+        Export { pcap: true, .. } => pcapng::pcapng(recording),
+        _ => (serde_json::to_string(&export::json(recording)).unwrap_or_default() + "\n").into_bytes(),
+    };
+    match &form.output {
+        None => Ok(report::print_bytes(&bytes)),
+        Some(path) => match fs::write(path, &bytes) {
+            Ok(()) => Ok(ExitCode::SUCCESS),
+            Err(error) => {
+                let path = path.display();
+                Err(failed(&format!(
+                    "cannot write the export: {error}; {path}; name another file"
+                )))
+            }
+        },
+    }
+}

@@ -1,0 +1,31 @@
+//! `[recordings]`: what the recorder keeps.
+
+use std::path::Path;
+
+use super::keys::RECORDINGS;
+use crate::document::{Finding, Reader, parse_size};
+use crate::history::RecorderOptions;
+
+pub(super) fn read(reader: &Reader<'_>, state_dir: &Path) -> RecorderOptions {
+    let options = RecorderOptions {
+        dir: state_dir.join("recordings"),
+        before: RECORDINGS.before.get(reader),
+        after: RECORDINGS.after.get(reader),
+        max_bytes: RECORDINGS.max_bytes.get(reader),
+        max_count: RECORDINGS.max_count.get(reader),
+        warnings: RECORDINGS.warnings.get(reader),
+    };
+    reader.finish();
+    options
+}
+
+/// Size of all recordings, bytes.
+pub(super) fn parse_size_limit(text: &str) -> Result<u64, Finding> {
+    match parse_size(text)? {
+        bytes if ((1 << 20)..=(1 << 40)).contains(&bytes) => Ok(bytes),
+        _ => Err(Finding::new(
+            format!("{text} is out of range"),
+            format!("write {}", RECORDINGS.max_bytes.form.range()),
+        )),
+    }
+}

@@ -1,0 +1,95 @@
+//! The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
+//! time after it; one file a recording.
+//!
+//! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
+//! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
+//! - [`budget`]: how much memory the rings take at most.
+//! - [`assemble`]: the raw words of a ring as points, and what they show in one sentence (`summary`).
+//! - [`recording`]: the form of a file, its parts and its faults; [`export`] and [`pcapng`] turn one into other forms.
+//! - [`store`]: the directory of the recordings; [`retention`] decides which of them go.
+//! - `task`: the two threads: one takes what the buses taped, the other writes files. [`Recordings`] is how the rest of the
+//!   gateway sees them.
+
+pub mod assemble;
+pub mod budget;
+pub mod export;
+pub mod pcapng;
+pub mod recorder;
+pub mod recording;
+pub mod retention;
+mod ring;
+pub mod store;
+mod summary;
+mod task;
+pub mod trigger;
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant, SystemTime};
+
+pub use recorder::{Capture, Recorder};
+pub use recording::{Recording, RecordingError};
+pub use store::{Entry, Store};
+pub use task::{NotRecorded, RecorderTask, Recordings};
+pub use trigger::{Trigger, TriggerKind};
+
+/// What the recorder keeps.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RecorderOptions {
+    /// Directory of the recordings.
+    pub dir: PathBuf,
+    /// Time before the trigger.
+    pub before: Duration,
+    /// Time after it.
+    pub after: Duration,
+    /// Size of all recordings on disk at most, bytes.
+    pub max_bytes: u64,
+    /// Recordings on disk at most; 0: nothing is recorded.
+    pub max_count: usize,
+    /// Whether a warning of a drive makes a recording.
+    pub warnings: bool,
+}
+
+impl RecorderOptions {
+    /// Time that a ring must hold: the whole recording, and what passes until it is taken out.
+    pub(crate) fn window(&self) -> Duration {
+        self.before + self.after + Duration::from_secs(1)
+    }
+}
+
+/// An instant and the time of day at it.
+#[derive(Debug, Clone, Copy)]
+pub struct Clock {
+    /// The instant.
+    pub now: Instant,
+    /// The time of day.
+    pub wall: SystemTime,
+}
+
+impl Clock {
+    /// Both as they are.
+    pub fn read() -> Clock {
+        Clock {
+            now: Instant::now(),
+            wall: SystemTime::now(),
+        }
+    }
+
+    /// The time of day at an instant.
+    pub fn wall_at(&self, at: Instant) -> SystemTime {
+        match self.now.checked_duration_since(at) {
+            Some(ago) => self.wall.checked_sub(ago).unwrap_or(SystemTime::UNIX_EPOCH),
+            None => self.wall + at.saturating_duration_since(self.now),
+        }
+    }
+
+    /// The instant of a time of day.
+    pub fn instant_at(&self, wall: SystemTime) -> Instant {
+        match self.wall.duration_since(wall) {
+            Ok(ago) => self.now.checked_sub(ago).unwrap_or(self.now),
+            Err(ahead) => self.now + ahead.duration(),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,377 @@
+//! The rings of all buses and the recordings under way. Pure: time is an argument, what the buses taped is taken from their
+//! images.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::budget::Budget;
+use super::ring::{Ring, Timed};
+use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
+use super::{Clock, RecorderOptions};
+use crate::drive::Plan;
+use crate::process_image::{BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead};
+
+/// Triggers of a recording that are noted beside the first.
+const MOST_TRIGGERS: usize = 32;
+/// Age at which a value is still good here: a recording shows what was read, whenever that was.
+const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
+
+/// What happened to a drive beside its samples.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Note {
+    /// When.
+    pub at: Instant,
+    /// What.
+    pub body: NoteBody,
+}
+
+/// What happened.
+#[derive(Debug, Clone, PartialEq)]
+pub enum NoteBody {
+    /// An event of the drive or of its bus.
+    Event {
+        /// Kind of the event.
+        kind: &'static str,
+        /// Its text.
+        text: String,
+    },
+    /// A command that was answered.
+    Command {
+        /// Kind of the source.
+        source: &'static str,
+        /// Who.
+        client: String,
+        /// What.
+        command: String,
+        /// The result code.
+        result: &'static str,
+        /// From acceptance to answer.
+        latency: Duration,
+    },
+}
+
+impl Timed for Note {
+    fn at(&self) -> Instant {
+        self.at
+    }
+
+    fn size(&self) -> usize {
+        size_of::<Note>()
+            + match &self.body {
+                NoteBody::Event { text, .. } => text.len(),
+                NoteBody::Command { client, command, .. } => client.len() + command.len(),
+            }
+    }
+}
+
+impl Timed for TapedRead {
+    fn at(&self) -> Instant {
+        self.at
+    }
+
+    fn size(&self) -> usize {
+        TapedRead::size(self)
+    }
+}
+
+impl Timed for TapedFrame {
+    fn at(&self) -> Instant {
+        self.at
+    }
+
+    fn size(&self) -> usize {
+        TapedFrame::size(self)
+    }
+}
+
+/// A drive as its samples tell, with the reads that only a fault asks for.
+pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
+    let Plan { mut reads, on_fault } = Plan::of(&spec.profile);
+    reads.extend(on_fault.iter().copied());
+    let mut snapshot = Snapshot::empty(&Plan { reads, on_fault });
+    // What is not answered is not in the samples, so whatever is there was said.
+    snapshot.link = Link::Online(std::time::SystemTime::UNIX_EPOCH);
+    snapshot
+}
+
+/// How a drive reads at that time, by its samples.
+pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Instant) -> Reading<'d> {
+    Reading {
+        spec,
+        snapshot: snapshot.clone(),
+        now: at,
+        stale_after: ANY_AGE,
+        slow_cycle: Duration::ZERO,
+    }
+}
+
+/// All that a recording is made of.
+#[derive(Debug, Clone)]
+pub struct Capture {
+    /// Its id.
+    pub id: String,
+    /// Time of day and instant that the times of the capture are reckoned by.
+    pub clock: Clock,
+    /// The bus.
+    pub bus: Arc<BusImage>,
+    /// The drive.
+    pub drive: Arc<DriveImage>,
+    /// Why it was made.
+    pub trigger: Trigger,
+    /// What else happened meanwhile that would have made one.
+    pub more: Vec<Trigger>,
+    /// Its beginning and end.
+    pub span: (Instant, Instant),
+    /// What was known of the drive before the first sample.
+    pub base: Arc<Snapshot>,
+    /// What was read, oldest first; from before the span too.
+    pub samples: Vec<TapedRead>,
+    /// Events and commands, oldest first.
+    pub notes: Vec<Note>,
+    /// Frames of the line, oldest first.
+    pub frames: Vec<TapedFrame>,
+    /// Entries that were taped and lost since the gateway started, because nobody took them in time.
+    pub lost: u64,
+}
+
+#[derive(Debug)]
+struct DriveRing {
+    image: Arc<DriveImage>,
+    samples: Ring<TapedRead>,
+    notes: Ring<Note>,
+    /// What was known before the oldest sample, and what is known now.
+    base: Arc<Snapshot>,
+    now: Arc<Snapshot>,
+    watch: Watch,
+    pending: Option<Pending>,
+    /// When the last recording of each kind was begun.
+    last: BTreeMap<TriggerKind, Instant>,
+}
+
+/// A recording that goes on.
+#[derive(Debug)]
+struct Pending {
+    id: String,
+    trigger: Trigger,
+    more: Vec<Trigger>,
+}
+
+#[derive(Debug)]
+struct LineRing {
+    bus: Arc<BusImage>,
+    drives: Vec<DriveRing>,
+    frames: Ring<TapedFrame>,
+    errors: LineErrors,
+    lost: u64,
+}
+
+/// The recorder of a gateway.
+#[derive(Debug)]
+pub struct Recorder {
+    options: RecorderOptions,
+    lines: Vec<LineRing>,
+}
+
+impl Recorder {
+    /// A recorder without buses.
+    pub fn new(options: RecorderOptions) -> Recorder {
+        Recorder {
+            options,
+            lines: Vec::new(),
+        }
+    }
+
+    /// Records these buses from now on. Those that are there already keep their rings; what was recorded of the others ends
+    /// now.
+    pub fn adopt(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
+        let mut captures = Vec::new();
+        let (kept, gone): (Vec<_>, Vec<_>) = std::mem::take(&mut self.lines)
+            .into_iter()
+            .partition(|line| buses.iter().any(|bus| Arc::ptr_eq(bus, &line.bus)));
+        self.lines = kept;
+        for mut line in gone {
+            line.take_in(&self.options, clock);
+            line.bus.tape.switch(false);
+            captures.extend(line.ended(&self.options, clock, true));
+        }
+        for bus in buses {
+            if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
+                self.lines.push(LineRing::new(bus, &self.options));
+                bus.tape.switch(true);
+            }
+        }
+        captures
+    }
+
+    /// Notes what happened to a drive, or to a whole bus.
+    pub fn note(&mut self, bus: &str, drive: Option<&str>, note: &Note) {
+        let lines = self.lines.iter_mut().filter(|line| line.bus.spec.name == bus);
+        let drives = lines.flat_map(|line| &mut line.drives);
+        for ring in drives.filter(|ring| drive.is_none_or(|name| ring.image.spec.name == name)) {
+            ring.notes.push(note.clone(), drop);
+        }
+    }
+
+    /// The drive of that name and its bus.
+    pub fn drive(&self, name: &str) -> Option<(Arc<BusImage>, Arc<DriveImage>)> {
+        self.lines.iter().find_map(|line| {
+            let ring = line.drives.iter().find(|ring| ring.image.spec.name == name)?;
+            Some((line.bus.clone(), ring.image.clone()))
+        })
+    }
+
+    /// Begins a recording of a drive, or notes the trigger in the one that goes on. Its id; none where there is no such drive,
+    /// or where the drive had one of that kind a moment ago.
+    pub fn trigger(&mut self, drive: &str, trigger: Trigger, clock: Clock) -> Option<String> {
+        let mut drives = self.lines.iter_mut().flat_map(|line| &mut line.drives);
+        drives
+            .find(|ring| ring.image.spec.name == drive)?
+            .trigger(trigger, clock)
+    }
+
+    /// Takes in what the buses have taped; the recordings that are complete at `clock.now`.
+    pub fn tick(&mut self, clock: Clock) -> Vec<Capture> {
+        let mut captures = Vec::new();
+        for line in &mut self.lines {
+            line.take_in(&self.options, clock);
+            captures.extend(line.ended(&self.options, clock, false));
+        }
+        captures
+    }
+
+    /// Ends all recordings now; the tapes stop.
+    pub fn end(&mut self, clock: Clock) -> Vec<Capture> {
+        let captures = self.tick(clock);
+        captures.into_iter().chain(self.adopt(&[], clock)).collect()
+    }
+}
+
+impl LineRing {
+    fn new(bus: &Arc<BusImage>, options: &RecorderOptions) -> LineRing {
+        let specs: Vec<DriveSpec> = bus.drives.iter().map(|drive| drive.spec.clone()).collect();
+        let budget = Budget::of(&bus.spec, &specs, options);
+        let window = options.window();
+        let ring = |(image, samples): (&Arc<DriveImage>, &usize)| {
+            let base = Arc::new(empty_snapshot(&image.spec));
+            DriveRing {
+                image: image.clone(),
+                samples: Ring::new(*samples, window),
+                notes: Ring::new(budget.notes, window),
+                now: base.clone(),
+                base,
+                watch: Watch::default(),
+                pending: None,
+                last: BTreeMap::new(),
+            }
+        };
+        LineRing {
+            drives: bus.drives.iter().zip(&budget.samples).map(ring).collect(),
+            frames: Ring::new(budget.frames, window),
+            errors: LineErrors::default(),
+            lost: 0,
+            bus: bus.clone(),
+        }
+    }
+
+    fn take_in(&mut self, options: &RecorderOptions, clock: Clock) {
+        let (entries, lost) = self.bus.tape.take();
+        self.lost += lost;
+        for entry in entries {
+            match entry {
+                Taped::Read(index, read) => {
+                    if let Some(drive) = self.drives.get_mut(index)
+                        && let Some(trigger) = drive.read(read, options.warnings)
+                    {
+                        drive.trigger(trigger, clock);
+                    }
+                }
+                Taped::Frame(frame) => {
+                    let failed = frame.drive.filter(|_| frame.verdict.is_error());
+                    let burst = failed.filter(|drive| self.answers(*drive));
+                    let burst = burst.and_then(|drive| self.errors.note(frame.at, drive));
+                    self.frames.push(frame, drop);
+                    if let Some((drive, trigger)) = burst
+                        && let Some(drive) = self.drives.get_mut(drive)
+                    {
+                        drive.trigger(trigger, clock);
+                    }
+                }
+            }
+        }
+    }
+
+    fn answers(&self, drive: usize) -> bool {
+        let ring = self.drives.get(drive);
+        ring.is_some_and(|ring| ring.image.snapshot().link.is_online())
+    }
+
+    /// The recordings that are complete, or all of them.
+    fn ended(&mut self, options: &RecorderOptions, clock: Clock, all: bool) -> Vec<Capture> {
+        let mut captures = Vec::new();
+        for ring in &mut self.drives {
+            let complete = |pending: &mut Pending| all || clock.now > pending.trigger.at + options.after;
+            let Some(Pending { id, trigger, more }) = ring.pending.take_if(complete) else {
+                continue;
+            };
+            let from = trigger.at.checked_sub(options.before).unwrap_or(trigger.at);
+            let to = (trigger.at + options.after).min(clock.now);
+            let within = |at: Instant| at >= from && at <= to;
+            captures.push(Capture {
+                id,
+                clock,
+                bus: self.bus.clone(),
+                drive: ring.image.clone(),
+                trigger,
+                more,
+                span: (from, to),
+                base: ring.base.clone(),
+                samples: ring.samples.iter().filter(|sample| sample.at <= to).cloned().collect(),
+                notes: ring.notes.iter().filter(|note| within(note.at)).cloned().collect(),
+                frames: self.frames.iter().filter(|frame| within(frame.at)).cloned().collect(),
+                lost: self.lost,
+            });
+        }
+        captures
+    }
+}
+
+impl DriveRing {
+    fn read(&mut self, read: TapedRead, warnings: bool) -> Option<Trigger> {
+        let at = read.at;
+        Arc::make_mut(&mut self.now).store(read.table, read.start, &read.words, at);
+        let base = &mut self.base;
+        self.samples.push(read, |gone| {
+            Arc::make_mut(base).store(gone.table, gone.start, &gone.words, gone.at);
+        });
+        self.watch.look(&reading(&self.image.spec, &self.now, at), at, warnings)
+    }
+
+    fn trigger(&mut self, trigger: Trigger, clock: Clock) -> Option<String> {
+        if let Some(pending) = &mut self.pending {
+            if pending.more.len() < MOST_TRIGGERS {
+                pending.more.push(trigger);
+            }
+            return Some(pending.id.clone());
+        }
+        // A drive that was never there is not lost.
+        if trigger.kind == TriggerKind::Lost && self.samples.iter().next().is_none() {
+            return None;
+        }
+        let pause = trigger.kind.pause();
+        let last = self.last.get(&trigger.kind);
+        if last.is_some_and(|last| trigger.at.saturating_duration_since(*last) < pause) {
+            return None;
+        }
+        self.last.insert(trigger.kind, trigger.at);
+        let time = humantime::format_rfc3339_millis(clock.wall_at(trigger.at)).to_string();
+        let time: String = time.chars().filter(|c| !matches!(c, '-' | ':')).collect();
+        let id = format!("{time}-{}", self.image.spec.name);
+        self.pending = Some(Pending {
+            id: id.clone(),
+            trigger,
+            more: Vec::new(),
+        });
+        Some(id)
+    }
+}

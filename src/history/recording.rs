@@ -1,0 +1,371 @@
+//! A recording and the form of its file (`docs/recordings.md`): a JSON object a line, the header first, the end last. Pure.
+
+use std::collections::BTreeMap;
+
+use serde::{Deserialize, Serialize};
+use serde_json::Value as Json;
+
+use super::trigger::TriggerKind;
+use crate::codec::Table;
+use crate::codec::checksum::crc16;
+use crate::process_image::Verdict;
+
+/// Version of the form.
+pub const VERSION: u32 = 1;
+/// Ending of the files.
+pub const ENDING: &str = "dgrec";
+
+/// What a recording is of, and what it shows in short.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Header {
+    /// [`VERSION`]; its presence tells that the file is a recording.
+    pub drivegate_recording: u32,
+    /// Its id: time of the trigger and the drive.
+    pub id: String,
+    /// Time of the trigger, RFC 3339 with microseconds, UTC. All times below are seconds from it.
+    pub time: String,
+    /// What made it.
+    pub trigger: TriggerKind,
+    /// What it shows, in one sentence.
+    pub summary: String,
+    /// It is among the first of a storm of recordings, which are kept longer.
+    pub first: bool,
+    /// What else happened meanwhile that would have made a recording.
+    pub more: Vec<Further>,
+    /// The drive.
+    pub drive: Drive,
+    /// Its bus.
+    pub bus: Bus,
+    /// Beginning and end.
+    pub from: f64,
+    /// See `from`.
+    pub to: f64,
+    /// The points, in the order of `values` here.
+    pub points: Vec<Column>,
+    /// What was known at the trigger, whenever it was read.
+    pub values: Vec<Json>,
+    /// The reads that the samples are of.
+    pub reads: Vec<Read>,
+    /// Entries that the recorder could not take in time since the gateway started; 0 on a sound machine.
+    pub lost: u64,
+}
+
+/// A further trigger.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Further {
+    /// When.
+    pub t: f64,
+    /// What.
+    pub trigger: TriggerKind,
+    /// In words.
+    pub text: String,
+}
+
+/// The drive of a recording.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Drive {
+    /// Name.
+    pub name: String,
+    /// Address on the bus.
+    pub address: u8,
+    /// Name of its profile.
+    pub profile: String,
+}
+
+/// The bus of a recording.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Bus {
+    /// Name.
+    pub name: String,
+    /// Protocol.
+    pub protocol: String,
+    /// Baud rate and character format.
+    pub format: String,
+    /// Names of its drives; frames name one by its place here.
+    pub drives: Vec<String>,
+}
+
+/// A point.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Column {
+    /// Name.
+    pub name: String,
+    /// Unit; empty for states and codes.
+    pub unit: String,
+}
+
+/// A read that samples are of.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Read {
+    /// Table.
+    pub table: Table,
+    /// First PDU address.
+    pub start: u16,
+    /// Items.
+    pub count: u16,
+    /// The points that it shows, by their places in the header.
+    pub points: Vec<usize>,
+}
+
+/// The values of one read.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Sample {
+    /// When it was read.
+    pub t: f64,
+    /// Place of the read in the header.
+    pub read: usize,
+    /// A value for each point of the read; null where it is none.
+    pub values: Vec<Json>,
+}
+
+/// An event.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EventNote {
+    /// When.
+    pub t: f64,
+    /// Kind.
+    pub event: String,
+    /// In words.
+    pub text: String,
+}
+
+/// A command that was answered.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct CommandNote {
+    /// When it was answered.
+    pub t: f64,
+    /// Kind of the source.
+    pub source: String,
+    /// Who.
+    pub client: String,
+    /// What.
+    pub command: String,
+    /// Result code.
+    pub result: String,
+    /// From acceptance to answer, ms.
+    pub latency_ms: f64,
+}
+
+/// Bytes on the line.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Frame {
+    /// A request: when it was given to the port. Else when the last of it came.
+    pub t: f64,
+    /// Place of the drive that was asked.
+    pub drive: Option<usize>,
+    /// What it was.
+    pub verdict: Verdict,
+    /// The bytes, two hexadecimal digits each.
+    pub hex: String,
+}
+
+/// A line of the file after the header.
+#[derive(Debug, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Line {
+    Sample(Sample),
+    Event(EventNote),
+    Command(CommandNote),
+    Frame(Frame),
+    End(End),
+}
+
+/// The last line.
+#[derive(Debug, Serialize, Deserialize)]
+struct End {
+    /// Lines before this one.
+    lines: usize,
+    /// CRC-16 (of Modbus) of all bytes before this line.
+    check: String,
+}
+
+/// A recording.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Recording {
+    /// What it is of.
+    pub header: Header,
+    /// What was read, oldest first.
+    pub samples: Vec<Sample>,
+    /// Events, oldest first.
+    pub events: Vec<EventNote>,
+    /// Commands, oldest first.
+    pub commands: Vec<CommandNote>,
+    /// Frames of the line, oldest first.
+    pub frames: Vec<Frame>,
+}
+
+/// Why bytes are no recording.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{what}, at byte {offset}")]
+pub struct RecordingError {
+    /// Offset of the fault in the file.
+    pub offset: usize,
+    /// The fault.
+    pub what: String,
+}
+
+fn fault(offset: usize, what: impl Into<String>) -> RecordingError {
+    let what = what.into();
+    RecordingError { offset, what }
+}
+
+impl Header {
+    /// Reads the header of a file from its beginning, and where the next line begins.
+    ///
+    /// # Errors
+    /// The bytes do not begin with a header of this version.
+    pub fn parse(bytes: &[u8]) -> Result<(Header, usize), RecordingError> {
+        let end = bytes.iter().position(|byte| *byte == b'\n');
+        let line = bytes.get(..end.unwrap_or(bytes.len())).unwrap_or_default();
+        let value: BTreeMap<String, Json> = match serde_json::from_slice(line) {
+            Ok(value) => value,
+            Err(_) if end.is_none() && line.starts_with(b"{\"drivegate_recording\":") => {
+                return Err(fault(bytes.len(), "the file ends within its header: it is cut short"));
+            }
+            Err(error) if line.starts_with(b"{\"drivegate_recording\":") => {
+                return Err(fault(error.column(), format!("the header is damaged ({error})")));
+            }
+            Err(_) => return Err(fault(0, "this is not a recording of drivegate")),
+        };
+        match value.get("drivegate_recording").and_then(Json::as_u64) {
+            None => return Err(fault(0, "this is not a recording of drivegate")),
+            Some(version) if version != u64::from(VERSION) => {
+                let what = format!("the recording has version {version}, this program reads version {VERSION}");
+                return Err(fault(0, what));
+            }
+            Some(_) => {}
+        }
+        let header = serde_json::from_slice(line)
+            .map_err(|error| fault(error.column(), format!("the header is damaged ({error})")))?;
+        match end {
+            Some(end) => Ok((header, end + 1)),
+            None => Err(fault(bytes.len(), "the file ends after its header: it is cut short")),
+        }
+    }
+}
+
+impl Recording {
+    /// The bytes of its file.
+    pub fn to_bytes(&self) -> Vec<u8> {
+        let mut bytes = Vec::with_capacity(128 * (self.samples.len() + self.frames.len()) + 4096);
+        add(&mut bytes, &self.header);
+        let events = self.events.iter().cloned().map(Line::Event);
+        let commands = self.commands.iter().cloned().map(Line::Command);
+        let samples = self.samples.iter().cloned().map(Line::Sample);
+        let frames = self.frames.iter().cloned().map(Line::Frame);
+        let mut lines = 1;
+        for line in events.chain(commands).chain(samples).chain(frames) {
+            add(&mut bytes, &line);
+            lines += 1;
+        }
+        let check = format!("{:04X}", crc16(&bytes));
+        add(&mut bytes, &Line::End(End { lines, check }));
+        bytes
+    }
+
+    /// Reads the bytes of a file.
+    ///
+    /// # Errors
+    /// They are no whole, sound recording of this version: what is wrong, and where.
+    pub fn parse(bytes: &[u8]) -> Result<Recording, RecordingError> {
+        let (header, mut offset) = Header::parse(bytes)?;
+        let mut recording = Recording {
+            header,
+            samples: Vec::new(),
+            events: Vec::new(),
+            commands: Vec::new(),
+            frames: Vec::new(),
+        };
+        let mut lines = 1;
+        loop {
+            let rest = bytes.get(offset..).unwrap_or_default();
+            let Some(length) = rest.iter().position(|byte| *byte == b'\n') else {
+                return Err(fault(bytes.len(), "the file has no end line: it is cut short"));
+            };
+            let text = rest.get(..length).unwrap_or_default();
+            let line: Line = serde_json::from_slice(text)
+                .map_err(|error| fault(offset + error.column(), format!("the line is damaged ({error})")))?;
+            match line {
+                Line::Sample(sample) => {
+                    let read = recording.header.reads.get(sample.read);
+                    if read.is_none_or(|read| read.points.len() != sample.values.len()) {
+                        return Err(fault(offset, "the sample does not fit the reads of the header"));
+                    }
+                    recording.samples.push(sample);
+                }
+                Line::Event(event) => recording.events.push(event),
+                Line::Command(command) => recording.commands.push(command),
+                Line::Frame(frame) => {
+                    if bytes_of(&frame.hex).is_none() {
+                        return Err(fault(offset, "the bytes of the frame are not hexadecimal"));
+                    }
+                    recording.frames.push(frame);
+                }
+                Line::End(end) => {
+                    recording.check_end(bytes, offset, lines, &end)?;
+                    let after = offset + length + 1;
+                    return match bytes.len() {
+                        all if all > after => Err(fault(after, "something follows the end line")),
+                        _ => Ok(recording),
+                    };
+                }
+            }
+            lines += 1;
+            offset += length + 1;
+        }
+    }
+
+    fn check_end(&self, bytes: &[u8], offset: usize, lines: usize, end: &End) -> Result<(), RecordingError> {
+        if end.lines != lines {
+            return Err(fault(
+                offset,
+                format!("{lines} lines instead of {}: some are missing", end.lines),
+            ));
+        }
+        let check = format!("{:04X}", crc16(bytes.get(..offset).unwrap_or_default()));
+        if end.check != check {
+            let what = format!("the check code of what is before is {check} instead of {}", end.check);
+            return Err(fault(offset, what));
+        }
+        let places = self.header.reads.iter().flat_map(|read| &read.points);
+        if places.max().is_some_and(|place| *place >= self.header.points.len()) {
+            return Err(fault(0, "a read of the header names a point that is not there"));
+        }
+        Ok(())
+    }
+
+    /// The values of a point with their times, as they were read.
+    pub fn values_of(&self, point: &str) -> Vec<(f64, &Json)> {
+        let Some(place) = self.header.points.iter().position(|column| column.name == point) else {
+            return Vec::new();
+        };
+        let value = |sample: &'_ Sample| -> Option<usize> {
+            let read = self.header.reads.get(sample.read)?;
+            read.points.iter().position(|of| *of == place)
+        };
+        let samples = self.samples.iter();
+        samples
+            .filter_map(|sample| Some((sample.t, sample.values.get(value(sample)?)?)))
+            .collect()
+    }
+}
+
+fn add(bytes: &mut Vec<u8>, line: &impl Serialize) {
+    // Strings and numbers can always be written to memory.
+    let _ = serde_json::to_writer(&mut *bytes, line);
+    bytes.push(b'\n');
+}
+
+/// Two hexadecimal digits for each byte.
+pub(super) fn hex(bytes: &[u8]) -> String {
+    bytes.iter().map(|byte| format!("{byte:02X}")).collect()
+}
+
+/// The bytes of hexadecimal digits.
+pub(super) fn bytes_of(hex: &str) -> Option<Vec<u8>> {
+    if !hex.is_ascii() || !hex.len().is_multiple_of(2) {
+        return None;
+    }
+    let pairs = (0..hex.len()).step_by(2).map(|at| hex.get(at..at + 2));
+    pairs.map(|pair| u8::from_str_radix(pair?, 16).ok()).collect()
+}

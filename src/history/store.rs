@@ -1,0 +1,262 @@
+//! The directory of the recordings. A file is written aside, synced and renamed, so that there are only whole ones.
+
+use std::fs::{self, File};
+use std::io::{self, Read as _, Write as _};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::SystemTime;
+
+use serde::Serialize;
+
+use super::RecorderOptions;
+use super::recording::{ENDING, Header, Recording, RecordingError};
+use super::retention::{Kept, Storm, surplus};
+use super::trigger::TriggerKind;
+
+/// Ending of files that are being written.
+const PARTIAL: &str = "partial";
+/// Longest header that is looked for when a directory is listed.
+const MOST_HEADER: u64 = 1 << 20;
+/// Largest file that is read.
+const MOST_BYTES: u64 = 1 << 30;
+
+/// A recording in short.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Entry {
+    /// Its id.
+    pub id: String,
+    /// Time of the trigger, RFC 3339.
+    pub time: String,
+    /// The drive.
+    pub drive: String,
+    /// Its bus.
+    pub bus: String,
+    /// What made it.
+    pub trigger: TriggerKind,
+    /// What it shows.
+    pub summary: String,
+    /// Size of its file.
+    pub bytes: u64,
+    #[serde(skip)]
+    first: bool,
+}
+
+impl Entry {
+    fn new(header: &Header, bytes: u64) -> Entry {
+        Entry {
+            id: header.id.clone(),
+            time: header.time.clone(),
+            drive: header.drive.name.clone(),
+            bus: header.bus.name.clone(),
+            trigger: header.trigger,
+            summary: header.summary.clone(),
+            bytes,
+            first: header.first,
+        }
+    }
+}
+
+/// Why a recording cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The file cannot be read.
+    #[error("cannot read {path}: {error}")]
+    File {
+        /// The file.
+        path: String,
+        /// Why not.
+        error: io::Error,
+    },
+    /// Its content is not a recording.
+    #[error("{path}: {error}")]
+    Content {
+        /// The file.
+        path: String,
+        /// The fault and its place.
+        error: RecordingError,
+    },
+}
+
+/// Reads a recording.
+///
+/// # Errors
+/// The file cannot be read, or it is none.
+pub fn read(path: &Path) -> Result<Recording, ReadError> {
+    let failed = |error| ReadError::File {
+        path: path.display().to_string(),
+        error,
+    };
+    let file = File::open(path).map_err(failed)?;
+    let mut bytes = Vec::new();
+    file.take(MOST_BYTES).read_to_end(&mut bytes).map_err(failed)?;
+    Recording::parse(&bytes).map_err(|error| ReadError::Content {
+        path: path.display().to_string(),
+        error,
+    })
+}
+
+/// The recordings of a directory, oldest first, and what is wrong with the others.
+///
+/// # Errors
+/// The directory cannot be read; one that there is not has no recordings.
+pub fn list(dir: &Path) -> io::Result<(Vec<Entry>, Vec<ReadError>)> {
+    let files = match fs::read_dir(dir) {
+        Ok(files) => files,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok((Vec::new(), Vec::new())),
+        Err(error) => return Err(error),
+    };
+    let (mut entries, mut faults) = (Vec::new(), Vec::new());
+    for file in files {
+        let path = file?.path();
+        if path.extension().is_none_or(|ending| ending != ENDING) {
+            continue;
+        }
+        match entry(&path) {
+            Ok(entry) => entries.push(entry),
+            Err(error) => faults.push(error),
+        }
+    }
+    entries.sort_by(|a: &Entry, b: &Entry| (&a.time, &a.id).cmp(&(&b.time, &b.id)));
+    Ok((entries, faults))
+}
+
+fn entry(path: &Path) -> Result<Entry, ReadError> {
+    let failed = |error| ReadError::File {
+        path: path.display().to_string(),
+        error,
+    };
+    let file = File::open(path).map_err(failed)?;
+    let size = file.metadata().map_err(failed)?.len();
+    let mut bytes = Vec::new();
+    file.take(MOST_HEADER).read_to_end(&mut bytes).map_err(failed)?;
+    let header = Header::parse(&bytes).map_err(|error| ReadError::Content {
+        path: path.display().to_string(),
+        error,
+    })?;
+    Ok(Entry::new(&header.0, size))
+}
+
+/// The file of a recording.
+pub fn path_of(dir: &Path, id: &str) -> PathBuf {
+    dir.join(format!("{id}.{ENDING}"))
+}
+
+/// The directory with what is in it.
+#[derive(Debug)]
+pub struct Store {
+    dir: PathBuf,
+    max_bytes: u64,
+    max_count: usize,
+    storm: Storm,
+    entries: Vec<Arc<Entry>>,
+}
+
+impl Store {
+    /// Looks at the directory, and removes what was not written to its end.
+    pub fn open(options: &RecorderOptions) -> Store {
+        let (entries, faults) = list(&options.dir).unwrap_or_default();
+        for fault in faults {
+            tracing::warn!(target: "drivegate::history", "{fault}; it is left alone");
+        }
+        let mut storm = Storm::default();
+        for entry in &entries {
+            if let Ok(time) = humantime::parse_rfc3339(&entry.time) {
+                storm.is_first(time);
+            }
+        }
+        let files = fs::read_dir(&options.dir).into_iter().flatten().flatten();
+        for path in files.map(|file| file.path()) {
+            if path.extension().is_some_and(|ending| ending == PARTIAL) {
+                // Another try follows at the next start.
+                let _ = fs::remove_file(path);
+            }
+        }
+        Store {
+            dir: options.dir.clone(),
+            max_bytes: options.max_bytes,
+            max_count: options.max_count,
+            storm,
+            entries: entries.into_iter().map(Arc::new).collect(),
+        }
+    }
+
+    /// Where they are.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// What is there, oldest first.
+    pub fn entries(&self) -> &[Arc<Entry>] {
+        &self.entries
+    }
+
+    /// Writes a recording, then removes those that have to go for it.
+    ///
+    /// # Errors
+    /// It cannot be written, or is greater than all may be together; nothing of it is left then.
+    pub fn write(&mut self, recording: &mut Recording) -> io::Result<Arc<Entry>> {
+        let time = humantime::parse_rfc3339(&recording.header.time).unwrap_or(SystemTime::UNIX_EPOCH);
+        recording.header.first = self.storm.is_first(time);
+        let id = recording.header.id.clone();
+        let taken = |id: &str| self.entries.iter().any(|entry| entry.id == id);
+        // Only after the clock was set back.
+        let mut others = (2..).map(|n| format!("{id}-{n}")).filter(|id| !taken(id));
+        if taken(&id) {
+            recording.header.id = others.next().unwrap_or(id);
+        }
+        let bytes = recording.to_bytes();
+        let size = bytes.len() as u64;
+        if size > self.max_bytes {
+            let what = format!(
+                "it has {size} bytes, and max_bytes of [recordings] is {}",
+                self.max_bytes
+            );
+            return Err(io::Error::new(io::ErrorKind::FileTooLarge, what));
+        }
+        let path = path_of(&self.dir, &recording.header.id);
+        let aside = path.with_extension(PARTIAL);
+        let written = self
+            .write_aside(&aside, &bytes)
+            .and_then(|()| fs::rename(&aside, &path));
+        if let Err(error) = written {
+            // It may not have been created at all.
+            let _ = fs::remove_file(&aside);
+            return Err(error);
+        }
+        // The rename is on disk when the directory is; without that only the newest name is at stake.
+        let _ = File::open(&self.dir).and_then(|dir| dir.sync_all());
+        let entry = Arc::new(Entry::new(&recording.header, size));
+        let at = self
+            .entries
+            .partition_point(|other| (&other.time, &other.id) <= (&entry.time, &entry.id));
+        self.entries.insert(at, entry.clone());
+        self.make_room();
+        Ok(entry)
+    }
+
+    fn write_aside(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
+        fs::create_dir_all(&self.dir)?;
+        let mut file = File::create(path)?;
+        file.write_all(bytes)?;
+        file.sync_all()
+    }
+
+    fn make_room(&mut self) {
+        let kept = |entry: &Arc<Entry>| Kept {
+            bytes: entry.bytes,
+            first: entry.first,
+        };
+        let all: Vec<Kept> = self.entries.iter().map(kept).collect();
+        let mut gone = surplus(&all, self.max_bytes, self.max_count);
+        gone.sort_unstable();
+        for place in gone.into_iter().rev() {
+            let entry = self.entries.remove(place);
+            let path = path_of(&self.dir, &entry.id);
+            if let Err(error) = fs::remove_file(&path)
+                && error.kind() != io::ErrorKind::NotFound
+            {
+                tracing::warn!(target: "drivegate::history", "cannot remove {}: {error}; remove it", path.display());
+            }
+        }
+    }
+}

@@ -1,0 +1,374 @@
+//! The recorder at work: a thread that takes what the buses taped, and one that writes files. A slow disk holds up neither the
+//! buses nor the rings.
+
+use std::collections::BTreeMap;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
+use std::sync::{Arc, Mutex, PoisonError};
+use std::thread::JoinHandle;
+use std::time::Duration;
+
+use tokio::sync::broadcast::error::TryRecvError;
+use tokio::sync::{broadcast, oneshot};
+
+use super::assemble::assemble;
+use super::recorder::{Capture, Note, NoteBody, Recorder};
+use super::store::{self, Entry, ReadError, Store};
+use super::trigger::{Trigger, TriggerKind, is_refused_stop};
+use super::{Clock, RecorderOptions, Recording};
+use crate::command::{AuditRecord, WriteStats};
+use crate::event::{Event, EventKind, Events, RecordingMade};
+use crate::process_image::BusImage;
+
+/// What the buses taped is taken at this interval.
+const TICK: Duration = Duration::from_millis(100);
+/// Recordings that wait for the disk at most.
+const WAITING: usize = 64;
+/// Characters of a text of a client that are kept.
+const MOST_TEXT: usize = 300;
+
+/// Why no recording was begun.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum NotRecorded {
+    /// The recorder is off.
+    #[error("the recorder is off (max_count of [recordings] is 0)")]
+    Off,
+    /// There is no such drive.
+    #[error("there is no drive `{0}`")]
+    UnknownDrive(String),
+}
+
+enum Control {
+    Buses(Vec<Arc<BusImage>>),
+    Record(String, String, oneshot::Sender<Option<String>>),
+    Stop,
+}
+
+/// The recordings, as the rest of the gateway sees them.
+#[derive(Debug, Default)]
+pub struct Recordings {
+    shared: Mutex<Shared>,
+}
+
+#[derive(Debug, Default)]
+struct Shared {
+    options: Option<RecorderOptions>,
+    control: Option<Sender<Control>>,
+    entries: Vec<Arc<Entry>>,
+    made: BTreeMap<TriggerKind, u64>,
+}
+
+impl Recordings {
+    fn shared(&self) -> std::sync::MutexGuard<'_, Shared> {
+        self.shared.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
+    /// What is on disk, oldest first.
+    pub fn list(&self) -> Vec<Arc<Entry>> {
+        self.shared().entries.clone()
+    }
+
+    /// Recordings made since the gateway started, by what made them.
+    pub fn made(&self) -> BTreeMap<TriggerKind, u64> {
+        self.shared().made.clone()
+    }
+
+    /// Reads a recording; none where there is no such one. Takes the time that the disk takes.
+    ///
+    /// # Errors
+    /// Its file cannot be read.
+    pub fn read(&self, id: &str) -> Option<Result<Recording, ReadError>> {
+        let path = {
+            let shared = self.shared();
+            let known = shared.entries.iter().any(|entry| entry.id == id);
+            shared
+                .options
+                .as_ref()
+                .filter(|_| known)
+                .map(|options| store::path_of(&options.dir, id))
+        };
+        path.map(|path| store::read(&path))
+    }
+
+    /// Begins a recording of a drive because `who` asks for it. Its id, and the time after which it is complete.
+    ///
+    /// # Errors
+    /// The recorder is off, or there is no such drive.
+    pub async fn record(&self, drive: &str, who: &str) -> Result<(String, Duration), NotRecorded> {
+        let (reply, begun) = oneshot::channel();
+        let after = {
+            let shared = self.shared();
+            let (Some(control), Some(options)) = (&shared.control, &shared.options) else {
+                return Err(NotRecorded::Off);
+            };
+            // A recorder that has ended drops the reply.
+            let _ = control.send(Control::Record(drive.to_string(), who.to_string(), reply));
+            options.after
+        };
+        match begun.await {
+            Ok(Some(id)) => Ok((id, after)),
+            Ok(None) => Err(NotRecorded::UnknownDrive(drive.to_string())),
+            Err(_) => Err(NotRecorded::Off),
+        }
+    }
+}
+
+/// The recorder of a gateway, at work.
+#[derive(Debug)]
+pub struct RecorderTask {
+    recordings: Arc<Recordings>,
+    control: Sender<Control>,
+    threads: Vec<JoinHandle<()>>,
+}
+
+impl RecorderTask {
+    /// Starts the threads. Nothing is recorded before [`RecorderTask::adopt`].
+    ///
+    /// # Errors
+    /// The system gives no thread.
+    pub fn start(
+        options: RecorderOptions,
+        recordings: Arc<Recordings>,
+        events: Events,
+        writes: &Arc<WriteStats>,
+    ) -> std::io::Result<RecorderTask> {
+        let (control, orders) = channel();
+        let (captures, waiting) = sync_channel(WAITING);
+        let store = Store::open(&options);
+        {
+            let mut shared = recordings.shared();
+            shared.entries = store.entries().to_vec();
+            shared.control = Some(control.clone());
+            shared.options = Some(options.clone());
+        }
+        let writer = Writer {
+            store,
+            recordings: recordings.clone(),
+            events: events.clone(),
+            failing: false,
+        };
+        let taker = Taker {
+            recorder: Recorder::new(options),
+            events: events.clone(),
+            heard: events.subscribe(),
+            commands: writes.audit().subscribe(),
+            captures,
+            left_out: 0,
+        };
+        let thread = |name: &str| std::thread::Builder::new().name(name.to_string());
+        let writer = thread("recordings").spawn(move || writer.run(&waiting))?;
+        let taker = thread("recorder").spawn(move || taker.run(&orders))?;
+        Ok(RecorderTask {
+            recordings,
+            control,
+            threads: vec![taker, writer],
+        })
+    }
+
+    /// Records these buses from now on.
+    pub fn adopt(&self, buses: Vec<Arc<BusImage>>) {
+        // The thread only ends when this is stopped.
+        let _ = self.control.send(Control::Buses(buses));
+    }
+
+    /// Ends what is being recorded, and waits until it is on disk.
+    pub fn stop(self) {
+        let _ = self.control.send(Control::Stop);
+        for thread in self.threads {
+            if thread.join().is_err() {
+                tracing::error!(target: "drivegate::history", "a thread of the recorder panicked; report this");
+            }
+        }
+        let mut shared = self.recordings.shared();
+        (shared.control, shared.options) = (None, None);
+    }
+}
+
+/// Takes what the buses taped.
+struct Taker {
+    recorder: Recorder,
+    events: Events,
+    heard: broadcast::Receiver<Arc<Event>>,
+    commands: broadcast::Receiver<Arc<AuditRecord>>,
+    captures: SyncSender<Capture>,
+    /// Recordings that the writer had no room for, since it was last reported.
+    left_out: u64,
+}
+
+impl Taker {
+    fn run(mut self, orders: &Receiver<Control>) {
+        loop {
+            let order = orders.recv_timeout(TICK);
+            let clock = Clock::read();
+            // What was taped before an order belongs before it.
+            self.take_notes(clock);
+            let mut captures = self.recorder.tick(clock);
+            match order {
+                Ok(Control::Buses(buses)) => captures.extend(self.recorder.adopt(&buses, clock)),
+                Ok(Control::Record(drive, who, reply)) => {
+                    let trigger = Trigger {
+                        kind: TriggerKind::Command,
+                        at: clock.now,
+                        text: format!("asked for by {who}"),
+                    };
+                    // The client may have gone.
+                    let _ = reply.send(self.recorder.trigger(&drive, trigger, clock));
+                }
+                Ok(Control::Stop) | Err(RecvTimeoutError::Disconnected) => {
+                    for capture in self.recorder.end(clock) {
+                        // The writer ends after this thread.
+                        let _ = self.captures.send(capture);
+                    }
+                    return;
+                }
+                Err(RecvTimeoutError::Timeout) => {}
+            }
+            for capture in captures {
+                self.hand_over(capture);
+            }
+            self.report_left_out();
+        }
+    }
+
+    fn hand_over(&mut self, capture: Capture) {
+        if let Err(TrySendError::Full(_) | TrySendError::Disconnected(_)) = self.captures.try_send(capture) {
+            self.left_out += 1;
+        }
+    }
+
+    fn report_left_out(&mut self) {
+        let lost = std::mem::take(&mut self.left_out);
+        if lost > 0 {
+            let text = format!("{lost} recordings are lost: {WAITING} wait for the disk, which is too slow for more");
+            publish(&self.events, String::new(), None, text, None);
+        }
+    }
+
+    /// Events and commands since the last time.
+    fn take_notes(&mut self, clock: Clock) {
+        loop {
+            match self.heard.try_recv() {
+                Ok(event) => self.event(&event, clock),
+                Err(TryRecvError::Lagged(_)) => {}
+                Err(TryRecvError::Empty | TryRecvError::Closed) => break,
+            }
+        }
+        loop {
+            match self.commands.try_recv() {
+                Ok(record) => self.command(&record, clock),
+                Err(TryRecvError::Lagged(_)) => {}
+                Err(TryRecvError::Empty | TryRecvError::Closed) => break,
+            }
+        }
+    }
+
+    fn event(&mut self, event: &Event, clock: Clock) {
+        if event.kind == EventKind::Recording {
+            return;
+        }
+        let at = clock.instant_at(event.time).min(clock.now);
+        let body = NoteBody::Event {
+            kind: event.kind.name(),
+            text: shortened(&event.text),
+        };
+        self.recorder
+            .note(&event.bus, event.drive.as_deref(), &Note { at, body });
+        if let (Some(kind), Some(drive)) = (TriggerKind::of_event(event.kind), &event.drive) {
+            let text = shortened(&event.text);
+            self.recorder.trigger(drive, Trigger { kind, at, text }, clock);
+        }
+    }
+
+    fn command(&mut self, record: &AuditRecord, clock: Clock) {
+        let Some((bus, drive)) = self.recorder.drive(&record.drive) else {
+            return;
+        };
+        let at = clock.instant_at(record.time).min(clock.now);
+        let body = NoteBody::Command {
+            source: record.source,
+            client: shortened(&record.client),
+            command: shortened(&record.command),
+            result: record.result,
+            latency: record.latency,
+        };
+        self.recorder
+            .note(&bus.spec.name, Some(&record.drive), &Note { at, body });
+        if is_refused_stop(record, &drive.spec.profile) {
+            let text = format!(
+                "a stop from {} {} failed: {}",
+                record.source, record.client, record.text
+            );
+            let trigger = Trigger {
+                kind: TriggerKind::RefusedStop,
+                at,
+                text: shortened(&text),
+            };
+            self.recorder.trigger(&record.drive, trigger, clock);
+        }
+    }
+}
+
+fn shortened(text: &str) -> String {
+    text.chars().take(MOST_TEXT).collect()
+}
+
+/// Writes files.
+struct Writer {
+    store: Store,
+    recordings: Arc<Recordings>,
+    events: Events,
+    /// The last one could not be written.
+    failing: bool,
+}
+
+impl Writer {
+    fn run(mut self, waiting: &Receiver<Capture>) {
+        while let Ok(capture) = waiting.recv() {
+            let mut recording = assemble(&capture);
+            let written = self.store.write(&mut recording);
+            let header = &recording.header;
+            let (bus, drive) = (header.bus.name.clone(), header.drive.name.clone());
+            match written {
+                Ok(entry) => {
+                    self.failing = false;
+                    {
+                        let mut shared = self.recordings.shared();
+                        shared.entries = self.store.entries().to_vec();
+                        *shared.made.entry(entry.trigger).or_default() += 1;
+                    }
+                    let text = format!("recording {}: {}", entry.id, entry.summary);
+                    let made = RecordingMade {
+                        id: entry.id.clone(),
+                        trigger: entry.trigger.name(),
+                        summary: entry.summary.clone(),
+                    };
+                    publish(&self.events, bus, Some(drive), text, Some(made));
+                }
+                // Told once: the disk stays as it is until somebody sees to it.
+                Err(_) if self.failing => {}
+                Err(error) => {
+                    self.failing = true;
+                    let text = format!(
+                        "the recording of {drive} is lost: cannot write {}: {error}; further ones are lost, too, until \
+                         there is room and permission; everything else goes on",
+                        store::path_of(self.store.dir(), &header.id).display()
+                    );
+                    publish(&self.events, bus, Some(drive), text, None);
+                }
+            }
+        }
+    }
+}
+
+fn publish(events: &Events, bus: String, drive: Option<String>, text: String, recording: Option<RecordingMade>) {
+    events.publish(Event {
+        id: 0,
+        time: std::time::SystemTime::now(),
+        kind: EventKind::Recording,
+        bus,
+        drive,
+        fault_code: None,
+        count: None,
+        text,
+        recording,
+    });
+}

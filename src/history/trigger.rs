@@ -1,0 +1,237 @@
+//! What makes a recording. Pure.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use crate::command::AuditRecord;
+use crate::drive::{ModelPoint, Profile, Value};
+use crate::event::EventKind;
+use crate::process_image::{Reading, TriggerLimit};
+
+/// Errors on a line within [`BURST_IN`] that are a burst.
+pub const BURST: usize = 10;
+/// Time in which errors on a line are counted.
+pub const BURST_IN: Duration = Duration::from_secs(10);
+
+/// Kinds of triggers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum TriggerKind {
+    /// A fault came up, be it for one poll.
+    Fault,
+    /// A warning came up.
+    Warning,
+    /// The drive does not answer any more.
+    Lost,
+    /// A lease ran out.
+    Supervision,
+    /// A stop did not get its acknowledgement.
+    RefusedStop,
+    /// An acknowledged command showed no effect.
+    NotConfirmed,
+    /// Many exchanges on the line failed.
+    LineErrors,
+    /// A point was beyond its limit for a time.
+    Point,
+    /// Somebody asked for it.
+    Command,
+}
+
+impl TriggerKind {
+    /// All kinds.
+    pub const ALL: [TriggerKind; 9] = [
+        TriggerKind::Fault,
+        TriggerKind::Warning,
+        TriggerKind::Lost,
+        TriggerKind::Supervision,
+        TriggerKind::RefusedStop,
+        TriggerKind::NotConfirmed,
+        TriggerKind::LineErrors,
+        TriggerKind::Point,
+        TriggerKind::Command,
+    ];
+
+    /// The name in payloads and labels.
+    pub fn name(self) -> &'static str {
+        match self {
+            TriggerKind::Fault => "fault",
+            TriggerKind::Warning => "warning",
+            TriggerKind::Lost => "lost",
+            TriggerKind::Supervision => "supervision",
+            TriggerKind::RefusedStop => "refused_stop",
+            TriggerKind::NotConfirmed => "not_confirmed",
+            TriggerKind::LineErrors => "line_errors",
+            TriggerKind::Point => "point",
+            TriggerKind::Command => "command",
+        }
+    }
+
+    /// Time after a recording of that kind in which the same drive makes no other of it: what repeats by itself, or can be
+    /// repeated by a client, must not push out the rest.
+    pub(super) fn pause(self) -> Duration {
+        match self {
+            TriggerKind::Fault | TriggerKind::Supervision | TriggerKind::Command => Duration::ZERO,
+            _ => Duration::from_secs(60),
+        }
+    }
+
+    /// The kind of an event that makes a recording. A fault is seen in the samples.
+    pub(super) fn of_event(kind: EventKind) -> Option<TriggerKind> {
+        match kind {
+            EventKind::Offline => Some(TriggerKind::Lost),
+            EventKind::Supervision => Some(TriggerKind::Supervision),
+            EventKind::NotConfirmed => Some(TriggerKind::NotConfirmed),
+            _ => None,
+        }
+    }
+}
+
+/// A trigger at a time.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Trigger {
+    /// Its kind.
+    pub kind: TriggerKind,
+    /// When.
+    pub at: Instant,
+    /// What it was, for people.
+    pub text: String,
+}
+
+/// Whether a record is a stop that the drive did not acknowledge, and that nothing newer took the place of.
+pub(super) fn is_refused_stop(record: &AuditRecord, profile: &Profile) -> bool {
+    const TAKEN: [&str; 7] = [
+        "acknowledged",
+        crate::command::CONFIRMED,
+        "replaced",
+        "purged",
+        "withdrawn",
+        "shutting_down",
+        "interrupted",
+    ];
+    let stops = |change: &crate::command::Change| match (change.point.split_once(' '), change.new) {
+        (None, Value::Bool(false)) => change.point == ModelPoint::Run.name(),
+        // A raw write: table and address.
+        (Some((table, address)), Value::Integer(word)) => {
+            let run = profile.run_bit().map(|(raw, ..)| raw.table);
+            let address = address.parse::<u16>().ok();
+            let word = u16::try_from(word).ok();
+            match (run.filter(|run| run.name() == table), address, word) {
+                (Some(table), Some(address), Some(word)) => profile.is_stop(table, address, word),
+                _ => false,
+            }
+        }
+        _ => false,
+    };
+    !TAKEN.contains(&record.result) && record.points.iter().any(stops)
+}
+
+/// What a drive showed last, as far as a change of it makes a recording.
+#[derive(Debug, Default)]
+pub(super) struct Watch {
+    fault: Option<bool>,
+    code: i64,
+    warning: Option<bool>,
+    /// For each trigger of the drive since when it holds, and whether it has made its recording.
+    points: Vec<Option<(Instant, bool)>>,
+}
+
+impl Watch {
+    /// Looks at a drive that was read at `at`.
+    pub(super) fn look(&mut self, reading: &Reading<'_>, at: Instant, warnings: bool) -> Option<Trigger> {
+        let fault = self.fault(reading);
+        let warning = self.warning(reading).filter(|_| warnings);
+        let point = self.points(reading, at);
+        let (kind, text) = fault.or(warning).or(point)?;
+        Some(Trigger { kind, at, text })
+    }
+
+    fn fault(&mut self, reading: &Reading<'_>) -> Option<(TriggerKind, String)> {
+        let fault = reading.model(ModelPoint::Fault).good()?.as_bool();
+        let code = match reading.model(ModelPoint::FaultCode).good() {
+            Some(Value::Integer(code)) if fault => code,
+            _ => 0,
+        };
+        let came = fault && self.fault.replace(fault) == Some(false);
+        self.fault = Some(fault);
+        // The code may be read after the fault, which is no other fault.
+        let before = std::mem::replace(&mut self.code, code);
+        let changed = fault && before != 0 && code != 0 && before != code;
+        (came || changed).then(|| (TriggerKind::Fault, "fault".to_string()))
+    }
+
+    fn warning(&mut self, reading: &Reading<'_>) -> Option<(TriggerKind, String)> {
+        let warning = reading.model(ModelPoint::Warning).good()?.as_bool();
+        let before = self.warning.replace(warning);
+        (warning && before == Some(false)).then(|| (TriggerKind::Warning, "warning".to_string()))
+    }
+
+    fn points(&mut self, reading: &Reading<'_>, at: Instant) -> Option<(TriggerKind, String)> {
+        let triggers = &reading.spec.triggers;
+        self.points.resize(triggers.len(), None);
+        let mut fired = None;
+        for (trigger, state) in triggers.iter().zip(&mut self.points) {
+            let value = reading.sample(trigger.point).good().map(Value::as_f64);
+            let beyond = value.is_some_and(|value| match trigger.limit {
+                TriggerLimit::Above(limit) => value > limit,
+                TriggerLimit::Below(limit) => value < limit,
+            });
+            if !beyond {
+                *state = None;
+                continue;
+            }
+            let (since, done) = state.get_or_insert((at, false));
+            if !*done && at.saturating_duration_since(*since) >= trigger.hold {
+                *done = true;
+                let point = reading.spec.profile.points.get(trigger.point);
+                let (name, unit) = point.map_or(("", ""), |point| (point.name.as_str(), point.unit.as_str()));
+                let side = match trigger.limit {
+                    TriggerLimit::Above(limit) => format!("above {limit}"),
+                    TriggerLimit::Below(limit) => format!("below {limit}"),
+                };
+                let text = format!("{name} {side} {unit}");
+                fired = fired.or(Some((TriggerKind::Point, text.trim_end().to_string())));
+            }
+        }
+        fired
+    }
+}
+
+/// Failed exchanges of a line.
+#[derive(Debug, Default)]
+pub(super) struct LineErrors {
+    /// When, and with which drive.
+    recent: VecDeque<(Instant, usize)>,
+}
+
+impl LineErrors {
+    /// Notes a failed exchange with a drive that answered before. The drive with most of them, when they are a burst.
+    pub(super) fn note(&mut self, at: Instant, drive: usize) -> Option<(usize, Trigger)> {
+        self.recent.push_back((at, drive));
+        while let Some((oldest, _)) = self.recent.front() {
+            if at.saturating_duration_since(*oldest) <= BURST_IN {
+                break;
+            }
+            self.recent.pop_front();
+        }
+        if self.recent.len() < BURST {
+            return None;
+        }
+        let of = |drive: usize| self.recent.iter().filter(|(_, other)| *other == drive).count();
+        let most = self
+            .recent
+            .iter()
+            .map(|(_, drive)| *drive)
+            .max_by_key(|drive| of(*drive))?;
+        let text = format!(
+            "{} of the exchanges on the line failed within {} s, {} of them with this drive",
+            self.recent.len(),
+            BURST_IN.as_secs(),
+            of(most)
+        );
+        self.recent.clear();
+        let kind = TriggerKind::LineErrors;
+        Some((most, Trigger { kind, at, text }))
+    }
+}
