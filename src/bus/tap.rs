@@ -23,6 +23,8 @@ pub(super) struct Tap {
     request: Request,
     frame: Vec<u8>,
     hearing: Hearing,
+    /// Somebody listened when the request went out: a trace never begins with half an exchange.
+    traced: bool,
 }
 
 impl Tap {
@@ -31,6 +33,7 @@ impl Tap {
         let format = image.spec.format;
         let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
         Tap {
+            traced: image.trace.wanted(),
             image,
             index,
             drive,
@@ -62,7 +65,7 @@ impl Tap {
     /// Publishes what came back, a record for each frame.
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
         self.tape(&self.hearing.bytes, taped(ended), now);
-        if !self.image.trace.wanted() {
+        if !self.traced {
             return;
         }
         let protocol = self.image.spec.protocol;
