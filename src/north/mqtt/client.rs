@@ -1,5 +1,7 @@
 //! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
+mod buffering;
+
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -11,9 +13,10 @@ use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio_util::sync::CancellationToken;
 
+use self::buffering::buffers;
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::complaints::{Complaints, Outages};
 use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
+use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
 use super::payload::{self, Topics};
 use super::publisher::{Publisher, Update};
@@ -22,6 +25,7 @@ use super::request::Incoming;
 use super::store::{Loaded, LostCount, Store};
 use super::{Buffer, History, Options, tls};
 use crate::event::{BURST, Event, EventKind};
+use crate::north::log_throttle::LogThrottle;
 use crate::north::{MqttLoss, NorthStats};
 use crate::plant::{Plant, SharedPlant};
 
@@ -45,10 +49,8 @@ const LAST_WRITE: Duration = Duration::from_secs(1);
 const HISTORY_PACE: Duration = Duration::from_millis(50);
 /// Minimum time between two repairs of the status.
 const REPAIR: Duration = Duration::from_secs(1);
-/// What an event takes on disk, bytes, at most for all but the longest texts.
-const EVENT_BYTES: u64 = 512;
-/// Minimum time between two log lines about lost messages.
-const LOST_LOGGED: Duration = Duration::from_secs(60);
+/// Minimum time between two log lines about messages that the broker refused.
+const REFUSED_LOGGED: Duration = Duration::from_secs(60);
 /// Names of the files of the buffer.
 const EVENT_FILES: &str = "mqtt-events";
 const HISTORY_FILES: &str = "mqtt-history";
@@ -132,8 +134,9 @@ struct Client {
     link: BrokerLink,
     /// Wait before the next connection attempt.
     back_off: Duration,
-    outages: Outages,
-    refused: Complaints,
+    outages: OutageLog,
+    /// Log lines about messages that the broker refused.
+    refused: LogThrottle,
     /// Number of events lost because they arrived too fast.
     missed: u64,
     /// How many lost messages were logged, and when.
@@ -169,8 +172,8 @@ impl Client {
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
             back_off: BACK_OFF.0,
-            outages: Outages::default(),
-            refused: Complaints::default(),
+            outages: OutageLog::default(),
+            refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
             lost_logged: (0, None),
             repaired: None,
@@ -190,100 +193,6 @@ impl Client {
     /// Whether another message from the broker may be taken: a result of it finds room.
     fn receives(&self) -> bool {
         self.commands.has_room() && self.outbox.has_room_for_results()
-    }
-
-    fn on_event(&mut self, event: Result<Arc<Event>, RecvError>) {
-        match event {
-            Ok(event) => self.store_event(&event),
-            Err(RecvError::Lagged(lost)) => self.missed(lost),
-            // The plant was replaced.
-            Err(RecvError::Closed) => self.events = self.plant.load().events.subscribe(),
-        }
-        self.take_pending_events();
-    }
-
-    /// Stores all pending events at once, before newer ones displace them.
-    fn take_pending_events(&mut self) {
-        loop {
-            match self.events.try_recv() {
-                Ok(event) => self.store_event(&event),
-                Err(TryRecvError::Lagged(lost)) => self.missed(lost),
-                Err(TryRecvError::Empty | TryRecvError::Closed) => return,
-            }
-        }
-    }
-
-    /// Events in memory and on disk.
-    fn waiting_events(&self) -> u64 {
-        self.outbox.events() as u64 + self.store.waiting()
-    }
-
-    fn missed(&mut self, lost: u64) {
-        self.missed += lost;
-        self.stats.mqtt.lost(MqttLoss::Event, lost);
-        tracing::error!(
-            "{lost} events arrived too fast and were not published, {} since the start; they are in the log",
-            self.missed
-        );
-    }
-
-    fn store_event(&mut self, event: &Event) {
-        // Refusals have a part of the room only, so that they push out no other event.
-        if event.kind == EventKind::RefusedCommand && self.waiting_events() >= refusal_limit(&self.options) {
-            self.stats.mqtt.lost(MqttLoss::Event, 1);
-            return;
-        }
-        let (topics, payload) = payload::event(&self.topics, event, &self.observed);
-        for topic in topics {
-            self.keep(Kind::Event, Message::not_retained(topic, payload.clone()));
-        }
-        if let Some((topic, payload)) = payload::recording(&self.topics, event) {
-            self.keep(Kind::Event, Message::not_retained(topic, payload));
-        }
-    }
-
-    /// Gives a message to the store, and to the outbox if its turn has come.
-    fn keep(&mut self, kind: Kind, message: Message) {
-        let room = self.outbox.room(kind) > 0;
-        let store = if kind == Kind::Event {
-            &mut self.store
-        } else {
-            &mut self.history
-        };
-        if let Some((number, message)) = store.push(message, room) {
-            self.outbox.push(kind, message, number);
-        }
-    }
-
-    fn on_loaded(&mut self, kind: Kind, loaded: Loaded) {
-        let opened = matches!(loaded, Loaded::Opened { .. });
-        let store = if kind == Kind::Event {
-            &mut self.store
-        } else {
-            &mut self.history
-        };
-        let (messages, topics) = store.take(loaded);
-        for (number, message) in messages {
-            self.outbox.push(kind, message, Some(number));
-        }
-        if kind == Kind::Event && opened {
-            self.clear_old(topics);
-            self.remember_topics();
-        }
-    }
-
-    /// Clears the topics of earlier runs that are not published any more: drives that were removed, another base.
-    fn clear_old(&mut self, topics: Vec<String>) {
-        let status = self.topics.status();
-        let sound = |topic: &String| !topic.is_empty() && !topic.contains(['+', '#', '\0']) && *topic != status;
-        self.publisher.clear(topics.into_iter().filter(sound).map(Arc::from));
-    }
-
-    /// Keeps the retained topics for the next run, with those that are still to be cleared.
-    fn remember_topics(&self) {
-        let topics = self.publisher.all_topics().chain(self.publisher.vanished());
-        let topics = topics.map(|topic| topic.to_string());
-        self.store.remember(topics.chain([self.topics.status()]).collect());
     }
 
     fn on_connection_event(&mut self, event: ConnectionEvent) {
@@ -336,8 +245,12 @@ impl Client {
             Some(Kind::History) => self.stats.mqtt.lost(MqttLoss::History, 1),
             None => {}
         }
-        if let Some(more) = self.refused.permit(Instant::now()) {
+        if let Some(omitted) = self.refused.permit(Instant::now()) {
             let root = self.topics.root();
+            let more = match omitted {
+                0 => String::new(),
+                omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
+            };
             tracing::warn!(
                 "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/# and to the \
                  response topics in use{more}",
@@ -599,29 +512,6 @@ impl Client {
         }
     }
 
-    /// Counts what the outbox lost, and logs it once a minute.
-    fn count_lost(&mut self, now: Instant) {
-        let lost = self.outbox.take_lost();
-        let counts = [
-            (MqttLoss::Event, lost.events),
-            (MqttLoss::Result, lost.results),
-            (MqttLoss::History, lost.history),
-        ];
-        for (kind, count) in counts {
-            self.stats.mqtt.lost(kind, count);
-        }
-        let total: u64 = self.stats.mqtt.losses().map(|(_, count)| count).sum();
-        let (logged, at) = self.lost_logged;
-        if total > logged && at.is_none_or(|at| now.saturating_duration_since(at) >= LOST_LOGGED) {
-            tracing::warn!(
-                "{} events, results or arrays of history were lost since the last such line: the buffer is full or \
-                 damaged, or the broker refuses them",
-                total - logged
-            );
-            self.lost_logged = (total, Some(now));
-        }
-    }
-
     /// Sends what is waiting, publishes `offline` and disconnects, all within half a second.
     async fn shut_down(mut self) {
         self.take_pending_events();
@@ -672,27 +562,6 @@ impl Client {
             while !matches!(session.connection.next().await, ConnectionEvent::Lost(_)) {}
         }
     }
-}
-
-/// The buffers of events and of history; with both, each has half.
-fn buffers(options: &Options) -> (Option<Buffer>, Option<Buffer>) {
-    match (options.buffer.clone(), options.telemetry.history) {
-        (None, _) => (None, None),
-        (buffer, History::Off) => (buffer, None),
-        (Some(Buffer { dir, max_bytes }), _) => {
-            let half = Buffer {
-                dir,
-                max_bytes: max_bytes / 2,
-            };
-            (Some(half.clone()), Some(half))
-        }
-    }
-}
-
-/// Refused commands are dropped while so many events wait: half of the room in memory, about half of that on disk.
-fn refusal_limit(options: &Options) -> u64 {
-    let on_disk = options.buffer.as_ref().map(|buffer| buffer.max_bytes / EVENT_BYTES / 4);
-    on_disk.unwrap_or(u64::MAX).min(BURST as u64 / 2)
 }
 
 fn refusal(why: PubAckReason) -> String {

@@ -16,13 +16,13 @@
 
 mod client;
 mod commands;
-mod complaints;
 mod connection;
 #[cfg(test)]
 mod fixture;
 mod history;
 mod journal;
 mod offline;
+mod outage_log;
 mod outbox;
 mod payload;
 mod publisher;

@@ -1,45 +1,18 @@
-//! How often the same trouble is logged. Time is an argument.
+//! How often a reason for having no connection is logged. Time is an argument.
 
 use std::collections::HashMap;
 use std::time::{Duration, Instant};
 
-/// Minimum time between two lines about refused messages.
-const REFUSED: Duration = Duration::from_secs(60);
 /// Minimum time between two lines with the same reason for having no connection.
 const SAME_REASON: Duration = Duration::from_secs(3600);
 /// Number of reasons that are told apart.
 const REASONS: usize = 16;
 
-/// One line a minute, and how many were left out.
-#[derive(Debug, Default)]
-pub(super) struct Complaints {
-    last: Option<Instant>,
-    omitted: u64,
-}
-
-impl Complaints {
-    /// `None` if nothing is logged now, otherwise what to add about those left out.
-    pub(super) fn permit(&mut self, now: Instant) -> Option<String> {
-        if self
-            .last
-            .is_some_and(|last| now.saturating_duration_since(last) < REFUSED)
-        {
-            self.omitted += 1;
-            return None;
-        }
-        self.last = Some(now);
-        Some(match std::mem::take(&mut self.omitted) {
-            0 => String::new(),
-            omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
-        })
-    }
-}
-
 /// Why there is no connection: each reason once, and again after an hour or a connection.
 #[derive(Debug, Default)]
-pub(super) struct Outages(HashMap<String, Instant>);
+pub(super) struct OutageLog(HashMap<String, Instant>);
 
-impl Outages {
+impl OutageLog {
     /// Whether to log this reason now. Reasons that differ only in numbers, such as the time of day, are the same.
     pub(super) fn permit(&mut self, why: &str, now: Instant) -> bool {
         let reason: String = why.chars().filter(|c| !c.is_ascii_digit()).collect();
@@ -65,16 +38,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn one_line_a_minute_counts_the_others() {
-        let (mut complaints, now) = (Complaints::default(), Instant::now());
-        assert_eq!(complaints.permit(now), Some(String::new()));
-        assert_eq!(complaints.permit(now + REFUSED / 2), None);
-        assert!(complaints.permit(now + REFUSED).unwrap().contains("1 more"));
-    }
-
-    #[test]
     fn an_expired_certificate_is_logged_once_an_hour() {
-        let (mut outages, now) = (Outages::default(), Instant::now());
+        let (mut outages, now) = (OutageLog::default(), Instant::now());
         let why = |n: u64| format!("invalid peer certificate: expired: verified at {n}, not after 17");
         assert!(outages.permit(&why(1), now));
         for second in 1..3600 {
