@@ -21,7 +21,7 @@ struct Manners {
     refused: Option<(&'static str, u8)>,
     /// It writes each byte on its own.
     piecemeal: bool,
-    /// It acknowledges two messages at a time, the later one first.
+    /// It acknowledges two events at a time, the later one first.
     backwards: bool,
     /// The first connection ends with this DISCONNECT after the first event.
     farewell: Option<Vec<u8>>,
@@ -84,7 +84,7 @@ struct Session {
     seen: Arc<Mutex<Seen>>,
     first: bool,
     aliases: HashMap<u16, String>,
-    /// Packet ids to acknowledge, with their reason codes.
+    /// Packet ids of events to acknowledge, with their reason codes.
     owed: Vec<(u16, u8)>,
 }
 
@@ -206,19 +206,27 @@ impl Session {
             .refused
             .filter(|(below, _)| topic.starts_with(below))
             .map_or(0, |(_, code)| code);
-        self.owed.push((packet, code));
-        let in_flight = self.owed.len();
+        let in_flight = self.owed.len() + 1;
         let mut seen = self.seen.lock().unwrap();
         seen.most_in_flight = seen.most_in_flight.max(in_flight);
         drop(seen);
-        if self.manners.backwards && is_event && in_flight < 2 {
+        // An event waits for another event only: telemetry in between does not end the wait, so that no event is left over.
+        if self.manners.backwards && is_event && self.owed.is_empty() {
+            self.owed.push((packet, code));
             return Some(());
         }
-        while let Some((packet, code)) = self.owed.pop() {
-            let packet = packet.to_be_bytes();
-            self.send(0x40, &[packet[0], packet[1], code, 0])?;
+        self.acknowledge(packet, code)?;
+        if is_event {
+            while let Some((packet, code)) = self.owed.pop() {
+                self.acknowledge(packet, code)?;
+            }
         }
         Some(())
+    }
+
+    fn acknowledge(&mut self, packet: u16, code: u8) -> Option<()> {
+        let packet = packet.to_be_bytes();
+        self.send(0x40, &[packet[0], packet[1], code, 0])
     }
 }
 
