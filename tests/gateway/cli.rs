@@ -8,6 +8,8 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value;
 
+use crate::support::process::PATIENCE;
+
 const BINARY: &str = env!("CARGO_BIN_EXE_drivegate");
 const ROOT: &str = env!("CARGO_MANIFEST_DIR");
 
@@ -440,7 +442,7 @@ fn a_bad_log_level_of_the_demo_is_a_wrong_command_line() {
             .spawn()
             .unwrap();
         let began = Instant::now();
-        while child.try_wait().unwrap().is_none() && began.elapsed() < Duration::from_secs(60) {
+        while child.try_wait().unwrap().is_none() && began.elapsed() < PATIENCE {
             std::thread::sleep(Duration::from_millis(20));
         }
         let _ = child.kill();

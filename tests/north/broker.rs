@@ -15,10 +15,11 @@ use rumqttc::{
 use tokio::runtime::Runtime;
 use tokio_util::sync::CancellationToken;
 
+use crate::support::process::PATIENCE;
 use crate::support::tools::{python, run_well, tool};
 
 /// Longest wait for something that has to happen. It happens at once, so this measures nothing.
-const DEADLINE: Duration = Duration::from_secs(30);
+const DEADLINE: Duration = PATIENCE;
 const VERSIONS: [&str; 2] = ["mqttv311", "mqttv5"];
 
 /// A broker on a port of its own.

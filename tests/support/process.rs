@@ -10,8 +10,8 @@ use std::time::{Duration, Instant};
 
 use super::tools::tool;
 
-/// Longest wait for something that must come.
-pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
+/// Longest wait for something that must come, on a machine however busy.
+pub(crate) const PATIENCE: Duration = Duration::from_secs(240);
 
 /// A running process; killed when dropped.
 pub(crate) struct Running {

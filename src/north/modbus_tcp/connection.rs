@@ -109,6 +109,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         loop {
             let consumed = self.process(&mut input_end);
             self.dialogue.collect(self.now.into_std());
+            // Before the answers leave: who has an answer is in use.
+            if consumed.frames > 0 {
+                self.used();
+            }
             if !flush_at_once(&mut self.stream, &mut self.dialogue)? {
                 tokio::select! {
                     biased;
@@ -119,7 +123,6 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
             }
             if consumed.frames > 0 {
                 half_frame_since = None;
-                self.used();
                 self.yield_if_due(consumed.frames).await;
                 if self.since_yield == 0 && place.closing().is_cancelled() {
                     return Err(self.close_reason());

@@ -571,9 +571,9 @@ fn refusal(why: PubAckReason) -> String {
     }
 }
 
-/// 75 to 100 % of `wait`, by a random number, so that gateways do not reconnect to a broker at the same time.
+/// 10 to 100 % of `wait`, by a random number: gateways that lost their broker at the same time come back one after the other.
 fn jittered(wait: Duration, random: u64) -> Duration {
-    wait.mul_f64(0.75 + 0.25 * (random as f64 / u64::MAX as f64))
+    wait.mul_f64(0.1 + 0.9 * (random as f64 / u64::MAX as f64))
 }
 
 #[cfg(test)]

@@ -1,0 +1,330 @@
+#!/usr/bin/env python3
+"""Many gateways on one machine: what a site costs the broker, Prometheus and itself, and what happens when the broker restarts.
+
+Starts one mosquitto, one Prometheus, one process that simulates all lines without wire time, and GATEWAYS processes of
+`drivegate run` with DRIVES simulated drives each. Everything listens on loopback and lives in a temporary directory.
+Prints the figures; ends with 1 if a gateway was not back within BOUND seconds of the broker's return, or ended by itself.
+"""
+
+import argparse
+import collections
+import json
+import os
+import pathlib
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.parse
+import urllib.request
+
+import paho.mqtt.client as paho
+
+# docs/mqtt.md: the gateway tries again at intervals of up to 5 s; the rest is for the connection itself.
+BOUND = 8.0
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def gateway_name(number):
+    return f"site-{number:04}"
+
+
+def bus(directory, number, options):
+    lines = [
+        "[[bus]]",
+        f'name = "line{number}"',
+        f'port = "{directory}/line{number}"',
+        'protocol = "modbus-rtu"',
+        "baud = 115200",
+        f'cycle = "{options.cycle}"',
+        'slow_cycle = "10s"',
+    ]
+    for drive in range(1, options.drives + 1):
+        lines += ["[[bus.drive]]", f'name = "drive{number}-{drive}"', f"address = {drive}", 'profile = "vacon-nx"']
+    return lines
+
+
+def free_port():
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def write(path, text):
+    path.write_text(text + "\n")
+    return path
+
+
+def configurations(directory, options, broker_port):
+    """One file with all lines for the simulation, one for each gateway; the HTTP ports of the gateways."""
+    numbers = range(options.gateways)
+    lines = [line for number in numbers for line in bus(directory, number, options)]
+    everything = ["[gateway]", 'name = "all-lines"', *lines]
+    write(directory / "lines.toml", "\n".join(everything))
+    ports = []
+    for number in numbers:
+        port = free_port()
+        while port in ports:
+            port = free_port()
+        ports.append(port)
+        own = [
+            "[gateway]",
+            f'name = "{gateway_name(number)}"',
+            *bus(directory, number, options),
+            "[mqtt]",
+            f'url = "mqtt://127.0.0.1:{broker_port}"',
+            f"topics = {json.dumps(options.topics.split(','))}",
+            "[http]",
+            f'listen = "127.0.0.1:{port}"',
+            "[recordings]",
+            "max_count = 0",
+        ]
+        write(directory / f"{gateway_name(number)}.toml", "\n".join(own))
+    return ports
+
+
+class Processes:
+    """Everything that was started; ended with the program."""
+
+    def __init__(self, directory):
+        self.directory = directory
+        self.all = []
+
+    def start(self, name, command, **environment):
+        output = open(self.directory / f"{name}.log", "ab")
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, env=os.environ | environment
+        )
+        output.close()
+        self.all.append(process)
+        return process
+
+    def end(self):
+        for process in self.all:
+            if process.poll() is None:
+                process.terminate()
+        for process in self.all:
+            try:
+                process.wait(20)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def processor_seconds(pid):
+    fields = pathlib.Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def memory(pid):
+    """Resident and proportional memory in MiB."""
+    text = pathlib.Path(f"/proc/{pid}/smaps_rollup").read_text()
+    values = {line.split(":")[0]: int(line.split()[1]) for line in text.splitlines()[1:] if line.endswith("kB")}
+    return values["Rss"] / 1024, values["Pss"] / 1024
+
+
+class Subscriber:
+    """Counts what arrives at the broker, and when each gateway says that it is online."""
+
+    def __init__(self, port):
+        self.messages = 0
+        self.payload = 0
+        self.online = {}
+        self.states = collections.Counter()
+        self.lock = threading.Lock()
+        self.client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id="fleet-counter", protocol=paho.MQTTv5)
+        self.client.reconnect_delay_set(0.05, 0.05)
+        self.client.on_connect = lambda client, *_: client.subscribe("drivegate/#", 0)
+        self.client.on_message = self.received
+        self.client.connect("127.0.0.1", port)
+        self.client.loop_start()
+
+    def received(self, _client, _data, message):
+        with self.lock:
+            self.messages += 1
+            self.payload += len(message.topic) + len(message.payload)
+            parts = message.topic.split("/")
+            if parts[-1] == "status" and message.payload == b"online":
+                self.online[parts[1]] = time.monotonic()
+
+    def restart_count(self):
+        with self.lock:
+            self.online = {}
+
+    def names_online(self):
+        with self.lock:
+            return dict(self.online)
+
+    def counts(self):
+        with self.lock:
+            return self.messages, self.payload
+
+
+def until(what, ready, seconds):
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if ready():
+            return
+        time.sleep(0.05)
+    raise SystemExit(f"fleet: {what} did not happen within {seconds} s; the logs stand in the directory that is named above")
+
+
+def start_broker(processes, directory, port):
+    text = f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nset_tcp_nodelay true\n"
+    text += "max_queued_messages 100000\n"
+    mosquitto = shutil.which("mosquitto") or "/usr/sbin/mosquitto"
+    return processes.start("mosquitto", [mosquitto, "-c", str(write(directory / "mosquitto.conf", text))])
+
+
+def listens(port):
+    with socket.socket() as probe:
+        return probe.connect_ex(("127.0.0.1", port)) == 0
+
+
+def start_prometheus(processes, directory, ports):
+    port = free_port()
+    targets = json.dumps([f"127.0.0.1:{each}" for each in ports])
+    text = f"global:\n  scrape_interval: 5s\n  scrape_timeout: 5s\nscrape_configs:\n- job_name: drivegate\n"
+    text += f"  static_configs:\n  - targets: {targets}\n"
+    config = write(directory / "prometheus.yml", text)
+    process = processes.start(
+        "prometheus",
+        [
+            shutil.which("prometheus") or sys.exit("fleet: no prometheus; `make tools` installs it"),
+            f"--config.file={config}",
+            f"--storage.tsdb.path={directory}/prometheus",
+            f"--web.listen-address=127.0.0.1:{port}",
+        ],
+    )
+    return process, port
+
+
+def query(port, expression):
+    address = f"http://127.0.0.1:{port}/api/v1/query?" + urllib.parse.urlencode({"query": expression})
+    with urllib.request.urlopen(address, timeout=20) as answer:
+        result = json.load(answer)["data"]["result"]
+    return float(result[0]["value"][1]) if result else float("nan")
+
+
+def steady(options, processes, subscriber, broker, gateways, simulation, prometheus, prometheus_port):
+    """Rates and costs while nothing happens."""
+    watched = {"broker": [broker], "prometheus": [prometheus], "lines": [simulation], "gateways": gateways}
+    before = {name: sum(processor_seconds(p.pid) for p in group) for name, group in watched.items()}
+    messages, payload = subscriber.counts()
+    began = time.monotonic()
+    time.sleep(options.seconds)
+    took = time.monotonic() - began
+    used = {
+        name: (sum(processor_seconds(p.pid) for p in group) - before[name]) / took for name, group in watched.items()
+    }
+    after_messages, after_payload = subscriber.counts()
+    resident = sorted(memory(p.pid)[0] for p in gateways)
+    proportional = sum(memory(p.pid)[1] for p in gateways) / len(gateways)
+    rate = (after_messages - messages) / took
+    count = len(gateways)
+    print(f"messages: {rate:.0f}/s, {(after_payload - payload) / took / 1000:.0f} kB/s of topics and payloads; "
+          f"a gateway: {rate / count:.1f}/s, {(after_payload - payload) / took / count:.0f} B/s")
+    print(f"broker: {100 * used['broker']:.1f} % of a core (one subscriber to everything), "
+          f"{1e6 * used['broker'] / max(rate, 1):.0f} us a message, RSS {memory(broker.pid)[0]:.1f} MiB")
+    print(f"gateway: {100 * used['gateways'] / count:.2f} % of a core, RSS {resident[len(resident) // 2]:.1f} MiB, "
+          f"proportional {proportional:.1f} MiB, threads {len(os.listdir(f'/proc/{gateways[0].pid}/task'))}, "
+          f"files {len(os.listdir(f'/proc/{gateways[0].pid}/fd'))}")
+    print(f"lines (simulated): {100 * used['lines']:.1f} % of a core")
+    for name, expression in [
+        ("scrape, median s", "quantile(0.5, avg_over_time(scrape_duration_seconds{job='drivegate'}[1m]))"),
+        ("scrape, slowest s", "max(max_over_time(scrape_duration_seconds{job='drivegate'}[1m]))"),
+        ("series a gateway", "avg(scrape_samples_scraped{job='drivegate'})"),
+        ("gateways up", "sum(up{job='drivegate'})"),
+        ("drives online", "sum(drivegate_drive_up)"),
+    ]:
+        print(f"prometheus: {name}: {query(prometheus_port, expression):.4g}")
+    print(f"prometheus: {100 * used['prometheus']:.1f} % of a core, RSS {memory(prometheus.pid)[0]:.0f} MiB")
+
+
+def storm(options, processes, directory, subscriber, broker, broker_port, gateways):
+    """The broker is killed and comes back; when each gateway is online again. The new broker and whether all was well."""
+    broker.kill()
+    broker.wait()
+    subscriber.restart_count()
+    time.sleep(options.outage)
+    broker = start_broker(processes, directory, broker_port)
+    until("the broker's return", lambda: listens(broker_port), 20)
+    back = time.monotonic()
+    used = processor_seconds(broker.pid)
+    while len(subscriber.names_online()) < len(gateways) and time.monotonic() - back < 4 * BOUND:
+        time.sleep(0.05)
+    online = sorted(at - back for at in subscriber.names_online().values())
+    busy = processor_seconds(broker.pid) - used
+    if not online:
+        print("storm: no gateway came back")
+        return broker, False
+    buckets = collections.Counter(int(max(at, 0) * 10) for at in online)
+    print(f"storm after {options.outage} s: {len(online)} of {len(gateways)} back; half after {online[len(online) // 2]:.2f} s, "
+          f"the last after {online[-1]:.2f} s; at most {max(buckets.values())} in 0.1 s; the broker took {busy:.2f} s of a core")
+    well = len(online) == len(gateways) and online[-1] <= BOUND
+    if not well:
+        print(f"storm: a gateway was away for more than {BOUND} s")
+    return broker, well
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser.add_argument("--gateways", type=int, default=100)
+    parser.add_argument("--drives", type=int, default=10, help="drives of each gateway")
+    parser.add_argument("--cycle", default="1s", help="fast cycle of each line")
+    parser.add_argument("--topics", default="state,points", help="`topics` of [mqtt]")
+    parser.add_argument("--seconds", type=float, default=60, help="how long the quiet state is measured")
+    parser.add_argument("--outage", type=float, default=10, help="how long the broker is away, s")
+    parser.add_argument("--binary", default="target/release/drivegate")
+    options = parser.parse_args()
+    binary = pathlib.Path(options.binary).resolve()
+    if not binary.is_file():
+        sys.exit(f"fleet: no program at {binary}; `make build` builds it")
+    directory = pathlib.Path(tempfile.mkdtemp(prefix="drivegate-fleet-"))
+    print(f"fleet: {options.gateways} gateways of {options.drives} drives, cycle {options.cycle}, topics {options.topics}; "
+          f"logs in {directory}", flush=True)
+    processes = Processes(directory)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
+    well = False
+    try:
+        broker_port = free_port()
+        broker = start_broker(processes, directory, broker_port)
+        until("the broker's start", lambda: listens(broker_port), 20)
+        ports = configurations(directory, options, broker_port)
+        simulation = processes.start(
+            "lines", [binary, "simulate", "--config", directory / "lines.toml", "--speed", "max", "--autopilot"]
+        )
+        until("the simulated lines", lambda: all((directory / f"line{n}").exists() for n in range(options.gateways)), 60)
+        subscriber = Subscriber(broker_port)
+        began = time.monotonic()
+        gateways = []
+        for number in range(options.gateways):
+            state = directory / f"state{number}"
+            state.mkdir()
+            command = [binary, "run", "--config", directory / f"{gateway_name(number)}.toml"]
+            runtime = {"STATE_DIRECTORY": str(state), "RUNTIME_DIRECTORY": str(state)}
+            gateways.append(processes.start(gateway_name(number), command, **runtime))
+        until("all gateways online", lambda: len(subscriber.names_online()) == options.gateways, 120)
+        print(f"start: all gateways online after {time.monotonic() - began:.1f} s", flush=True)
+        prometheus, prometheus_port = start_prometheus(processes, directory, ports)
+        time.sleep(70)
+        steady(options, processes, subscriber, broker, gateways, simulation, prometheus, prometheus_port)
+        sys.stdout.flush()
+        broker, well = storm(options, processes, directory, subscriber, broker, broker_port, gateways)
+        lost = [gateway_name(n) for n, process in enumerate(gateways) if process.poll() is not None]
+        if lost:
+            print(f"fleet: ended by themselves: {', '.join(lost)}")
+            well = False
+    finally:
+        processes.end()
+    if well:
+        shutil.rmtree(directory)
+    sys.exit(0 if well else 1)
+
+
+if __name__ == "__main__":
+    main()
