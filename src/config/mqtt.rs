@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
+use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH};
 use super::{files, values};
 use crate::document::{Finding, Reader, format_duration, parse_size};
 use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
@@ -83,13 +83,11 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         warn_of_clear_text(reader, &broker.host, password.is_some(), commands);
     }
     let buffer = read_buffer(reader, base);
-    if reader.or(MQTT.home_assistant.name, false) {
-        reader.problem(
-            MQTT.home_assistant.name,
-            "home_assistant = true is not supported by this version",
-            "remove it",
-        );
-    }
+    let home_assistant = MQTT.home_assistant.table(reader).map(|table| {
+        let prefix = MQTT_HOME_ASSISTANT.discovery_prefix.get(&table);
+        table.finish();
+        prefix
+    });
     reader.finish();
     let Broker { host, port, tls } = broker?;
     Some(Options {
@@ -112,6 +110,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         require_id,
         response_topics,
         buffer,
+        home_assistant,
     })
 }
 
