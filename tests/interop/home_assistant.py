@@ -66,10 +66,10 @@ def main():
     python = venv("home-assistant", REQUIREMENTS, python_of("3.13"))
     with Bench() as bench:
         bench.broker()
-        bench.line(3)
-        drives = ["p1", "p2", "m3"]
-        gateway = bench.gateway(bench.configuration(drives, DISCOVERY))
-        until("the first state", lambda: bench.retained("drivegate/hall/drive/m3/state"))
+        line = bench.line(3)
+        drives = ["p1", "p2", "p3"]
+        gateway = bench.gateway(bench.configuration(drives, DISCOVERY, ["p3"]))
+        until("the first state", lambda: bench.retained("drivegate/hall/drive/p3/state"))
         hass = HomeAssistant(bench, python)
         wanted = expected_entities(bench, drives)
         until("the entities", lambda: len(hass.entities()) >= wanted)
@@ -79,9 +79,10 @@ def main():
         devices = {device["name"]: device for device in hass.ask(do="devices")}
         expect("a device for each drive, by the gateway", all(devices[d]["via"] == devices["hall"]["id"] for d in drives))
         controls = [name for name in entities if name.split(".")[0] in ("switch", "number", "button")]
-        expect("controls of p1 and p2 only", len(controls) == 8 and not any("m3" in name for name in controls))
-        unknown = [name for name, e in entities.items() if e["state"] in ("unavailable", None)]
-        expect("all are available", not unknown)
+        expect("controls of p1 and p2 only", len(controls) == 8 and not any("p3" in name for name in controls))
+        available = lambda: all(e["state"] not in ("unavailable", None) for e in hass.entities().values())
+        _, took = until("all to be available", available)
+        say(f"   ok: all are available {took:.2f} s later")
 
         hass.call("number", "set_value", entity_id="number.p1_speed_reference", value=40)
         begin = time.monotonic()
@@ -99,10 +100,16 @@ def main():
         away = lambda: all(e["state"] == "unavailable" for e in hass.entities().values())
         _, took = until("unavailable", away)
         expect(f"gateway killed, all are unavailable after {took:.2f} s", took <= 2)
-        gateway = bench.gateway(bench.configuration(drives[:2], DISCOVERY))
+        gateway = bench.gateway(bench.configuration(drives[:2], DISCOVERY, ["p2"]))
         fewer = expected_entities(bench, drives[:2])
         until("a drive less", lambda: len(hass.entities()) == fewer)
         until("the others", lambda: hass.state("sensor.p1_state") == "ready")
+        names = hass.entities()
+        expect("p2 lost its switch with `access`", "switch.p2_run" not in names and "binary_sensor.p2_run" in names)
+        end(line)
+        until("the drive offline", lambda: hass.state("sensor.p1_state") == "offline")
+        until("its values", lambda: hass.state("sensor.p1_motor_current") == "unavailable")
+        say("   ok: a drive that is offline says so, and has no values")
         gateway.terminate()
         gateway.wait()
         gateway = bench.gateway(bench.configuration(drives[:2], f'buffer = {{ dir = "{bench.dir}" }}\n' + DISCOVERY))
@@ -116,6 +123,8 @@ def main():
         for complaint in complaints:
             say(f"   {complaint}")
         expect("no warning or error of MQTT in the log", not complaints)
+        bench.publish("homeassistant/device/broken/config", "{")
+        until("a complaint about a broken message", lambda: hass.ask(do="complaints"))
 
 
 main()

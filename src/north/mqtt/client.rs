@@ -565,6 +565,7 @@ impl Client {
     async fn disconnect(&mut self, last_results: tokio::time::Instant) {
         let status = self.topics.status();
         self.options.commands = false;
+        self.announcer = None;
         self.outbox.drop_telemetry();
         let mut offline_queued = false;
         while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {

@@ -122,15 +122,16 @@ class Bench:
         link = self.dir / "line"
         log = (self.dir / "simulate.log").open("w")
         command = [DRIVEGATE, "simulate", "--profile", "vacon-nx", "--addresses", f"1-{drives}", "--link", link]
-        self.start([*command, "--baud", "115200"], stdout=log, stderr=log)
+        process = self.start([*command, "--baud", "115200"], stdout=log, stderr=log)
         until("the simulated line", link.exists)
+        return process
 
-    def configuration(self, drives, mqtt=""):
-        """A configuration of these drives; they may be commanded unless their name begins with `m`."""
+    def configuration(self, drives, mqtt="", monitored=()):
+        """A configuration of these drives; they may be commanded, except those `monitored`."""
         text = f'[gateway]\nname = "hall"\nsocket = ""\nstate_dir = "{self.dir}/state"\n'
         text += f'[[bus]]\nname = "line1"\nport = "{self.dir}/line"\nbaud = 115200\n'
         for address, name in enumerate(drives, 1):
-            access = "monitor" if name.startswith("m") else "control"
+            access = "monitor" if name in monitored else "control"
             text += f'[[bus.drive]]\nname = "{name}"\naddress = {address}\nprofile = "vacon-nx"\naccess = "{access}"\n'
             text += "limits = { speed_reference = [0.0, 80.0] }\n"
         text += f'[http]\nlisten = "127.0.0.1:{self.http}"\n'

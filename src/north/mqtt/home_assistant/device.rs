@@ -71,11 +71,10 @@ impl Device {
 
     fn head(&self, sources: &Sources, name: &str, model: &str, gateway: Option<&str>) -> Map<String, Value> {
         let version = env!("CARGO_PKG_VERSION");
-        let mut device = json!({ "ids": [self.id], "name": name, "mdl": model });
-        match gateway {
-            Some(gateway) => device["via_device"] = gateway.into(),
-            None => device["sw"] = version.into(),
-        }
+        let device = match gateway {
+            Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
+            None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),
+        };
         let mut head = Map::new();
         head.insert("dev".into(), device);
         head.insert("o".into(), json!({ "name": "drivegate", "sw": version }));
