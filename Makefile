@@ -10,7 +10,7 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants fleet clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants fleet interop clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -65,6 +65,10 @@ mutants: ## Put faults into the core on purpose; the seeded world must find each
 N ?= 100
 fleet: tools build ## Run N gateways with one broker and one Prometheus on this machine; prints what they cost
 	.tools/venv/bin/python tests/fleet/fleet.py --gateways $(N)
+
+CHECKS ?=
+interop: ## Run the gateway with Home Assistant and Node-RED; installs them, which takes minutes. CHECKS=name runs one
+	tests/interop/run.sh $(CHECKS)
 
 clean: ## Remove everything that was built or installed here
 	cargo clean

@@ -101,6 +101,7 @@ impl Gateway {
             require_id: false,
             response_topics: Vec::new(),
             buffer: None,
+            home_assistant: None,
         };
         let stats = Arc::<NorthStats>::default();
         let cancel = CancellationToken::new();

@@ -63,6 +63,28 @@ pub enum EventKind {
 }
 
 impl EventKind {
+    /// All kinds.
+    pub const ALL: [EventKind; 18] = [
+        EventKind::Online,
+        EventKind::Offline,
+        EventKind::Fault,
+        EventKind::FaultEnd,
+        EventKind::Started,
+        EventKind::Stopped,
+        EventKind::Warning,
+        EventKind::WarningEnd,
+        EventKind::ControlPlace,
+        EventKind::Restarted,
+        EventKind::UnlikeProfile,
+        EventKind::Supervision,
+        EventKind::Unsupervised,
+        EventKind::RefusedCommand,
+        EventKind::NotConfirmed,
+        EventKind::BusUp,
+        EventKind::BusDown,
+        EventKind::Recording,
+    ];
+
     /// Whether somebody should look: the log has it as a warning.
     pub fn is_trouble(self) -> bool {
         match self {
@@ -323,6 +345,22 @@ mod tests {
             count: None,
             text,
             recording: None,
+        }
+    }
+
+    /// A new kind does not compile until it is here, and then in `ALL`.
+    #[test]
+    fn all_kinds_are_listed() {
+        use EventKind::*;
+        for (place, kind) in EventKind::ALL.into_iter().enumerate() {
+            let last = match kind {
+                Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
+                | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
+                | BusDown => false,
+                Recording => true,
+            };
+            assert_eq!(kind as usize, place);
+            assert_eq!(last, place + 1 == EventKind::ALL.len());
         }
     }
 

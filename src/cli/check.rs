@@ -125,18 +125,22 @@ fn milliseconds(time: Duration) -> f64 {
 }
 
 fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
+    // Writing to a String cannot fail.
     let mut text = String::new();
     for bus in &settings.buses {
         text += &bus_text(bus, &settings.recordings);
         text.push('\n');
     }
     let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
+    if let Some(prefix) = settings.mqtt.as_ref().and_then(|mqtt| mqtt.home_assistant.as_ref()) {
+        let drives = counted(drives, "drive", "drives");
+        let _ = writeln!(text, "Home Assistant: {drives} announced below {prefix}/device\n");
+    }
     let warnings = match warnings {
         0 => "no warnings".to_string(),
         1 => "1 warning".to_string(),
         more => format!("{more} warnings"),
     };
-    // Writing to a String cannot fail.
     let _ = writeln!(
         text,
         "{}: ok, {}, {}, {warnings}",

@@ -409,8 +409,19 @@ keys! {
         }, default [];
         /// Where events and history are buffered while the broker is unreachable.
         buffer: Present = Own { schema: Buffer::schema, range: "[mqtt.buffer]" }, or "in memory only";
-        /// Discovery for Home Assistant; not supported in this version.
-        home_assistant: Present = Own { schema: || json!({ "const": false }), range: "false" }, default false;
+        /// Discovery for Home Assistant: [the drives appear there](home-assistant.md) by themselves.
+        home_assistant: Present = Own {
+            schema: || json!({ "anyOf": [{ "const": false }, MqttHomeAssistant::schema()] }),
+            range: "[mqtt.home_assistant], or false",
+        }, or "off";
+    }
+
+    /// Discovery for Home Assistant; off without this table.
+    MQTT_HOME_ASSISTANT: MqttHomeAssistant {
+        /// The discovery prefix that is set in Home Assistant.
+        discovery_prefix: String = Parsed {
+            parse: mqtt::parse_base, words: &[], pattern: "", range: "a topic without + and #",
+        }, default "homeassistant";
     }
 
     /// How often values are published.

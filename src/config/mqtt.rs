@@ -7,9 +7,9 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, MQTT_QOS, PUBLISH};
+use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH};
 use super::{files, values};
-use crate::document::{Finding, Reader, format_duration, parse_size};
+use crate::document::{Finding, FromNode, Reader, format_duration, parse_size};
 use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
 use crate::north::{ServerIdentity, TlsFile};
 
@@ -83,13 +83,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         warn_of_clear_text(reader, &broker.host, password.is_some(), commands);
     }
     let buffer = read_buffer(reader, base);
-    if reader.or(MQTT.home_assistant.name, false) {
-        reader.problem(
-            MQTT.home_assistant.name,
-            "home_assistant = true is not supported by this version",
-            "remove it",
-        );
-    }
+    let home_assistant = read_home_assistant(reader);
     reader.finish();
     let Broker { host, port, tls } = broker?;
     Some(Options {
@@ -112,7 +106,20 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         require_id,
         response_topics,
         buffer,
+        home_assistant,
     })
+}
+
+/// The discovery prefix; `home_assistant = false` means the same as no table.
+fn read_home_assistant(reader: &Reader<'_>) -> Option<String> {
+    let off = |node| bool::from_node(node).is_ok_and(|on| !on);
+    if reader.raw(MQTT.home_assistant.name).is_some_and(off) {
+        return None;
+    }
+    let table = MQTT.home_assistant.table(reader)?;
+    let prefix = MQTT_HOME_ASSISTANT.discovery_prefix.get(&table);
+    table.finish();
+    Some(prefix)
 }
 
 pub(super) fn parse_client_id(text: &str) -> Result<String, Finding> {

@@ -326,6 +326,14 @@ fn what_mqtt_publishes_and_accepts() {
         let options = loaded.settings.and_then(|settings| settings.mqtt);
         (options, first(loaded.errors), first(loaded.warnings))
     };
+    let prefix = |more: &str| mqtt(more).0.unwrap().home_assistant;
+    assert_eq!(prefix(""), None);
+    assert_eq!(prefix("home_assistant = false"), None);
+    assert_eq!(prefix("[mqtt.home_assistant]").as_deref(), Some("homeassistant"));
+    assert_eq!(
+        prefix("home_assistant = { discovery_prefix = \"ha/1\" }").as_deref(),
+        Some("ha/1")
+    );
     let (options, ..) = mqtt("");
     let options = options.unwrap();
     assert!(options.telemetry.state && options.telemetry.points && !options.require_id);

@@ -206,6 +206,8 @@ pub struct MqttStats {
     /// Messages waiting for the broker.
     pub buffered: AtomicU64,
     lost: [AtomicU64; MqttLoss::ALL.len()],
+    /// The retained topics of the client that runs, for the one that a reload puts in its place.
+    retained: Mutex<Vec<String>>,
 }
 
 /// What the MQTT client lost.
@@ -234,6 +236,12 @@ impl MqttLoss {
 }
 
 impl MqttStats {
+    /// Keeps the retained topics that are published; returns those kept before.
+    pub(crate) fn keep_retained(&self, topics: Vec<String>) -> Vec<String> {
+        let mut kept = self.retained.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, topics)
+    }
+
     /// Counts lost messages.
     pub(crate) fn lost(&self, kind: MqttLoss, count: u64) {
         if let Some(counter) = self.lost.get(kind as usize) {

@@ -255,6 +255,17 @@ fn the_tables_name_every_request() {
 }
 
 #[test]
+fn what_home_assistant_is_told_is_announced() {
+    let (_dir, path) = sound();
+    assert!(!run(&["check", "--config", &path]).out.contains("Home Assistant"));
+    let source = fs::read_to_string(&path).unwrap() + "\n[mqtt.home_assistant]\n";
+    fs::write(&path, source).unwrap();
+    let told = "Home Assistant: 2 drives announced below homeassistant/device\n";
+    let ran = run(&["check", "--config", &path]);
+    assert!(ran.out.contains(told), "{}", ran.out);
+}
+
+#[test]
 fn stops_at_shutdown_are_told_with_their_time() {
     let (_dir, path) = sound();
     assert!(

@@ -1,6 +1,7 @@
 //! The task that owns outbox, journal and publisher, and publishes while there is a connection.
 
 mod buffering;
+mod discovery;
 
 use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
@@ -14,8 +15,10 @@ use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
+use self::discovery::{announcer, discovery_topics, report_refused, subscriptions};
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
+use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE, Subscribed, Subscription};
+use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
 use super::payload::{self, Topics};
@@ -121,6 +124,12 @@ struct Client {
     events: Receiver<Arc<Event>>,
     topics: Topics,
     publisher: Publisher,
+    /// Of Home Assistant, if it is told.
+    announcer: Option<Announcer>,
+    /// Whether discovery messages of an earlier run were asked for, or need not be.
+    leftovers_known: bool,
+    /// What the present connection subscribed to.
+    subscriptions: Vec<Subscription>,
     /// Woken when a drive was updated.
     fresh: Arc<Notify>,
     /// When the publisher, and when everything else is looked at again at the latest.
@@ -151,7 +160,8 @@ impl Client {
         let fresh = Arc::new(Notify::new());
         let intervals = (options.min_interval, options.max_interval);
         let mut publisher = Publisher::new(topics.clone(), intervals, options.telemetry, fresh.clone());
-        publisher.adopt(&observed);
+        let mut announcer = announcer(&options, &topics);
+        publisher.adopt(&observed, discovery_topics(announcer.as_mut(), &observed));
         let rules = Rules {
             responses: ResponseTopics::new(&options.base, &observed.gateway, options.response_topics.clone()),
             require_id: options.require_id,
@@ -162,9 +172,10 @@ impl Client {
             expiry: options.expiry.and_then(|expiry| u32::try_from(expiry.as_secs()).ok()),
         };
         let (events_buffer, history_buffer) = buffers(&options);
+        let has_buffer = events_buffer.is_some();
         let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
-        Client {
+        let mut client = Client {
             store: Store::open(events_buffer, EVENT_FILES, count(MqttLoss::Event)),
             history: Store::open(history_buffer, HISTORY_FILES, count(MqttLoss::History)),
             history_at: now,
@@ -184,10 +195,15 @@ impl Client {
             events,
             topics,
             publisher,
+            announcer,
+            leftovers_known: has_buffer,
+            subscriptions: Vec::new(),
             fresh,
             look_at: now,
             check_at: now,
-        }
+        };
+        client.take_over();
+        client
     }
 
     /// Whether another message from the broker may be taken: a result of it finds room.
@@ -205,12 +221,7 @@ impl Client {
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
             ConnectionEvent::Subscribed(refused) => {
-                if let Some(why) = refused {
-                    tracing::error!(
-                        "the broker refuses the set topics ({why}): no commands over MQTT; allow the client to subscribe to {}",
-                        self.topics.set_filters().join(" and ")
-                    );
-                }
+                report_refused(&self.subscriptions, &refused);
                 if let Phase::Subscribing { limits, since } = session.phase {
                     self.ready(limits, since);
                 }
@@ -247,13 +258,17 @@ impl Client {
         }
         if let Some(omitted) = self.refused.permit(Instant::now()) {
             let root = self.topics.root();
+            let discovery = self
+                .announcer
+                .as_ref()
+                .map_or_else(String::new, |announcer| format!(", {}", announcer.own_topics()));
             let more = match omitted {
                 0 => String::new(),
                 omitted => format!(" ({omitted} more messages, on this or other topics, since the last such line)"),
             };
             tracing::warn!(
-                "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/# and to the \
-                 response topics in use{more}",
+                "dropped a message on {topic}: {why}; the broker must let client {} publish to {root}/#{discovery} and to \
+                 the response topics in use{more}",
                 self.options.client_id
             );
         }
@@ -276,7 +291,13 @@ impl Client {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if session.connection.subscribe(&self.topics, self.options.commands) {
+        self.subscriptions = subscriptions(
+            &self.topics,
+            self.options.commands,
+            self.announcer.as_ref(),
+            self.leftovers_known,
+        );
+        if session.connection.subscribe(&self.subscriptions) {
             // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
@@ -308,6 +329,10 @@ impl Client {
             self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
         }
         self.publisher.restart();
+        if let Some(announcer) = &mut self.announcer {
+            announcer.restart(limits.max_packet);
+        }
+        self.leftovers_known = true;
         self.look_at = since;
     }
 
@@ -350,6 +375,9 @@ impl Client {
     fn on_message(&mut self, message: Incoming) {
         if message.topic == self.topics.status() {
             return self.on_status(&message.payload);
+        }
+        if self.on_discovery(&message) {
+            return;
         }
         let plant = self.plant.load();
         let crowded = |topic: &str| self.outbox.is_crowded(topic);
@@ -446,7 +474,8 @@ impl Client {
             self.take_pending_events();
             self.events = events;
         }
-        self.publisher.adopt(&plant);
+        let discovery = discovery_topics(self.announcer.as_mut(), &plant);
+        self.publisher.adopt(&plant, discovery);
         self.observed = plant;
         self.remember_topics();
     }
@@ -478,8 +507,10 @@ impl Client {
             ..
         }) = &self.link
         {
+            let limits = *limits;
             self.history.load(self.outbox.room(Kind::History));
-            self.publish(*limits);
+            self.announce();
+            self.publish(limits);
         }
         let waiting = self.outbox.waiting() as u64 + self.store.waiting() + self.history.waiting();
         self.stats.mqtt.buffered.store(waiting, Ordering::Relaxed);
@@ -534,6 +565,7 @@ impl Client {
     async fn disconnect(&mut self, last_results: tokio::time::Instant) {
         let status = self.topics.status();
         self.options.commands = false;
+        self.announcer = None;
         self.outbox.drop_telemetry();
         let mut offline_queued = false;
         while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {

@@ -22,7 +22,6 @@ use tokio::task::JoinHandle;
 
 use super::Options;
 use super::outbox::Message;
-use super::payload::Topics;
 use super::request::Incoming;
 
 /// Keep-alive interval, s.
@@ -52,8 +51,8 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) enum ConnectionEvent {
     /// The broker accepted the connection.
     Connected(BrokerLimits),
-    /// The broker answered the subscriptions; with the reason if it refused that of the set topics.
-    Subscribed(Option<String>),
+    /// The broker answered the subscriptions: for each filter the reason if it refused it.
+    Subscribed(Vec<Option<String>>),
     /// The oldest published message with an acknowledgement was sent with this packet id.
     Sent(u16),
     /// The broker acknowledged the message.
@@ -68,6 +67,27 @@ pub(super) enum ConnectionEvent {
     Alive,
     /// The connection is lost, with the reason. The last event.
     Lost(String),
+}
+
+/// A filter that is subscribed to.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct Subscription {
+    pub(super) filter: String,
+    pub(super) of: Subscribed,
+}
+
+/// What a subscription is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Subscribed {
+    /// The status that others publish in the gateway's name.
+    Status,
+    /// The set topics. Retained messages are requested too, and stay marked even if they arrive during the subscription,
+    /// so that they can be refused.
+    Commands,
+    /// Home Assistant was started.
+    Birth,
+    /// Retained discovery messages of an earlier run.
+    Leftovers,
 }
 
 /// What the broker can do.
@@ -182,27 +202,18 @@ impl Connection {
         self.event.recv().await.unwrap_or_else(silent)
     }
 
-    /// Subscribes to the status that others publish in the gateway's name, and to all set topics if there are `commands`.
-    /// Retained messages on set topics are requested too, and stay marked even if they arrive during the subscription,
-    /// so that they can be refused.
-    pub(super) fn subscribe(&self, topics: &Topics, commands: bool) -> bool {
-        let set = |path| Filter {
-            path,
+    /// Subscribes to all of these.
+    pub(super) fn subscribe(&self, subscriptions: &[Subscription]) -> bool {
+        let filters = subscriptions.iter().map(|Subscription { filter, of }| Filter {
+            path: filter.clone(),
             qos: QoS::AtLeastOnce,
-            preserve_retain: true,
-            ..Filter::default()
-        };
-        let status = Filter {
-            path: topics.status(),
-            qos: QoS::AtLeastOnce,
-            nolocal: true,
-            retain_forward_rule: RetainForwardRule::Never,
-            ..Filter::default()
-        };
-        let mut filters = vec![status];
-        if commands {
-            filters.extend(topics.set_filters().map(set));
-        }
+            nolocal: *of != Subscribed::Commands,
+            preserve_retain: *of == Subscribed::Commands,
+            retain_forward_rule: match of {
+                Subscribed::Status | Subscribed::Birth => RetainForwardRule::Never,
+                Subscribed::Commands | Subscribed::Leftovers => RetainForwardRule::default(),
+            },
+        });
         self.client.try_subscribe_many(filters).is_ok()
     }
 
@@ -308,10 +319,13 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
     match event {
         Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
-            let granted = |code: &SubscribeReasonCode| matches!(code, SubscribeReasonCode::Success(_));
-            // The first is that of the status, which the gateway can do without.
-            let refused = ack.return_codes.iter().skip(1).find(|code| !granted(code));
-            Some(ConnectionEvent::Subscribed(refused.map(|code| format!("{code:?}"))))
+            let refused = |code: &SubscribeReasonCode| match code {
+                SubscribeReasonCode::Success(_) => None,
+                why => Some(format!("{why:?}")),
+            };
+            Some(ConnectionEvent::Subscribed(
+                ack.return_codes.iter().map(refused).collect(),
+            ))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
             PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),

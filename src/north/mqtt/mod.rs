@@ -9,7 +9,7 @@
 //!                commands ◀──────────────────────── set topics ◀──────┘
 //! ```
 //!
-//! `payload`, `publisher`, `history`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
+//! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
 //! in which order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps
 //! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
 //! sent again from the outbox.
@@ -20,6 +20,7 @@ mod connection;
 #[cfg(test)]
 mod fixture;
 mod history;
+mod home_assistant;
 mod journal;
 mod offline;
 mod outage_log;
@@ -99,6 +100,8 @@ pub struct Options {
     pub response_topics: Vec<String>,
     /// Disk buffer for events and history while the broker is not connected; in memory only if absent.
     pub buffer: Option<Buffer>,
+    /// Discovery prefix of Home Assistant; no discovery if absent.
+    pub home_assistant: Option<String>,
 }
 
 /// Which telemetry is published.

@@ -44,6 +44,8 @@ pub(super) struct Publisher {
     cursor: usize,
     buses: Vec<BusTopic>,
     buses_at: Option<Instant>,
+    /// Retained topics that are published besides.
+    besides: Vec<Arc<str>>,
     /// Topics that are no longer published, to be cleared at the broker.
     vanished: BTreeSet<Arc<str>>,
     vanished_cleared: bool,
@@ -122,13 +124,15 @@ impl Publisher {
             cursor: 0,
             buses: Vec::new(),
             buses_at: None,
+            besides: Vec::new(),
             vanished: BTreeSet::new(),
             vanished_cleared: false,
         }
     }
 
-    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist.
-    pub(super) fn adopt(&mut self, plant: &Plant) {
+    /// Observes this plant from now on; publishes everything again and clears the topics that no longer exist. `besides`
+    /// are retained topics that somebody else publishes.
+    pub(super) fn adopt(&mut self, plant: &Plant, besides: Vec<Arc<str>>) {
         let old: Vec<Arc<str>> = self.all_topics().cloned().collect();
         self.drives = plant
             .drives()
@@ -145,6 +149,13 @@ impl Publisher {
         };
         self.buses = plant.buses.iter().map(bus_topic).collect();
         self.buses_at = None;
+        self.besides = besides;
+        self.clear(old);
+    }
+
+    /// Somebody else publishes these retained topics from now on.
+    pub(super) fn publish_besides(&mut self, besides: Vec<Arc<str>>) {
+        let old = std::mem::replace(&mut self.besides, besides);
         self.clear(old);
     }
 
@@ -156,13 +167,13 @@ impl Publisher {
         self.vanished_cleared = false;
     }
 
-    /// The retained topics of drives and buses.
+    /// The retained topics of drives and buses, and those besides.
     pub(super) fn all_topics(&self) -> impl Iterator<Item = &Arc<str>> {
         let drives = self
             .drives
             .iter()
             .flat_map(|d| d.points.iter().map(|p| &p.topic).chain(&d.state));
-        drives.chain(self.buses.iter().map(|b| &b.topic))
+        drives.chain(self.buses.iter().map(|b| &b.topic)).chain(&self.besides)
     }
 
     /// Publishes everything again, since the broker may have lost it.

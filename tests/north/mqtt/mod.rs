@@ -3,6 +3,7 @@
 mod bench;
 mod commands;
 mod delivery;
+mod home_assistant;
 mod hostile;
 mod telemetry;
 mod tls;

@@ -95,11 +95,20 @@ impl Client {
         self.publisher.clear(topics.into_iter().filter(sound).map(Arc::from));
     }
 
+    /// All topics that have a retained message, or may have one.
+    pub(super) fn retained_topics(&self) -> Vec<String> {
+        let topics = self.publisher.all_topics().chain(self.publisher.vanished());
+        topics
+            .map(|topic| topic.to_string())
+            .chain([self.topics.status()])
+            .collect()
+    }
+
     /// Keeps the retained topics for the next run, with those that are still to be cleared.
     pub(super) fn remember_topics(&self) {
-        let topics = self.publisher.all_topics().chain(self.publisher.vanished());
-        let topics = topics.map(|topic| topic.to_string());
-        self.store.remember(topics.chain([self.topics.status()]).collect());
+        let topics = self.retained_topics();
+        self.stats.mqtt.keep_retained(topics.clone());
+        self.store.remember(topics);
     }
 
     /// Counts what the outbox lost, and logs it once a minute.

@@ -24,7 +24,7 @@ impl Bench {
         };
         let intervals = (Duration::from_millis(100), Duration::from_secs(60));
         let mut publisher = Publisher::new(topics, intervals, telemetry, Arc::default());
-        publisher.adopt(&plant);
+        publisher.adopt(&plant, Vec::new());
         let bench = Bench {
             plant,
             publisher,
@@ -220,7 +220,7 @@ fn after_a_restart_everything_comes_again() {
 fn vanished_drives_are_cleared_until_they_come_back() {
     let mut bench = Bench::new();
     bench.after(0);
-    bench.publisher.adopt(&fixture::plant(&["p1", "p3"]));
+    bench.publisher.adopt(&fixture::plant(&["p1", "p3"]), Vec::new());
     let all = bench.after(10);
     assert_eq!(payload(&all, "drive/p2/state"), Some(""));
     assert_eq!(payload(&all, "drive/p2/point/running"), Some(""));
@@ -232,7 +232,7 @@ fn vanished_drives_are_cleared_until_they_come_back() {
         Some(""),
         "and again for a broker that comes back"
     );
-    bench.publisher.adopt(&bench.plant);
+    bench.publisher.adopt(&bench.plant, Vec::new());
     let back = bench.after(1);
     assert_ne!(payload(&back, "drive/p2/state"), Some(""));
     assert_eq!(payload(&back, "drive/p3/state"), Some(""));
@@ -272,7 +272,7 @@ fn many_drives_are_looked_at_a_few_at_a_time() {
     let names: Vec<&str> = names.iter().map(String::as_str).collect();
     let mut bench = Bench::new();
     bench.plant = fixture::plant(&names);
-    bench.publisher.adopt(&bench.plant);
+    bench.publisher.adopt(&bench.plant, Vec::new());
     let mut states = 0;
     for calls in 1.. {
         let (updates, next) = bench.publisher.tick(bench.now, bench.wall);
@@ -295,7 +295,7 @@ fn only_what_is_wanted_is_published() {
         let mut bench = Bench::new();
         bench.publisher.telemetry.state = state;
         bench.publisher.telemetry.points = points;
-        bench.publisher.adopt(&bench.plant);
+        bench.publisher.adopt(&bench.plant, Vec::new());
         let (updates, _) = bench.publisher.tick(bench.now, bench.wall);
         assert_eq!(updates.iter().any(|u| u.topic.ends_with("p1/state")), state);
         assert_eq!(updates.iter().any(|u| u.topic.contains("/point/")), points);

@@ -1,0 +1,109 @@
+//! A device and its message: the gateway with the health of its buses, or a drive.
+
+use serde_json::{Map, Value, json};
+
+use super::entity::{self, Entities};
+use super::{Sources, id_of};
+use crate::plant::{DriveHandle, Plant};
+
+/// A device of Home Assistant.
+#[derive(Debug)]
+pub(super) struct Device {
+    id: String,
+    kind: Kind,
+}
+
+#[derive(Debug)]
+enum Kind {
+    /// With its name and those of its buses.
+    Gateway { name: String, buses: Vec<String> },
+    /// With the id of its gateway.
+    Drive { drive: DriveHandle, gateway: String },
+}
+
+impl Device {
+    /// The gateway of this id.
+    pub(super) fn gateway(id: &str, plant: &Plant) -> Device {
+        let name = |bus: &crate::plant::BusHandle| bus.image.spec.name.clone();
+        Device {
+            id: id.to_string(),
+            kind: Kind::Gateway {
+                name: plant.gateway.clone(),
+                buses: plant.buses.iter().map(name).collect(),
+            },
+        }
+    }
+
+    /// A drive of the gateway of this id.
+    pub(super) fn drive(gateway: &str, sources: &Sources, drive: DriveHandle) -> Device {
+        let topic = format!("{}/drive/{}", sources.topics.root(), drive.image.spec.name);
+        Device {
+            id: id_of(&topic),
+            kind: Kind::Drive {
+                drive,
+                gateway: gateway.to_string(),
+            },
+        }
+    }
+
+    /// Its id, unique on the broker.
+    pub(super) fn id(&self) -> &str {
+        &self.id
+    }
+
+    /// Its message, in as many parts as `limit`, the largest payload, requires; each describes the device and some of its
+    /// entities. An entity that is larger by itself is a part of its own.
+    pub(super) fn payloads(&self, sources: &Sources, limit: usize) -> Vec<Vec<u8>> {
+        let (head, entities) = match &self.kind {
+            Kind::Gateway { name, buses } => (
+                self.head(sources, name, "drivegate", None),
+                entity::of_gateway(sources, &self.id, buses),
+            ),
+            Kind::Drive { drive, gateway } => {
+                let spec = &drive.image.spec;
+                let mut head = self.head(sources, &spec.name, &spec.profile.title, Some(gateway));
+                head.insert("avty".into(), entity::of_drive_availability(sources, spec));
+                (head, entity::of_drive(sources, &self.id, spec))
+            }
+        };
+        parts(&head, entities, limit)
+    }
+
+    fn head(&self, sources: &Sources, name: &str, model: &str, gateway: Option<&str>) -> Map<String, Value> {
+        let version = env!("CARGO_PKG_VERSION");
+        let device = match gateway {
+            Some(gateway) => json!({ "ids": [self.id], "name": name, "mdl": model, "via_device": gateway }),
+            None => json!({ "ids": [self.id], "name": name, "mdl": model, "sw": version }),
+        };
+        let mut head = Map::new();
+        head.insert("dev".into(), device);
+        head.insert("o".into(), json!({ "name": "drivegate", "sw": version }));
+        head.insert("avty".into(), entity::of_gateway_availability(sources));
+        head.insert("avty_mode".into(), "all".into());
+        head
+    }
+}
+
+/// The entities with the head, in payloads of at most `limit` bytes as far as possible.
+fn parts(head: &Map<String, Value>, entities: Entities, limit: usize) -> Vec<Vec<u8>> {
+    let render = |entities: Map<String, Value>| {
+        let mut message = head.clone();
+        message.insert("cmps".into(), entities.into());
+        Value::from(message).to_string().into_bytes()
+    };
+    let empty = render(Map::new()).len();
+    let mut payloads = Vec::new();
+    let (mut part, mut size) = (Map::new(), empty);
+    for (key, entity) in entities {
+        // Quotes, colon and comma.
+        let more = key.len() + entity.to_string().len() + 4;
+        if size + more > limit && !part.is_empty() {
+            payloads.push(render(std::mem::take(&mut part)));
+            size = empty;
+        }
+        size += more;
+        part.insert(key, entity);
+    }
+    payloads.push(render(part));
+    payloads
+}

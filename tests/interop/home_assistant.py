@@ -1,0 +1,130 @@
+"""Home Assistant from PyPI shows the drives by themselves, commands them, and knows when they are away."""
+
+import json
+import subprocess
+import time
+from pathlib import Path
+
+from bench import Bench, end, expect, python_of, say, until, venv
+
+VERSION = "2025.4.4"
+# Of the MQTT integration; Home Assistant would install it by itself.
+REQUIREMENTS = [f"homeassistant=={VERSION}", "paho-mqtt==2.1.0"]
+DISCOVERY = "[mqtt.home_assistant]\n"
+# Entities of the gateway for each bus.
+OF_BUS = 5
+# Keys of a state that are no entities.
+BESIDES = {"quality", "time", "age_ms", "point_quality"}
+
+
+class HomeAssistant:
+    def __init__(self, bench, python):
+        directory = bench.dir / "home-assistant"
+        directory.mkdir()
+        (directory / "configuration.yaml").write_text("homeassistant:\n  name: interop\n")
+        inside = Path(__file__).parent / "lib" / "inside_home_assistant.py"
+        log = (bench.dir / "home-assistant.log").open("w")
+        self.process = subprocess.Popen(
+            [python, inside, directory, str(bench.mqtt)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, start_new_session=True,
+        )
+        bench.stack.callback(end, self.process)
+        self.log = Path(log.name)
+        if self.read() != "ready":
+            raise SystemExit(f"error: Home Assistant did not start:\n{self.log.read_text()[-4000:]}")
+
+    def read(self):
+        line = self.process.stdout.readline()
+        return json.loads(line) if line else None
+
+    def ask(self, **command):
+        self.process.stdin.write(json.dumps(command) + "\n")
+        self.process.stdin.flush()
+        return self.read()
+
+    def entities(self):
+        return self.ask(do="entities")
+
+    def state(self, name):
+        return self.entities().get(name, {}).get("state")
+
+    def call(self, domain, service, **data):
+        self.ask(do="call", domain=domain, service=service, data=data)
+
+
+def expected_entities(bench, drives):
+    """One for each point of the state and its texts, and the events; those of the bus."""
+    count = OF_BUS
+    for drive in drives:
+        state = json.loads(bench.retained(f"drivegate/hall/drive/{drive}/state"))
+        texts = {key for key in state if key.endswith("_text") and key != "fault_text"}
+        count += len(set(state) - BESIDES - texts) + 1
+    return count
+
+
+def main():
+    python = venv("home-assistant", REQUIREMENTS, python_of("3.13"))
+    with Bench() as bench:
+        bench.broker()
+        line = bench.line(3)
+        drives = ["p1", "p2", "p3"]
+        gateway = bench.gateway(bench.configuration(drives, DISCOVERY, ["p3"]))
+        until("the first state", lambda: bench.retained("drivegate/hall/drive/p3/state"))
+        hass = HomeAssistant(bench, python)
+        wanted = expected_entities(bench, drives)
+        until("the entities", lambda: len(hass.entities()) >= wanted)
+        time.sleep(1)
+        entities = hass.entities()
+        expect(f"{len(entities)} entities = {wanted} points", len(entities) == wanted)
+        devices = {device["name"]: device for device in hass.ask(do="devices")}
+        expect("a device for each drive, by the gateway", all(devices[d]["via"] == devices["hall"]["id"] for d in drives))
+        controls = [name for name in entities if name.split(".")[0] in ("switch", "number", "button")]
+        expect("controls of p1 and p2 only", len(controls) == 8 and not any("p3" in name for name in controls))
+        available = lambda: all(e["state"] not in ("unavailable", None) for e in hass.entities().values())
+        _, took = until("all to be available", available)
+        say(f"   ok: all are available {took:.2f} s later")
+
+        hass.call("number", "set_value", entity_id="number.p1_speed_reference", value=40)
+        begin = time.monotonic()
+        hass.call("switch", "turn_on", entity_id="switch.p1_run")
+        until("the motor", lambda: hass.state("binary_sensor.p1_running") == "on")
+        took = time.monotonic() - begin
+        expect(f"switch on, the motor runs after {took:.2f} s", took <= 2)
+        until("the speed", lambda: float(hass.state("sensor.p1_actual_speed")) > 39)
+        until("the event", lambda: hass.entities()["event.p1_event"]["attributes"].get("event_type") == "started")
+        hass.call("switch", "turn_off", entity_id="switch.p1_run")
+        until("the stop", lambda: hass.state("binary_sensor.p1_running") == "off")
+        hass.call("button", "press", entity_id="button.p1_fault_reset")
+
+        gateway.kill()
+        away = lambda: all(e["state"] == "unavailable" for e in hass.entities().values())
+        _, took = until("unavailable", away)
+        expect(f"gateway killed, all are unavailable after {took:.2f} s", took <= 2)
+        gateway = bench.gateway(bench.configuration(drives[:2], DISCOVERY, ["p2"]))
+        fewer = expected_entities(bench, drives[:2])
+        until("a drive less", lambda: len(hass.entities()) == fewer)
+        until("the others", lambda: hass.state("sensor.p1_state") == "ready")
+        names = hass.entities()
+        expect("p2 lost its switch with `access`", "switch.p2_run" not in names and "binary_sensor.p2_run" in names)
+        end(line)
+        until("the drive offline", lambda: hass.state("sensor.p1_state") == "offline")
+        until("its values", lambda: hass.state("sensor.p1_motor_current") == "unavailable")
+        say("   ok: a drive that is offline says so, and has no values")
+        gateway.terminate()
+        gateway.wait()
+        gateway = bench.gateway(bench.configuration(drives[:2], f'buffer = {{ dir = "{bench.dir}" }}\n' + DISCOVERY))
+        until("the buffer's list", lambda: (bench.dir / "mqtt-topics").exists())
+        gateway.terminate()
+        gateway.wait()
+        bench.gateway(bench.configuration(drives[:2], f'buffer = {{ dir = "{bench.dir}" }}\n'))
+        until("no entity after switching it off", lambda: not hass.entities())
+        say("   ok: a removed drive and discovery switched off take their entities away")
+        complaints = hass.ask(do="complaints")
+        for complaint in complaints:
+            say(f"   {complaint}")
+        expect("no warning or error of MQTT in the log", not complaints)
+        bench.publish("homeassistant/device/broken/config", "{")
+        until("a complaint about a broken message", lambda: hass.ask(do="complaints"))
+
+
+main()

@@ -1,0 +1,61 @@
+"""The real Home Assistant with its MQTT integration, commanded by JSON lines: run by the Python that has it.
+
+Without its default integrations (frontend, backup and so on), which play no part and take long to install."""
+
+import asyncio
+import json
+import logging
+import sys
+
+from homeassistant import bootstrap, runner
+from homeassistant.helpers import device_registry, entity_registry
+
+directory, port = sys.argv[1], int(sys.argv[2])
+complaints = []
+
+
+class Complaints(logging.Handler):
+    """What the integration logs as a warning or worse."""
+
+    def emit(self, record):
+        if record.name.startswith("homeassistant") and ("mqtt" in record.name or "template" in record.name):
+            complaints.append(f"{record.levelname} {record.name}: {record.getMessage()}")
+
+
+async def answer(hass, command):
+    match command["do"]:
+        case "entities":
+            registry = entity_registry.async_get(hass)
+            names = {entry.entity_id: entry.unique_id for entry in registry.entities.values() if entry.platform == "mqtt"}
+            states = {name: hass.states.get(name) for name in names}
+            return {name: {"unique_id": names[name], "state": s and s.state, "attributes": dict(s.attributes) if s else {}}
+                    for name, s in states.items()}
+        case "devices":
+            devices = device_registry.async_get(hass).devices.values()
+            return [{"name": d.name, "id": d.id, "via": d.via_device_id, "model": d.model} for d in devices]
+        case "call":
+            await hass.services.async_call(command["domain"], command["service"], command["data"], blocking=True)
+            return None
+        case "complaints":
+            return complaints
+
+
+async def main():
+    bootstrap.DEFAULT_INTEGRATIONS = set()
+    bootstrap.CRITICAL_INTEGRATIONS = set()
+    hass = await bootstrap.async_setup_hass(runner.RuntimeConfig(config_dir=directory))
+    logging.getLogger().addHandler(handler := Complaints(logging.WARNING))
+    await hass.async_start()
+    flow = await hass.config_entries.flow.async_init("mqtt", context={"source": "user"})
+    result = await hass.config_entries.flow.async_configure(flow["flow_id"], {"broker": "127.0.0.1", "port": port})
+    assert result["type"] == "create_entry", result
+    reader = asyncio.StreamReader()
+    await asyncio.get_running_loop().connect_read_pipe(lambda: asyncio.StreamReaderProtocol(reader), sys.stdin)
+    print(json.dumps("ready"), flush=True)
+    while line := await reader.readline():
+        print(json.dumps(await answer(hass, json.loads(line)), default=str), flush=True)
+    logging.getLogger().removeHandler(handler)
+    await hass.async_stop()
+
+
+asyncio.run(main())
