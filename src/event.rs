@@ -60,6 +60,8 @@ pub enum EventKind {
     BusDown,
     /// A recording was made, or lost.
     Recording,
+    /// A new configuration was not applied; the former one goes on.
+    ReloadRefused,
 }
 
 impl EventKind {
@@ -73,7 +75,8 @@ impl EventKind {
             | EventKind::Supervision
             | EventKind::Unsupervised
             | EventKind::NotConfirmed
-            | EventKind::BusDown => true,
+            | EventKind::BusDown
+            | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
             | EventKind::Started
@@ -108,6 +111,7 @@ impl EventKind {
             EventKind::BusUp => "bus_up",
             EventKind::BusDown => "bus_down",
             EventKind::Recording => "recording",
+            EventKind::ReloadRefused => "reload_refused",
         }
     }
 }
@@ -124,7 +128,8 @@ pub struct Event {
     /// What happened.
     #[serde(rename = "event")]
     pub kind: EventKind,
-    /// The bus.
+    /// The bus; empty if the whole gateway is meant.
+    #[serde(skip_serializing_if = "String::is_empty")]
     pub bus: String,
     /// The drive, unless the whole bus is meant.
     #[serde(skip_serializing_if = "Option::is_none")]
