@@ -101,7 +101,8 @@ fn restore(args: &Args) -> Result<String, Refused> {
         Ok(below) => base.join(below),
         Err(_) => settings.state_dir.clone(),
     };
-    if manifest.members.len() > 1 && absolute(&state_dir) != absolute(&args.state_dir) {
+    let has_state = manifest.members.iter().any(|member| member.name.starts_with("state/"));
+    if has_state && absolute(&state_dir) != absolute(&args.state_dir) {
         return Err(Refused::Because(format!(
             "the configuration in the backup has the state directory {0}; if that is right, add --state-dir {0}",
             state_dir.display()
