@@ -326,7 +326,7 @@ impl Daemon {
         if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.stats).await {
             tracing::warn!(
                 target: "drivegate::local",
-                "{error}; `drivegate read` and `drivegate write` cannot use this gateway; set `socket` of [gateway], or \
+                "{error}; `drivegate read`, `write`, `reload` and `health` cannot reach this gateway; set `socket` of [gateway], or \
                  socket = \"\" to do without"
             );
         }

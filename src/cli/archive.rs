@@ -1,7 +1,7 @@
 //! The archive of `backup` and `restore`: a tar file whose first member, `manifest.json`, names all the others. A member is
 //! `config/…`, below the directory of the configuration, or `state/…`, below the state directory; nothing else is accepted.
 
-use std::collections::BTreeMap;
+use std::collections::BTreeSet;
 use std::io::{self, Read, Write};
 use std::path::{Component, Path, PathBuf};
 
@@ -213,12 +213,12 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
         ));
     }
     let manifest: Manifest = serde_json::from_slice(json).map_err(no_manifest)?;
-    let mut names = BTreeMap::new();
+    let mut names = BTreeSet::new();
     let mut bytes = 0u64;
     for member in &manifest.members {
         place(&member.name)?;
         bytes = bytes.saturating_add(member.bytes);
-        if names.insert(&member.name, ()).is_some() {
+        if !names.insert(&member.name) {
             return Err(format!("{} is in it twice", member.name));
         }
     }

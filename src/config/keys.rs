@@ -166,8 +166,8 @@ keys! {
     GATEWAY: Gateway {
         /// Name of the gateway, used in MQTT topics and in the metric `drivegate_build_info`.
         name: String = Name("-"), required;
-        /// Path of the local socket, mode 0660, through which `drivegate read` and `drivegate write` [reach the running
-        /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
+        /// Path of the local socket, mode 0660, through which `drivegate read`, `write`, `reload` and `health` [reach the
+        /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
         /// Directory of what the gateway keeps: [recordings](recordings.md), and the [audit file](commands.md#the-audit-file).

@@ -56,11 +56,6 @@ fn an_absent_drive_with_a_long_timeout_holds_up_neither_the_watchdog_nor_a_reloa
     until_notified("WATCHDOG=1");
     gateway.signal("TERM");
     assert!(gateway.ended().success());
-    let printed = gateway.output();
-    assert!(
-        !printed.contains("stalled") && !printed.contains("did not stop within"),
-        "{printed}"
-    );
 }
 
 #[test]
