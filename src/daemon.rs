@@ -383,8 +383,12 @@ impl Daemon {
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
-            // Before them, the exchange that is on the line.
-            let time = settings.options.response_timeout + settings.shutdown_time().unanswered;
+            let stops = settings.shutdown_time();
+            let time = match stops.drives {
+                0 => Duration::ZERO,
+                // Before them, the exchange that is on the line.
+                _ => settings.options.response_timeout + stops.unanswered,
+            };
             let missing = task.handle().queue.begin_shutdown(now + time, now);
             async move {
                 // A bus whose port is closed does not report.
