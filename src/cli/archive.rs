@@ -36,6 +36,8 @@ pub(super) struct Manifest {
     pub(super) state_dir: PathBuf,
     /// The members, in their order; the configuration is the first.
     pub(super) members: Vec<Member>,
+    /// Directories of profiles, `config/…`, which may be empty.
+    pub(super) directories: Vec<String>,
     /// Files that belong to the gateway and are not in the archive.
     pub(super) left_out: Vec<LeftOut>,
     /// The recordings that there were; they themselves are not in the archive.
@@ -222,7 +224,12 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
             return Err(format!("{} is in it twice", member.name));
         }
     }
-    if manifest.members.len() > MOST_MEMBERS || bytes > MOST_BYTES {
+    for directory in &manifest.directories {
+        if place(directory)?.0 != Root::Config {
+            return Err(format!("{directory} is no directory of profiles"));
+        }
+    }
+    if manifest.directories.len() > MOST_MEMBERS || manifest.members.len() > MOST_MEMBERS || bytes > MOST_BYTES {
         let count = manifest.members.len();
         return Err(format!(
             "it says it has {count} files of {bytes} bytes, more than any backup"

@@ -131,6 +131,12 @@ fn state(settings: &Settings, sources: &mut Sources) -> io::Result<()> {
 }
 
 fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
+    let base = config.parent().unwrap_or(Path::new(""));
+    let below = settings
+        .profile_dirs
+        .iter()
+        .filter_map(|dir| dir.strip_prefix(base).ok());
+    let below = below.filter(|dir| !dir.as_os_str().is_empty());
     let (recordings, _) = store::list(&settings.recordings.dir).unwrap_or_default();
     Manifest {
         drivegate_backup: FORMAT,
@@ -140,6 +146,7 @@ fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
         config: config.to_path_buf(),
         state_dir: settings.state_dir.clone(),
         members: sources.files.iter().map(|(_, member)| member.clone()).collect(),
+        directories: below.filter_map(|dir| Root::Config.member(dir)).collect(),
         left_out: sources.left_out.clone(),
         recordings: recordings
             .iter()

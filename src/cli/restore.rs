@@ -42,8 +42,8 @@ pub(super) struct Args {
 enum Refused {
     /// In words.
     Because(String),
-    /// The configuration is invalid.
-    Configuration(Box<Loaded>),
+    /// The configuration is invalid: its errors, as if it were in its place.
+    Configuration(Vec<String>),
 }
 
 impl From<String> for Refused {
@@ -55,8 +55,8 @@ impl From<String> for Refused {
 pub(super) fn run(args: &Args) -> ExitCode {
     match restore(args) {
         Ok(text) => report::print(&text),
-        Err(Refused::Configuration(loaded)) => {
-            report::problems(&loaded);
+        Err(Refused::Configuration(errors)) => {
+            errors.iter().for_each(|error| report::error(error));
             report::note("nothing was restored");
             ExitCode::from(EXIT_CONFIG)
         }
@@ -92,9 +92,20 @@ fn restore(args: &Args) -> Result<String, Refused> {
         };
         staging.unpack(root, path, member.mode, content)
     })?;
+    for directory in &manifest.directories {
+        let (_, path) = archive::place(directory)?;
+        staging.make_directory(&path)?;
+    }
     let loaded = check(&staging, name, &manifest, base)?;
     let Some(settings) = &loaded.settings else {
-        return Err(Refused::Configuration(Box::new(loaded)));
+        let in_place = |text: String| {
+            text.replace(
+                &staging.of(Root::Config).display().to_string(),
+                &base.display().to_string(),
+            )
+        };
+        let errors = loaded.errors.iter().map(|error| in_place(error.to_string()));
+        return Err(Refused::Configuration(errors.collect()));
     };
     // A relative one is below the directory of the configuration, wherever that is.
     let state_dir = match settings.state_dir.strip_prefix(staging.of(Root::Config)) {
@@ -117,7 +128,6 @@ fn restore(args: &Args) -> Result<String, Refused> {
         )));
     }
     let placed = staging.place()?;
-    report::problems(&loaded);
     Ok(summary(&manifest, &placed))
 }
 

@@ -112,8 +112,8 @@ mod tests {
         assert_eq!(
             warnings,
             [
-                "`slave` is called `address` now; t.toml:6, bus[0].drive[1].slave; write `address`; version 9.9 refuses it",
                 "`device` is called `port` now; t.toml:2, bus[0].device; write `port`; version 9.9 refuses it",
+                "`slave` is called `address` now; t.toml:6, bus[0].drive[1].slave; write `address`; version 9.9 refuses it",
             ]
         );
         let reader = document.reader();

@@ -23,6 +23,7 @@ fn manifest(members: Vec<Member>) -> Manifest {
         config: "/etc/drivegate/drivegate.toml".into(),
         state_dir: "/var/lib/drivegate".into(),
         members,
+        directories: vec!["config/profiles".to_string()],
         left_out: Vec::new(),
         recordings: Vec::new(),
     }
@@ -152,6 +153,11 @@ fn what_a_backup_never_has_is_refused() {
     let mut huge = sound.clone();
     huge.members[0].bytes = u64::MAX;
     refused(&huge, &[], "more than any backup");
+    for name in ["state/a", "/etc", "config/../a"] {
+        let mut hostile = sound.clone();
+        hostile.directories.push(name.to_string());
+        assert!(taken(&archive(&hostile, &[config])).is_err(), "{name}");
+    }
     let later = Manifest {
         drivegate_backup: FORMAT + 1,
         ..sound

@@ -14,6 +14,8 @@ pub(super) struct Staging {
     state: Place,
     /// In the order of the archive; the configuration is the first.
     files: Vec<(Root, PathBuf)>,
+    /// Below the directory of the configuration.
+    directories: Vec<PathBuf>,
 }
 
 #[derive(Debug)]
@@ -66,6 +68,7 @@ impl Staging {
             config: Place::new(config)?,
             state: Place::new(state)?,
             files: Vec::new(),
+            directories: Vec::new(),
         })
     }
 
@@ -98,6 +101,18 @@ impl Staging {
         Ok(())
     }
 
+    /// Makes a directory for the configuration. `path` has normal components only.
+    ///
+    /// # Errors
+    /// It cannot be made.
+    pub(super) fn make_directory(&mut self, path: &Path) -> Result<(), String> {
+        let to = self.config.aside.join(path);
+        let failed = |error: io::Error| format!("cannot make {}: {error}", to.display());
+        fs::create_dir_all(&to).map_err(failed)?;
+        self.directories.push(path.to_path_buf());
+        Ok(())
+    }
+
     /// Lets the unpacked configuration have a file that is at `path` already, for the check.
     ///
     /// # Errors
@@ -127,6 +142,11 @@ impl Staging {
     /// # Errors
     /// One file cannot be put in place: which, and what is in place already.
     pub(super) fn place(&self) -> Result<Vec<PathBuf>, String> {
+        for path in &self.directories {
+            let failed = |error: io::Error| format!("cannot make {}: {error}", path.display());
+            // The directory of any file in it.
+            directory_of(&self.config.to, &path.join("file")).map_err(failed)?;
+        }
         let mut placed = Vec::new();
         for (root, path) in self.files.iter().skip(1).chain(self.files.first()) {
             let Place { to, aside, .. } = self.place_of(*root);
