@@ -1,6 +1,8 @@
 //! The gateway as a whole: start, reload and the order of shutdown.
 
+mod changes;
 mod file_limit;
+mod pulse;
 mod server;
 
 use std::collections::BTreeMap;
@@ -9,6 +11,7 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 
+pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
@@ -17,6 +20,7 @@ use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{RecorderTask, Recordings};
+use crate::north::local::Control;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
@@ -62,8 +66,9 @@ pub struct Daemon {
     recorder: Option<RecorderTask>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
-    /// Beats of the bus threads at the last check, by bus.
-    beats: BTreeMap<String, u64>,
+    pulse: Pulse,
+    /// Who is asked to reload, and the file that the gateway runs with.
+    control: Option<Control>,
 }
 
 type PreparedServers = (Prepared<modbus_tcp::Server>, Prepared<http::Http>);
@@ -74,6 +79,14 @@ impl Daemon {
     /// # Errors
     /// A server cannot start, or the system does not provide a thread.
     pub async fn start(settings: Settings) -> Result<Daemon, StartError> {
+        Daemon::start_with(settings, None).await
+    }
+
+    /// As [`Daemon::start`]; `control` takes the orders of local clients to the gateway itself.
+    ///
+    /// # Errors
+    /// As [`Daemon::start`].
+    pub async fn start_with(settings: Settings, control: Option<Control>) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
@@ -100,14 +113,15 @@ impl Daemon {
             recordings,
             recorder: None,
             reporter: report_refusals(shared),
-            beats: BTreeMap::new(),
+            pulse: Pulse::default(),
+            control,
         };
         daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
-        daemon.apply_recorder(&settings)?;
-        daemon.replace_buses(&settings, prepared);
+        daemon.apply_recorder(&settings).await?;
+        daemon.replace_buses(&settings, prepared).await;
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
         daemon.apply_local(&settings).await;
@@ -135,43 +149,38 @@ impl Daemon {
         self.local.server().map(local::Local::path)
     }
 
-    /// Whether every bus thread has run since the last call. If not, the watchdog keep-alive must be withheld.
-    pub fn is_moving(&mut self) -> bool {
-        let mut moving = self.buses.len() >= self.settings.buses.len();
-        if !moving {
-            tracing::error!("not every configured bus is running; withholding the watchdog keep-alive");
-        }
-        for (settings, task) in &self.buses {
-            let beats = task.beats();
-            if self.beats.insert(settings.spec.name.clone(), beats) == Some(beats) {
-                tracing::error!(bus = %settings.spec.name, "bus thread stalled; withholding the watchdog keep-alive");
-                moving = false;
-            }
-        }
-        moving
+    /// Whether the bus threads move.
+    pub fn pulse(&self) -> Pulse {
+        self.pulse.clone()
     }
 
-    /// Applies a new configuration. What is unchanged keeps running without a lost cycle.
+    /// Counters of the servers.
+    pub fn stats(&self) -> Arc<NorthStats> {
+        self.stats.clone()
+    }
+
+    /// Applies a new configuration and returns what changed. What is unchanged keeps running without a lost cycle.
     ///
     /// # Errors
     /// A bus or a server cannot start: everything runs as before. Or a changed recorder cannot: everything else runs as
     /// before, without a recorder.
-    pub async fn reload(&mut self, settings: Settings) -> Result<(), StartError> {
+    pub async fn reload(&mut self, settings: Settings) -> Result<Vec<String>, StartError> {
         let settings = file_limit::fit(settings);
         // Everything that can fail comes before anything that runs is stopped for good.
         let prepared = self.prepare_buses(&settings)?;
         let servers = self.prepare_servers(&settings).await?;
-        if let Err(error) = self.apply_recorder(&settings) {
+        if let Err(error) = self.apply_recorder(&settings).await {
             self.abort_servers(servers).await;
             return Err(error);
         }
         self.commit_servers(servers).await;
-        self.replace_buses(&settings, prepared);
+        self.replace_buses(&settings, prepared).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
+        let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
-        Ok(())
+        Ok(changes)
     }
 
     /// Prepares the buses that are new or changed.
@@ -182,17 +191,16 @@ impl Daemon {
     }
 
     /// Stops the buses that are removed or changed, and starts the `prepared` ones.
-    fn replace_buses(&mut self, settings: &Settings, prepared: Vec<(BusSettings, BusTask)>) {
+    async fn replace_buses(&mut self, settings: &Settings, prepared: Vec<(BusSettings, BusTask)>) {
         let (mut kept, removed): (Vec<_>, Vec<_>) = std::mem::take(&mut self.buses)
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
-        for (before, task) in removed {
-            tracing::info!(bus = %before.spec.name, "stopping the bus");
+        self.watch(&kept);
+        for (before, left) in stop_all(removed).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
-            let left = task.stop();
             leases.extend(drives.zip(left.leases));
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
@@ -223,7 +231,7 @@ impl Daemon {
         }
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
-        self.beats.clear();
+        self.watch(&kept);
         self.plant.store(Arc::new(Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
@@ -236,6 +244,11 @@ impl Daemon {
             recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
         }
         self.buses = kept;
+    }
+
+    fn watch(&self, buses: &[(BusSettings, BusTask)]) {
+        let beats = buses.iter().map(|(bus, task)| (bus.spec.name.clone(), task.beats()));
+        self.pulse.watch(beats);
     }
 
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
@@ -255,12 +268,13 @@ impl Daemon {
     }
 
     /// Starts the recorder, or another one where it is configured otherwise; what the one before recorded is on disk then.
-    fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
+    async fn apply_recorder(&mut self, settings: &Settings) -> Result<(), StartError> {
         if self.recorder.is_some() && self.settings.recordings == settings.recordings {
             return Ok(());
         }
         if let Some(recorder) = self.recorder.take() {
-            recorder.stop();
+            // A thread of it that panicked has logged that.
+            let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
         }
         if settings.recordings.max_count > 0 {
             let (recordings, events) = (self.recordings.clone(), self.events.clone());
@@ -305,11 +319,14 @@ impl Daemon {
     /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries
     /// again.
     async fn apply_local(&mut self, settings: &Settings) {
-        let socket = Some(&settings.socket).filter(|socket| **socket != local::SocketPath::Off);
-        if let Err(error) = self.local.apply(socket, &self.plant, &self.stats).await {
+        let options = (settings.socket != local::SocketPath::Off).then(|| local::Options {
+            socket: settings.socket.clone(),
+            control: self.control.clone(),
+        });
+        if let Err(error) = self.local.apply(options.as_ref(), &self.plant, &self.stats).await {
             tracing::warn!(
                 target: "drivegate::local",
-                "{error}; `drivegate read` and `drivegate write` cannot use this gateway; set `socket` of [gateway], or \
+                "{error}; `drivegate read`, `write`, `reload` and `health` cannot reach this gateway; set `socket` of [gateway], or \
                  socket = \"\" to do without"
             );
         }
@@ -341,17 +358,12 @@ impl Daemon {
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();
-        let stopped = tokio::task::spawn_blocking(move || {
-            for (_, task) in buses {
-                task.stop();
-            }
-            if let Some(recorder) = recorder {
-                recorder.stop();
-            }
-        });
         within(STOP_BUSES, "buses", async {
-            // A bus thread that panicked has logged it.
-            let _ = stopped.await;
+            stop_all(buses).await;
+            if let Some(recorder) = recorder {
+                // A thread of it that panicked has logged that.
+                let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
+            }
         })
         .await;
         self.reporter.abort();
@@ -371,7 +383,12 @@ impl Daemon {
     async fn stop_drives(&self) {
         let now = Instant::now();
         let stops = self.buses.iter().map(|(settings, task)| {
-            let time = settings.shutdown_time().unanswered;
+            let stops = settings.shutdown_time();
+            let time = match stops.drives {
+                0 => Duration::ZERO,
+                // Before them, the exchange that is on the line.
+                _ => settings.options.response_timeout + stops.unanswered,
+            };
             let missing = task.handle().queue.begin_shutdown(now + time, now);
             async move {
                 // A bus whose port is closed does not report.
@@ -397,6 +414,18 @@ impl Daemon {
             );
         }
     }
+}
+
+/// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
+async fn stop_all(buses: Vec<(BusSettings, BusTask)>) -> Vec<(BusSettings, Handover)> {
+    let stop = |(settings, task): (BusSettings, BusTask)| {
+        tracing::info!(bus = %settings.spec.name, "stopping the bus");
+        tokio::task::spawn_blocking(move || (settings, task.stop()))
+    };
+    let stopping: Vec<_> = buses.into_iter().map(stop).collect();
+    // A bus thread that panicked has ended the process.
+    let stopped = futures_util::future::join_all(stopping).await;
+    stopped.into_iter().filter_map(Result::ok).collect()
 }
 
 /// Reports refusals of the plant whose count is due.

@@ -60,6 +60,8 @@ pub enum EventKind {
     BusDown,
     /// A recording was made, or lost.
     Recording,
+    /// A new configuration was not applied; the former one goes on.
+    ReloadRefused,
 }
 
 impl EventKind {
@@ -95,7 +97,8 @@ impl EventKind {
             | EventKind::Supervision
             | EventKind::Unsupervised
             | EventKind::NotConfirmed
-            | EventKind::BusDown => true,
+            | EventKind::BusDown
+            | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
             | EventKind::Started
@@ -130,6 +133,7 @@ impl EventKind {
             EventKind::BusUp => "bus_up",
             EventKind::BusDown => "bus_down",
             EventKind::Recording => "recording",
+            EventKind::ReloadRefused => "reload_refused",
         }
     }
 }
@@ -146,7 +150,8 @@ pub struct Event {
     /// What happened.
     #[serde(rename = "event")]
     pub kind: EventKind,
-    /// The bus.
+    /// The bus; empty if the whole gateway is meant.
+    #[serde(skip_serializing_if = "String::is_empty")]
     pub bus: String,
     /// The drive, unless the whole bus is meant.
     #[serde(skip_serializing_if = "Option::is_none")]

@@ -100,9 +100,11 @@ impl BusCore {
         self.report_all(&news, now);
     }
 
-    /// The bus ends: everybody who waits is answered. What the bus that comes after has to know.
+    /// The bus ends: everybody who waits is answered. What the bus that comes after has to know; the reply to an exchange
+    /// that is broken off may still come.
     pub fn ended(&mut self, now: Instant) -> Handover {
-        self.master.ended(now)
+        let broken_off = self.asked.as_ref().and(self.line.deadline());
+        self.master.ended(broken_off, now)
     }
 
     /// What is to be done now.

@@ -24,7 +24,7 @@ use std::time::{Duration, Instant};
 use crate::codec::RequestPdu;
 
 /// A reply that has not come by then will not come.
-const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
+pub const FORGOTTEN_AFTER: Duration = Duration::from_secs(1);
 /// A look-alike waits no longer than that before the request whose reply is late is held back for it.
 const PATIENCE: Duration = Duration::from_secs(1);
 /// No more tries of one write than that are acknowledged late: neither the drive nor what is before it keeps more.

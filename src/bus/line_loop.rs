@@ -11,11 +11,14 @@ use super::core::{Action, BusCore};
 use super::master::Handover;
 use crate::command::{Outcome, WriteStats};
 use crate::event::Events;
-use crate::line::{self, Line, Lost, Names, Woken};
+use crate::line::{self, Arrival, Line, Lost, Names, Woken};
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
 const REOPEN: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(3));
+/// Longest wait for the end of the exchange on the line when the bus is to stop: a drive that is there replies within it,
+/// one that is absent must not hold up a stop or a reload for all of its `response_timeout`.
+const LAST_EXCHANGE: Duration = Duration::from_secs(1);
 /// The thread shows that it is alive at least this often, also while it waits for a reply.
 const BEAT: Duration = Duration::from_millis(100);
 
@@ -91,8 +94,8 @@ impl BusTask {
     }
 
     /// Turns that the bus has taken: it hangs when this stands still for seconds.
-    pub fn beats(&self) -> u64 {
-        self.beats.load(Ordering::Relaxed)
+    pub fn beats(&self) -> Arc<AtomicU64> {
+        self.beats.clone()
     }
 
     /// The bus.
@@ -100,8 +103,8 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus after the exchange that is on the line; everything that waits is answered. What a bus that comes
-    /// after has to know.
+    /// Ends the bus after the exchange that is on the line, but within a second; everything that waits is answered. What a
+    /// bus that comes after has to know.
     pub fn stop(mut self) -> Handover {
         self.halt()
     }
@@ -154,6 +157,11 @@ impl Default for ReopenPauses {
 }
 
 impl ReopenPauses {
+    /// The device has come back.
+    fn begin_anew(&mut self) {
+        self.next = REOPEN.0;
+    }
+
     /// A port that was open for so long begins anew.
     fn was_open_for(&mut self, time: Duration) {
         if time >= REOPEN.1 {
@@ -185,8 +193,11 @@ impl Worker {
         while !self.stopping() {
             let spec = &self.handle.image.spec;
             let go_on = || !self.stopping();
-            match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
+            // Before the try, so that nothing is missed after it.
+            let watching = Arrival::of(&spec.port);
+            let arrival = match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
                 Ok((line, warnings)) => {
+                    drop(watching);
                     for warning in warnings {
                         tracing::warn!(bus = %spec.name, "{warning}");
                     }
@@ -197,12 +208,18 @@ impl Worker {
                     if let Err(lost) = why {
                         core.lost(&lost.to_string(), Instant::now());
                     }
+                    Arrival::of(&spec.port)
                 }
                 // Whoever ended the bus ended the try, too.
-                Err(_) if self.stopping() => {}
-                Err(error) => core.lost(&error.to_string(), Instant::now()),
+                Err(_) if self.stopping() => None,
+                Err(error) => {
+                    core.lost(&error.to_string(), Instant::now());
+                    watching
+                }
+            };
+            if self.rest(pauses.next(), arrival.as_ref()) {
+                pauses.begin_anew();
             }
-            self.rest(pauses.next());
         }
         core.ended(Instant::now())
     }
@@ -212,19 +229,32 @@ impl Worker {
         self.stop.load(Ordering::Relaxed)
     }
 
-    fn rest(&self, pause: Duration) {
-        let until = Instant::now() + pause;
+    /// Waits before the next try to open the port: for that time, or until the device has come, which it returns; never
+    /// less than the first pause.
+    fn rest(&self, pause: Duration, arrival: Option<&Arrival>) -> bool {
+        let began = Instant::now();
+        let mut until = began + pause;
+        let mut came = false;
         while !self.stopping() && Instant::now() < until {
-            line::wait_without_port(until.min(Instant::now() + BEAT), self.handle.queue.wake_fd());
+            let beat = until.min(Instant::now() + BEAT);
+            if line::wait_without_port(beat, self.handle.queue.wake_fd(), arrival) {
+                came = true;
+                until = until.min(began + REOPEN.0);
+            }
             self.handle.queue.clear_wake();
         }
+        came
     }
 
     fn serve(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
+        let mut break_off = None;
         // The exchange on the line is ended first: whoever comes after would talk into its reply.
         while !self.stopping() || core.asked().is_some() {
             let now = Instant::now();
+            if self.stop.load(Ordering::Relaxed) && now >= *break_off.get_or_insert(now + LAST_EXCHANGE) {
+                return Ok(());
+            }
             let woken = match core.poll(now) {
                 Action::Send if self.stopping() => return Ok(()),
                 Action::Send => {

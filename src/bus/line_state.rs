@@ -168,6 +168,11 @@ impl LineState {
         self.underway.is_some()
     }
 
+    /// When the exchange that is under way ends at the latest.
+    pub fn deadline(&self) -> Option<Instant> {
+        self.underway.as_ref().map(|underway| underway.transaction.deadline())
+    }
+
     /// Bytes came in at `now`. The exchange, if it is over by them.
     pub fn heard(&mut self, bytes: &[u8], now: Instant) -> Option<Exchanged> {
         if !bytes.is_empty() {

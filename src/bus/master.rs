@@ -16,7 +16,7 @@ use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
-use super::late_replies::look_alike;
+use super::late_replies::{FORGOTTEN_AFTER, look_alike};
 use super::line_state::Sending;
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
@@ -218,8 +218,9 @@ impl Master {
         (0..self.drives.len()).map(News::Offline).collect()
     }
 
-    /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know.
-    pub fn ended(&mut self, now: Instant) -> Handover {
+    /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know. An exchange
+    /// that is still on the line is broken off; it would have ended at `broken_off`.
+    pub fn ended(&mut self, broken_off: Option<Instant>, now: Instant) -> Handover {
         if let Some(shutdown) = &mut self.shutdown {
             shutdown.end(&self.bus);
         }
@@ -229,9 +230,14 @@ impl Master {
         };
         let leases = self.drives.iter_mut().map(close).collect();
         let late = self.drives.iter().filter_map(|drive| drive.late.until());
+        let window = match self.sessions.is_empty() {
+            true => FORGOTTEN_AFTER,
+            false => N2_LATE * self.response_timeout,
+        };
+        let broken_off = broken_off.map(|deadline| deadline + window);
         Handover {
             leases,
-            quiet_until: late.chain(self.n2_late.until()).chain([now]).max(),
+            quiet_until: late.chain(self.n2_late.until()).chain(broken_off).chain([now]).max(),
         }
     }
 

@@ -138,6 +138,11 @@ impl Transaction {
         self.protocol.begins_reply(&self.request, &self.received)
     }
 
+    /// When it ends at the latest.
+    pub fn deadline(&self) -> Instant {
+        self.deadline
+    }
+
     /// The request.
     pub fn request(&self) -> &Request {
         &self.request

@@ -1,5 +1,7 @@
 //! `drivegate check`: what is wrong with a configuration, and what its buses will do.
 
+mod as_service;
+
 use std::fmt::Write;
 use std::path::Path;
 use std::process::ExitCode;
@@ -21,6 +23,7 @@ use crate::history::budget::Budget;
 #[derive(Debug, clap::Args)]
 #[command(
     after_help = "Examples:\n  drivegate check --config /etc/drivegate/drivegate.toml\n  \
+    sudo drivegate check --as-service\n  \
     drivegate check --config drivegate.toml --json | jq '.buses[] | {name, load_ratio, fast_cycle_ms}'"
 )]
 pub(super) struct Args {
@@ -29,6 +32,9 @@ pub(super) struct Args {
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
+    /// Also report the files that the user of the systemd service could not read, by permissions and groups.
+    #[arg(long)]
+    as_service: bool,
 }
 
 #[derive(Serialize)]
@@ -65,7 +71,11 @@ struct Request<'a> {
 
 pub(super) fn run(args: &Args) -> ExitCode {
     let path = &args.config.path;
-    let loaded = Settings::load(path, environment());
+    let mut loaded = Settings::load(path, environment());
+    if args.as_service {
+        loaded.errors.extend(as_service::problems(path));
+        loaded.settings = loaded.settings.filter(|_| loaded.errors.is_empty());
+    }
     let printed = if args.json {
         report::print(&json(&loaded))
     } else {

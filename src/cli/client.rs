@@ -260,6 +260,39 @@ pub(super) async fn get_json(gateway: &Gateway, path: &str) -> Result<serde_json
     timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
 }
 
+/// Requests a short text, such as that of `/readyz`, and whether its status is 200.
+///
+/// # Errors
+/// When the gateway cannot be reached, or the server is another one.
+pub(super) async fn get_text(gateway: &Gateway, path: &str) -> Result<(bool, String), ClientError> {
+    let url = &gateway.url;
+    let late = || ClientError::Unreachable(url.clone(), "no reply within 10 s".to_string());
+    let whole = async {
+        let (wire, response) = ask(gateway, path).await?;
+        let status = response.status();
+        if !matches!(status, StatusCode::OK | StatusCode::SERVICE_UNAVAILABLE) {
+            let why = format!("the server answered `{status}`");
+            return Err(ClientError::Strange(url.clone(), why));
+        }
+        let mut stream = EventStream {
+            url: url.clone(),
+            wire,
+            body: response.into_body(),
+            parser: Parser::default(),
+        };
+        let mut text = Vec::new();
+        while let Some(chunk) = stream.chunk().await {
+            let chunk = chunk.map_err(|error| ClientError::Ended(url.clone(), format!(" ({error})")))?;
+            text.extend_from_slice(&chunk);
+            if text.len() > MOST_BYTES {
+                return Err(ClientError::Strange(url.clone(), "the reply is too long".to_string()));
+            }
+        }
+        Ok((status == StatusCode::OK, String::from_utf8_lossy(&text).into_owned()))
+    };
+    timeout(OPEN_TIMEOUT, whole).await.map_err(|_| late())?
+}
+
 async fn ask(gateway: &Gateway, path: &str) -> Result<(Wire, Response<Incoming>), ClientError> {
     let url = &gateway.url;
     let unreachable = |why: String| ClientError::Unreachable(url.clone(), why);

@@ -1,5 +1,6 @@
 //! Log lines: for the journal under systemd, coloured on a terminal, else JSON.
 
+mod journal;
 mod line;
 
 use std::io::IsTerminal;
@@ -14,7 +15,8 @@ use tracing_subscriber::layer::SubscriberExt;
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
-use self::line::LogLine;
+use self::journal::Journal;
+use self::line::{Form, LogLine};
 use crate::command::SENT;
 use crate::config::{LogFormat, LogSettings};
 
@@ -77,17 +79,26 @@ impl<'w> MakeWriter<'w> for Ways {
 /// Starts logging to standard error, on threads of its own: a reader that stalls (a full pipe, a hanging collector) must
 /// not delay a stop.
 pub(super) fn start(settings: &LogSettings) -> LogHandle {
+    let takes_entries = matches!(settings.format, LogFormat::Auto | LogFormat::Journal);
+    let journal = Journal::of_stderr().filter(|_| takes_entries);
+    let form = match journal {
+        Some(_) => Form::Entry,
+        None => form(settings.format),
+    };
     let way = |name: &str| {
-        NonBlockingBuilder::default()
+        let way = NonBlockingBuilder::default()
             .buffered_lines_limit(WAITING)
             .lossy(true)
-            .thread_name(name)
-            .finish(std::io::stderr())
+            .thread_name(name);
+        match &journal {
+            Some(journal) => way.finish(journal.clone()),
+            None => way.finish(std::io::stderr()),
+        }
     };
     let ((sent, sent_guard), (others, others_guard)) = (way("log-commands"), way("log"));
     let lost = [sent.error_counter(), others.error_counter()];
     LogHandle {
-        filter: subscribe(settings, BoxMakeWriter::new(Ways { sent, others })),
+        filter: subscribe(&settings.level, form, BoxMakeWriter::new(Ways { sent, others })),
         lost,
         reported: AtomicUsize::new(0),
         _writers: [sent_guard, others_guard],
@@ -96,23 +107,32 @@ pub(super) fn start(settings: &LogSettings) -> LogHandle {
 
 /// Starts logging for a one-shot command: synchronously, so that log lines and output keep their order.
 pub(super) fn start_in_order(settings: &LogSettings) {
-    subscribe(settings, BoxMakeWriter::new(std::io::stderr));
+    subscribe(
+        &settings.level,
+        form(settings.format),
+        BoxMakeWriter::new(std::io::stderr),
+    );
 }
 
-fn subscribe(settings: &LogSettings, writer: BoxMakeWriter) -> reload::Handle<EnvFilter, Registry> {
-    let (filter, handle) = reload::Layer::new(filter(&settings.level));
+/// The form of lines on standard error.
+fn form(format: LogFormat) -> Form {
+    match format {
+        LogFormat::Journal => Form::Priority,
+        LogFormat::Auto if std::env::var_os("JOURNAL_STREAM").is_some() => Form::Priority,
+        LogFormat::Text => Form::Text,
+        LogFormat::Auto if std::io::stderr().is_terminal() => Form::Text,
+        LogFormat::Json | LogFormat::Auto => Form::Json,
+    }
+}
+
+fn subscribe(level: &str, form: Form, writer: BoxMakeWriter) -> reload::Handle<EnvFilter, Registry> {
+    let (filter, handle) = reload::Layer::new(filter(level));
     let terminal = std::io::stderr().is_terminal();
-    let format = match settings.format {
-        LogFormat::Auto if std::env::var_os("JOURNAL_STREAM").is_some() => LogFormat::Journal,
-        LogFormat::Auto if terminal => LogFormat::Text,
-        LogFormat::Auto => LogFormat::Json,
-        other => other,
-    };
     let lines = tracing_subscriber::fmt::layer().with_writer(writer).with_ansi(terminal);
-    let line = LogLine::new(format);
-    let lines = match format {
-        LogFormat::Journal | LogFormat::Text => lines.event_format(line).boxed(),
-        LogFormat::Json | LogFormat::Auto => lines.json().event_format(line).boxed(),
+    let line = LogLine::new(form);
+    let lines = match form {
+        Form::Entry | Form::Priority | Form::Text => lines.event_format(line).boxed(),
+        Form::Json => lines.json().event_format(line).boxed(),
     };
     // A second start in one process keeps the first subscriber.
     if tracing_subscriber::registry()

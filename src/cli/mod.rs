@@ -4,11 +4,16 @@
 //! line in `commands!` below.
 
 mod addresses;
+mod archive;
 mod audit;
+mod backup;
 mod check;
 mod client;
 mod demo;
 mod drive_access;
+mod health;
+mod loading;
+mod local_client;
 mod log;
 mod map;
 mod printable;
@@ -18,6 +23,7 @@ mod record;
 mod recordings;
 mod reload;
 mod report;
+mod restore;
 mod run;
 mod scan;
 mod schema;
@@ -29,8 +35,11 @@ mod write;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
+use std::sync::LazyLock;
 
 use clap::Parser;
+
+use crate::north::metrics::COMMIT;
 
 /// Exit code of a failure.
 pub const EXIT_FAILED: u8 = 1;
@@ -41,9 +50,15 @@ pub const EXIT_CONFIG: u8 = 78;
 /// Default path of the configuration.
 pub const DEFAULT_CONFIG: &str = "/etc/drivegate/drivegate.toml";
 
+/// Version and commit of the build.
+static VERSION: LazyLock<String> = LazyLock::new(|| match COMMIT {
+    Some(commit) => format!("{} (commit {commit})", env!("CARGO_PKG_VERSION")),
+    None => env!("CARGO_PKG_VERSION").to_string(),
+});
+
 /// Puts RS-485 drives (frequency converters) on Modbus TCP, MQTT and Prometheus.
 #[derive(Debug, Parser)]
-#[command(name = "drivegate", version, max_term_width = 100)]
+#[command(name = "drivegate", version = VERSION.as_str(), max_term_width = 100)]
 #[command(
     after_help = "Example:\n  drivegate check --config /etc/drivegate/drivegate.toml\n\n\
     Exit codes: 0 success, 1 failure, 2 wrong command line, 78 invalid configuration."
@@ -73,6 +88,8 @@ macro_rules! commands {
 // In the order of the help.
 commands! {
     Run => run,
+    Reload => reload,
+    Health => health,
     Demo => demo,
     Check => check,
     Scan => scan,
@@ -87,6 +104,8 @@ commands! {
     Map => map,
     Audit => audit,
     Token => token,
+    Backup => backup,
+    Restore => restore,
     Schema => schema,
 }
 

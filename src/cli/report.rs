@@ -40,6 +40,11 @@ pub(super) fn error(message: &str) {
     line("error", message);
 }
 
+/// Prints a warning to stderr.
+pub(super) fn warning(message: &str) {
+    line("warning", message);
+}
+
 /// Prints a note to stderr.
 pub(super) fn note(message: &str) {
     line("note", message);
@@ -55,7 +60,7 @@ pub(super) fn errors(problems: &[Problem]) {
 /// Prints warnings and errors of a configuration to stderr, the errors last.
 pub(super) fn problems(loaded: &Loaded) {
     for problem in &loaded.warnings {
-        line("warning", &problem.to_string());
+        warning(&problem.to_string());
     }
     errors(&loaded.errors);
 }

@@ -1,20 +1,24 @@
 //! `drivegate run`: the daemon under systemd, in a container or by hand.
 
+mod reloads;
+mod serving;
+mod watch;
+
 use std::io;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
-use std::time::Duration;
 
 use futures_util::FutureExt;
 use sd_notify::NotifyState;
 use tokio::runtime::{Builder, Runtime};
 use tokio::signal::unix::{Signal, SignalKind, signal};
 
+use super::loading::Loading;
 use super::log::LogHandle;
-use super::reload::{Loading, NotLoaded, Reloads};
-use super::{EXIT_CONFIG, EXIT_FAILED, report};
+use super::{EXIT_CONFIG, EXIT_FAILED, VERSION, report};
 use crate::config::{Loaded, Settings};
 use crate::daemon::Daemon;
+use crate::north::local::Control;
 
 /// Runs the gateway until SIGTERM or Ctrl-C; SIGHUP reloads the configuration
 #[derive(Debug, clap::Args)]
@@ -74,99 +78,24 @@ async fn load(path: &Path, signals: &mut Signals) -> io::Result<Option<Loaded>> 
 
 async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signals) -> ExitCode {
     let (gateway, buses) = (settings.gateway.clone(), settings.buses.len());
-    let daemon = match Daemon::start(settings).await {
+    let (control, orders) = Control::new(path);
+    let daemon = match Daemon::start_with(settings, Some(control)).await {
         Ok(daemon) => daemon,
         Err(error) => {
             report::error(&error.to_string());
             return ExitCode::from(EXIT_FAILED);
         }
     };
-    tracing::info!(gateway, buses, config = %path.display(), version = env!("CARGO_PKG_VERSION"), "drivegate runs");
+    tracing::info!(gateway, buses, config = %path.display(), version = VERSION.as_str(), "drivegate runs");
     notify(&[NotifyState::Ready]);
-    let daemon = until_stopped(daemon, path, log, signals).await;
+    let daemon = serving::until_stopped(daemon, orders, path, log, signals).await;
     notify(&[NotifyState::Stopping]);
     daemon.stop().await;
     tracing::info!("drivegate has stopped");
     ExitCode::SUCCESS
 }
 
-/// Serves signals and the watchdog until the daemon is to stop. Files of a reload are read elsewhere.
-async fn until_stopped(mut daemon: Daemon, path: &Path, log: &LogHandle, mut signals: Signals) -> Daemon {
-    let mut reloads = Reloads::default();
-    let watchdog = sd_notify::watchdog_enabled();
-    let mut feed = tokio::time::interval(
-        watchdog
-            .map_or(Duration::from_secs(5), |t| t / 2)
-            .max(Duration::from_millis(500)),
-    );
-    loop {
-        if signals.wanted.stop {
-            return daemon;
-        }
-        if std::mem::take(&mut signals.wanted.reload) {
-            begin_reload(&mut reloads, path);
-        }
-        tokio::select! {
-            signal = signals.next() => signals.wanted.add(signal),
-            loaded = reloads.loaded() => {
-                finish_reload(&mut daemon, loaded, path, log).await;
-                if reloads.is_wanted_again() {
-                    begin_reload(&mut reloads, path);
-                }
-            }
-            _ = feed.tick() => {
-                log.report_lost();
-                if daemon.is_moving() && watchdog.is_some() {
-                    notify(&[NotifyState::Watchdog]);
-                }
-            }
-        }
-    }
-}
-
-fn begin_reload(reloads: &mut Reloads, path: &Path) {
-    let mut states = vec![NotifyState::Reloading];
-    states.extend(NotifyState::monotonic_usec_now());
-    notify(&states);
-    if let Err(why) = reloads.begin(path) {
-        reject(&why);
-        notify(&[NotifyState::Ready]);
-    }
-}
-
-/// Applies the configuration that was read; an invalid one is rejected and changes nothing.
-async fn finish_reload(daemon: &mut Daemon, loaded: Result<Loaded, NotLoaded>, path: &Path, log: &LogHandle) {
-    match loaded {
-        Ok(loaded) => {
-            for problem in &loaded.errors {
-                tracing::error!("{problem}");
-            }
-            for problem in &loaded.warnings {
-                tracing::warn!("{problem}");
-            }
-            match loaded.settings {
-                None => tracing::error!("reload rejected; keeping the current configuration"),
-                Some(settings) => {
-                    let level = settings.log.level.clone();
-                    match daemon.reload(settings).await {
-                        Ok(()) => {
-                            log.set_level(&level);
-                            tracing::info!(config = %path.display(), "configuration reloaded");
-                        }
-                        Err(why) => reject(&why),
-                    }
-                }
-            }
-        }
-        Err(why) => reject(&why),
-    }
-    notify(&[NotifyState::Ready]);
-}
-
-fn reject(why: &dyn std::fmt::Display) {
-    tracing::error!("reload rejected: {why}; keeping the current configuration");
-}
-
+/// Tells systemd, if it started this process.
 fn notify(states: &[NotifyState<'_>]) {
     if let Err(error) = sd_notify::notify(states) {
         tracing::debug!("cannot notify systemd: {error}");

@@ -14,6 +14,8 @@ use crate::drive::profile::Profiles;
 use crate::line::Rs485;
 use crate::process_image::{BusSpec, DriveSpec};
 
+/// A longer `response_timeout` causes a warning.
+const LONG_TIMEOUT: Duration = Duration::from_secs(1);
 /// Longest fixed silence.
 const MOST_SILENCE: Duration = Duration::from_secs(1);
 
@@ -98,6 +100,16 @@ fn read_options(
         silence: read_silence(reader, protocol, format),
         rs485: BUS.rs485.get(reader),
     };
+    if options.response_timeout > LONG_TIMEOUT {
+        let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
+        reader.warning(
+            BUS.response_timeout.name,
+            format!("each try to reach an absent drive takes the line for {timeout}"),
+            format!(
+                "write {limit} or less; drives begin their replies within milliseconds, device servers within 0.5 s"
+            ),
+        );
+    }
     let device_server = port.is_some_and(|p| p.starts_with("tcp://"));
     if device_server && options.rs485 != Rs485::Off {
         reader.warning(

@@ -8,6 +8,7 @@ use std::time::Duration;
 use ipnet::IpNet;
 use serde_json::{Value, json};
 
+use super::deprecated::Capped;
 use super::key::{
     DURATION, Figure, Flag, Key, List, Name, Number, Own, Parsed, Present, Preset, SIZE, Text, Time, Words, table,
 };
@@ -73,6 +74,13 @@ const MILLISECOND: Duration = Duration::from_millis(1);
 const HOUR: Duration = Duration::from_secs(3600);
 /// Range of cadences and timeouts.
 const TIMES: Time = Time(MILLISECOND..=HOUR);
+/// `response_timeout`: an hour was allowed before. A master that waits so long for an absent drive serves nobody else.
+pub(super) const RESPONSE_TIMEOUT: Capped = Capped {
+    range: MILLISECOND..=Duration::from_secs(5),
+    before: HOUR,
+    why: "is longer than any drive takes to begin its reply",
+    until: "0.2",
+};
 /// Range of `idle_timeout`.
 pub(super) const IDLE: Time = Time(Duration::from_secs(1)..=Duration::from_secs(7 * 86_400));
 /// Most that `frequency_range` may contain, Hz.
@@ -158,8 +166,8 @@ keys! {
     GATEWAY: Gateway {
         /// Name of the gateway, used in MQTT topics and in the metric `drivegate_build_info`.
         name: String = Name("-"), required;
-        /// Path of the local socket, mode 0660, through which `drivegate read` and `drivegate write` [reach the running
-        /// gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
+        /// Path of the local socket, mode 0660, through which `drivegate read`, `write`, `reload` and `health` [reach the
+        /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
         /// Directory of what the gateway keeps: [recordings](recordings.md), and the [audit file](commands.md#the-audit-file).
@@ -196,8 +204,9 @@ keys! {
         cycle: Duration = TIMES, default "10ms";
         /// Target poll cycle of class slow: temperatures and other slowly changing values.
         slow_cycle: Duration = TIMES, default "1s";
-        /// Time a drive may take to begin its reply; the time on the wire is added. N2: `"250ms"`.
-        response_timeout: Duration = TIMES, default "100ms";
+        /// Time a drive may take to begin its reply; the time on the wire is added. N2: `"250ms"`. Above `"1s"` causes a
+        /// warning: each try to reach an absent drive takes the line for that time.
+        response_timeout: Duration = RESPONSE_TIMEOUT, default "100ms";
         /// Retries after the first attempt before a drive counts as offline. N2: `2`.
         retries: u32 = Number(0..=10, None), default 1;
         /// Silence before each request. `"spec"`: 3.5 characters, fixed at 1.75 ms above 19200 baud, as in the Modbus

@@ -4,6 +4,7 @@
 //! secrets it names. Relative paths are relative to the directory of the file.
 
 mod bus;
+mod deprecated;
 mod drive;
 mod files;
 mod key;
@@ -11,6 +12,7 @@ mod keys;
 mod log;
 mod modbus_tcp;
 mod mqtt;
+mod named_files;
 mod north;
 mod recordings;
 mod shutdown;
@@ -23,6 +25,7 @@ pub(crate) use bus::{check_port, default_format};
 pub(crate) use drive::{addresses, unknown_profile};
 pub(crate) use keys::schema;
 pub(crate) use log::parse_level;
+pub(crate) use named_files::{FileKind, NamedFile, named_files};
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -136,6 +139,19 @@ impl Settings {
     }
 }
 
+impl Settings {
+    /// The local socket of the gateway that runs with the file `path`, also if the file is invalid since it started.
+    pub(crate) fn socket_of(path: &Path, env: impl Iterator<Item = (String, String)>) -> SocketPath {
+        let source = document::read_file(path).unwrap_or_default();
+        let mut document = Document::parse(path.display().to_string(), &source);
+        document.ensure_section(ROOT.gateway.name);
+        document.overlay(ENVIRONMENT, env);
+        let base = path.parent().unwrap_or(Path::new(""));
+        let gateway = ROOT.gateway.table(&document.reader());
+        gateway.map_or(SocketPath::Default, |gateway| read_socket(&gateway, base))
+    }
+}
+
 /// The variables of this process that override the configuration. Invalid UTF-8 in them becomes U+FFFD, which
 /// [`Settings::load`] refuses.
 pub(crate) fn environment() -> impl Iterator<Item = (String, String)> {
@@ -159,6 +175,7 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
         .filter(|(name, _)| name.starts_with(ENVIRONMENT))
         .partition(|(_, value)| !value.contains(char::REPLACEMENT_CHARACTER));
     document.overlay(ENVIRONMENT, variables);
+    deprecated::rename(&mut document, deprecated::RENAMED);
     let mut profile_errors = Vec::new();
     let base = path.parent().unwrap_or(Path::new(""));
     let settings = read(&document.reader(), base, &mut profile_errors);
@@ -311,11 +328,7 @@ impl Default for Gateway {
 
 fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
     let name = GATEWAY.name.read(reader);
-    let socket = match GATEWAY.socket.written(reader) {
-        None => SocketPath::Default,
-        Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
-        Some(path) => SocketPath::At(values::resolved(base, path)),
-    };
+    let socket = read_socket(reader, base);
     let state_dir = GATEWAY.state_dir.written(reader);
     let state_dir = state_dir.map_or_else(default_state_dir, |dir| values::resolved(base, dir));
     let mut profiles = Profiles::built_in();
@@ -340,6 +353,14 @@ fn read_gateway(reader: &Reader<'_>, base: &Path) -> Gateway {
         profile_dirs,
         profiles,
         errors,
+    }
+}
+
+fn read_socket(reader: &Reader<'_>, base: &Path) -> SocketPath {
+    match GATEWAY.socket.written(reader) {
+        None => SocketPath::Default,
+        Some(path) if path.as_os_str().is_empty() => SocketPath::Off,
+        Some(path) => SocketPath::At(values::resolved(base, path)),
     }
 }
 

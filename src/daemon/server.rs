@@ -219,15 +219,17 @@ impl Reconfigure for modbus_tcp::Server {
 
 impl Server for local::Local {
     const NAME: &'static str = "the local socket";
-    type Options = local::SocketPath;
+    type Options = local::Options;
 
     async fn start(
         options: Self::Options,
         plant: SharedPlant,
-        _stats: Arc<NorthStats>,
+        stats: Arc<NorthStats>,
         cancel: CancellationToken,
     ) -> Result<Self, ServerError> {
-        local::start(&options, plant, cancel).await.map_err(ServerError::Local)
+        local::start(&options, plant, stats, cancel)
+            .await
+            .map_err(ServerError::Local)
     }
 
     async fn stopped(self) {

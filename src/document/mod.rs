@@ -113,7 +113,7 @@ pub(crate) struct Place {
 }
 
 /// A parsed file and the problems found in it so far.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(crate) struct Document {
     file: String,
     root: Node,
@@ -177,6 +177,13 @@ impl Document {
                 self.problems.get_mut().push(problem);
             }
         }
+    }
+
+    /// Renames the key `old` in all tables that the keys of `path` lead to, unless they have `new` too; where that was.
+    pub(crate) fn rename(&mut self, path: &[&str], old: &str, new: &str) -> Vec<Place> {
+        let mut places = Vec::new();
+        tree::rename(&mut self.root, String::new(), path, (old, new), &mut places);
+        places
     }
 
     /// The whole tree.

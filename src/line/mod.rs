@@ -4,10 +4,12 @@
 //! The port is opened through tokio-serial's builder and then driven by the bus's own thread with `ppoll`: the timer
 //! of an async runtime ticks at a millisecond, which is longer than the silence of a frame at 38400 baud.
 
+mod arrival;
 mod clock;
 mod names;
 mod sys;
 
+pub use arrival::Arrival;
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 pub use names::Names;
@@ -222,11 +224,15 @@ impl Line {
     }
 }
 
-/// Waits for a command or for the time, with no port to listen to.
-pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>) {
-    let mut fds = [PollFd::from_borrowed_fd(wake, PollFlags::IN)];
+/// Waits for a command, for the time, or for the device, with no port to listen to; whether the device may have come.
+pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>, arrival: Option<&Arrival>) -> bool {
+    let readable = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
     // An error ends the wait early, which is harmless.
-    let _ = poll_until(&mut fds, until);
+    let _ = match arrival {
+        None => poll_until(&mut [readable(wake)], until),
+        Some(arrival) => poll_until(&mut [readable(wake), readable(arrival.fd())], until),
+    };
+    arrival.is_some_and(Arrival::take)
 }
 
 fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {

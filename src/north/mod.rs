@@ -12,6 +12,7 @@ pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
 mod pem;
+mod readiness;
 mod refusals;
 pub(crate) mod register_map;
 mod stats;
@@ -22,7 +23,8 @@ use std::net::SocketAddr;
 pub(crate) use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use stats::{
-    ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ServerKind,
+    ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
+    ServerKind,
 };
 
 /// Why a server cannot start.

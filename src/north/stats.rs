@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
+use std::time::SystemTime;
 
 /// Counters of all north sides.
 #[derive(Debug, Default)]
@@ -16,6 +17,30 @@ pub struct NorthStats {
     pub refused: RefusalStats,
     /// Listeners that do not work.
     pub lost_listeners: LostListeners,
+    /// The last time the configuration was read.
+    pub reload: ReloadStats,
+}
+
+/// How the last reload ended; the start counts as one.
+#[derive(Debug)]
+pub struct ReloadStats(Mutex<(bool, SystemTime)>);
+
+impl Default for ReloadStats {
+    fn default() -> ReloadStats {
+        ReloadStats(Mutex::new((true, SystemTime::now())))
+    }
+}
+
+impl ReloadStats {
+    /// A reload was applied, or refused, at `at`.
+    pub fn ended(&self, applied: bool, at: SystemTime) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner) = (applied, at);
+    }
+
+    /// Whether the last one was applied, and when it ended.
+    pub fn last(&self) -> (bool, SystemTime) {
+        *self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 const FUNCTIONS: [u8; 11] = [1, 2, 3, 4, 5, 6, 15, 16, 22, 23, 43];

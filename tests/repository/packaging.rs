@@ -11,7 +11,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// The metrics of the public contract; dashboards and alerts of users hang on these names.
-const METRICS: [&str; 38] = [
+const METRICS: [&str; 40] = [
     "drivegate_drive_up",
     "drivegate_drive_state",
     "drivegate_drive_sample_age_seconds",
@@ -47,6 +47,8 @@ const METRICS: [&str; 38] = [
     "drivegate_mqtt_published_total",
     "drivegate_mqtt_buffered_messages",
     "drivegate_build_info",
+    "drivegate_config_last_reload_successful",
+    "drivegate_config_last_reload_timestamp_seconds",
     "drivegate_bus_cycle_seconds_bucket",
     "drivegate_bus_transaction_seconds_bucket",
     "drivegate_write_seconds_bucket",

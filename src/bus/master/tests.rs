@@ -543,3 +543,20 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
     }
 }
+
+#[test]
+fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() {
+    for protocol in [(Protocol::ModbusRtu, "vacon-nx"), (Protocol::N2, "vacon-nx-n2")] {
+        let mut rig = Rig::of(1, protocol.1, protocol.0);
+        let (now, deadline) = (rig.now, rig.now + Duration::from_secs(4));
+        let quiet = |handover: Handover| handover.quiet_until.unwrap();
+        let left = quiet(rig.master.ended(Some(deadline), now));
+        let window = match protocol.0 {
+            Protocol::N2 => N2_LATE * rig.master.response_timeout,
+            _ => FORGOTTEN_AFTER,
+        };
+        assert_eq!(left, deadline + window);
+    }
+    let mut rig = Rig::new(1);
+    assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
+}

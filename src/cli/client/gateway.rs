@@ -31,6 +31,12 @@ pub(super) trait Stream: AsyncRead + AsyncWrite + Unpin + Send {}
 impl<S: AsyncRead + AsyncWrite + Unpin + Send> Stream for S {}
 
 impl Gateway {
+    /// One without a token.
+    pub(in crate::cli) fn at(url: Url, ca: Option<PathBuf>) -> Gateway {
+        let token_file = None;
+        Gateway { url, ca, token_file }
+    }
+
     /// The token to send, if one is configured.
     ///
     /// # Errors

@@ -2,19 +2,14 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
-use std::time::Duration;
 
-use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
-use tokio::time::timeout;
 
 use super::Target;
+use crate::cli::local_client::{exchange, is_nobody};
 use crate::cli::report;
-use crate::north::local::protocol::{FailureCode, MAX_RESPONSE, Outcome, Request, Response, request_line};
+use crate::north::local::protocol::{FailureCode, Outcome, Request};
 use crate::north::local::{RuntimeDirectories, SocketPath};
-
-/// Time for a response: a command may wait for its turn and its confirmation, a read for a slow line.
-const RESPONSE_TIMEOUT: Duration = Duration::from_secs(40);
 
 /// Why no gateway was asked, for the message when the port cannot be opened either.
 #[derive(Debug)]
@@ -62,32 +57,9 @@ pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Out
     Ok(Err(NotFound(not_found(target, &paths, reasons))))
 }
 
-/// Whether no gateway listens there.
-fn is_nobody(error: &io::Error) -> bool {
-    use io::ErrorKind::{ConnectionRefused, NotADirectory, NotFound};
-    matches!(error.kind(), ConnectionRefused | NotFound | NotADirectory)
-}
-
-async fn exchange(mut stream: UnixStream, request: &Request) -> io::Result<Response> {
-    let exchange = async {
-        // A gateway that turns a client away answers without waiting for its request.
-        let written = stream.write_all(&request_line(request)).await;
-        let mut line = Vec::new();
-        BufReader::new((&mut stream).take(MAX_RESPONSE as u64))
-            .read_until(b'\n', &mut line)
-            .await?;
-        if line.last() != Some(&b'\n') {
-            written?;
-            return Err(io::Error::new(io::ErrorKind::UnexpectedEof, "it closed the connection"));
-        }
-        serde_json::from_slice(&line).map_err(io::Error::from)
-    };
-    timeout(RESPONSE_TIMEOUT, exchange).await.map_err(io::Error::from)?
-}
-
 fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
     let remedy = match request {
-        Request::Read(_) | Request::Record(_) => "try again",
+        Request::Read(_) | Request::Record(_) | Request::Reload(_) | Request::Health(_) => "try again",
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };
     format!("the gateway did not answer: {error}; {}; {remedy}", path.display())

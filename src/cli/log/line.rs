@@ -11,9 +11,8 @@ use tracing_subscriber::fmt::format::{Format, Json, Writer};
 use tracing_subscriber::fmt::{FmtContext, FormatEvent, FormatFields};
 use tracing_subscriber::registry::LookupSpan;
 
-use super::AUDIT;
+use super::{AUDIT, journal};
 use crate::cli::printable;
-use crate::config::LogFormat;
 
 /// Shortest time between two lines of one kind that a library logs.
 const INTERVAL: Duration = Duration::from_secs(60);
@@ -22,17 +21,30 @@ const KINDS: usize = 1024;
 /// Own targets begin with this.
 const OWN: &str = env!("CARGO_PKG_NAME");
 
+/// What is made of an event.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Form {
+    /// An entry of the journal, with fields.
+    Entry,
+    /// A line with the priority before it, which the journal reads.
+    Priority,
+    /// A line for people.
+    Text,
+    /// A JSON object.
+    Json,
+}
+
 /// Formats log lines.
 pub(super) struct LogLine {
-    format: LogFormat,
+    form: Form,
     json: Format<Json>,
     libraries: Mutex<Libraries>,
 }
 
 impl LogLine {
-    pub(super) fn new(format: LogFormat) -> LogLine {
+    pub(super) fn new(form: Form) -> LogLine {
         LogLine {
-            format,
+            form,
             json: Format::default().json().flatten_event(true),
             libraries: Mutex::default(),
         }
@@ -54,21 +66,29 @@ where
         };
         drop(libraries);
         let mut text = String::new();
-        match self.format {
-            LogFormat::Json | LogFormat::Auto => {
+        match self.form {
+            Form::Json => {
                 self.json.format_event(context, Writer::new(&mut text), event)?;
                 if left_out > 0 {
                     let end = text.trim_end().trim_end_matches('}').len();
                     text.insert_str(end, &format!(",\"left_out\":{left_out}"));
                 }
             }
-            LogFormat::Journal | LogFormat::Text => {
+            Form::Entry | Form::Priority | Form::Text => {
                 context.format_fields(Writer::new(&mut text), event)?;
                 if left_out > 0 {
                     write!(text, " left_out={left_out}")?;
                 }
-                self.head(metadata, &mut writer)?;
             }
+        }
+        match self.form {
+            Form::Entry => {
+                let target = metadata.target();
+                let message = format!("{target}: {text}");
+                return writer.write_str(&journal::entry(priority(*metadata.level()), target, &message, event));
+            }
+            Form::Priority | Form::Text => self.head(metadata, &mut writer)?,
+            Form::Json => {}
         }
         writeln!(writer, "{}", printable::line(text.trim_end_matches('\n')))
     }
@@ -77,16 +97,16 @@ where
 impl LogLine {
     /// What stands before the fields: for the journal the priority, which it reads, and no time, which it adds.
     fn head(&self, metadata: &Metadata<'_>, writer: &mut Writer<'_>) -> fmt::Result {
-        let (priority, colour) = match *metadata.level() {
-            Level::ERROR => (3, 31),
-            Level::WARN => (4, 33),
-            Level::INFO => (6, 32),
-            Level::DEBUG => (7, 34),
-            Level::TRACE => (7, 35),
+        let colour = match *metadata.level() {
+            Level::ERROR => 31,
+            Level::WARN => 33,
+            Level::INFO => 32,
+            Level::DEBUG => 34,
+            Level::TRACE => 35,
         };
         let (level, target) = (metadata.level(), metadata.target());
-        if self.format == LogFormat::Journal {
-            return write!(writer, "<{priority}>{target}: ");
+        if self.form == Form::Priority {
+            return write!(writer, "<{}>{target}: ", priority(*level));
         }
         let time = humantime::format_rfc3339_micros(SystemTime::now());
         match writer.has_ansi_escapes() {
@@ -96,6 +116,16 @@ impl LogLine {
             ),
             false => write!(writer, "{time} {level:>5} {target}: "),
         }
+    }
+}
+
+/// Priority in the journal.
+fn priority(level: Level) -> u8 {
+    match level {
+        Level::ERROR => 3,
+        Level::WARN => 4,
+        Level::INFO => 6,
+        Level::DEBUG | Level::TRACE => 7,
     }
 }
 
@@ -166,13 +196,13 @@ mod tests {
         }
     }
 
-    fn logged(format: LogFormat, events: impl FnOnce()) -> String {
+    fn logged(format: Form, events: impl FnOnce()) -> String {
         let written = Written::default();
         let lines = tracing_subscriber::fmt::layer()
             .with_writer(written.clone())
             .with_ansi(false);
         match format {
-            LogFormat::Json => {
+            Form::Json => {
                 let lines = lines.json().event_format(LogLine::new(format));
                 tracing::subscriber::with_default(Registry::default().with(lines), events);
             }
@@ -188,9 +218,9 @@ mod tests {
     fn no_field_makes_a_line_or_commands_a_terminal() {
         let bad = "x\n<3>forged: \x1b[2J\u{202e}y\u{9b}";
         for (format, head) in [
-            (LogFormat::Journal, "<4>drivegate"),
-            (LogFormat::Text, "20"),
-            (LogFormat::Json, "{\""),
+            (Form::Priority, "<4>drivegate"),
+            (Form::Text, "20"),
+            (Form::Json, "{\""),
         ] {
             let text = logged(
                 format,
@@ -200,7 +230,7 @@ mod tests {
             let one = text.strip_suffix('\n').unwrap();
             assert!(one.starts_with(head) && one.matches("forged").count() == 4, "{one}");
             assert!(!one.chars().any(|c| c.is_control() || c == '\u{202e}'), "{one:?}");
-            if format == LogFormat::Json {
+            if format == Form::Json {
                 let json: serde_json::Value = serde_json::from_str(one).unwrap();
                 assert_eq!((&json["message"], &json["shown"]), (&bad.into(), &bad.into()));
             }
@@ -208,8 +238,27 @@ mod tests {
     }
 
     #[test]
+    fn an_entry_of_the_journal_has_a_field_for_each_value() {
+        let bad = "a\nPRIORITY=0";
+        let text = logged(Form::Entry, || {
+            tracing::warn!(target: "audit", drive = "pump-1", bus = %"line1", count = 3, who = bad, priority = 9, "{bad}");
+        });
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(
+            lines[..3],
+            ["PRIORITY=4", "SYSLOG_IDENTIFIER=drivegate", "TARGET=audit"]
+        );
+        assert!(
+            lines[3].starts_with("MESSAGE=audit: a") && lines[3].contains("drive=\"pump-1\""),
+            "{text}"
+        );
+        assert_eq!(lines[4..7], ["DRIVE=pump-1", "BUS=line1", "COUNT=3"]);
+        assert!(lines[7].starts_with("WHO=a") && lines.len() == 8, "{text}");
+    }
+
+    #[test]
     fn libraries_are_limited_and_own_lines_are_not() {
-        for (format, lines) in [(LogFormat::Journal, 14), (LogFormat::Json, 14)] {
+        for (format, lines) in [(Form::Priority, 14), (Form::Json, 14)] {
             let text = logged(format, || {
                 for n in 0..10 {
                     tracing::warn!(target: "rustls::conn", "bad record {n}");
@@ -223,7 +272,7 @@ mod tests {
         }
         let mut libraries = Libraries::default();
         let start = Instant::now();
-        let text = logged(LogFormat::Text, || ());
+        let text = logged(Form::Text, || ());
         assert_eq!(text, "");
         tracing::subscriber::with_default(Registry::default(), || {
             let metadata = tracing::debug_span!(target: "rustls", "x").metadata();

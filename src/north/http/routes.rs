@@ -21,8 +21,8 @@ use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, strea
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::log_throttle::LogThrottle;
-use crate::north::{NorthStats, metrics};
-use crate::plant::{Plant, SharedPlant};
+use crate::north::{NorthStats, metrics, readiness};
+use crate::plant::SharedPlant;
 
 /// What all handlers share.
 #[derive(Debug)]
@@ -175,8 +175,7 @@ async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Res
 }
 
 async fn ready(State(app): State<Arc<AppState>>) -> Response {
-    let mut reasons = unready(&app.plant.load());
-    reasons.extend(app.stats.lost_listeners.reasons());
+    let reasons = readiness::reasons(&app.plant.load(), &app.stats);
     if reasons.is_empty() {
         return "ready\n".into_response();
     }
@@ -186,27 +185,6 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
         let _ = writeln!(text, "{reason}");
     }
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
-}
-
-/// Why the gateway is not ready: buses that are not open and drives that were not tried yet.
-fn unready(plant: &Plant) -> Vec<String> {
-    let mut reasons = Vec::new();
-    for bus in &plant.buses {
-        let name = &bus.image.spec.name;
-        let health = bus.image.health();
-        if !health.up {
-            let why = health
-                .reason
-                .unwrap_or_else(|| "its port has not been opened yet".to_string());
-            reasons.push(format!("bus {name}: {why}"));
-        }
-        for drive in &bus.image.drives {
-            if !drive.snapshot().link.is_tried() {
-                reasons.push(format!("drive {} on bus {name}: not tried yet", drive.spec.name));
-            }
-        }
-    }
-    reasons
 }
 
 async fn drives(State(app): State<Arc<AppState>>) -> Response {

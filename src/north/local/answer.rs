@@ -28,6 +28,10 @@ pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
+        Request::Reload(_) | Request::Health(_) => {
+            let message = "this is no request to a drive";
+            Err(Failure::new(FailureCode::BadRequest, message))
+        }
     };
     answered.unwrap_or_else(Outcome::Error)
 }

@@ -1,10 +1,11 @@
-//! The local socket: what `drivegate read` and `drivegate write` speak to, on the machine of the gateway.
+//! The local socket: what `drivegate read`, `write`, `record`, `reload` and `health` speak to, on the machine of the gateway.
 //!
 //! Who may connect is decided by the permissions of the socket's file, and whoever may connect may command, as far as the
 //! drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited with the user
 //! id of the client's process. A client can hold a place and nothing else: lines, places and times are bounded.
 
 mod answer;
+mod control;
 mod path;
 pub mod protocol;
 
@@ -21,11 +22,13 @@ use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
-use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Response, VERSION};
+use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Request, Response, VERSION};
 use crate::command::{Origin, SourceKind};
+use crate::north::NorthStats;
 use crate::plant::{Plant, SharedPlant};
 
 pub use answer::answer;
+pub use control::{Control, ReloadOrder, absolute};
 pub use path::{RuntimeDirectories, SocketPath};
 
 /// Clients at one time.
@@ -36,6 +39,38 @@ const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 const RESPONSE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Wait after an accept error, such as no free descriptors.
 const ACCEPT_PAUSE: Duration = Duration::from_millis(100);
+
+/// How the server is configured.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Options {
+    /// Where it listens.
+    pub socket: SocketPath,
+    /// The gateway that it belongs to, where that has a configuration file.
+    pub control: Option<Control>,
+}
+
+/// What a client may ask.
+#[derive(Debug)]
+struct Asked {
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    control: Option<Control>,
+}
+
+impl Asked {
+    async fn answer(&self, request: &Request, origin: Origin) -> Outcome {
+        let plant = self.plant.load_full();
+        let control = self.control.as_ref();
+        let answered = match request {
+            Request::Reload(asked) => control::reload(control, asked, origin.who.to_string())
+                .await
+                .map(Outcome::Reload),
+            Request::Health(asked) => control::health(control, asked, &plant, &self.stats).map(Outcome::Health),
+            of_drive => Ok(answer(of_drive, &plant, origin).await),
+        };
+        answered.unwrap_or_else(Outcome::Error)
+    }
+}
 
 /// The running server.
 #[derive(Debug)]
@@ -63,25 +98,32 @@ impl Local {
 ///
 /// # Errors
 /// When the socket cannot be bound: what and where.
-pub async fn start(path: &SocketPath, plant: SharedPlant, cancel: CancellationToken) -> io::Result<Local> {
-    let paths = path.of_gateway(&RuntimeDirectories::of_this_process());
+pub async fn start(
+    options: &Options,
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    cancel: CancellationToken,
+) -> io::Result<Local> {
+    let paths = options.socket.of_gateway(&RuntimeDirectories::of_this_process());
     let first = paths.first().map(|path| path.display().to_string()).unwrap_or_default();
     let bound = path::bind_first(&paths)
         .await
         .map_err(|error| io::Error::new(error.kind(), format!("cannot listen on {first}: {error}")))?;
     let path = bound.path.clone();
+    let control = options.control.clone();
+    let asked = Arc::new(Asked { plant, stats, control });
     tracing::info!(target: "drivegate::local", path = %path.display(), "local socket: listening");
-    let task = tokio::spawn(accept(bound, plant, cancel));
+    let task = tokio::spawn(accept(bound, asked, cancel));
     Ok(Local { path, task })
 }
 
-async fn accept(bound: Bound, plant: SharedPlant, cancel: CancellationToken) {
+async fn accept(bound: Bound, asked: Arc<Asked>, cancel: CancellationToken) {
     let places = Arc::new(Semaphore::new(MAX_CLIENTS));
     while let Some(accepted) = cancel.run_until_cancelled(bound.listener.accept()).await {
         match accepted {
             Ok((stream, _)) => match places.clone().try_acquire_owned() {
-                Ok(place) => drop(tokio::spawn(serve(stream, plant.clone(), cancel.clone(), place))),
-                Err(_) => turn_away(&stream, &plant.load()),
+                Ok(place) => drop(tokio::spawn(serve(stream, asked.clone(), cancel.clone(), place))),
+                Err(_) => turn_away(&stream, &asked.plant.load()),
             },
             Err(error) => {
                 tracing::debug!(target: "drivegate::local", "cannot accept a local client: {error}; trying again");
@@ -107,7 +149,7 @@ fn response(plant: &Plant, result: Outcome) -> Vec<u8> {
 }
 
 /// Serves one client until it leaves, falls silent or takes no response.
-async fn serve(mut stream: UnixStream, plant: SharedPlant, cancel: CancellationToken, place: OwnedSemaphorePermit) {
+async fn serve(mut stream: UnixStream, asked: Arc<Asked>, cancel: CancellationToken, place: OwnedSemaphorePermit) {
     // Without a user id there is nobody to hold the command against.
     let Ok(peer) = stream.peer_cred() else { return };
     let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
@@ -118,7 +160,6 @@ async fn serve(mut stream: UnixStream, plant: SharedPlant, cancel: CancellationT
         let Some(Ok(Ok(line))) = cancel.run_until_cancelled(request).await else {
             break;
         };
-        let plant = plant.load_full();
         let (result, goes_on) = match line {
             Line::End => break,
             Line::TooLong => {
@@ -126,11 +167,11 @@ async fn serve(mut stream: UnixStream, plant: SharedPlant, cancel: CancellationT
                 (Outcome::Error(Failure::new(FailureCode::BadRequest, message)), false)
             }
             Line::Whole(line) => match protocol::parse(&line) {
-                Ok(request) => (answer(&request, &plant, origin.clone()).await, true),
+                Ok(request) => (asked.answer(&request, origin.clone()).await, true),
                 Err(failure) => (Outcome::Error(failure), true),
             },
         };
-        let response = response(&plant, result);
+        let response = response(&asked.plant.load(), result);
         let written = timeout(RESPONSE_TIMEOUT, write_half.write_all(&response)).await;
         if !matches!(written, Ok(Ok(()))) || !goes_on {
             break;

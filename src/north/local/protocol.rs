@@ -6,6 +6,10 @@
 //! {"v":1,"write":{"drive":"pump-1","points":[{"point":"run","value":false}]}}
 //! {"v":1,"record":{"drive":"pump-1"}}
 //! {"v":1,"gateway":"plant","record":{"id":"20260302T074012.118Z-pump-1","after_s":10.0}}
+//! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
+//! {"v":1,"gateway":"plant","reload":{"errors":[],"warnings":[],"changes":["changed: MQTT"]}}
+//! {"v":1,"health":{}}
+//! {"v":1,"gateway":"plant","health":{"ready":true,"reasons":[]}}
 //! {"v":1,"gateway":"plant","write":{"ok":true,"result":"confirmed","message":"…","latency_ms":9.1,"confirmed_ms":31.4}}
 //! ```
 
@@ -36,6 +40,19 @@ pub enum Request {
     Write(WriteRequest),
     /// A recording of one drive.
     Record(RecordRequest),
+    /// The gateway reads its configuration anew.
+    Reload(OfGateway),
+    /// Whether the gateway is ready.
+    Health(OfGateway),
+}
+
+/// Which gateway is meant.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OfGateway {
+    /// The one that runs with this configuration file, an absolute path without links; absent: whichever answers.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub config: Option<String>,
 }
 
 /// A recording of one drive.
@@ -144,6 +161,10 @@ pub enum Outcome {
     Write(WriteOutcome),
     /// A recording goes on.
     Record(RecordOutcome),
+    /// The configuration was read anew.
+    Reload(ReloadOutcome),
+    /// The gateway is ready, or not.
+    Health(HealthOutcome),
     /// Nothing was read or written.
     Error(Failure),
 }
@@ -156,6 +177,26 @@ impl Outcome {
             _ => "the response does not fit the request; the local socket; restart the gateway".to_string(),
         }
     }
+}
+
+/// The configuration was read anew; it applies unless there are errors.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, Deserialize)]
+pub struct ReloadOutcome {
+    /// What must be mended; the gateway runs as before.
+    pub errors: Vec<String>,
+    /// What works but probably not as intended.
+    pub warnings: Vec<String>,
+    /// What changed.
+    pub changes: Vec<String>,
+}
+
+/// Whether the gateway is ready.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HealthOutcome {
+    /// As `/readyz` says.
+    pub ready: bool,
+    /// Why it is not.
+    pub reasons: Vec<String>,
 }
 
 /// A recording that goes on.
@@ -267,6 +308,8 @@ pub enum FailureCode {
     NotRecorded,
     /// The client's port is none of this gateway's.
     OtherGateway,
+    /// The gateway stops.
+    Stopping,
     /// The gateway owns the client's port and runs with another configuration.
     OtherConfiguration,
     /// One that this version does not know.

@@ -2,7 +2,7 @@
 //! of the servers come from `NorthStats`.
 
 use std::sync::atomic::Ordering;
-use std::time::Instant;
+use std::time::{Instant, SystemTime};
 
 use super::model::MODEL;
 use super::process;
@@ -11,9 +11,6 @@ use crate::history::TriggerKind;
 use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
-
-/// Commit of the build, set for releases.
-const COMMIT: Option<&str> = option_env!("DRIVEGATE_COMMIT");
 
 /// Label names and values.
 pub(super) type Labels = Vec<(&'static str, String)>;
@@ -77,6 +74,7 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Fa
     writes(plant, &mut all);
     recordings(plant, &mut all);
     north(stats, &mut all);
+    reload(stats, &mut all);
     all.push(build(plant));
     process(&process::read(), &mut all);
     all
@@ -342,10 +340,27 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     all.push(lost);
 }
 
+fn reload(stats: &NorthStats, all: &mut Vec<Family>) {
+    let (applied, at) = stats.reload.last();
+    let since_epoch = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    all.push(Family::of(
+        Kind::Gauge,
+        "drivegate_config_last_reload_successful",
+        "Whether the last reload of the configuration was applied: 1; 0 if it was refused and the former one goes on.",
+        flag(applied),
+    ));
+    all.push(Family::of(
+        Kind::Gauge,
+        "drivegate_config_last_reload_timestamp_seconds",
+        "When the last reload of the configuration ended, applied or refused; the start counts as one.",
+        SeriesValue::Value((since_epoch.as_secs_f64() * 1e3).round() / 1e3),
+    ));
+}
+
 fn build(plant: &Plant) -> Family {
     let labels = vec![
         ("version", env!("CARGO_PKG_VERSION").to_string()),
-        ("commit", COMMIT.unwrap_or("unknown").to_string()),
+        ("commit", super::COMMIT.unwrap_or("unknown").to_string()),
         ("gateway", plant.gateway.clone()),
     ];
     let mut family = Family::new(

@@ -139,6 +139,15 @@ impl Journal {
     fn adopt(&mut self, number: u64, path: PathBuf) -> io::Result<()> {
         let file = OpenOptions::new().read(true).write(true).open(&path)?;
         let bytes = fs::read(&path)?;
+        if let Some(version) = record::other_version(&bytes) {
+            tracing::warn!(
+                "{} was written by another version of drivegate (form {:?}, this one reads 'J'); it is left as it is; that \
+                 version publishes what is in it, or remove it",
+                path.display(),
+                char::from(version),
+            );
+            return Ok(());
+        }
         let mut numbers: Option<(u64, u64)> = None;
         let mut end = 0;
         for Record { entry, range } in record::records(&bytes).flatten() {
@@ -150,7 +159,16 @@ impl Journal {
         }
         if end < bytes.len() as u64 {
             // Nothing valid follows: what was being written when the process ended.
-            self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default());
+            if let Err(error) = self.quarantine(number, end, bytes.get(end as usize..).unwrap_or_default())
+                && end == 0
+            {
+                // Nothing in it is understood, and nothing of it could be kept elsewhere.
+                let what = format!(
+                    "{}: none of it is valid, and it cannot be copied: {error}",
+                    path.display()
+                );
+                return Err(io::Error::new(error.kind(), what));
+            }
             self.lost += 1;
             file.set_len(end)?;
         }
@@ -256,7 +274,9 @@ impl Journal {
                     }
                 }
                 Err(range) => {
-                    self.quarantine(number, from + range.start as u64, bytes.get(range).unwrap_or_default());
+                    let damaged = bytes.get(range.clone()).unwrap_or_default();
+                    // What cannot be kept is in the log, and stays in its segment until that is acknowledged.
+                    let _ = self.quarantine(number, from + range.start as u64, damaged);
                 }
             }
         }
@@ -425,21 +445,22 @@ impl Journal {
     }
 
     /// Keeps a copy of bytes that are no records.
-    fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) {
+    fn quarantine(&self, segment: u64, offset: u64, bytes: &[u8]) -> io::Result<()> {
         let Some(Place { dir, name, .. }) = &self.place else {
-            return;
+            return Ok(());
         };
         let path = dir.join(format!("{name}-{segment:012}-{offset}{DAMAGED}"));
         let kept = remove_old_quarantine(dir, name).and_then(|()| fs::write(&path, bytes));
-        let kept = kept.map_or_else(
-            |error| format!("they cannot be kept: {error}"),
-            |()| format!("kept in {}", path.display()),
-        );
+        let shown = match &kept {
+            Err(error) => format!("they cannot be kept: {error}"),
+            Ok(()) => format!("kept in {}", path.display()),
+        };
         tracing::warn!(
-            "{} bytes of {name} in {} are damaged; {kept}; the other records are read",
+            "{} bytes of {name} in {} are damaged; {shown}; the other records are read",
             bytes.len(),
             dir.display()
         );
+        kept
     }
 }
 

@@ -280,13 +280,14 @@ pub(super) fn bus_object(state: &BusState, figures: &BusFigures, wall: SystemTim
     object.to_string().into_bytes()
 }
 
-/// The event object and its topics: that of its drive, or those of all drives of its bus.
+/// The event object and its topics: that of its drive, or those of all drives of its bus, or of the gateway.
 pub(super) fn event(topics: &Topics, event: &Event, plant: &Plant) -> (Vec<String>, Vec<u8>) {
     let drives = match &event.drive {
         Some(drive) => vec![drive.clone()],
         None => {
-            let bus = plant.buses.iter().find(|bus| bus.image.spec.name == event.bus);
-            let drives = bus.into_iter().flat_map(|bus| &bus.image.drives);
+            let meant = |name: &str| event.bus.is_empty() || event.bus == name;
+            let buses = plant.buses.iter().filter(|bus| meant(&bus.image.spec.name));
+            let drives = buses.flat_map(|bus| &bus.image.drives);
             drives.map(|drive| drive.spec.name.clone()).collect()
         }
     };

@@ -5,7 +5,8 @@ use std::ops::Range;
 
 use super::outbox::Message;
 
-/// Where a record begins; no UTF-8 text contains it.
+/// Where a record begins; no UTF-8 text contains it. The third byte is the version of the form: `J` is the first, and
+/// whatever this version cannot read needs another.
 const MARK: [u8; 4] = [0xD7, b'G', b'J', 0xFE];
 const HEADER: usize = 21;
 /// Maximum length of a body; a longer one is damaged.
@@ -92,6 +93,14 @@ pub(super) fn records(bytes: &[u8]) -> impl Iterator<Item = Result<Record, Range
         }
         (damaged < at).then_some(Err(damaged..at))
     })
+}
+
+/// The version of the records that `bytes` begin with, if it is not the one that is read here.
+pub(super) fn other_version(bytes: &[u8]) -> Option<u8> {
+    match bytes {
+        [0xD7, b'G', version, 0xFE, ..] if *version != b'J' => Some(*version),
+        _ => None,
+    }
 }
 
 /// Number and bytes of the whole records of a file, for the fuzzer.

@@ -310,7 +310,7 @@ async function tick() {
 // ---- Events
 
 const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", supervision: "amber", unsupervised: "amber", refused_command: "amber",
-  restarted: "amber", unlike_profile: "amber", not_confirmed: "amber", fault_end: "green", online: "green", bus_up: "green" };
+  restarted: "amber", unlike_profile: "amber", not_confirmed: "amber", reload_refused: "amber", fault_end: "green", online: "green", bus_up: "green" };
 let lastEvent = "";
 
 function addEvent(time, kind, subject, words) {
@@ -327,7 +327,7 @@ function showEvents(news) {
   const anew = news.last.split("-")[0] !== lastEvent.split("-")[0];
   if (anew) $("events").replaceChildren();
   lastEvent = news.last;
-  for (const event of news.events.slice(-EVENTS_SHOWN)) addEvent(new Date(event.time), event.event, event.drive || event.bus, event.text);
+  for (const event of news.events.slice(-EVENTS_SHOWN)) addEvent(new Date(event.time), event.event, event.drive || event.bus || "gateway", event.text);
   $("events-note").hidden = $("events").children.length > 0;
 }
 

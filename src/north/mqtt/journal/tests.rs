@@ -125,6 +125,32 @@ fn an_incomplete_tail_is_kept_aside() {
 }
 
 #[test]
+fn a_file_of_another_version_is_left_as_it_is() {
+    let dir = tempfile::tempdir().unwrap();
+    append(&mut open(dir.path(), BIG), 1..3);
+    let path = files(dir.path(), SUFFIX).pop().unwrap();
+    let bytes: Vec<u8> = fs::read(&path).unwrap();
+    let later: Vec<u8> = bytes
+        .iter()
+        .map(|byte| if *byte == b'J' { b'K' } else { *byte })
+        .collect();
+    assert_ne!(bytes, later);
+    fs::write(&path, &later).unwrap();
+    for n in 3..5 {
+        let mut journal = open(dir.path(), BIG);
+        append(&mut journal, n..n + 1);
+        assert_eq!(numbers(&take_all(&mut journal)), [n]);
+        journal.acknowledge(journal.last());
+        journal.write().unwrap();
+        assert_eq!(journal.take_lost(), 0);
+        assert_eq!(fs::read(&path).unwrap(), later);
+    }
+    // The version that wrote it is back.
+    fs::write(&path, &bytes).unwrap();
+    assert_eq!(numbers(&take_all(&mut open(dir.path(), BIG))), [1, 2]);
+}
+
+#[test]
 fn one_flipped_bit_costs_one_message() {
     let dir = tempfile::tempdir().unwrap();
     append(&mut open(dir.path(), BIG), 0..1000);

@@ -1,0 +1,281 @@
+//! The archive of `backup` and `restore`: a tar file whose first member, `manifest.json`, names all the others. A member is
+//! `config/…`, below the directory of the configuration, or `state/…`, below the state directory; nothing else is accepted.
+
+use std::collections::BTreeSet;
+use std::io::{self, Read, Write};
+use std::path::{Component, Path, PathBuf};
+
+use ring::digest::{Context, SHA256};
+use serde::{Deserialize, Serialize};
+use tar::{Archive, Builder, EntryType, Header};
+
+/// Version of the form; one that is greater cannot be read.
+pub(super) const FORMAT: u32 = 1;
+const MANIFEST: &str = "manifest.json";
+/// Largest manifest, bytes.
+const MOST_MANIFEST: u64 = 16 << 20;
+/// Most members.
+const MOST_MEMBERS: usize = 10_000;
+/// Most bytes of all members together.
+const MOST_BYTES: u64 = 8 << 30;
+
+/// What an archive has.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Manifest {
+    /// [`FORMAT`].
+    pub(super) drivegate_backup: u32,
+    /// Version of the program that made it.
+    pub(super) version: String,
+    /// When, RFC 3339.
+    pub(super) time: String,
+    /// Name of the gateway.
+    pub(super) gateway: String,
+    /// Path of the configuration when it was made.
+    pub(super) config: PathBuf,
+    /// The state directory then.
+    pub(super) state_dir: PathBuf,
+    /// The members, in their order; the configuration is the first.
+    pub(super) members: Vec<Member>,
+    /// Directories of profiles, `config/…`, which may be empty.
+    pub(super) directories: Vec<String>,
+    /// Files that belong to the gateway and are not in the archive.
+    pub(super) left_out: Vec<LeftOut>,
+    /// The recordings that there were; they themselves are not in the archive.
+    pub(super) recordings: Vec<serde_json::Value>,
+}
+
+/// A file in an archive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct Member {
+    /// `config/…` or `state/…`.
+    pub(super) name: String,
+    /// Its size.
+    pub(super) bytes: u64,
+    /// Permissions.
+    pub(super) mode: u32,
+    /// Of its content, in hexadecimal.
+    pub(super) sha256: String,
+}
+
+/// A file that is not in the archive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub(super) struct LeftOut {
+    /// Where it is.
+    pub(super) path: PathBuf,
+    /// Why.
+    pub(super) why: String,
+}
+
+/// The directories of members.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Root {
+    /// That of the configuration.
+    Config,
+    /// That of the state.
+    State,
+}
+
+impl Root {
+    fn name(self) -> &'static str {
+        match self {
+            Root::Config => "config",
+            Root::State => "state",
+        }
+    }
+
+    /// The name of the member for the file at `path` below the directory.
+    pub(super) fn member(self, path: &Path) -> Option<String> {
+        Some(format!("{}/{}", self.name(), path.to_str()?))
+    }
+}
+
+/// Where the member `name` belongs.
+///
+/// # Errors
+/// The name leads elsewhere.
+pub(super) fn place(name: &str) -> Result<(Root, PathBuf), String> {
+    let bad = || Err(format!("the member {name:?} has no name that a backup uses"));
+    let (root, rest) = match name.split_once('/') {
+        Some(("config", rest)) => (Root::Config, rest),
+        Some(("state", rest)) => (Root::State, rest),
+        _ => return bad(),
+    };
+    let path = PathBuf::from(rest);
+    let normal = |part: Component<'_>| matches!(part, Component::Normal(_));
+    // What the components make together again is the name itself: no `//`, no `.` and no slash at the end.
+    let same = path.components().collect::<PathBuf>().as_os_str() == rest;
+    if rest.is_empty() || rest.contains('\0') || !same || !path.components().all(normal) {
+        return bad();
+    }
+    Ok((root, path))
+}
+
+/// The content of a file that is being put into an archive, whose size and hash are known.
+pub(super) struct Content<R> {
+    pub(super) member: Member,
+    pub(super) reader: R,
+}
+
+/// Writes an archive: the manifest, then each member as it is in it.
+///
+/// # Errors
+/// It cannot be written, or a file is no longer as its member says.
+pub(super) fn write<R: Read>(
+    to: impl Write,
+    manifest: &Manifest,
+    contents: impl Iterator<Item = io::Result<Content<R>>>,
+) -> io::Result<()> {
+    let mut builder = Builder::new(to);
+    let json = serde_json::to_vec_pretty(manifest)?;
+    builder.append(&header(MANIFEST, json.len() as u64, 0o600)?, json.as_slice())?;
+    for content in contents {
+        let Content { member, reader } = content?;
+        let mut hashed = Hashed::new(reader.take(member.bytes));
+        builder.append(&header(&member.name, member.bytes, member.mode)?, &mut hashed)?;
+        if hashed.finish() != (member.bytes, member.sha256.clone()) {
+            let what = format!("{} changed while it was copied; try again", member.name);
+            return Err(io::Error::other(what));
+        }
+    }
+    builder.into_inner()?.flush()
+}
+
+fn header(name: &str, bytes: u64, mode: u32) -> io::Result<Header> {
+    let mut header = Header::new_ustar();
+    header.set_path(name)?;
+    header.set_entry_type(EntryType::Regular);
+    header.set_size(bytes);
+    header.set_mode(mode & 0o777);
+    header.set_mtime(0);
+    header.set_cksum();
+    Ok(header)
+}
+
+/// Reads an archive, which may be hostile: `take` gets each member with its content, which it must read to the end.
+/// Members that the manifest does not name, other kinds than files, names that lead elsewhere and wrong contents are
+/// errors.
+///
+/// # Errors
+/// What is wrong with it; members before that were taken.
+pub(super) fn read(
+    from: impl Read,
+    mut take: impl FnMut(&Member, Root, &Path, &mut dyn Read) -> io::Result<()>,
+) -> Result<Manifest, String> {
+    let broken = |error: io::Error| format!("it is not an archive, or damaged: {error}");
+    let mut archive = Archive::new(from);
+    // Raw: extensions of the format, such as endless names, are members, and refused as such.
+    let mut entries = archive.entries().map_err(broken)?.raw(true);
+    let first = entries.next().ok_or("it is empty")?.map_err(broken)?;
+    if first.path_bytes().as_ref() != MANIFEST.as_bytes() || first.size() > MOST_MANIFEST {
+        return Err("it is not a backup of drivegate: it does not begin with a manifest".to_string());
+    }
+    let mut json = Vec::new();
+    first.take(MOST_MANIFEST).read_to_end(&mut json).map_err(broken)?;
+    let manifest = parse(&json)?;
+    let mut expected = manifest.members.iter();
+    for entry in entries {
+        let mut entry = entry.map_err(broken)?;
+        let name = String::from_utf8_lossy(&entry.path_bytes()).into_owned();
+        let kind = entry.header().entry_type();
+        if kind != EntryType::Regular {
+            return Err(format!("the member {name:?} is no file but {kind:?}"));
+        }
+        let member = expected.next().filter(|member| member.name == name);
+        let member = member.ok_or_else(|| format!("the member {name:?} is not the one the manifest names here"))?;
+        if entry.size() != member.bytes {
+            let size = entry.size();
+            return Err(format!("{name} has {size} bytes, the manifest says {}", member.bytes));
+        }
+        let (root, path) = place(&name)?;
+        let mut hashed = Hashed::new(&mut entry);
+        take(member, root, &path, &mut hashed).map_err(|error| format!("{name}: {error}"))?;
+        if hashed.finish() != (member.bytes, member.sha256.clone()) {
+            return Err(format!("{name} is damaged: its content is not what the manifest says"));
+        }
+    }
+    match expected.next() {
+        Some(missing) => Err(format!("{} is missing: the archive was cut", missing.name)),
+        None => Ok(manifest),
+    }
+}
+
+/// A manifest, and whether it can be that of a backup.
+fn parse(json: &[u8]) -> Result<Manifest, String> {
+    #[derive(Deserialize)]
+    struct Version {
+        drivegate_backup: u32,
+    }
+    let no_manifest = |error: serde_json::Error| format!("its manifest is damaged: {error}");
+    let Version {
+        drivegate_backup: format,
+    } = serde_json::from_slice(json).map_err(no_manifest)?;
+    if format > FORMAT {
+        return Err(format!(
+            "it has format {format}, and this version reads {FORMAT}: restore it with the version that made it, or a later one"
+        ));
+    }
+    let manifest: Manifest = serde_json::from_slice(json).map_err(no_manifest)?;
+    let mut names = BTreeSet::new();
+    let mut bytes = 0u64;
+    for member in &manifest.members {
+        place(&member.name)?;
+        bytes = bytes.saturating_add(member.bytes);
+        if !names.insert(&member.name) {
+            return Err(format!("{} is in it twice", member.name));
+        }
+    }
+    for directory in &manifest.directories {
+        if place(directory)?.0 != Root::Config {
+            return Err(format!("{directory} is no directory of profiles"));
+        }
+    }
+    if manifest.directories.len() > MOST_MEMBERS || manifest.members.len() > MOST_MEMBERS || bytes > MOST_BYTES {
+        let count = manifest.members.len();
+        return Err(format!(
+            "it says it has {count} files of {bytes} bytes, more than any backup"
+        ));
+    }
+    match manifest.members.first() {
+        Some(first) if place(&first.name)?.0 == Root::Config => Ok(manifest),
+        _ => Err("it has no configuration".to_string()),
+    }
+}
+
+/// Counts and hashes what is read.
+pub(super) struct Hashed<R> {
+    reader: R,
+    bytes: u64,
+    hash: Context,
+}
+
+impl<R> Hashed<R> {
+    pub(super) fn new(reader: R) -> Hashed<R> {
+        Hashed {
+            reader,
+            bytes: 0,
+            hash: Context::new(&SHA256),
+        }
+    }
+
+    /// Bytes that were read, and their hash.
+    pub(super) fn finish(self) -> (u64, String) {
+        let digest = self.hash.finish();
+        (
+            self.bytes,
+            digest.as_ref().iter().map(|byte| format!("{byte:02x}")).collect(),
+        )
+    }
+}
+
+impl<R: Read> Read for Hashed<R> {
+    fn read(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
+        let count = self.reader.read(buffer)?;
+        let read = buffer.get(..count).unwrap_or_default();
+        self.hash.update(read);
+        self.bytes += count as u64;
+        Ok(count)
+    }
+}
+
+#[cfg(test)]
+mod tests;

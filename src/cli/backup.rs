@@ -1,0 +1,201 @@
+//! `drivegate backup`: what a gateway needs to be set up again, in one file.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, BufWriter, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::SystemTime;
+
+use super::archive::{Content, FORMAT, Hashed, LeftOut, Manifest, Member, Root, write};
+use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
+use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
+use crate::history::store;
+
+/// Files in the state directory that a backup does not need: locks, and what is being written.
+const TRANSIENT: [&str; 2] = ["lock", "partial"];
+
+/// Writes configuration, profiles and state into one file, from which `restore` sets the gateway up again.
+///
+/// The gateway may run. Certificates, keys, passwords and tokens are named in the backup, and are in it only with
+/// --with-keys: keep such a file as secret as the keys. Recordings are listed, not copied.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Example:\n  sudo drivegate backup pump-house.tar --config /etc/drivegate/drivegate.toml")]
+pub(super) struct Args {
+    /// The file to write, a tar archive; it must not exist.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    #[command(flatten)]
+    config: ConfigFile,
+    /// Also certificates, keys, passwords and tokens.
+    #[arg(long)]
+    with_keys: bool,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    let path = &args.config.path;
+    let loaded = Settings::load(path, environment());
+    let Some(settings) = loaded.settings else {
+        report::errors(&loaded.errors);
+        return ExitCode::from(EXIT_CONFIG);
+    };
+    let made = collect(path, &settings, args.with_keys).and_then(|sources| {
+        let manifest = manifest(path, &settings, &sources);
+        save(&args.file, &manifest, &sources).map(|()| manifest)
+    });
+    match made {
+        Ok(manifest) => report::print(&summary(&args.file, &manifest)),
+        Err(why) => {
+            report::error(&format!("{why}; {}; no backup was made", args.file.display()));
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}
+
+/// The files of a backup, and what is not in it.
+#[derive(Debug, Default)]
+struct Sources {
+    files: Vec<(PathBuf, Member)>,
+    left_out: Vec<LeftOut>,
+}
+
+impl Sources {
+    fn leave_out(&mut self, path: &Path, why: &str) {
+        self.left_out.push(LeftOut {
+            path: path.to_path_buf(),
+            why: why.to_string(),
+        });
+    }
+
+    /// Adds the file at `dir`/`below`.
+    fn add(&mut self, root: Root, dir: &Path, below: &Path) -> io::Result<()> {
+        let path = dir.join(below);
+        let Some(name) = root.member(below) else {
+            self.leave_out(&path, "its name is not UTF-8");
+            return Ok(());
+        };
+        let shown = |error: io::Error| io::Error::new(error.kind(), format!("cannot read {}: {error}", path.display()));
+        let file = File::open(&path).map_err(shown)?;
+        let metadata = file.metadata()?;
+        // A file that grows, such as the audit, counts as long as it is now.
+        let mut hashed = Hashed::new(io::Read::take(file, metadata.len()));
+        io::copy(&mut hashed, &mut io::sink()).map_err(shown)?;
+        let (bytes, sha256) = hashed.finish();
+        let mode = metadata.mode() & 0o777;
+        let member = Member {
+            name,
+            bytes,
+            mode,
+            sha256,
+        };
+        self.files.push((path, member));
+        Ok(())
+    }
+}
+
+fn collect(config: &Path, settings: &Settings, with_keys: bool) -> io::Result<Sources> {
+    let base = config.parent().unwrap_or(Path::new(""));
+    let mut sources = Sources::default();
+    for NamedFile { path, kind, .. } in named_files(config, environment()) {
+        let belongs = matches!(kind, FileKind::Configuration | FileKind::Profile);
+        match path.strip_prefix(base) {
+            _ if !belongs && !with_keys => sources.leave_out(&path, "a certificate, key, password or token"),
+            Ok(below) => sources.add(Root::Config, base, below)?,
+            Err(_) => sources.leave_out(&path, "it is outside the directory of the configuration"),
+        }
+    }
+    state(settings, &mut sources)?;
+    Ok(sources)
+}
+
+/// The files of the state directory, without what is in directories of it but recordings, which are listed.
+fn state(settings: &Settings, sources: &mut Sources) -> io::Result<()> {
+    let dir = &settings.state_dir;
+    let mut names: Vec<PathBuf> = match fs::read_dir(dir) {
+        Ok(files) => files.map(|file| Ok(file?.path())).collect::<io::Result<_>>()?,
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
+        Err(error) => {
+            let what = format!("cannot read {}: {error}", dir.display());
+            return Err(io::Error::new(error.kind(), what));
+        }
+    };
+    names.sort();
+    for path in names {
+        let is_transient = |ending| TRANSIENT.iter().any(|transient| ending == *transient);
+        let is_file = fs::symlink_metadata(&path).is_ok_and(|found| found.is_file());
+        if let (true, Some(name)) = (is_file && !path.extension().is_some_and(is_transient), path.file_name()) {
+            sources.add(Root::State, dir, Path::new(name))?;
+        }
+    }
+    Ok(())
+}
+
+fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
+    let base = config.parent().unwrap_or(Path::new(""));
+    let below = settings
+        .profile_dirs
+        .iter()
+        .filter_map(|dir| dir.strip_prefix(base).ok());
+    let below = below.filter(|dir| !dir.as_os_str().is_empty());
+    let (recordings, _) = store::list(&settings.recordings.dir).unwrap_or_default();
+    Manifest {
+        drivegate_backup: FORMAT,
+        version: super::VERSION.clone(),
+        time: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
+        gateway: settings.gateway.clone(),
+        config: config.to_path_buf(),
+        state_dir: settings.state_dir.clone(),
+        members: sources.files.iter().map(|(_, member)| member.clone()).collect(),
+        directories: below.filter_map(|dir| Root::Config.member(dir)).collect(),
+        left_out: sources.left_out.clone(),
+        recordings: recordings
+            .iter()
+            .filter_map(|entry| serde_json::to_value(entry).ok())
+            .collect(),
+    }
+}
+
+/// Writes the archive beside its name and renames it, so that there are only whole ones.
+fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
+    if fs::symlink_metadata(file).is_ok() {
+        return Err(io::Error::other("the file exists already: name another, or remove it"));
+    }
+    let mut name = file.file_name().unwrap_or_default().to_os_string();
+    name.push(".partial");
+    let aside = file.with_file_name(name);
+    let written = OpenOptions::new()
+        .write(true)
+        .create_new(true)
+        .mode(0o600)
+        .open(&aside)
+        .and_then(|open| {
+            let contents = sources.files.iter().map(|(path, member)| {
+                let (member, reader) = (member.clone(), File::open(path)?);
+                Ok(Content { member, reader })
+            });
+            let mut to = BufWriter::new(&open);
+            write(&mut to, manifest, contents)?;
+            to.flush()?;
+            open.sync_all()?;
+            fs::rename(&aside, file)
+        });
+    written.inspect_err(|error| {
+        if error.kind() != io::ErrorKind::AlreadyExists {
+            let _ = fs::remove_file(&aside);
+        }
+    })
+}
+
+fn summary(file: &Path, manifest: &Manifest) -> String {
+    let bytes: u64 = manifest.members.iter().map(|member| member.bytes).sum();
+    let mut text = format!(
+        "{}: {} files, {bytes} bytes; {} recordings listed\n",
+        file.display(),
+        manifest.members.len(),
+        manifest.recordings.len()
+    );
+    for LeftOut { path, why } in &manifest.left_out {
+        text += &format!("not in it: {} ({why})\n", path.display());
+    }
+    text
+}

@@ -1,0 +1,190 @@
+//! Whether the user of the systemd service could read the files of a configuration: by their permission bits, those of
+//! the directories on the way, and the groups of the unit.
+
+use std::collections::BTreeSet;
+use std::fs;
+use std::os::unix::fs::MetadataExt;
+use std::path::Path;
+use std::process::Command;
+
+use crate::config::{NamedFile, environment, named_files};
+use crate::document::{Finding, Problem};
+
+const UNIT: &str = "drivegate.service";
+/// The group of the shipped unit, where there is no systemd to ask.
+const SHIPPED_GROUP: &str = "dialout";
+/// Made by systemd for the service while it runs.
+const CREDENTIALS: &str = "/run/credentials/";
+const READ: u32 = 0o4;
+const SEARCH: u32 = 0o1;
+
+/// Who reads the files.
+#[derive(Debug, PartialEq, Eq)]
+struct Service {
+    /// The user; `None` for one that exists only while the service runs, and owns nothing.
+    user: Option<u32>,
+    groups: BTreeSet<u32>,
+    /// Both in words.
+    shown: String,
+}
+
+/// What is asked of a file or directory, and what it grants.
+#[derive(Debug, Clone, Copy)]
+struct Node {
+    mode: u32,
+    user: u32,
+    group: u32,
+}
+
+impl Service {
+    /// As the system has the unit.
+    fn of_unit() -> Service {
+        let asked = ["User", "DynamicUser", "Group", "SupplementaryGroups", "LoadState"];
+        let output = Command::new("systemctl")
+            .args(["show", UNIT, &format!("--property={}", asked.join(","))])
+            .output();
+        let text = output.map(|output| String::from_utf8_lossy(&output.stdout).into_owned());
+        let text = text.unwrap_or_default();
+        let read = |path| fs::read_to_string(path).unwrap_or_default();
+        Service::parse(&text, &read("/etc/passwd"), &read("/etc/group"))
+    }
+
+    /// From what `systemctl show` prints; without a loaded unit, as the shipped one is.
+    fn parse(unit: &str, passwd: &str, group: &str) -> Service {
+        let value = |key: &str| {
+            let mut lines = unit.lines().filter_map(|line| line.split_once('='));
+            lines.find(|(name, _)| *name == key).map_or("", |(_, value)| value)
+        };
+        let loaded = value("LoadState") == "loaded";
+        let name = value("User");
+        let user = match value("DynamicUser") {
+            "yes" => None,
+            _ if !loaded => None,
+            _ if name.is_empty() => Some(0),
+            _ => id(passwd, name),
+        };
+        let names = format!("{} {}", value("Group"), value("SupplementaryGroups"));
+        let mut names: Vec<&str> = names.split_whitespace().collect();
+        if !loaded {
+            names = vec![SHIPPED_GROUP];
+        }
+        let who = match user {
+            None => "a user of its own".to_string(),
+            Some(_) if name.is_empty() => "root".to_string(),
+            Some(_) => format!("user `{name}`"),
+        };
+        let groups = match names.as_slice() {
+            [] => "no group".to_string(),
+            names => format!("the groups {}", names.join(", ")),
+        };
+        // The group that a user has by itself.
+        let own = passwd.lines().map(|line| line.split(':').collect::<Vec<_>>());
+        let own = own.filter(|fields| user.is_some() && fields.first() == Some(&name));
+        let own = own.filter_map(|fields| fields.get(3)?.parse().ok());
+        Service {
+            user,
+            groups: names.iter().filter_map(|name| id(group, name)).chain(own).collect(),
+            shown: format!("{who} with {groups}"),
+        }
+    }
+
+    /// Whether the service has this permission; a capability of root is not counted, the unit has none.
+    fn may(&self, node: Node, wanted: u32) -> bool {
+        let shift = match () {
+            () if self.user == Some(node.user) => 6,
+            () if self.groups.contains(&node.group) => 3,
+            () => 0,
+        };
+        node.mode >> shift & wanted == wanted
+    }
+}
+
+/// The number of a user or group, by its name or as it is written.
+fn id(table: &str, name: &str) -> Option<u32> {
+    let mut lines = table.lines().map(|line| line.split(':'));
+    let found = lines.find_map(|mut fields| (fields.next() == Some(name)).then(|| fields.nth(1)?.parse().ok())?);
+    found.or_else(|| name.parse().ok())
+}
+
+/// What the service could not read of the configuration `path` and the files it names.
+pub(super) fn problems(path: &Path) -> Vec<Problem> {
+    let service = Service::of_unit();
+    let files = named_files(path, environment());
+    let lasting = files.iter().filter(|file| !file.path.starts_with(CREDENTIALS));
+    lasting.filter_map(|file| problem(path, file, &service)).collect()
+}
+
+fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem> {
+    // A file that there is not is reported by who reads it.
+    let whole = file.path.canonicalize().ok()?;
+    let steps: Vec<&Path> = whole.ancestors().collect();
+    let refusing = steps.into_iter().rev().find_map(|step| {
+        let meta = fs::metadata(step).ok()?;
+        let wanted = if meta.is_dir() { SEARCH } else { READ };
+        let node = Node {
+            mode: meta.mode(),
+            user: meta.uid(),
+            group: meta.gid(),
+        };
+        (!service.may(node, wanted)).then(|| (step.to_path_buf(), meta))
+    });
+    let (step, meta) = refusing?;
+    let (shown, mode) = (step.display(), meta.mode() & 0o7777);
+    let bits = if meta.is_dir() { "g+x" } else { "g+r" };
+    let finding = Finding::new(
+        format!(
+            "the service could not read {}: {shown} has mode {mode:04o}, user {} and group {}, and the service runs as {}",
+            file.path.display(),
+            meta.uid(),
+            meta.gid(),
+            service.shown
+        ),
+        format!("give it a group of the service: chgrp GROUP {shown} && chmod {bits} {shown}"),
+    );
+    Some(Problem::of_file(config.display().to_string(), &file.key, finding))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PASSWD: &str = "root:x:0:0::/root:/bin/sh\ngateway:x:990:991::/:/bin/false\n";
+    const GROUP: &str = "root:x:0:\ndialout:x:20:\nkeys:x:900:a,b\ngateway:x:991:\n";
+
+    #[test]
+    fn the_unit_says_who_reads() {
+        let dynamic = "User=drivegate\nDynamicUser=yes\nGroup=\nSupplementaryGroups=dialout keys\nLoadState=loaded\n";
+        let service = Service::parse(dynamic, PASSWD, GROUP);
+        assert_eq!((service.user, service.groups), (None, [20, 900].into()));
+        assert_eq!(service.shown, "a user of its own with the groups dialout, keys");
+        let named = "User=gateway\nDynamicUser=no\nGroup=\nSupplementaryGroups=900\nLoadState=loaded\n";
+        let service = Service::parse(named, PASSWD, GROUP);
+        assert_eq!((service.user, service.groups), (Some(990), [900, 991].into()));
+        let root = Service::parse("User=\nDynamicUser=no\nLoadState=loaded\n", PASSWD, GROUP);
+        assert_eq!((root.user, root.shown.as_str()), (Some(0), "root with no group"));
+        for none in ["", "User=\nDynamicUser=no\nLoadState=not-found\n"] {
+            let service = Service::parse(none, PASSWD, GROUP);
+            assert_eq!((service.user, service.groups), (None, [20].into()));
+        }
+    }
+
+    #[test]
+    fn owner_group_and_others_count_in_this_order() {
+        let service = Service {
+            user: Some(990),
+            groups: [20].into(),
+            shown: String::new(),
+        };
+        let may = |mode, user, group| service.may(Node { mode, user, group }, READ);
+        for (mode, user, group, expected) in [
+            (0o100_400, 990, 0, true),
+            (0o100_044, 990, 20, false),
+            (0o100_640, 0, 20, true),
+            (0o100_604, 0, 20, false),
+            (0o100_604, 0, 0, true),
+            (0o100_640, 0, 0, false),
+        ] {
+            assert_eq!(may(mode, user, group), expected, "{mode:o} {user} {group}");
+        }
+    }
+}

@@ -1,0 +1,158 @@
+//! `drivegate restore`: sets a gateway up again from a backup. All is unpacked aside and the configuration checked before
+//! anything is put in place.
+
+mod staging;
+
+use std::fs::File;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use self::staging::Staging;
+use super::archive::{self, Manifest, Root};
+use super::local_client::ask_gateway;
+use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
+use crate::config::{Loaded, Settings, environment};
+use crate::north::local::protocol::Request;
+
+/// Sets a gateway up again from a file that `backup` wrote.
+///
+/// The gateway must not run. The configuration is checked before anything is put in place; certificates and keys that
+/// the backup does not have must be in their places by then.
+#[derive(Debug, clap::Args)]
+#[command(
+    after_help = "Examples:\n  sudo drivegate restore pump-house.tar --config /etc/drivegate/drivegate.toml\n  \
+    sudo drivegate restore pump-house.tar --force\n\n\
+    Exit codes: 0 done, 1 nothing or not everything was done, 78 the configuration in the backup is invalid here."
+)]
+pub(super) struct Args {
+    /// The backup.
+    #[arg(value_name = "FILE")]
+    file: PathBuf,
+    #[command(flatten)]
+    config: ConfigFile,
+    /// State directory of the gateway.
+    #[arg(long, value_name = "DIR", default_value = "/var/lib/drivegate")]
+    state_dir: PathBuf,
+    /// Replace files that exist.
+    #[arg(long)]
+    force: bool,
+}
+
+/// Why nothing was restored.
+enum Refused {
+    /// In words.
+    Because(String),
+    /// The configuration is invalid: its errors, as if it were in its place.
+    Configuration(Vec<String>),
+}
+
+impl From<String> for Refused {
+    fn from(why: String) -> Refused {
+        Refused::Because(why)
+    }
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    match restore(args) {
+        Ok(text) => report::print(&text),
+        Err(Refused::Configuration(errors)) => {
+            errors.iter().for_each(|error| report::error(error));
+            report::note("nothing was restored");
+            ExitCode::from(EXIT_CONFIG)
+        }
+        Err(Refused::Because(why)) => {
+            report::error(&format!("{why}; {}", args.file.display()));
+            ExitCode::from(EXIT_FAILED)
+        }
+    }
+}
+
+fn restore(args: &Args) -> Result<String, Refused> {
+    let config = &args.config.path;
+    let name = config.file_name().ok_or("--config names no file".to_string())?;
+    let runtime = super::runtime()?;
+    if runtime.block_on(ask_gateway(config, Request::Health)).is_ok() {
+        return Err(Refused::Because(
+            "the gateway runs: stop it first (systemctl stop drivegate)".to_string(),
+        ));
+    }
+    let file = File::open(&args.file).map_err(|error| format!("cannot read the backup: {error}"))?;
+    let base = match config.parent() {
+        Some(dir) if !dir.as_os_str().is_empty() => dir,
+        _ => Path::new("."),
+    };
+    let mut staging = Staging::new(base, &args.state_dir)?;
+    let mut is_first = true;
+    let manifest = archive::read(file, |member, root, path, content| {
+        // The first member is the configuration, whatever it was called.
+        let path = if std::mem::take(&mut is_first) {
+            Path::new(name)
+        } else {
+            path
+        };
+        staging.unpack(root, path, member.mode, content)
+    })?;
+    for directory in &manifest.directories {
+        let (_, path) = archive::place(directory)?;
+        staging.make_directory(&path)?;
+    }
+    let loaded = check(&staging, name, &manifest, base)?;
+    let Some(settings) = &loaded.settings else {
+        let in_place = |text: String| {
+            text.replace(
+                &staging.of(Root::Config).display().to_string(),
+                &base.display().to_string(),
+            )
+        };
+        let errors = loaded.errors.iter().map(|error| in_place(error.to_string()));
+        return Err(Refused::Configuration(errors.collect()));
+    };
+    // A relative one is below the directory of the configuration, wherever that is.
+    let state_dir = match settings.state_dir.strip_prefix(staging.of(Root::Config)) {
+        Ok(below) => base.join(below),
+        Err(_) => settings.state_dir.clone(),
+    };
+    let has_state = manifest.members.iter().any(|member| member.name.starts_with("state/"));
+    if has_state && absolute(&state_dir) != absolute(&args.state_dir) {
+        return Err(Refused::Because(format!(
+            "the configuration in the backup has the state directory {0}; if that is right, add --state-dir {0}",
+            state_dir.display()
+        )));
+    }
+    let exist = staging.existing();
+    if !args.force && !exist.is_empty() {
+        let shown: Vec<String> = exist.iter().map(|path| path.display().to_string()).collect();
+        return Err(Refused::Because(format!(
+            "these files exist already: {}; --force replaces them",
+            shown.join(", ")
+        )));
+    }
+    let placed = staging.place()?;
+    Ok(summary(&manifest, &placed))
+}
+
+fn absolute(path: &Path) -> PathBuf {
+    std::path::absolute(path).unwrap_or_else(|_| path.to_path_buf())
+}
+
+/// Checks the unpacked configuration, with the certificates and keys that are in place and not in the backup.
+fn check(staging: &Staging, name: &std::ffi::OsStr, manifest: &Manifest, base: &Path) -> Result<Loaded, String> {
+    let old_base = manifest.config.parent().unwrap_or(Path::new(""));
+    for left_out in &manifest.left_out {
+        if let Ok(below) = left_out.path.strip_prefix(old_base) {
+            staging.borrow(below, &base.join(below))?;
+        }
+    }
+    Ok(Settings::load(staging.of(Root::Config).join(name), environment()))
+}
+
+fn summary(manifest: &Manifest, placed: &[PathBuf]) -> String {
+    let mut text = format!(
+        "restored gateway `{}` as of {}, made by version {}\n",
+        manifest.gateway, manifest.time, manifest.version
+    );
+    for path in placed {
+        text += &format!("{}\n", path.display());
+    }
+    text + "start it with: systemctl start drivegate\n"
+}

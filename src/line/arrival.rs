@@ -1,0 +1,159 @@
+//! Notices that the device of a port may have come back: by inotify, on the directories where its path and the links in
+//! it appear. Without inotify, only the pauses between two tries count.
+
+use std::mem::MaybeUninit;
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
+use std::os::unix::ffi::OsStrExt;
+use std::path::{Path, PathBuf};
+
+use rustix::fs::inotify::{self, CreateFlags, Reader, WatchFlags};
+
+/// Links of links that are followed.
+const MOST_LINKS: usize = 8;
+/// A node or link is made, or its permissions change, which is what the system does last.
+const SEEN: WatchFlags = WatchFlags::CREATE
+    .union(WatchFlags::MOVED_TO)
+    .union(WatchFlags::ATTRIB)
+    .union(WatchFlags::ONLYDIR);
+
+/// Waits for the device of a port.
+#[derive(Debug)]
+pub struct Arrival {
+    inotify: OwnedFd,
+    /// Each watched directory, and the name that is to appear there.
+    watched: Vec<(i32, PathBuf)>,
+}
+
+impl Arrival {
+    /// Watches for the device `port`; what appears from now on is noticed. `None` for device servers, and where the system
+    /// has no inotify left.
+    pub fn of(port: &str) -> Option<Arrival> {
+        if port.contains("://") {
+            return None;
+        }
+        let watch = || -> rustix::io::Result<Arrival> {
+            let inotify = inotify::init(CreateFlags::NONBLOCK | CreateFlags::CLOEXEC)?;
+            let mut watched = Vec::new();
+            for (directory, name) in steps(Path::new(port)) {
+                watched.push((inotify::add_watch(&inotify, &directory, SEEN)?, name));
+            }
+            Ok(Arrival { inotify, watched })
+        };
+        watch()
+            .inspect_err(|error| tracing::debug!(port, "cannot watch for the device: {error}; trying in pauses"))
+            .ok()
+    }
+
+    /// Readable when something has appeared.
+    pub fn fd(&self) -> BorrowedFd<'_> {
+        self.inotify.as_fd()
+    }
+
+    /// Whether what has appeared concerns the device; forgets it.
+    pub fn take(&self) -> bool {
+        let mut buffer = [MaybeUninit::uninit(); 4096];
+        let mut reader = Reader::new(&self.inotify, &mut buffer);
+        let mut concerns = false;
+        while let Ok(event) = reader.next() {
+            let name = event.file_name().map(|name| name.to_bytes());
+            let is_wanted =
+                |(watch, wanted): &(i32, PathBuf)| *watch == event.wd() && name == Some(wanted.as_os_str().as_bytes());
+            concerns |= self.watched.iter().any(is_wanted);
+        }
+        concerns
+    }
+}
+
+/// Where to look: for the path and each link that it is, the nearest directory that exists and the name missing in it or,
+/// where all are there, its directory and its own name.
+fn steps(port: &Path) -> Vec<(PathBuf, PathBuf)> {
+    let mut steps = Vec::new();
+    let mut path = port.to_path_buf();
+    for _ in 0..MOST_LINKS {
+        let Some((directory, name)) = step(&path) else { break };
+        let target = std::fs::read_link(directory.join(&name));
+        steps.push((directory.clone(), name));
+        match target {
+            Ok(target) => path = directory.join(target),
+            Err(_) => break,
+        }
+    }
+    steps
+}
+
+fn step(path: &Path) -> Option<(PathBuf, PathBuf)> {
+    let mut name = path.file_name()?;
+    for directory in path.ancestors().skip(1) {
+        let directory = match directory.as_os_str().is_empty() {
+            true => Path::new("."),
+            false => directory,
+        };
+        if directory.is_dir() {
+            return Some((directory.to_path_buf(), PathBuf::from(name)));
+        }
+        name = directory.file_name()?;
+    }
+    None
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::os::unix::fs::{PermissionsExt, symlink};
+    use std::time::{Duration, Instant};
+
+    use rustix::event::{PollFd, PollFlags};
+
+    use super::*;
+
+    /// Waits until something concerns the device; without inotify this would take a minute, and fail.
+    fn arrives(arrival: &Arrival) -> bool {
+        let deadline = Instant::now() + Duration::from_secs(60);
+        while Instant::now() < deadline {
+            let fd = arrival.fd();
+            let mut fds = [PollFd::from_borrowed_fd(fd, PollFlags::IN)];
+            let _ = super::super::poll_until(&mut fds, deadline);
+            if arrival.take() {
+                return true;
+            }
+        }
+        false
+    }
+
+    #[test]
+    fn links_their_targets_and_missing_directories_are_noticed_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let root = folder.path();
+        let port = root.join("serial/by-id/usb-1");
+        let of = || Arrival::of(port.to_str().unwrap()).unwrap();
+        // What the system does when an adapter is plugged in.
+        let arrival = of();
+        fs::write(root.join("ttyUSB7"), "").unwrap();
+        assert!(!arrival.take(), "another device");
+        fs::create_dir(root.join("serial")).unwrap();
+        assert!(arrives(&arrival));
+        let arrival = of();
+        fs::create_dir(root.join("serial/by-id")).unwrap();
+        assert!(arrives(&arrival));
+        let arrival = of();
+        symlink("../../ttyUSB0", &port).unwrap();
+        assert!(arrives(&arrival));
+        let arrival = of();
+        assert!(!arrival.take());
+        fs::write(root.join("ttyUSB0"), "").unwrap();
+        assert!(arrives(&arrival));
+        let arrival = of();
+        fs::set_permissions(root.join("ttyUSB0"), fs::Permissions::from_mode(0o660)).unwrap();
+        assert!(arrives(&arrival));
+    }
+
+    #[test]
+    fn device_servers_and_links_in_a_circle_are_no_obstacle() {
+        assert!(Arrival::of("tcp://127.0.0.1:1").is_none());
+        let folder = tempfile::tempdir().unwrap();
+        let port = folder.path().join("a");
+        symlink("a", &port).unwrap();
+        assert_eq!(steps(&port).len(), MOST_LINKS);
+        assert!(Arrival::of(port.to_str().unwrap()).is_some());
+    }
+}
