@@ -66,7 +66,7 @@ pub enum EventKind {
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 18] = [
+    pub const ALL: [EventKind; 19] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -85,6 +85,7 @@ impl EventKind {
         EventKind::BusUp,
         EventKind::BusDown,
         EventKind::Recording,
+        EventKind::ReloadRefused,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -361,8 +362,8 @@ mod tests {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown => false,
-                Recording => true,
+                | BusDown | Recording => false,
+                ReloadRefused => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());
