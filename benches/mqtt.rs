@@ -101,6 +101,7 @@ impl Gateway {
             require_id: false,
             response_topics: Vec::new(),
             buffer: None,
+            sparkplug: None,
         };
         let stats = Arc::<NorthStats>::default();
         let cancel = CancellationToken::new();

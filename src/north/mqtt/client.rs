@@ -2,20 +2,21 @@
 
 mod buffering;
 
-use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::PubAckReason;
+use rumqttc::mqttbytes::QoS;
+use rumqttc::{LastWill, PubAckReason};
 use tokio::sync::Notify;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
 use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
+use super::back_off::BackOff;
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE};
+use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
 use super::payload::{self, Topics};
@@ -29,14 +30,6 @@ use crate::north::log_throttle::LogThrottle;
 use crate::north::{MqttLoss, NorthStats};
 use crate::plant::{Plant, SharedPlant};
 
-/// First and longest wait between two connection attempts.
-const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
-/// After a connection that lasted this long, the next attempt follows after the shortest wait.
-const STABLE: Duration = Duration::from_secs(5);
-/// Without a packet from the broker for this long, the connection is considered lost.
-const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
-/// Time limit for the broker to answer the subscription.
-const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two checks of the connection, the plant and the buffer.
 const CHECK: Duration = Duration::from_millis(25);
 /// Time for the orderly disconnect.
@@ -132,8 +125,7 @@ struct Client {
     history_at: Instant,
     commands: Commands,
     link: BrokerLink,
-    /// Wait before the next connection attempt.
-    back_off: Duration,
+    back_off: BackOff,
     outages: OutageLog,
     /// Log lines about messages that the broker refused.
     refused: LogThrottle,
@@ -171,7 +163,7 @@ impl Client {
             commands: Commands::new(topics.clone(), rules),
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
-            back_off: BACK_OFF.0,
+            back_off: BackOff::default(),
             outages: OutageLog::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
@@ -205,7 +197,8 @@ impl Client {
         match event {
             ConnectionEvent::Connected(limits) => self.connected(limits),
             ConnectionEvent::Subscribed(refused) => {
-                if let Some(why) = refused {
+                // The first is that of the status, which the gateway can do without.
+                if let Some(why) = refused.into_iter().skip(1).flatten().next() {
                     tracing::error!(
                         "the broker refuses the set topics ({why}): no commands over MQTT; allow the client to subscribe to {}",
                         self.topics.set_filters().join(" and ")
@@ -276,7 +269,10 @@ impl Client {
         let BrokerLink::Open(session) = &mut self.link else {
             return;
         };
-        if session.connection.subscribe(&self.topics, self.options.commands) {
+        if session
+            .connection
+            .subscribe(connection::filters(&self.topics, self.options.commands))
+        {
             // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
@@ -324,11 +320,7 @@ impl Client {
             }) => now.saturating_duration_since(*since),
             _ => Duration::ZERO,
         };
-        if held >= STABLE {
-            self.back_off = BACK_OFF.0;
-        }
-        let wait = jittered(self.back_off, RandomState::new().hash_one(0));
-        self.back_off = (self.back_off * 2).min(BACK_OFF.1);
+        let wait = self.back_off.after(held);
         // Dropping the session aborts its task and closes the socket.
         self.link = BrokerLink::Disconnected { retry_at: now + wait };
         self.outbox.lost();
@@ -459,7 +451,8 @@ impl Client {
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
-                let connection = Connection::open(&self.options, self.topics.status(), config);
+                let will = LastWill::new(self.topics.status(), "offline", QoS::AtLeastOnce, true, None);
+                let connection = Connection::open(&self.options, &self.options.client_id, will, config);
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
@@ -569,11 +562,6 @@ fn refusal(why: PubAckReason) -> String {
         PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
         why => format!("the broker refuses it ({why:?})"),
     }
-}
-
-/// 75 to 100 % of `wait`, by a random number, so that gateways do not reconnect to a broker at the same time.
-fn jittered(wait: Duration, random: u64) -> Duration {
-    wait.mul_f64(0.75 + 0.25 * (random as f64 / u64::MAX as f64))
 }
 
 #[cfg(test)]

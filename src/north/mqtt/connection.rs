@@ -28,7 +28,11 @@ use super::request::Incoming;
 /// Keep-alive interval, s.
 const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
-pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
+const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
+/// Without a packet from the broker for this long, the connection is considered lost.
+pub(super) const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
+/// Time limit for the broker to answer the subscription.
+pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
 pub(super) const INFLIGHT: u16 = 1000;
 /// Number of messages handed to rumqttc and not written to the socket yet.
@@ -52,8 +56,8 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) enum ConnectionEvent {
     /// The broker accepted the connection.
     Connected(BrokerLimits),
-    /// The broker answered the subscriptions; with the reason if it refused that of the set topics.
-    Subscribed(Option<String>),
+    /// The broker answered the subscriptions: of each, in order, the reason if it refused it.
+    Subscribed(Vec<Option<String>>),
     /// The oldest published message with an acknowledgement was sent with this packet id.
     Sent(u16),
     /// The broker acknowledged the message.
@@ -158,9 +162,14 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Starts to connect; `will` is the topic of the last will `offline`.
-    pub(super) fn open(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> Connection {
-        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, will, tls))
+    /// Starts to connect as this client, with this last will.
+    pub(super) fn open(
+        options: &Options,
+        client_id: &str,
+        will: LastWill,
+        tls: Option<Arc<ClientConfig>>,
+    ) -> Connection {
+        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, client_id, will, tls))
             .capacity(REQUESTS)
             .build();
         let (sender, event) = mpsc::channel(EVENTS);
@@ -182,27 +191,8 @@ impl Connection {
         self.event.recv().await.unwrap_or_else(silent)
     }
 
-    /// Subscribes to the status that others publish in the gateway's name, and to all set topics if there are `commands`.
-    /// Retained messages on set topics are requested too, and stay marked even if they arrive during the subscription,
-    /// so that they can be refused.
-    pub(super) fn subscribe(&self, topics: &Topics, commands: bool) -> bool {
-        let set = |path| Filter {
-            path,
-            qos: QoS::AtLeastOnce,
-            preserve_retain: true,
-            ..Filter::default()
-        };
-        let status = Filter {
-            path: topics.status(),
-            qos: QoS::AtLeastOnce,
-            nolocal: true,
-            retain_forward_rule: RetainForwardRule::Never,
-            ..Filter::default()
-        };
-        let mut filters = vec![status];
-        if commands {
-            filters.extend(topics.set_filters().map(set));
-        }
+    /// Subscribes; false if the connection does not take it.
+    pub(super) fn subscribe(&self, filters: Vec<Filter>) -> bool {
         self.client.try_subscribe_many(filters).is_ok()
     }
 
@@ -244,16 +234,43 @@ impl Connection {
     }
 }
 
+/// The status that others publish in the gateway's name, and all set topics if there are `commands`.
+pub(super) fn filters(topics: &Topics, commands: bool) -> Vec<Filter> {
+    let status = Filter {
+        path: topics.status(),
+        qos: QoS::AtLeastOnce,
+        nolocal: true,
+        retain_forward_rule: RetainForwardRule::Never,
+        ..Filter::default()
+    };
+    let mut filters = vec![status];
+    if commands {
+        filters.extend(topics.set_filters().map(commanding));
+    }
+    filters
+}
+
+/// Commands on these topics. Retained messages are requested too, and stay marked even if they arrive during the
+/// subscription, so that they can be refused.
+pub(super) fn commanding(path: String) -> Filter {
+    Filter {
+        path,
+        qos: QoS::AtLeastOnce,
+        preserve_retain: true,
+        ..Filter::default()
+    }
+}
+
 /// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
     message.topic.len() + message.payload.len() + correlation + 24
 }
 
-fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
+fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
     // rumqttc requires IPv6 addresses without brackets; TLS would take one with brackets for a name.
     let host = options.host.trim_start_matches('[').trim_end_matches(']');
-    let mut mqtt = MqttOptions::new(&options.client_id, (host, options.port));
+    let mut mqtt = MqttOptions::new(client_id, (host, options.port));
     let mut properties = ConnectProperties::new();
     properties.max_packet_size = Some(MAX_PACKET);
     properties.receive_maximum = Some(RECEIVE_MAXIMUM);
@@ -264,7 +281,7 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
         .set_max_request_batch(BATCH)
         .set_read_batch_size(BATCH)
         .set_outgoing_inflight_upper_limit(INFLIGHT)
-        .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
+        .set_last_will(will);
     if let Some(user) = &options.username {
         let password = options.password.as_ref().map_or("", |p| p.0.as_str());
         mqtt.set_credentials(user, password.to_string());
@@ -309,9 +326,10 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
         Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
             let granted = |code: &SubscribeReasonCode| matches!(code, SubscribeReasonCode::Success(_));
-            // The first is that of the status, which the gateway can do without.
-            let refused = ack.return_codes.iter().skip(1).find(|code| !granted(code));
-            Some(ConnectionEvent::Subscribed(refused.map(|code| format!("{code:?}"))))
+            let refused = |code| (!granted(code)).then(|| format!("{code:?}"));
+            Some(ConnectionEvent::Subscribed(
+                ack.return_codes.iter().map(refused).collect(),
+            ))
         }
         Event::Incoming(Packet::PubAck(ack)) => Some(match ack.reason {
             PubAckReason::Success | PubAckReason::NoMatchingSubscribers => ConnectionEvent::Acked(ack.pkid),

@@ -568,5 +568,6 @@ pub(crate) fn options(port: u16) -> Options {
         require_id: false,
         response_topics: Vec::new(),
         buffer: None,
+        sparkplug: None,
     }
 }

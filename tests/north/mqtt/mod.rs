@@ -4,5 +4,6 @@ mod bench;
 mod commands;
 mod delivery;
 mod hostile;
+mod sparkplug;
 mod telemetry;
 mod tls;

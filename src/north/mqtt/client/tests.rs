@@ -29,6 +29,7 @@ fn options(buffer: Option<Buffer>) -> Options {
         require_id: false,
         response_topics: Vec::new(),
         buffer,
+        sparkplug: None,
     }
 }
 
