@@ -17,6 +17,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.qos]", "MqttQos"),
         ("[mqtt.publish]", "Publish"),
         ("[mqtt.buffer]", "Buffer"),
+        ("[mqtt.sparkplug]", "Sparkplug"),
         ("[http]", "Http"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),

@@ -8,11 +8,11 @@ use std::sync::Arc;
 use std::time::SystemTime;
 
 use drivegate::drive::Value;
-use drivegate::north::mqtt::sparkplug;
+use drivegate::north::mqtt::{self, sparkplug};
 use drivegate::process_image::Link;
 use serde_json::{Value as Json, json};
 
-use super::bench::*;
+use super::bench::{Broker, CutLine, Gateway, Watcher, plant, wait_for};
 use crate::support::tools;
 
 const NODE: &str = "spBv1.0/plant/NCMD/pump-house";
@@ -32,8 +32,6 @@ fn options(port: u16, state_dir: &Path) -> mqtt::Options {
         ..super::bench::options(port)
     }
 }
-
-use drivegate::north::mqtt;
 
 fn watcher(broker: &Broker) -> Watcher {
     Watcher::with(broker, "spBv1.0/#", &["-F", "%r|%q|%t|%x"])
@@ -59,7 +57,7 @@ struct Seen(Json);
 
 impl Seen {
     fn of(watcher: &Watcher) -> Seen {
-        let line = |m: Seen1| format!("{}|{}|{}|{}\n", u8::from(m.retain), m.qos, m.topic, m.payload);
+        let line = |m: super::bench::Seen| format!("{}|{}|{}|{}\n", u8::from(m.retain), m.qos, m.topic, m.payload);
         let lines: String = watcher.all().into_iter().map(line).collect();
         Seen(serde_json::from_str(&peer(&["check"], &lines)).unwrap())
     }
@@ -80,7 +78,9 @@ impl Seen {
     fn births_and_deaths(&self) -> Vec<String> {
         let all = self.messages().into_iter();
         let word = |m: &Json| format!("{} {}", m["type"].as_str().unwrap(), m["device"].as_str().unwrap_or(""));
-        all.map(|m| word(m).trim().to_string()).filter(|m| !m.contains("DATA")).collect()
+        all.map(|m| word(m).trim().to_string())
+            .filter(|m| !m.contains("DATA"))
+            .collect()
     }
 
     /// The values of a metric that were published for a device, in order, those of history apart.
@@ -96,7 +96,9 @@ impl Seen {
         let messages = self.messages().into_iter().filter(of);
         let mut metrics = messages.flat_map(|m| m["metrics"].as_array().unwrap());
         let found = metrics.find(|m| m["name"] == name);
-        found.unwrap_or_else(|| panic!("no {name} in a {kind} of {device}")).clone()
+        found
+            .unwrap_or_else(|| panic!("no {name} in a {kind} of {device}"))
+            .clone()
     }
 
     fn bd_seqs(&self, kind: &str) -> Vec<u64> {
@@ -105,8 +107,6 @@ impl Seen {
         messages.map(number).collect()
     }
 }
-
-type Seen1 = super::bench::Seen;
 
 /// Waits until what was published is as wanted.
 fn wait_seen(what: &str, watcher: &Watcher, wanted: impl Fn(&Seen) -> bool) -> Seen {
@@ -122,7 +122,10 @@ fn command(broker: &Broker, topic: &str, metrics: Json, more: &[&str]) {
     let payload = json!({ "timestamp": now.as_millis() as u64, "metrics": metrics });
     let hex = peer(&["encode", &payload.to_string()], "");
     let hex = hex.trim();
-    let bytes: Vec<u8> = (0..hex.len()).step_by(2).map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap()).collect();
+    let bytes: Vec<u8> = (0..hex.len())
+        .step_by(2)
+        .map(|at| u8::from_str_radix(&hex[at..at + 2], 16).unwrap())
+        .collect();
     let file = broker.dir.path().join("command");
     std::fs::write(&file, bytes).unwrap();
     let file = file.to_str().unwrap();
@@ -210,16 +213,33 @@ fn a_session_keeps_the_rules_of_the_specification() {
         "message-flow-edge-node-birth-publish-will-message-qos",
     ]);
     let expected = [
-        "NBIRTH", "DBIRTH p1", "DBIRTH m1", "DDEATH m1", "DBIRTH m1", "NBIRTH", "DBIRTH p1", "DBIRTH m1", "NDEATH",
+        "NBIRTH",
+        "DBIRTH p1",
+        "DBIRTH m1",
+        "DDEATH m1",
+        "DBIRTH m1",
+        "NBIRTH",
+        "DBIRTH p1",
+        "DBIRTH m1",
+        "NDEATH",
     ];
     assert_eq!(seen.births_and_deaths(), expected);
     let frequency = seen.metric("DBIRTH", "p1", "output_frequency");
-    assert_eq!((&frequency["value"], &frequency["type"]), (&json!(25), &json!("Double")));
+    assert_eq!(
+        (&frequency["value"], &frequency["type"]),
+        (&json!(25), &json!("Double"))
+    );
     assert_eq!(frequency["properties"], json!({ "Quality": 192, "engUnit": "Hz" }));
     let reference = seen.metric("DBIRTH", "p1", "speed_reference");
-    assert_eq!((&reference["properties"]["engLow"], &reference["properties"]["engHigh"]), (&json!(0), &json!(80)));
-    let unknown = seen.metric("DBIRTH", "p1", "energy");
-    assert_eq!((&unknown["value"], &unknown["properties"]["Quality"]), (&json!(null), &json!(0)));
+    assert_eq!(
+        (&reference["properties"]["engLow"], &reference["properties"]["engHigh"]),
+        (&json!(0), &json!(80))
+    );
+    let unknown = seen.metric("DBIRTH", "p1", "heatsink_temperature");
+    assert_eq!(
+        (&unknown["value"], &unknown["properties"]["Quality"]),
+        (&json!(null), &json!(0))
+    );
     assert_eq!(seen.metric("DDATA", "p1", "output_frequency")["value"], 30);
     assert_eq!(seen.metric("NBIRTH", "", "Bus/line1/state")["value"], "up");
     assert_eq!(seen.metric("NDATA", "", "Bus/line1/online")["value"], 1);
@@ -252,7 +272,12 @@ fn a_device_command_is_an_order_like_any_other() {
 
     // Refused: outside the limits, only monitored, retained. The drive's own values are told again.
     let references = seen.values("p1", "speed_reference", false).len();
-    command(&broker, P1, json!([{ "name": "speed_reference", "type": "Double", "value": 80.1 }]), &[]);
+    command(
+        &broker,
+        P1,
+        json!([{ "name": "speed_reference", "type": "Double", "value": 80.1 }]),
+        &[],
+    );
     let seen = wait_seen("the refusal", &watcher, |seen| {
         seen.values("p1", "command_result", false).last() == Some(&json!("bad_value"))
     });
@@ -260,13 +285,25 @@ fn a_device_command_is_an_order_like_any_other() {
     assert!(told.len() > references && told.last() == told.first(), "{told:?}");
     let why = seen.values("p1", "command_error", false).last().cloned().unwrap();
     assert!(why.as_str().unwrap().contains("outside the limits 0 to 80"), "{why}");
-    plain.wait("the event", |m| m.topic == "drivegate/hall/drive/p1/event" && m.payload.contains("refused_command"));
+    plain.wait("the event", |m| {
+        m.topic == "drivegate/hall/drive/p1/event" && m.payload.contains("refused_command")
+    });
     let monitored = P1.replace("p1", "m1");
-    command(&broker, &monitored, json!([{ "name": "run", "type": "Boolean", "value": true }]), &[]);
+    command(
+        &broker,
+        &monitored,
+        json!([{ "name": "run", "type": "Boolean", "value": true }]),
+        &[],
+    );
     wait_seen("the refusal", &watcher, |seen| {
         seen.values("m1", "command_result", false).last() == Some(&json!("not_allowed"))
     });
-    command(&broker, P1, json!([{ "name": "run", "type": "Boolean", "value": true }]), &["-r"]);
+    command(
+        &broker,
+        P1,
+        json!([{ "name": "run", "type": "Boolean", "value": true }]),
+        &["-r"],
+    );
     wait_seen("the refusal", &watcher, |seen| {
         seen.values("p1", "command_result", false).last() == Some(&json!("not_allowed"))
     });
@@ -285,7 +322,12 @@ fn without_commands_nothing_is_commanded() {
     };
     let gateway = Gateway::start(options, plant(&["p1"]));
     watcher.wait("a birth", |m| m.topic == "spBv1.0/plant/DBIRTH/pump-house/p1");
-    command(&broker, P1, json!([{ "name": "run", "type": "Boolean", "value": true }]), &[]);
+    command(
+        &broker,
+        P1,
+        json!([{ "name": "run", "type": "Boolean", "value": true }]),
+        &[],
+    );
     // A birth that is asked for afterwards: what came before was received.
     let asks = json!([{ "name": "Node Control/Rebirth", "type": "Boolean", "value": true }]);
     command(&broker, NODE, asks, &[]);
@@ -308,7 +350,10 @@ fn a_killed_gateway_is_declared_dead_and_counts_on() {
     }
     let seen = Seen::of(&watcher);
     seen.keeps(&["topics-nbirth-bdseq-increment", "payloads-nbirth-bdseq-repeat"]);
-    assert_eq!((seen.bd_seqs("NBIRTH"), seen.bd_seqs("NDEATH")), (vec![0, 1, 2], vec![0, 1, 2]));
+    assert_eq!(
+        (seen.bd_seqs("NBIRTH"), seen.bd_seqs("NDEATH")),
+        (vec![0, 1, 2], vec![0, 1, 2])
+    );
 }
 
 #[test]
@@ -333,7 +378,10 @@ fn what_the_outage_held_comes_afterwards() {
         seen.values("p1", "output_frequency", true).ends_with(&expected)
     });
     seen.keeps(&["topics-nbirth-bdseq-increment", "payloads-ddata-order"]);
-    assert_eq!(seen.births_and_deaths(), ["NBIRTH", "DBIRTH p1", "NDEATH", "NBIRTH", "DBIRTH p1"]);
+    assert_eq!(
+        seen.births_and_deaths(),
+        ["NBIRTH", "DBIRTH p1", "NDEATH", "NBIRTH", "DBIRTH p1"]
+    );
     let births: Vec<_> = seen.values("p1", "output_frequency", false);
     assert_eq!(births.last(), Some(&json!(30)), "the birth has the value of now");
     gateway.stop();
@@ -351,7 +399,10 @@ fn a_broker_that_was_killed_gets_a_new_session() {
         let asks = json!([{ "name": "Node Control/Rebirth", "type": "Boolean", "value": true }]);
         wait_for("births", || {
             command(&broker, NODE, asks.clone(), &[]);
-            let born = watcher.all().iter().any(|m| m.topic == "spBv1.0/plant/DBIRTH/pump-house/p1");
+            let born = watcher
+                .all()
+                .iter()
+                .any(|m| m.topic == "spBv1.0/plant/DBIRTH/pump-house/p1");
             born.then_some(())
         });
         Seen::of(&watcher).keeps(&["payloads-nbirth-bdseq"]);
@@ -390,7 +441,10 @@ fn the_primary_host_is_waited_for() {
     watcher.wait_count("spBv1.0/plant/NDEATH/pump-house", 2);
     let seen = Seen::of(&watcher);
     seen.keeps(&["payloads-nbirth-bdseq-repeat"]);
-    assert_eq!(seen.births_and_deaths(), ["NBIRTH", "DBIRTH p1", "NDEATH", "NBIRTH", "DBIRTH p1", "NDEATH"]);
+    assert_eq!(
+        seen.births_and_deaths(),
+        ["NBIRTH", "DBIRTH p1", "NDEATH", "NBIRTH", "DBIRTH p1", "NDEATH"]
+    );
 }
 
 #[test]
@@ -406,7 +460,14 @@ fn a_reload_bears_the_node_anew() {
     let seen = Seen::of(&watcher);
     seen.keeps(&["payloads-alias-uniqueness"]);
     let expected = [
-        "NBIRTH", "DBIRTH p1", "DBIRTH p2", "DDEATH p1", "NBIRTH", "DBIRTH p2", "DBIRTH p3", "NDEATH",
+        "NBIRTH",
+        "DBIRTH p1",
+        "DBIRTH p2",
+        "DDEATH p1",
+        "NBIRTH",
+        "DBIRTH p2",
+        "DBIRTH p3",
+        "NDEATH",
     ];
     assert_eq!(seen.births_and_deaths(), expected);
 }

@@ -16,6 +16,14 @@ fn rules(primary_host: &str) -> Rules {
     }
 }
 
+/// Without history, for tests of everything else.
+fn live() -> Rules {
+    Rules {
+        history: false,
+        ..rules("")
+    }
+}
+
 fn definitions(names: &[&str]) -> Vec<Definition> {
     let of = |name: &&str| Definition {
         name: name.to_string(),
@@ -246,7 +254,7 @@ fn of(kind: Kind, device: &str) -> (Kind, String) {
 
 #[test]
 fn births_come_first_and_only_of_devices_that_are_there() {
-    let mut bench = Bench::new(rules(""), 3);
+    let mut bench = Bench::new(live(), 3);
     bench.tell(0, true, 1.0);
     bench.tell(2, true, 2.0);
     assert_eq!(bench.send(9), 0, "there is no connection");
@@ -289,7 +297,7 @@ fn births_come_first_and_only_of_devices_that_are_there() {
 
 #[test]
 fn changes_keep_their_distance() {
-    let mut bench = Bench::new(rules(""), 1);
+    let mut bench = Bench::new(live(), 1);
     bench.tell(0, true, 1.0);
     bench.connect(0);
     bench.session.subscribed();
@@ -321,7 +329,7 @@ fn changes_keep_their_distance() {
 
 #[test]
 fn a_rebirth_stops_data_and_repeats_all_births() {
-    let mut bench = Bench::new(rules(""), 2);
+    let mut bench = Bench::new(live(), 2);
     bench.tell(0, true, 1.0);
     bench.tell(1, true, 1.0);
     bench.connect(3);
@@ -457,7 +465,7 @@ fn what_there_is_no_room_for_is_counted() {
 
 #[test]
 fn a_reload_keeps_aliases_and_bears_anew() {
-    let mut bench = Bench::new(rules(""), 2);
+    let mut bench = Bench::new(live(), 2);
     bench.tell(0, true, 1.0);
     bench.tell(1, true, 1.0);
     bench.connect(0);
