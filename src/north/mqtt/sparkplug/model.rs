@@ -73,13 +73,13 @@ impl DriveMetrics {
             let Some(point) = spec.profile.points.get(index) else {
                 continue;
             };
-            let range = spec.limits.get(name).or(point.range.as_ref());
+            let range = spec.limits_of(index);
             let definition = Definition {
                 name: name.to_string(),
                 datatype: datatype(point),
                 unit: point.unit.clone(),
-                low: range.map(|range| *range.start()),
-                high: range.map(|range| *range.end()),
+                low: range.as_ref().map(|range| *range.start()),
+                high: range.as_ref().map(|range| *range.end()),
                 pace: Pace::Normal,
             };
             all.push((Source::Point(index), definition));

@@ -21,6 +21,8 @@ use crate::plant::{Placed, Plant};
 
 /// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
 const AWAITED: usize = 4096;
+/// Metrics in a command.
+const METRICS: usize = 64;
 /// How long a command is remembered, and how many are.
 const REMEMBERED: Duration = Duration::from_secs(600);
 const MOST: usize = 1 << 16;
@@ -192,6 +194,11 @@ impl Request {
             Ok(payload) => payload,
             Err(why) => return refused(Refusal::BadValue(format!("the payload is not Sparkplug B: {why}"))),
         };
+        let count = payload.metrics.len();
+        if count > METRICS {
+            let why = format!("the command has {count} metrics, {METRICS} are allowed");
+            return refused(Refusal::BadValue(why));
+        }
         let placed = |metric: Metric| {
             let place = place(&metric);
             (metric, place)

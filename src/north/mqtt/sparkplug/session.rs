@@ -370,11 +370,6 @@ impl Session {
         self.devices.get(device)?.definitions.get(metric)
     }
 
-    /// Values of an outage that wait.
-    pub(super) fn waiting(&self) -> usize {
-        self.devices.iter().map(|device| device.history.len()).sum()
-    }
-
     /// Values of an outage that were given up since the last call.
     pub(super) fn take_lost(&mut self) -> u64 {
         std::mem::take(&mut self.lost)

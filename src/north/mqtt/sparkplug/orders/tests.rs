@@ -173,6 +173,7 @@ fn what_is_wrong_is_refused_with_its_reason() {
         (retained, "not_allowed", "retained"),
         (garbage, "bad_value", "not Sparkplug B"),
         (large, "bad_value", "70000 bytes"),
+        (message(1, vec![unknown.clone(); 65]), "bad_value", "65 metrics"),
         (message(2, Vec::new()), "bad_value", "names no point"),
         (message(3, vec![null]), "bad_value", "null"),
         (message(4, vec![unknown]), "not_writable", "alias 9999"),
