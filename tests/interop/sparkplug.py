@@ -144,6 +144,8 @@ class Host:
 
 
 def bd_seq(payload):
+    if isinstance(payload, sparkplug.NDeath):
+        return payload.bd_seq_metric.value
     return next(metric.value for metric in payload.metrics if metric.name == "bdSeq")
 
 

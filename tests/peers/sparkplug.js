@@ -167,7 +167,9 @@ class Checker {
       const alias = number(metric.alias);
       if (alias === undefined) continue;
       const own = `${device}/${metric.name}`;
-      this.rule(state.aliases[alias] === undefined, `${where}, alias ${alias}`, "payloads-alias-uniqueness");
+      const taken = state.aliases[alias];
+      const mine = taken === undefined || `${taken.device}/${taken.name}` === own;
+      this.rule(mine, `${where}, alias ${alias}`, "payloads-alias-uniqueness");
       this.rule((state.ever[alias] ||= own) === own, `${where}, alias ${alias} was ${state.ever[alias]}`, "payloads-alias-uniqueness");
       state.aliases[alias] = { device, name: metric.name };
     }
