@@ -72,6 +72,21 @@ def free_port():
         return probe.getsockname()[1]
 
 
+class Line:
+    """The simulated line, which can be unplugged."""
+
+    def __init__(self, child):
+        self.child = child
+        self.start()
+
+    def start(self):
+        self.process = self.child()
+
+    def kill(self):
+        self.process.kill()
+        self.process.wait()
+
+
 class Host:
     """Follows the node: the last values of each device, and the messages that were not looked at."""
 
@@ -149,7 +164,7 @@ def bd_seq(payload):
     return next(metric.value for metric in payload.metrics if metric.name == "bdSeq")
 
 
-def session(host, start):
+def session(host, start, line):
     boolean, double = sparkplug.DataType.BOOLEAN, sparkplug.DataType.DOUBLE
     gateway = start()
     born = host.wait("NBIRTH", lambda kind, *_: kind == "NBIRTH")
@@ -167,6 +182,16 @@ def session(host, start):
     host.wait_value("pump-2", "command_result", "not_allowed")
     host.command("pump-1", ("run", boolean, False))
     host.wait_value("pump-1", "running", False)
+    line.kill()
+    dead = set()
+    host.wait(
+        "DDEATH of both drives",
+        lambda kind, device, _: kind == "DDEATH" and (dead.add(device) or dead == {"pump-1", "pump-2"}),
+    )
+    host.wait_value("", "Bus/line1/state", "down")
+    line.start()
+    host.wait("DBIRTH pump-1 again", lambda kind, device, _: (kind, device) == ("DBIRTH", "pump-1"))
+    host.wait_value("pump-1", "state", "ready")
     asked = time.monotonic()
     host.rebirth()
     host.wait("NBIRTH on request", lambda kind, *_: kind == "NBIRTH")
@@ -205,7 +230,8 @@ def main():
 
         try:
             child("mosquitto", "-c", f"{place}/mosquitto.conf")
-            child(program, "simulate", "--addresses", "1-2", "--link", f"{place}/line1", "--baud", "38400")
+            simulate = [program, "simulate", "--addresses", "1-2", "--link", f"{place}/line1", "--baud", "38400"]
+            line = Line(lambda: child(*simulate))
             deadline = time.monotonic() + PATIENCE
             while True:
                 assert time.monotonic() < deadline, "mosquitto or the simulated line does not start"
@@ -215,7 +241,7 @@ def main():
                     break
                 except OSError:
                     time.sleep(0.05)
-            session(Host(port), start)
+            session(Host(port), start, line)
         except BaseException:
             for number in range(len(children)):
                 with open(f"{place}/log-{number}", errors="replace") as log:
