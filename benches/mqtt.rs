@@ -102,6 +102,7 @@ impl Gateway {
             response_topics: Vec::new(),
             buffer: None,
             home_assistant: None,
+            sparkplug: None,
         };
         let stats = Arc::<NorthStats>::default();
         let cancel = CancellationToken::new();

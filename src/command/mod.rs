@@ -38,6 +38,8 @@ pub enum SourceKind {
     ModbusTcp,
     /// MQTT topic.
     Mqtt,
+    /// Command of a Sparkplug host.
+    Sparkplug,
     /// Lease that ran out.
     Supervision,
     /// The gateway stops.
@@ -50,9 +52,10 @@ pub enum SourceKind {
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 6] = [
+    pub const ALL: [SourceKind; 7] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
+        SourceKind::Sparkplug,
         SourceKind::Supervision,
         SourceKind::Shutdown,
         SourceKind::LocalSocket,
@@ -64,6 +67,7 @@ impl SourceKind {
         match self {
             SourceKind::ModbusTcp => "modbus_tcp",
             SourceKind::Mqtt => "mqtt",
+            SourceKind::Sparkplug => "sparkplug",
             SourceKind::Supervision => "supervision",
             SourceKind::Shutdown => "shutdown",
             SourceKind::LocalSocket => "local_socket",

@@ -119,6 +119,13 @@ const BUSES: List<String> = List {
     range: "names of buses",
 };
 
+const SPARKPLUG_ID: Parsed<String> = Parsed {
+    parse: mqtt::parse_sparkplug_id,
+    words: &[],
+    pattern: "^[^/+#]+$",
+    range: "an id without /, + and #",
+};
+
 const HOSTS: List<String> = List {
     parse: north::parse_host,
     empty: None,
@@ -423,6 +430,8 @@ keys! {
             schema: || json!({ "anyOf": [{ "const": false }, MqttHomeAssistant::schema()] }),
             range: "[mqtt.home_assistant], or false",
         }, or "off";
+        /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on a connection of its own.
+        sparkplug: Present = Own { schema: Sparkplug::schema, range: "[mqtt.sparkplug]" }, or "not published";
     }
 
     /// Discovery for Home Assistant; off without this table.
@@ -457,6 +466,23 @@ keys! {
         max_bytes: u64 = Parsed {
             parse: mqtt::parse_buffer_size, words: &[], pattern: SIZE, range: "\"64KiB\" to \"1024GiB\"",
         }, default "64MiB";
+    }
+
+    /// The gateway as an edge node of [Sparkplug B](sparkplug.md), on a connection of its own to the same broker; its client
+    /// id is that of `[mqtt]` with `-sparkplug` behind it.
+    SPARKPLUG: Sparkplug {
+        /// Group id: second level of all its topics.
+        group: String = SPARKPLUG_ID, required;
+        /// Edge node id, unique in the group.
+        node: String = SPARKPLUG_ID, or "the name of the gateway";
+        /// Id of the host that must be online: until then, and while it is not, values are kept as history. `""` is none.
+        primary_host: String = Parsed {
+            parse: mqtt::parse_primary_host, words: &[], pattern: "^[^/+#]*$", range: "an id without /, + and #, or \"\"",
+        }, default "";
+        /// Whether data messages name their metrics by aliases, which are shorter.
+        alias: bool = Flag, default true;
+        /// Whether values of an outage are published afterwards, as historical ones.
+        history: bool = Flag, default true;
     }
 
     /// HTTP server for metrics, health and the status page; not started without this section.

@@ -219,7 +219,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let mqtt = ROOT
         .mqtt
         .table(reader)
-        .map(|table| mqtt::read(&table, base, name.as_deref()));
+        .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
     let (http, http_listener) = ROOT
         .http
         .table(reader)

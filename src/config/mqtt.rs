@@ -7,10 +7,10 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime};
 
 use super::key::Key;
-use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH};
+use super::keys::{BUFFER, MQTT, MQTT_HOME_ASSISTANT, MQTT_QOS, PUBLISH, SPARKPLUG};
 use super::{files, values};
 use crate::document::{Finding, FromNode, Reader, format_duration, parse_size};
-use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry};
+use crate::north::mqtt::{Buffer, Options, Qos, Secret, Telemetry, sparkplug};
 use crate::north::{ServerIdentity, TlsFile};
 
 /// Most bytes of a secret: a longer file is not a password.
@@ -40,7 +40,8 @@ impl Broker {
     }
 }
 
-pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> Option<Options> {
+/// `gateway` and `state_dir` are those of the gateway.
+pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>, state_dir: &Path) -> Option<Options> {
     let broker = MQTT.url.read(reader);
     let tls = broker.as_ref().is_some_and(|b| b.tls);
     let client_id = MQTT.client_id.read(reader);
@@ -84,6 +85,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
     }
     let buffer = read_buffer(reader, base);
     let home_assistant = read_home_assistant(reader);
+    let sparkplug = read_sparkplug(reader, gateway, state_dir);
     reader.finish();
     let Broker { host, port, tls } = broker?;
     Some(Options {
@@ -107,6 +109,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, gateway: Option<&str>) -> O
         response_topics,
         buffer,
         home_assistant,
+        sparkplug,
     })
 }
 
@@ -358,6 +361,47 @@ fn read_buffer(reader: &Reader<'_>, base: &Path) -> Option<Buffer> {
         dir: values::resolved(base, dir),
         max_bytes,
     })
+}
+
+fn read_sparkplug(reader: &Reader<'_>, gateway: Option<&str>, state_dir: &Path) -> Option<sparkplug::Options> {
+    let table = MQTT.sparkplug.table(reader)?;
+    let group = SPARKPLUG.group.read(&table);
+    let node = SPARKPLUG.node.read(&table);
+    let primary_host = SPARKPLUG.primary_host.get(&table);
+    let (alias, history) = (SPARKPLUG.alias.get(&table), SPARKPLUG.history.get(&table));
+    table.finish();
+    Some(sparkplug::Options {
+        group: group?,
+        node: node.or_else(|| gateway.map(str::to_string))?,
+        primary_host,
+        alias,
+        history,
+        state_dir: state_dir.to_path_buf(),
+    })
+}
+
+/// An id of Sparkplug is a level of topics.
+pub(super) fn parse_sparkplug_id(text: &str) -> Result<String, Finding> {
+    if text.is_empty() || text.contains(['/', '+', '#', '\0']) {
+        return Err(Finding::new(
+            format!("`{text}` cannot be an id of Sparkplug"),
+            "write one level of a topic, without /, + and #",
+        ));
+    }
+    if text == "STATE" {
+        return Err(Finding::new(
+            "`STATE` is the level of the states of hosts",
+            "write another id",
+        ));
+    }
+    Ok(text.to_string())
+}
+
+pub(super) fn parse_primary_host(text: &str) -> Result<String, Finding> {
+    match text {
+        "" => Ok(String::new()),
+        id => parse_sparkplug_id(id),
+    }
 }
 
 pub(super) fn parse_buffer_size(text: &str) -> Result<u64, Finding> {

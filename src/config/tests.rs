@@ -42,6 +42,7 @@ roles = { operator = "control" }
 publish = {}
 qos = {}
 buffer = {}
+sparkplug = { group = "plant" }
 [http]
 hosts = ["gateway.example.com"]
 tokens_file = "DIR/tokens"
@@ -108,6 +109,7 @@ url = "mqtts://broker"
 commands = true
 publish = { min_interval = "0s" }
 buffer = { dir = "spool", max_bytes = "1MiB" }
+sparkplug = { group = "plant", primary_host = "scada" }
 "#;
     let all = settings(source);
     assert_eq!(
@@ -158,6 +160,15 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
     assert_eq!((mqtt.host.as_str(), mqtt.port, mqtt.tls), ("broker", 8883, true));
     assert_eq!(mqtt.client_id, "drivegate-pump-house");
     assert_eq!(mqtt.buffer.as_ref().unwrap().dir, Path::new("/etc/drivegate/spool"));
+    let node = mqtt.sparkplug.as_ref().unwrap();
+    assert_eq!(
+        (node.group.as_str(), node.node.as_str(), node.primary_host.as_str()),
+        ("plant", "pump-house", "scada")
+    );
+    assert_eq!(
+        (node.alias, node.history, node.state_dir.as_path()),
+        (true, true, all.state_dir.as_path())
+    );
     assert_eq!(all.http, None);
     assert_eq!((all.log.level.as_str(), all.log.format), ("info", LogFormat::Auto));
 }

@@ -16,10 +16,10 @@ pub use trace::{Direction, FrameRecord, Trace};
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError, Weak};
 use std::time::{Duration, Instant};
 
-use arc_swap::{ArcSwap, ArcSwapOption};
+use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
 use crate::codec::{LineFormat, Protocol};
@@ -146,7 +146,7 @@ pub struct DriveImage {
     stale_floor: AtomicU64,
     snapshot: ArcSwap<Snapshot>,
     /// Woken by every update.
-    listener: ArcSwapOption<Notify>,
+    listeners: ArcSwap<Vec<Weak<Notify>>>,
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
@@ -168,7 +168,7 @@ impl DriveImage {
             slow_cycle,
             stale_floor: AtomicU64::new(0),
             snapshot,
-            listener: ArcSwapOption::empty(),
+            listeners: ArcSwap::default(),
             outcomes,
             turnaround: AtomicU64::new(0),
             heartbeat: Mutex::default(),
@@ -199,7 +199,7 @@ impl DriveImage {
         let mut next = Snapshot::clone(&self.snapshot.load());
         change(&mut next);
         self.snapshot.store(Arc::new(next));
-        if let Some(listener) = &*self.listener.load() {
+        for listener in self.listeners.load().iter().filter_map(Weak::upgrade) {
             listener.notify_one();
         }
     }
@@ -209,9 +209,15 @@ impl DriveImage {
         !Arc::ptr_eq(&self.snapshot.load(), seen)
     }
 
-    /// Wakes `listener` at every update from now on, in place of an earlier one.
-    pub fn notify(&self, listener: Arc<Notify>) {
-        self.listener.store(Some(listener));
+    /// Wakes `listener` at every update from now on, as long as it exists.
+    pub fn notify(&self, listener: &Arc<Notify>) {
+        let listener = Arc::downgrade(listener);
+        self.listeners.rcu(|listeners| {
+            let others = listeners
+                .iter()
+                .filter(|other| other.strong_count() > 0 && !other.ptr_eq(&listener));
+            others.chain([&listener]).cloned().collect::<Vec<_>>()
+        });
     }
 
     /// How a reader at `now` looks at the drive.

@@ -104,7 +104,7 @@ install_python_packages() {
     fi
 }
 
-# No lock file and no scripts: the two are pure JavaScript, and what they depend on is small and as old as they are.
+# No lock file and no scripts: all are pure JavaScript, and what they depend on is as old as they are.
 install_node_packages() {
     local list=tests/tools/node/package.json stamp=.tools/node/package.json
     if ! cmp --quiet $list $stamp; then

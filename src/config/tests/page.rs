@@ -18,6 +18,7 @@ fn with_tables(page: &str) -> String {
         ("[mqtt.publish]", "Publish"),
         ("[mqtt.buffer]", "Buffer"),
         ("[mqtt.home_assistant]", "MqttHomeAssistant"),
+        ("[mqtt.sparkplug]", "Sparkplug"),
         ("[http]", "Http"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),

@@ -3,12 +3,12 @@
 mod buffering;
 mod discovery;
 
-use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant, SystemTime};
 
-use rumqttc::PubAckReason;
+use rumqttc::mqttbytes::QoS;
+use rumqttc::{LastWill, PubAckReason};
 use tokio::sync::Notify;
 use tokio::sync::broadcast::Receiver;
 use tokio::sync::broadcast::error::{RecvError, TryRecvError};
@@ -16,8 +16,11 @@ use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
 use self::discovery::{announcer, discovery_topics, report_refused, subscriptions};
+use super::back_off::BackOff;
 use super::commands::{Commands, FinishedCommand, Rules};
-use super::connection::{self, BrokerLimits, Connection, ConnectionEvent, KEEP_ALIVE, Subscribed, Subscription};
+use super::connection::{
+    self, BrokerLimits, Connection, ConnectionEvent, SILENCE, SUBSCRIBE_TIMEOUT, Subscribed, Subscription,
+};
 use super::home_assistant::{Announcer, Sources};
 use super::outage_log::OutageLog;
 use super::outbox::{Delivery, Key, Kind, Message, Outbox, Settled};
@@ -32,14 +35,6 @@ use crate::north::log_throttle::LogThrottle;
 use crate::north::{MqttLoss, NorthStats};
 use crate::plant::{Plant, SharedPlant};
 
-/// First and longest wait between two connection attempts.
-const BACK_OFF: (Duration, Duration) = (Duration::from_millis(100), Duration::from_secs(5));
-/// After a connection that lasted this long, the next attempt follows after the shortest wait.
-const STABLE: Duration = Duration::from_secs(5);
-/// Without a packet from the broker for this long, the connection is considered lost.
-const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
-/// Time limit for the broker to answer the subscription.
-const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum time between two checks of the connection, the plant and the buffer.
 const CHECK: Duration = Duration::from_millis(25);
 /// Time for the orderly disconnect.
@@ -141,8 +136,7 @@ struct Client {
     history_at: Instant,
     commands: Commands,
     link: BrokerLink,
-    /// Wait before the next connection attempt.
-    back_off: Duration,
+    back_off: BackOff,
     outages: OutageLog,
     /// Log lines about messages that the broker refused.
     refused: LogThrottle,
@@ -182,7 +176,7 @@ impl Client {
             commands: Commands::new(topics.clone(), rules),
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
-            back_off: BACK_OFF.0,
+            back_off: BackOff::default(),
             outages: OutageLog::default(),
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
@@ -297,7 +291,10 @@ impl Client {
             self.announcer.as_ref(),
             self.leftovers_known,
         );
-        if session.connection.subscribe(&self.subscriptions) {
+        if session
+            .connection
+            .subscribe(self.subscriptions.iter().map(Subscription::filter).collect())
+        {
             // A client that reads `online` may send commands, so the subscription comes first.
             session.phase = Phase::Subscribing { limits, since };
         } else {
@@ -349,11 +346,7 @@ impl Client {
             }) => now.saturating_duration_since(*since),
             _ => Duration::ZERO,
         };
-        if held >= STABLE {
-            self.back_off = BACK_OFF.0;
-        }
-        let wait = jittered(self.back_off, RandomState::new().hash_one(0));
-        self.back_off = (self.back_off * 2).min(BACK_OFF.1);
+        let wait = self.back_off.after(held);
         // Dropping the session aborts its task and closes the socket.
         self.link = BrokerLink::Disconnected { retry_at: now + wait };
         self.outbox.lost();
@@ -488,7 +481,8 @@ impl Client {
         let config = config.map_err(|error| error.to_string());
         match config.and_then(|config| config.map_err(|error| error.to_string())) {
             Ok(config) => {
-                let connection = Connection::open(&self.options, self.topics.status(), config);
+                let will = LastWill::new(self.topics.status(), "offline", QoS::AtLeastOnce, true, None);
+                let connection = Connection::open(&self.options, &self.options.client_id, will, config);
                 self.link = BrokerLink::Open(BrokerSession {
                     connection,
                     phase: Phase::Connecting,
@@ -601,11 +595,6 @@ fn refusal(why: PubAckReason) -> String {
         PubAckReason::NotAuthorized => "the broker does not allow it (ACL)".to_string(),
         why => format!("the broker refuses it ({why:?})"),
     }
-}
-
-/// 10 to 100 % of `wait`, by a random number: gateways that lost their broker at the same time come back one after the other.
-fn jittered(wait: Duration, random: u64) -> Duration {
-    wait.mul_f64(0.1 + 0.9 * (random as f64 / u64::MAX as f64))
 }
 
 #[cfg(test)]

@@ -296,7 +296,7 @@ impl PendingCommands {
     }
 }
 
-fn unknown_drive(name: &str, plant: &Plant) -> String {
+pub(super) fn unknown_drive(name: &str, plant: &Plant) -> String {
     let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
     let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));
     let hint = near

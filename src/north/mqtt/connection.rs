@@ -27,7 +27,11 @@ use super::request::Incoming;
 /// Keep-alive interval, s.
 const KEEP_ALIVE_S: u16 = 10;
 /// Keep-alive interval.
-pub(super) const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
+const KEEP_ALIVE: Duration = Duration::from_secs(KEEP_ALIVE_S as u64);
+/// Without a packet from the broker for this long, the connection is considered lost.
+pub(super) const SILENCE: Duration = KEEP_ALIVE.saturating_mul(3);
+/// Time limit for the broker to answer the subscription.
+pub(super) const SUBSCRIBE_TIMEOUT: Duration = Duration::from_secs(5);
 /// Maximum number of unacknowledged messages; the broker may allow fewer.
 pub(super) const INFLIGHT: u16 = 1000;
 /// Number of messages handed to rumqttc and not written to the socket yet.
@@ -51,7 +55,7 @@ const CONNECT_TIMEOUT: Duration = Duration::from_secs(5);
 pub(super) enum ConnectionEvent {
     /// The broker accepted the connection.
     Connected(BrokerLimits),
-    /// The broker answered the subscriptions: for each filter the reason if it refused it.
+    /// The broker answered the subscriptions: of each, in order, the reason if it refused it.
     Subscribed(Vec<Option<String>>),
     /// The oldest published message with an acknowledgement was sent with this packet id.
     Sent(u16),
@@ -76,13 +80,37 @@ pub(super) struct Subscription {
     pub(super) of: Subscribed,
 }
 
+impl Subscription {
+    /// As it is sent to the broker.
+    pub(super) fn filter(&self) -> Filter {
+        let path = self.filter.clone();
+        match self.of {
+            Subscribed::Commands => commanding(path),
+            Subscribed::Status | Subscribed::Birth => Filter {
+                retain_forward_rule: RetainForwardRule::Never,
+                ..Subscription::own(path)
+            },
+            Subscribed::Leftovers => Subscription::own(path),
+        }
+    }
+
+    /// Without what the gateway itself publishes.
+    fn own(path: String) -> Filter {
+        Filter {
+            path,
+            qos: QoS::AtLeastOnce,
+            nolocal: true,
+            ..Filter::default()
+        }
+    }
+}
+
 /// What a subscription is for.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Subscribed {
     /// The status that others publish in the gateway's name.
     Status,
-    /// The set topics. Retained messages are requested too, and stay marked even if they arrive during the subscription,
-    /// so that they can be refused.
+    /// The set topics.
     Commands,
     /// Home Assistant was started.
     Birth,
@@ -178,9 +206,14 @@ impl Drop for Connection {
 }
 
 impl Connection {
-    /// Starts to connect; `will` is the topic of the last will `offline`.
-    pub(super) fn open(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> Connection {
-        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, will, tls))
+    /// Starts to connect as this client, with this last will.
+    pub(super) fn open(
+        options: &Options,
+        client_id: &str,
+        will: LastWill,
+        tls: Option<Arc<ClientConfig>>,
+    ) -> Connection {
+        let (client, eventloop) = AsyncClient::builder(mqtt_options(options, client_id, will, tls))
             .capacity(REQUESTS)
             .build();
         let (sender, event) = mpsc::channel(EVENTS);
@@ -202,18 +235,8 @@ impl Connection {
         self.event.recv().await.unwrap_or_else(silent)
     }
 
-    /// Subscribes to all of these.
-    pub(super) fn subscribe(&self, subscriptions: &[Subscription]) -> bool {
-        let filters = subscriptions.iter().map(|Subscription { filter, of }| Filter {
-            path: filter.clone(),
-            qos: QoS::AtLeastOnce,
-            nolocal: *of != Subscribed::Commands,
-            preserve_retain: *of == Subscribed::Commands,
-            retain_forward_rule: match of {
-                Subscribed::Status | Subscribed::Birth => RetainForwardRule::Never,
-                Subscribed::Commands | Subscribed::Leftovers => RetainForwardRule::default(),
-            },
-        });
+    /// Subscribes; false if the connection does not take it.
+    pub(super) fn subscribe(&self, filters: Vec<Filter>) -> bool {
         self.client.try_subscribe_many(filters).is_ok()
     }
 
@@ -255,16 +278,27 @@ impl Connection {
     }
 }
 
+/// Commands on these topics. Retained messages are requested too, and stay marked even if they arrive during the
+/// subscription, so that they can be refused.
+pub(super) fn commanding(path: String) -> Filter {
+    Filter {
+        path,
+        qos: QoS::AtLeastOnce,
+        preserve_retain: true,
+        ..Filter::default()
+    }
+}
+
 /// Maximum size of the packet with `message`, bytes.
 pub(super) fn packet_size(message: &Message) -> usize {
     let correlation = message.correlation.as_ref().map_or(0, |c| c.len() + 3);
     message.topic.len() + message.payload.len() + correlation + 24
 }
 
-fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
+fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<Arc<ClientConfig>>) -> MqttOptions {
     // rumqttc requires IPv6 addresses without brackets; TLS would take one with brackets for a name.
     let host = options.host.trim_start_matches('[').trim_end_matches(']');
-    let mut mqtt = MqttOptions::new(&options.client_id, (host, options.port));
+    let mut mqtt = MqttOptions::new(client_id, (host, options.port));
     let mut properties = ConnectProperties::new();
     properties.max_packet_size = Some(MAX_PACKET);
     properties.receive_maximum = Some(RECEIVE_MAXIMUM);
@@ -275,7 +309,7 @@ fn mqtt_options(options: &Options, will: String, tls: Option<Arc<ClientConfig>>)
         .set_max_request_batch(BATCH)
         .set_read_batch_size(BATCH)
         .set_outgoing_inflight_upper_limit(INFLIGHT)
-        .set_last_will(LastWill::new(will, "offline", QoS::AtLeastOnce, true, None));
+        .set_last_will(will);
     if let Some(user) = &options.username {
         let password = options.password.as_ref().map_or("", |p| p.0.as_str());
         mqtt.set_credentials(user, password.to_string());

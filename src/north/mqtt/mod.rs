@@ -12,8 +12,9 @@
 //! `payload`, `publisher`, `history`, `home_assistant`, `commands`, `reply` and `outbox` have no I/O: they decide what is published, when, and
 //! in which order; `offline` drives `commands` without a broker. `client` is the task that owns them. `connection` wraps
 //! rumqttc, which keeps no state: every connection is a new client with a clean session, and unacknowledged messages are
-//! sent again from the outbox.
+//! sent again from the outbox. `sparkplug` is a client of its own, on a connection of its own.
 
+mod back_off;
 mod client;
 mod commands;
 mod connection;
@@ -30,6 +31,7 @@ mod publisher;
 mod record;
 mod reply;
 mod request;
+pub mod sparkplug;
 mod store;
 mod tls;
 
@@ -102,6 +104,8 @@ pub struct Options {
     pub buffer: Option<Buffer>,
     /// Discovery prefix of Home Assistant; no discovery if absent.
     pub home_assistant: Option<String>,
+    /// The gateway as an edge node of Sparkplug B.
+    pub sparkplug: Option<sparkplug::Options>,
 }
 
 /// Which telemetry is published.
@@ -159,14 +163,16 @@ impl Buffer {
 
 /// The running MQTT client.
 #[derive(Debug)]
-pub struct Mqtt(JoinHandle<()>);
+pub struct Mqtt(Vec<JoinHandle<()>>);
 
 impl Mqtt {
     /// Waits until the client has ended: at most about half a second after the cancellation, in which it publishes
     /// `offline` and disconnects.
     pub async fn stopped(self) {
-        if let Err(error) = self.0.await {
-            tracing::error!("the MQTT client ended unexpectedly: {error}");
+        for task in self.0 {
+            if let Err(error) = task.await {
+                tracing::error!("the MQTT client ended unexpectedly: {error}");
+            }
         }
     }
 }
@@ -177,5 +183,16 @@ pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, c
     options.buffer = options.buffer.or_else(Buffer::of_system);
     // Subscribed here and not in the task, so that no event after this call is missed.
     let events = plant.load().events.subscribe();
-    Mqtt(tokio::spawn(client::run(options, plant, stats, events, cancel)))
+    let node = options.sparkplug.clone().map(|node| {
+        let broker = options.clone();
+        tokio::spawn(sparkplug::run(
+            node,
+            broker,
+            plant.clone(),
+            stats.clone(),
+            cancel.clone(),
+        ))
+    });
+    let client = tokio::spawn(client::run(options, plant, stats, events, cancel));
+    Mqtt([client].into_iter().chain(node).collect())
 }

@@ -218,21 +218,21 @@ impl PointPayload {
 /// The part of a bus message whose changes are published at once.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusState {
-    up: bool,
-    reason: Option<String>,
-    drives: usize,
-    online: usize,
+    pub(super) up: bool,
+    pub(super) reason: Option<String>,
+    pub(super) drives: usize,
+    pub(super) online: usize,
 }
 
 /// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
-    load: f64,
-    fast_cycle_ms: Option<f64>,
-    slow_cycle_ms: Option<f64>,
-    transactions: u64,
-    errors: u64,
-    queue: usize,
+    pub(super) load: f64,
+    pub(super) fast_cycle_ms: Option<f64>,
+    pub(super) slow_cycle_ms: Option<f64>,
+    pub(super) transactions: u64,
+    pub(super) errors: u64,
+    pub(super) queue: usize,
 }
 
 /// State and figures of a bus.

@@ -139,7 +139,7 @@ impl Publisher {
             .map(|drive| DriveTopics::new(&self.topics, self.telemetry, drive))
             .collect();
         for drive in &self.drives {
-            drive.drive.image.notify(self.fresh.clone());
+            drive.drive.image.notify(&self.fresh);
         }
         let bus_topic = |bus: &BusHandle| BusTopic {
             bus: bus.clone(),

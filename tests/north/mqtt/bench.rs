@@ -569,5 +569,6 @@ pub(crate) fn options(port: u16) -> Options {
         response_topics: Vec::new(),
         buffer: None,
         home_assistant: None,
+        sparkplug: None,
     }
 }

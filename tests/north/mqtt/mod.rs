@@ -5,5 +5,6 @@ mod commands;
 mod delivery;
 mod home_assistant;
 mod hostile;
+mod sparkplug;
 mod telemetry;
 mod tls;

@@ -30,6 +30,7 @@ fn options(buffer: Option<Buffer>) -> Options {
         response_topics: Vec::new(),
         buffer,
         home_assistant: None,
+        sparkplug: None,
     }
 }
 

@@ -352,3 +352,21 @@ fn the_values_of_an_outage_are_recorded() {
         assert!(bench.publisher.recorded().is_empty());
     }
 }
+
+#[test]
+fn every_client_that_observes_a_drive_is_woken_once() {
+    use futures_util::FutureExt as _;
+    let plant = fixture::plant(&["p1"]);
+    let image = plant.drive("p1").unwrap().image;
+    let listeners: [Arc<Notify>; 2] = Default::default();
+    let ended = Arc::<Notify>::default();
+    for listener in [&listeners[0], &ended, &listeners[1], &listeners[0]] {
+        image.notify(listener);
+    }
+    drop(ended);
+    image.update(|_| {});
+    for listener in &listeners {
+        let woken = || listener.notified().now_or_never().is_some();
+        assert_eq!((woken(), woken()), (true, false));
+    }
+}

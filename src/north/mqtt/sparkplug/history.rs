@@ -1,0 +1,94 @@
+//! Values of one device while nobody receives them: the newest, in memory. Time is an argument.
+
+use std::collections::VecDeque;
+use std::time::{Duration, Instant};
+
+use super::metric::Sample;
+
+/// Collects what changes.
+#[derive(Debug, Default)]
+pub(super) struct Recorder {
+    /// Place of the metric and its value, oldest first.
+    entries: VecDeque<(usize, Sample)>,
+    at: Option<Instant>,
+}
+
+impl Recorder {
+    /// Records what differs from `before`, at most once in `least`; keeps `most` values. Returns whether it was recorded,
+    /// and how many older values were given up for it.
+    pub(super) fn record(
+        &mut self,
+        before: &[Option<Sample>],
+        now_is: &[Sample],
+        (least, most): (Duration, usize),
+        now: Instant,
+    ) -> Option<u64> {
+        let early = |at: Instant| now.saturating_duration_since(at) < least;
+        if self.at.is_some_and(early) {
+            return None;
+        }
+        let changed = |(place, sample): (usize, &Sample)| {
+            let same = before
+                .get(place)
+                .and_then(Option::as_ref)
+                .is_some_and(|b| b.is_same(sample));
+            (!same).then(|| (place, sample.clone()))
+        };
+        let held = self.entries.len();
+        self.entries.extend(now_is.iter().enumerate().filter_map(changed));
+        if self.entries.len() == held {
+            return None;
+        }
+        self.at = Some(now);
+        let surplus = self.entries.len().saturating_sub(most);
+        self.entries.drain(..surplus);
+        Some(surplus as u64)
+    }
+
+    /// Takes the oldest, up to `most`.
+    pub(super) fn take(&mut self, most: usize) -> Vec<(usize, Sample)> {
+        let count = self.entries.len().min(most);
+        self.entries.drain(..count).collect()
+    }
+
+    pub(super) fn len(&self) -> usize {
+        self.entries.len()
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.entries.is_empty()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::metric::Datum;
+    use super::*;
+    use crate::drive::Quality;
+
+    #[test]
+    fn the_newest_changes_are_kept() {
+        let start = Instant::now();
+        let mut recorder = Recorder::default();
+        let sample = |number| Sample {
+            value: Some(Datum::Number(number)),
+            quality: Quality::Good,
+            time: number as u64,
+        };
+        let bounds = (Duration::from_millis(50), 3);
+        let mut before = vec![None];
+        let mut outcomes = Vec::new();
+        for (ms, number) in [(0, 1.0), (10, 2.0), (50, 2.0), (100, 2.0), (150, 3.0), (200, 4.0)] {
+            let now = [sample(number)];
+            let recorded = recorder.record(&before, &now, bounds, start + Duration::from_millis(ms));
+            if recorded.is_some() {
+                before = vec![Some(now[0].clone())];
+            }
+            outcomes.push(recorded);
+        }
+        assert_eq!(outcomes, [Some(0), None, Some(0), None, Some(0), Some(1)]);
+        assert_eq!(recorder.take(2), [(0, sample(2.0)), (0, sample(3.0))]);
+        assert_eq!((recorder.len(), recorder.take(9)), (1, vec![(0, sample(4.0))]));
+        assert!(recorder.is_empty());
+    }
+}

@@ -1,0 +1,317 @@
+//! DCMD messages: each becomes one order, checked, audited and answered like any other. The session has no message for
+//! results, so they become metrics of the drive. Time is an argument.
+
+use std::collections::{HashSet, VecDeque};
+use std::future::poll_fn;
+use std::hash::{BuildHasher, RandomState};
+use std::sync::Arc;
+use std::task::{Context, Poll};
+use std::time::{Duration, Instant};
+
+use serde_json::Value as Json;
+
+use super::super::commands::unknown_drive;
+use super::super::request::{self, Incoming, excerpt};
+use super::model::DriveMetrics;
+use super::session::Session;
+use super::wire::{self, Metric, MetricValue, Payload};
+use crate::command::{Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Refusal, SourceKind};
+use crate::drive::{ModelPoint, Profile, Value};
+use crate::plant::{Placed, Plant};
+
+/// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
+const AWAITED: usize = 4096;
+/// Metrics in a command.
+const METRICS: usize = 64;
+/// How long a command is remembered, and how many are.
+const REMEMBERED: Duration = Duration::from_secs(600);
+const MOST: usize = 1 << 16;
+
+/// The orders over Sparkplug.
+#[derive(Debug)]
+pub(super) struct Orders {
+    /// Everything from the connection to the broker counts as one client.
+    client: Arc<str>,
+    awaited: VecDeque<Awaited>,
+    memory: Memory,
+}
+
+#[derive(Debug)]
+struct Awaited {
+    drive: String,
+    metrics: Vec<usize>,
+    placed: Placed,
+}
+
+/// The result of an order.
+#[derive(Debug, PartialEq)]
+pub(super) struct Finished {
+    /// The drive by its name: a reload may have moved it.
+    pub(super) drive: String,
+    /// The metrics that were to be changed.
+    pub(super) metrics: Vec<usize>,
+    /// The code of the result, and why it failed; empty if it did not.
+    pub(super) code: &'static str,
+    pub(super) error: String,
+}
+
+impl Finished {
+    fn of(drive: &str, metrics: Vec<usize>, answer: &Answer, confirmed: Option<Duration>) -> Finished {
+        let ok = answer.outcome.is_ok();
+        Finished {
+            drive: drive.to_string(),
+            metrics,
+            code: if confirmed.is_some() {
+                CONFIRMED
+            } else {
+                answer.outcome.code()
+            },
+            error: if ok { String::new() } else { answer.outcome.to_string() },
+        }
+    }
+}
+
+impl Orders {
+    pub(super) fn new() -> Orders {
+        Orders {
+            client: SourceKind::Sparkplug.name().into(),
+            awaited: VecDeque::new(),
+            memory: Memory::default(),
+        }
+    }
+
+    /// Takes a command for the device of that name. When this returns, its order is in the queue of the bus, or the result
+    /// is returned. `target` is the drive of that name, with its place in the session.
+    pub(super) fn take(
+        &mut self,
+        incoming: &Incoming,
+        device: &str,
+        target: Option<(usize, &DriveMetrics)>,
+        session: &Session,
+        plant: &Plant,
+        now: Instant,
+    ) -> Option<Finished> {
+        let who = incoming.who.as_deref().map(|who| excerpt(who.as_bytes()));
+        let who = who
+            .as_deref()
+            .map_or(incoming.topic.as_str(), |who| who.trim_matches('`'));
+        let origin = Origin::of(self.client.clone(), SourceKind::Sparkplug, who);
+        let Some((place, metrics)) = target else {
+            let name = excerpt(device.as_bytes());
+            let why = unknown_drive(device, plant);
+            plant.refuse_unknown(name.trim_matches('`'), "a Sparkplug command", why, origin, now);
+            return None;
+        };
+        let drive = &metrics.drive;
+        let request = Request::read(incoming, |metric| {
+            session.metric(place, metric.name.as_deref(), metric.alias)
+        });
+        let touched = request.metrics();
+        let points = request.points(&drive.image.spec.profile, |metric| {
+            session.definition(place, metric).map(|d| d.name.clone())
+        });
+        let refuse = |refusal, origin| {
+            let answer = drive.refuse(&request.what(), refusal, origin, now);
+            Some(Finished::of(device, touched.clone(), &answer, None))
+        };
+        let points = match points {
+            Err(refusal) => return refuse(refusal, origin),
+            Ok(points) => points,
+        };
+        let run = drive.image.spec.profile.model_index(ModelPoint::Run);
+        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
+        if !stop
+            && request.timestamp.is_some()
+            && let Err(why) = self.memory.take(incoming, now)
+        {
+            return refuse(Refusal::NotAllowed(why.to_string()), origin);
+        }
+        let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
+        let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
+        let mut placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
+        if let Some(answer) = placed.answer().filter(|answer| !answer.outcome.is_ok()) {
+            return Some(Finished::of(device, touched, &answer, None));
+        }
+        if self.awaited.len() < AWAITED {
+            self.awaited.push_back(Awaited {
+                drive: device.to_string(),
+                metrics: touched,
+                placed,
+            });
+        }
+        None
+    }
+
+    /// The next order that ends; pending while there is none. Cancel safe.
+    pub(super) async fn finished(&mut self) -> Finished {
+        poll_fn(|cx| self.poll_finished(cx)).await
+    }
+
+    fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<Finished> {
+        let ready = |awaited: &mut Awaited| match awaited.placed.poll_answer(cx) {
+            Poll::Ready(answer) if answer.outcome.is_ok() => awaited.placed.poll_confirmation(cx).is_ready(),
+            Poll::Ready(_) => true,
+            Poll::Pending => false,
+        };
+        let place = self.awaited.iter_mut().position(ready);
+        let ended = place.and_then(|place| self.awaited.remove(place));
+        let finished = ended.and_then(|mut awaited| {
+            let (answer, confirmed) = (awaited.placed.answer()?, awaited.placed.confirmation().flatten());
+            Some(Finished::of(&awaited.drive, awaited.metrics, &answer, confirmed))
+        });
+        finished.map_or(Poll::Pending, Poll::Ready)
+    }
+
+    /// Whether no order waits for its result.
+    pub(super) fn is_idle(&self) -> bool {
+        self.awaited.is_empty()
+    }
+}
+
+/// What a message asks for.
+struct Request {
+    /// The metrics as they came, and their place in the session.
+    metrics: Result<Vec<(Metric, Option<usize>)>, Refusal>,
+    timestamp: Option<u64>,
+}
+
+impl Request {
+    fn read(incoming: &Incoming, place: impl Fn(&Metric) -> Option<usize>) -> Request {
+        let refused = |refusal| Request {
+            metrics: Err(refusal),
+            timestamp: None,
+        };
+        if incoming.retain {
+            let why = "a retained message is never a command; publish it without the retain flag and clear the topic";
+            return refused(Refusal::NotAllowed(why.to_string()));
+        }
+        if let Some(bytes) = incoming.oversized {
+            return refused(Refusal::BadValue(format!(
+                "the payload has {bytes} bytes, 65536 are allowed"
+            )));
+        }
+        let payload = match Payload::decoded(&incoming.payload) {
+            Ok(payload) => payload,
+            Err(why) => return refused(Refusal::BadValue(format!("the payload is not Sparkplug B: {why}"))),
+        };
+        let count = payload.metrics.len();
+        if count > METRICS {
+            let why = format!("the command has {count} metrics, {METRICS} are allowed");
+            return refused(Refusal::BadValue(why));
+        }
+        let placed = |metric: Metric| {
+            let place = place(&metric);
+            (metric, place)
+        };
+        Request {
+            metrics: Ok(payload.metrics.into_iter().map(placed).collect()),
+            timestamp: payload.timestamp,
+        }
+    }
+
+    fn metrics(&self) -> Vec<usize> {
+        self.metrics.iter().flatten().filter_map(|(_, place)| *place).collect()
+    }
+
+    /// For the audit, if it is refused before it becomes an order.
+    fn what(&self) -> String {
+        let Ok(metrics) = &self.metrics else {
+            return "a Sparkplug command".to_string();
+        };
+        let name = |(metric, _): &(Metric, Option<usize>)| {
+            let value = json(metric).map_or_else(|| "null".to_string(), |value| value.to_string());
+            match (&metric.name, metric.alias) {
+                (Some(name), _) => format!("{name}={value}"),
+                (None, Some(alias)) => format!("alias {alias}={value}"),
+                (None, None) => format!("?={value}"),
+            }
+        };
+        let all: Vec<String> = metrics.iter().take(8).map(name).collect();
+        excerpt(all.join(" ").as_bytes())
+    }
+
+    fn points(
+        &self,
+        profile: &Profile,
+        name: impl Fn(usize) -> Option<String>,
+    ) -> Result<Vec<(usize, Value)>, Refusal> {
+        let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
+        let point = |(metric, place): &(Metric, Option<usize>)| {
+            let name = match (&metric.name, place.and_then(&name)) {
+                (Some(name), _) => name.clone(),
+                (None, Some(name)) => name,
+                (None, None) => {
+                    let alias = metric
+                        .alias
+                        .map_or_else(|| "none".to_string(), |alias| alias.to_string());
+                    return Err(Refusal::NotWritable(format!(
+                        "no metric of the drive has the alias {alias}; ask for a birth with `Node Control/Rebirth`"
+                    )));
+                }
+            };
+            let value = json(metric).ok_or_else(|| {
+                let name = excerpt(name.as_bytes());
+                Refusal::BadValue(format!(
+                    "{name} has no value that can be commanded (null, a text, not finite)"
+                ))
+            })?;
+            request::resolve(profile, &name, &value)
+        };
+        metrics.iter().map(point).collect()
+    }
+}
+
+/// The value of a metric, whatever type of number the host sends; `None` for null, for texts and for what is no number.
+fn json(metric: &Metric) -> Option<Json> {
+    if metric.is_null == Some(true) {
+        return None;
+    }
+    let unsigned = metric.datatype.is_some_and(wire::is_unsigned);
+    let number = |number: f64| serde_json::Number::from_f64(number).map(Json::Number);
+    match metric.value.as_ref()? {
+        MetricValue::Boolean(state) => Some(Json::Bool(*state)),
+        MetricValue::Int(word) if unsigned => Some(Json::from(*word)),
+        MetricValue::Int(word) => Some(Json::from(word.cast_signed())),
+        MetricValue::Long(word) if unsigned => Some(Json::from(*word)),
+        MetricValue::Long(word) => Some(Json::from(word.cast_signed())),
+        // As the decimal that the host meant: 33.3, not 33.29999923706055.
+        MetricValue::Float(value) => number(value.to_string().parse().ok()?),
+        MetricValue::Double(value) => number(*value),
+        MetricValue::String(_) => None,
+    }
+}
+
+/// The commands of the last minutes. A bridge that loops cannot start a motor a second time: the same payload, with its
+/// time, is not executed again.
+#[derive(Debug, Default)]
+struct Memory {
+    hasher: RandomState,
+    order: VecDeque<(Instant, u64)>,
+    known: HashSet<u64>,
+}
+
+impl Memory {
+    fn take(&mut self, incoming: &Incoming, now: Instant) -> Result<(), &'static str> {
+        while let Some((at, print)) = self.order.front()
+            && now.saturating_duration_since(*at) >= REMEMBERED
+        {
+            self.known.remove(print);
+            self.order.pop_front();
+        }
+        let print = self.hasher.hash_one((&incoming.topic, &incoming.payload));
+        if self.known.contains(&print) {
+            return Err(
+                "it repeats an earlier command: the same payload with the same time; send it with its own time",
+            );
+        }
+        if self.order.len() >= MOST {
+            return Err("too many commands within ten minutes; nothing was written");
+        }
+        self.known.insert(print);
+        self.order.push_back((now, print));
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,571 @@
+//! The session of the edge node: births before data, sequence numbers without gaps, deaths before new births. No I/O and
+//! no clock: it is told what happens, and asked for the next message.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use super::history::Recorder;
+use super::host::Host;
+use super::metric::{Datum, Definition, Naming, Pace, Sample};
+use super::topics::{Kind, Topics};
+use super::wire::{DataType, Metric, Payload};
+use crate::drive::Quality;
+
+/// Least time between two births of the node on one connection: requests in between are served together.
+const REBIRTH: Duration = Duration::from_millis(250);
+/// Least time between two messages because of figures alone.
+const FIGURES: Duration = Duration::from_secs(1);
+/// Values in one message of the history, and least time between two of them, so that live values have the connection.
+const HISTORY_VALUES: usize = 250;
+const HISTORY_PACE: Duration = Duration::from_millis(25);
+/// Values of an outage that are kept, of all drives together.
+const HISTORY: usize = 200_000;
+/// The metric by which a host asks for a birth.
+pub(super) const REBIRTH_METRIC: &str = "Node Control/Rebirth";
+
+/// What is configured of the session.
+#[derive(Debug, Clone)]
+pub(super) struct Rules {
+    pub(super) topics: Topics,
+    /// Metrics have aliases.
+    pub(super) alias: bool,
+    /// Values of an outage are published afterwards.
+    pub(super) history: bool,
+    /// Least time between two messages of a device.
+    pub(super) min_interval: Duration,
+}
+
+/// A message for the broker.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Packet {
+    pub(super) kind: Kind,
+    pub(super) device: Option<String>,
+    pub(super) payload: Payload,
+}
+
+/// Time, as the session needs it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Tick {
+    pub(super) now: Instant,
+    /// ms since 1970.
+    pub(super) millis: u64,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Phase {
+    /// No connection, or none that is subscribed.
+    Away,
+    /// Connected; the primary host is not online.
+    Waiting,
+    /// Connected; the birth of the node comes next.
+    NodeBirth,
+    /// The births of the devices follow, from this place on.
+    DeviceBirths(usize),
+    Live,
+}
+
+/// The session; it lasts over connections.
+#[derive(Debug)]
+pub(super) struct Session {
+    rules: Rules,
+    phase: Phase,
+    host: Host,
+    seq: u8,
+    bd_seq: u8,
+    last_alias: u64,
+    node: Device,
+    devices: Vec<Device>,
+    /// Devices that are no longer configured and are to be declared dead.
+    departed: Vec<String>,
+    /// The device that is looked at first, so that each has its turn.
+    cursor: usize,
+    rebirth: bool,
+    born_at: Option<Instant>,
+    history_at: Option<Instant>,
+    lost: u64,
+}
+
+/// The node itself, or a drive.
+#[derive(Debug)]
+struct Device {
+    name: String,
+    definitions: Vec<Definition>,
+    namings: Vec<Naming>,
+    present: bool,
+    born: bool,
+    /// It went away since its birth, even if it is back.
+    gone: bool,
+    now_is: Vec<Sample>,
+    /// As last published or recorded.
+    sent: Vec<Option<Sample>>,
+    /// Metrics to be published although they did not change.
+    repeat: Vec<usize>,
+    sent_at: Option<Instant>,
+    /// What was told may differ from what was sent.
+    changed: bool,
+    history: Recorder,
+}
+
+impl Device {
+    fn new(name: String, definitions: Vec<Definition>) -> Device {
+        Device {
+            name,
+            namings: vec![Naming::Name; definitions.len()],
+            sent: vec![None; definitions.len()],
+            definitions,
+            present: false,
+            born: false,
+            gone: false,
+            now_is: Vec::new(),
+            repeat: Vec::new(),
+            sent_at: None,
+            changed: false,
+            history: Recorder::default(),
+        }
+    }
+
+    fn aliases(&self) -> BTreeMap<&str, Naming> {
+        let names = self.definitions.iter().map(|d| d.name.as_str());
+        names.zip(self.namings.iter().copied()).collect()
+    }
+
+    /// All metrics; they count as published at `now`.
+    fn birth(&mut self, now: Instant) -> Vec<Metric> {
+        let all = self.definitions.iter().zip(&self.namings).zip(&self.now_is);
+        let metrics = all.map(|((d, naming), sample)| d.birth(*naming, sample)).collect();
+        self.sent = self.now_is.iter().cloned().map(Some).collect();
+        (self.born, self.gone, self.changed, self.sent_at) = (true, false, false, Some(now));
+        self.repeat.clear();
+        metrics
+    }
+
+    /// What changed and is due. The second is when to ask again.
+    fn data(&mut self, least: Duration, now: Instant) -> (Vec<Metric>, Option<Instant>) {
+        if !self.changed {
+            return (Vec::new(), None);
+        }
+        let differs = |place: usize| match (self.now_is.get(place), self.sent.get(place)) {
+            (Some(sample), Some(Some(sent))) => !sent.is_same(sample),
+            _ => true,
+        };
+        let mut places: Vec<usize> = (0..self.now_is.len()).filter(|place| differs(*place)).collect();
+        let figures = |place: &usize| self.definitions.get(*place).is_some_and(|d| d.pace == Pace::Figure);
+        let least = match places.iter().all(figures) && self.repeat.is_empty() {
+            true => least.max(FIGURES),
+            false => least,
+        };
+        places.extend(self.repeat.iter().copied());
+        places.sort_unstable();
+        places.dedup();
+        if places.is_empty() {
+            self.changed = false;
+            return (Vec::new(), None);
+        }
+        let due = self.sent_at.map_or(now, |at| at + least);
+        if due > now {
+            return (Vec::new(), Some(due));
+        }
+        let metrics = places.iter().filter_map(|place| self.publish(*place)).collect();
+        (self.changed, self.sent_at) = (false, Some(now));
+        self.repeat.clear();
+        (metrics, None)
+    }
+
+    /// One metric as it is now.
+    fn publish(&mut self, place: usize) -> Option<Metric> {
+        let (definition, naming) = (self.definitions.get(place)?, *self.namings.get(place)?);
+        let sample = self.now_is.get(place)?;
+        let sent = self.sent.get_mut(place)?;
+        let before = sent.as_ref().map(|sent| sent.quality);
+        let metric = definition.data(naming, sample, before);
+        *sent = Some(sample.clone());
+        Some(metric)
+    }
+
+    fn history(&mut self, most: usize) -> Vec<Metric> {
+        let metric = |(place, sample): (usize, Sample)| {
+            let mut metric = self
+                .definitions
+                .get(place)?
+                .data(*self.namings.get(place)?, &sample, None);
+            metric.is_historical = Some(true);
+            Some(metric)
+        };
+        self.history.take(most).into_iter().filter_map(metric).collect()
+    }
+}
+
+impl Session {
+    pub(super) fn new(rules: Rules) -> Session {
+        Session {
+            rules,
+            phase: Phase::Away,
+            host: Host::default(),
+            seq: 0,
+            bd_seq: 0,
+            last_alias: 0,
+            node: Device::new(String::new(), Vec::new()),
+            devices: Vec::new(),
+            departed: Vec::new(),
+            cursor: 0,
+            rebirth: false,
+            born_at: None,
+            history_at: None,
+            lost: 0,
+        }
+    }
+
+    /// The metrics of the node and of the devices from now on. A born node is born again if they differ.
+    pub(super) fn adopt(&mut self, node: Vec<Definition>, devices: Vec<(String, Vec<Definition>)>) {
+        let before = self.devices.iter().map(|d| (d.name.as_str(), &d.definitions));
+        if self.node.definitions == node && before.eq(devices.iter().map(|(name, d)| (name.as_str(), d))) {
+            return;
+        }
+        let node_before = std::mem::replace(&mut self.node, Device::new(String::new(), node));
+        name(
+            &mut self.node,
+            Some(&node_before),
+            self.rules.alias,
+            &mut self.last_alias,
+        );
+        let mut old: BTreeMap<String, Device> = BTreeMap::new();
+        for device in std::mem::take(&mut self.devices) {
+            old.insert(device.name.clone(), device);
+        }
+        for (device_name, definitions) in devices {
+            let mut device = Device::new(device_name, definitions);
+            let before = old.remove(&device.name);
+            name(&mut device, before.as_ref(), self.rules.alias, &mut self.last_alias);
+            if let Some(before) = before {
+                (device.born, device.gone) = (before.born, before.gone);
+                match before.definitions == device.definitions {
+                    true => device.history = before.history,
+                    false => self.lost += before.history.len() as u64,
+                }
+            }
+            self.devices.push(device);
+        }
+        for device in old.into_values() {
+            self.lost += device.history.len() as u64;
+            if device.born {
+                self.departed.push(device.name);
+            }
+        }
+        self.cursor = 0;
+        self.request_birth();
+    }
+
+    /// The last will of a connection with this number.
+    pub(super) fn will(&self, bd_seq: u8, millis: u64) -> Packet {
+        death(bd_seq, millis)
+    }
+
+    /// The broker accepted the connection with this number; the state of the host is told anew.
+    pub(super) fn opened(&mut self, bd_seq: u8) {
+        self.bd_seq = bd_seq;
+        self.host = Host::default();
+        self.closed();
+    }
+
+    /// The broker granted the subscriptions.
+    pub(super) fn subscribed(&mut self) {
+        if self.phase == Phase::Away {
+            self.phase = match self.may_be_born() {
+                true => Phase::NodeBirth,
+                false => Phase::Waiting,
+            };
+        }
+    }
+
+    /// There is no connection any more.
+    pub(super) fn closed(&mut self) {
+        self.phase = Phase::Away;
+        (self.rebirth, self.born_at, self.node.born) = (false, None, false);
+        self.departed.clear();
+        for device in &mut self.devices {
+            (device.born, device.gone) = (false, false);
+        }
+    }
+
+    fn may_be_born(&self) -> bool {
+        self.rules.topics.state().is_none() || self.host.is_online()
+    }
+
+    /// Whether the node is born, or its birth is under way.
+    pub(super) fn is_alive(&self) -> bool {
+        matches!(self.phase, Phase::DeviceBirths(_) | Phase::Live)
+    }
+
+    /// Whether the session waits for the primary host.
+    pub(super) fn is_waiting(&self) -> bool {
+        self.phase == Phase::Waiting
+    }
+
+    /// A message about the primary host. Returns whether the connection is to be given up: the host went offline.
+    ///
+    /// # Errors
+    /// Why the message is not understood; nothing changes.
+    pub(super) fn host_state(&mut self, payload: &[u8]) -> Result<bool, String> {
+        self.host.take(payload)?;
+        match (self.phase, self.host.is_online()) {
+            (Phase::Waiting, true) => self.phase = Phase::NodeBirth,
+            (Phase::NodeBirth | Phase::DeviceBirths(_) | Phase::Live, false) => return Ok(true),
+            _ => {}
+        }
+        Ok(false)
+    }
+
+    /// A host asks for the births. No data is sent before them.
+    pub(super) fn request_birth(&mut self) {
+        self.rebirth = self.is_alive();
+    }
+
+    /// What the node is now.
+    pub(super) fn tell_node(&mut self, samples: Vec<Sample>) {
+        self.node.changed = true;
+        self.node.now_is = samples;
+    }
+
+    /// What a device is now, and whether it is there.
+    pub(super) fn tell(&mut self, device: usize, present: bool, samples: Vec<Sample>, now: Instant) {
+        let count = self.devices.len().max(1);
+        let record = self.rules.history && !self.is_alive();
+        let Some(device) = self.devices.get_mut(device) else {
+            return;
+        };
+        device.gone |= device.born && !present;
+        // Of a device that was never there, nothing is recorded.
+        if record && (present || device.sent.iter().any(Option::is_some)) {
+            let bounds = (self.rules.min_interval, (HISTORY / count).max(1));
+            if let Some(lost) = device.history.record(&device.sent, &samples, bounds, now) {
+                self.lost += lost;
+                device.sent = samples.iter().cloned().map(Some).collect();
+            }
+        }
+        (device.present, device.now_is, device.changed) = (present, samples, true);
+    }
+
+    /// Publishes these metrics of a device even if they do not change: somebody tried to change them.
+    pub(super) fn repeat(&mut self, device: usize, metrics: impl IntoIterator<Item = usize>) {
+        if let Some(device) = self.devices.get_mut(device) {
+            device.repeat.extend(metrics);
+            device.repeat.sort_unstable();
+            device.repeat.dedup();
+            device.changed = true;
+        }
+    }
+
+    /// The metric of a device by its name or its alias.
+    pub(super) fn metric(&self, device: usize, by_name: Option<&str>, alias: Option<u64>) -> Option<usize> {
+        let device = self.devices.get(device)?;
+        match (by_name, alias) {
+            (Some(name), _) => device.definitions.iter().position(|d| d.name == name),
+            (None, Some(alias)) => device.namings.iter().position(|n| *n == Naming::Alias(alias)),
+            (None, None) => None,
+        }
+    }
+
+    /// The name of a metric and its data type.
+    pub(super) fn definition(&self, device: usize, metric: usize) -> Option<&Definition> {
+        self.devices.get(device)?.definitions.get(metric)
+    }
+
+    /// Values of an outage that were given up since the last call.
+    pub(super) fn take_lost(&mut self) -> u64 {
+        std::mem::take(&mut self.lost)
+    }
+
+    /// The death of the node, before the connection is closed; nothing else is sent on it.
+    pub(super) fn end(&mut self, millis: u64) -> Packet {
+        self.closed();
+        death(self.bd_seq, millis)
+    }
+
+    /// The next message, if one is due; else when to ask again, unless something happens before. Once returned it counts
+    /// as sent.
+    pub(super) fn next(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+        match self.phase {
+            Phase::Away | Phase::Waiting => Err(None),
+            Phase::NodeBirth => Ok(self.node_birth(tick)),
+            Phase::DeviceBirths(from) => match self.next_born(from) {
+                Some(place) => {
+                    self.phase = Phase::DeviceBirths(place + 1);
+                    self.device_birth(place, tick).ok_or(None)
+                }
+                None => {
+                    self.phase = Phase::Live;
+                    self.live(tick)
+                }
+            },
+            Phase::Live => self.live(tick),
+        }
+    }
+
+    fn next_born(&self, from: usize) -> Option<usize> {
+        let waits = |device: &Device| device.present && !device.born;
+        let rest = self.devices.iter().enumerate().skip(from);
+        rest.filter(|(_, device)| waits(device)).map(|(place, _)| place).next()
+    }
+
+    fn live(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+        if let Some(name) = self.departed.pop() {
+            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), tick));
+        }
+        if self.rebirth {
+            let due = self.born_at.map_or(tick.now, |at| at + REBIRTH);
+            return if due > tick.now {
+                Err(Some(due))
+            } else {
+                Ok(self.node_birth(tick))
+            };
+        }
+        let mut again: Option<Instant> = None;
+        for step in 0..self.devices.len() {
+            let place = (self.cursor + step) % self.devices.len();
+            match self.device(place, tick) {
+                Ok(packet) => {
+                    self.cursor = place + 1;
+                    return Ok(packet);
+                }
+                Err(due) => again = again.into_iter().chain(due).min(),
+            }
+        }
+        let (metrics, due) = self.node.data(self.rules.min_interval, tick.now);
+        if !metrics.is_empty() {
+            return Ok(self.packet(Kind::NodeData, None, metrics, tick));
+        }
+        again = again.into_iter().chain(due).min();
+        self.past(tick).map_err(|due| again.into_iter().chain(due).min())
+    }
+
+    /// What is to be said of a device now.
+    fn device(&mut self, place: usize, tick: Tick) -> Result<Packet, Option<Instant>> {
+        let least = self.rules.min_interval;
+        let device = self.devices.get_mut(place).ok_or(None)?;
+        if device.gone {
+            (device.gone, device.born) = (false, false);
+            let name = device.name.clone();
+            return Ok(self.packet(Kind::DeviceDeath, Some(name), Vec::new(), tick));
+        }
+        if device.present && !device.born {
+            return self.device_birth(place, tick).ok_or(None);
+        }
+        if !device.born {
+            return Err(None);
+        }
+        let (metrics, due) = device.data(least, tick.now);
+        if metrics.is_empty() {
+            return Err(due);
+        }
+        let name = device.name.clone();
+        Ok(self.packet(Kind::DeviceData, Some(name), metrics, tick))
+    }
+
+    /// The next message of the history.
+    fn past(&mut self, tick: Tick) -> Result<Packet, Option<Instant>> {
+        let holds = |device: &&mut Device| device.born && !device.history.is_empty();
+        let device = self.devices.iter_mut().find(holds).ok_or(None)?;
+        if let Some(due) = self
+            .history_at
+            .map(|at| at + HISTORY_PACE)
+            .filter(|due| *due > tick.now)
+        {
+            return Err(Some(due));
+        }
+        let (name, metrics) = (device.name.clone(), device.history(HISTORY_VALUES));
+        self.history_at = Some(tick.now);
+        Ok(self.packet(Kind::DeviceData, Some(name), metrics, tick))
+    }
+
+    fn node_birth(&mut self, tick: Tick) -> Packet {
+        self.seq = u8::MAX;
+        (self.phase, self.rebirth, self.born_at) = (Phase::DeviceBirths(0), false, Some(tick.now));
+        for device in &mut self.devices {
+            // The birth of the node ends what hosts knew of its devices.
+            (device.born, device.gone) = (false, false);
+        }
+        let control = Definition {
+            name: REBIRTH_METRIC.to_string(),
+            datatype: DataType::Boolean,
+            unit: String::new(),
+            low: None,
+            high: None,
+            pace: Pace::Normal,
+        };
+        let off = Sample {
+            value: Some(Datum::Bool(false)),
+            quality: Quality::Good,
+            time: tick.millis,
+        };
+        let mut metrics = vec![number(self.bd_seq, tick.millis), control.birth(Naming::Name, &off)];
+        metrics.extend(self.node.birth(tick.now));
+        self.packet(Kind::NodeBirth, None, metrics, tick)
+    }
+
+    fn device_birth(&mut self, place: usize, tick: Tick) -> Option<Packet> {
+        let device = self.devices.get_mut(place)?;
+        let (name, metrics) = (device.name.clone(), device.birth(tick.now));
+        Some(self.packet(Kind::DeviceBirth, Some(name), metrics, tick))
+    }
+
+    fn packet(&mut self, kind: Kind, device: Option<String>, metrics: Vec<Metric>, tick: Tick) -> Packet {
+        self.seq = self.seq.wrapping_add(1);
+        Packet {
+            kind,
+            device,
+            payload: Payload {
+                timestamp: Some(tick.millis),
+                metrics,
+                seq: Some(self.seq.into()),
+            },
+        }
+    }
+}
+
+/// Gives each metric of `device` its alias: the one it had `before`, else one that no metric ever had.
+fn name(device: &mut Device, before: Option<&Device>, alias: bool, last: &mut u64) {
+    let known = before.map(Device::aliases).unwrap_or_default();
+    if alias {
+        let names = device.definitions.iter().map(|d| d.name.as_str());
+        let mut fresh = || {
+            *last += 1;
+            Naming::Alias(*last)
+        };
+        device.namings = names
+            .map(|name| known.get(name).copied().unwrap_or_else(&mut fresh))
+            .collect();
+    }
+}
+
+/// The metric `bdSeq`.
+fn number(bd_seq: u8, millis: u64) -> Metric {
+    let definition = Definition {
+        name: "bdSeq".to_string(),
+        datatype: DataType::Int64,
+        unit: String::new(),
+        low: None,
+        high: None,
+        pace: Pace::Normal,
+    };
+    let sample = Sample {
+        value: Some(Datum::Integer(bd_seq.into())),
+        quality: Quality::Good,
+        time: millis,
+    };
+    definition.data(Naming::Name, &sample, Some(Quality::Good))
+}
+
+fn death(bd_seq: u8, millis: u64) -> Packet {
+    Packet {
+        kind: Kind::NodeDeath,
+        device: None,
+        payload: Payload {
+            timestamp: Some(millis),
+            metrics: vec![number(bd_seq, millis)],
+            seq: None,
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests;
