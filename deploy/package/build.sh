@@ -1,0 +1,37 @@
+#!/usr/bin/env bash
+# Builds one release binary that does not depend on where it was built, and prints its path.
+#   deploy/package/build.sh ARCHITECTURE LINKAGE
+# ARCHITECTURE: amd64, arm64, armhf. LINKAGE: dynamic (for an old glibc) or static.
+set -euo pipefail
+cd "$(dirname "${BASH_SOURCE[0]}")/../.."
+source deploy/package/common.sh
+
+architecture=${1:?architecture: amd64, arm64 or armhf}
+linkage=${2:?linkage: dynamic or static}
+target=$(rust_target "$architecture")
+
+[ -d "$(rustc --print sysroot)/lib/rustlib/$target/lib" ] ||
+    fail "no Rust standard library for $target" "$(rustc --version)" \
+        "run \`rustup target add $target\`; other ways are in docs/releasing.md#the-standard-library-of-other-targets"
+
+# Panic messages name source files: they are named alike whatever folder the tree, the registry and the target
+# directory are in. The last prefix that fits counts.
+folder=$TARGET_FOLDER/$linkage
+flags="--remap-path-prefix=${CARGO_HOME:-$HOME/.cargo}=/cargo"
+flags+=" --remap-path-prefix=$(rustc --print sysroot)=/rust"
+flags+=" --remap-path-prefix=$PWD=/drivegate --remap-path-prefix=$folder=/target"
+case $linkage in
+    dynamic) build=(zigbuild --target "$target.$(libc_version "$architecture")") ;;
+    static)
+        flags+=" -C target-feature=+crt-static"
+        build=(build --target "$target")
+        ;;
+    *) fail "unknown linkage \"$linkage\"" "second argument" "dynamic or static" ;;
+esac
+
+# The cross compilers of Debian link the static binaries of ARM; zig links the dynamic ones.
+export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
+export CARGO_TARGET_ARMV7_UNKNOWN_LINUX_GNUEABIHF_LINKER=arm-linux-gnueabihf-gcc
+DRIVEGATE_COMMIT=$(commit) RUSTFLAGS=$flags CFLAGS="-ffile-prefix-map=${CARGO_HOME:-$HOME/.cargo}=/cargo -ffile-prefix-map=$folder=/target" \
+    cargo "${build[@]}" --profile "$PROFILE" --locked --bin drivegate --target-dir "$folder" >&2
+echo "$folder/$target/${PROFILE/#dev/debug}/drivegate"
