@@ -4,7 +4,7 @@
 export PATH="$PWD/.tools/package-venv/bin:$PWD/.tools/bin:$PATH:/usr/sbin:/sbin"
 
 # Binaries that ship have a target directory of their own: other flags would rebuild everything in the common one.
-TARGET_FOLDER=${PACKAGE_TARGET_DIR:-$PWD/target/package}
+TARGET_FOLDER=$PWD/target/package
 # `dev` builds in a fraction of the time, to try the packaging.
 PROFILE=${PROFILE:-release}
 # What is built carries the time of the commit.
@@ -42,4 +42,13 @@ libc_version() {
         amd64) echo 2.28 ;;
         *) echo 2.24 ;;
     esac
+}
+
+ARCHITECTURES=(amd64 arm64 armhf)
+# Where finished files go.
+DIST=${DIST:-dist}
+
+# A pre-release sorts before its release: 1.0.0-rc.1 is 1.0.0~rc.1.
+debian_version() {
+    version | sed 's/-/~/'
 }
