@@ -7,7 +7,13 @@ pin=/etc/systemd/system/drivegate.service.d/previous-version.conf
 previous=/usr/lib/drivegate/previous
 package=$(ls drivegate_*.deb)
 
-trap 'echo "FAILED in line $LINENO: $BASH_COMMAND"; systemctl status --no-pager drivegate; journalctl --no-pager -u drivegate | tail -n 20' ERR
+ended() {
+    [ "$1" != 0 ] || return 0
+    echo "FAILED with $1: $2"
+    systemctl status --no-pager --lines=0 drivegate || true
+    journalctl --no-pager --unit drivegate | tail -n 20
+}
+trap 'ended $? "$BASH_COMMAND"' EXIT
 
 step() { echo "--- $*"; }
 pid() { systemctl show --property=MainPID --value drivegate; }
@@ -23,7 +29,8 @@ until_true() {
     echo "not within a minute: $*"
     return 1
 }
-online() { [[ $(drivegate read pump-1 state 2>/dev/null) == *ready* ]]; }
+online() { drivegate read pump-1 ready >/dev/null 2>&1; }
+online_previous() { $previous read pump-1 ready >/dev/null 2>&1; }
 # `!` would not end the script.
 not() { if "$@" >/dev/null 2>&1; then echo "unexpected success: $*"; return 1; fi; }
 other_pid() { local now; now=$(pid); [ "$now" != 0 ] && [ "$now" != "$1" ]; }
@@ -51,7 +58,7 @@ bash -n /usr/share/bash-completion/completions/drivegate
 step "configured, enabled, started: the drive is online"
 simulate
 cp drivegate.toml /etc/drivegate/drivegate.toml
-drivegate check
+drivegate check | tail -n 1
 systemctl enable --quiet --now drivegate
 until_true online
 edited=$(md5sum /etc/drivegate/drivegate.toml)
@@ -62,7 +69,8 @@ dpkg --install newer.deb
 [ "$(installed)" = "ii 99.0.1" ]
 [ "$(pid)" != "$before" ]
 [ "$(program)" = /usr/bin/drivegate ]
-[ ! -e $pin ] && [ ! -e $previous ]
+[ ! -e $pin ]
+[ ! -e $previous ]
 until_true online
 
 step "a version that refuses the configuration is not started; the former goes on"
@@ -74,7 +82,7 @@ contains "$printed" "was NOT started"
 contains "$printed" "dpkg-reconfigure drivegate"
 [ "$(installed)" = "ii 99.0.2" ]
 [ "$(pid)" = "$before" ]
-online
+online_previous
 
 step "also when it crashes, and when the service is restarted"
 kill -KILL "$before"
@@ -83,17 +91,19 @@ until_true systemctl --quiet is-active drivegate
 [ "$(program)" = $previous ]
 systemctl restart drivegate
 [ "$(program)" = $previous ]
+until_true online_previous
 
 step "an upgrade to the same refusal keeps the version that works"
 dpkg --install choosy.deb
 [ "$(program)" = $previous ]
-$previous check
+$previous check | tail -n 1
 
 step "the configuration is corrected: dpkg-reconfigure starts the new version"
 touch /etc/drivegate/corrected
 dpkg-reconfigure drivegate
 [ "$(program)" = /usr/lib/drivegate-choosy/drivegate ]
-[ ! -e $pin ] && [ ! -e $previous ]
+[ ! -e $pin ]
+[ ! -e $previous ]
 until_true online
 
 step "a downgrade is an upgrade"
@@ -105,16 +115,17 @@ step "a version that cannot start gives way to the former"
 before=$(pid)
 printed=$(dpkg --install broken.deb 2>&1)
 echo "$printed" | grep '^drivegate:'
-contains "$printed" "does not start"
+contains "$printed" "does NOT start"
 [ "$(program)" = $previous ]
 [ "$(pid)" != "$before" ]
-until_true "$previous" read pump-1 state >/dev/null
+until_true online_previous
 
 step "a downgrade from there"
 dpkg --install older.deb
 [ "$(installed)" = "ii 0.0.1" ]
 [ "$(program)" = /usr/bin/drivegate ]
-[ ! -e $pin ] && [ ! -e $previous ]
+[ ! -e $pin ]
+[ ! -e $previous ]
 until_true online
 [ "$(md5sum /etc/drivegate/drivegate.toml)" = "$edited" ]
 
@@ -130,7 +141,8 @@ mkdir -p /var/lib/private/drivegate
 touch /var/lib/private/drivegate/kept
 dpkg --remove drivegate
 not systemctl --quiet is-active drivegate
-[ ! -e /usr/bin/drivegate ] && [ ! -e /usr/lib/drivegate ]
+[ ! -e /usr/bin/drivegate ]
+[ ! -e /usr/lib/drivegate ]
 [ "$(md5sum /etc/drivegate/drivegate.toml)" = "$edited" ]
 [ -e /var/lib/private/drivegate/kept ]
 dpkg --install "$package"
