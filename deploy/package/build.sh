@@ -32,6 +32,7 @@ esac
 # The cross compilers of Debian link the static binaries of ARM; zig links the dynamic ones.
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
 export CARGO_TARGET_ARMV7_UNKNOWN_LINUX_GNUEABIHF_LINKER=arm-linux-gnueabihf-gcc
-DRIVEGATE_COMMIT=$(commit) RUSTFLAGS=$flags CFLAGS="-ffile-prefix-map=${CARGO_HOME:-$HOME/.cargo}=/cargo -ffile-prefix-map=$folder=/target" \
-    cargo "${build[@]}" --profile "$PROFILE" --locked --bin drivegate --target-dir "$folder" >&2
-echo "$folder/$target/${PROFILE/#dev/debug}/drivegate"
+export CARGO_INCREMENTAL=0 RUSTFLAGS=$flags
+export CFLAGS="-ffile-prefix-map=${CARGO_HOME:-$HOME/.cargo}=/cargo -ffile-prefix-map=$folder=/target"
+DRIVEGATE_COMMIT=$(commit) cargo "${build[@]}" --release --locked --bin drivegate --target-dir "$folder" >&2
+echo "$folder/$target/release/drivegate"

@@ -5,8 +5,6 @@ export PATH="$PWD/.tools/package-venv/bin:$PWD/.tools/bin:$PATH:/usr/sbin:/sbin"
 
 # Binaries that ship have a target directory of their own: other flags would rebuild everything in the common one.
 TARGET_FOLDER=$PWD/target/package
-# `dev` builds in a fraction of the time, to try the packaging.
-PROFILE=${PROFILE:-release}
 # What is built carries the time of the commit.
 SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-$(git log -1 --format=%ct)}
 export SOURCE_DATE_EPOCH
@@ -22,9 +20,9 @@ version() {
     sed -n 's/^version = "\(.*\)"/\1/p' Cargo.toml | head -1
 }
 
-# The commit, with "-dirty" if the tree differs from it.
+# The commit, with "-dirty" if the tree differs from it; a build without the repository is told.
 commit() {
-    git describe --always --dirty --abbrev=12 --exclude='*'
+    echo "${DRIVEGATE_COMMIT:-$(git describe --always --dirty --abbrev=12 --exclude='*')}"
 }
 
 rust_target() {
