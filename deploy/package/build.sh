@@ -30,6 +30,7 @@ case $linkage in
 esac
 
 # The cross compilers of Debian link the static binaries of ARM; zig links the dynamic ones.
+[ "$(uname -m)" = x86_64 ] || export CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER=x86_64-linux-gnu-gcc
 export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
 export CARGO_TARGET_ARMV7_UNKNOWN_LINUX_GNUEABIHF_LINKER=arm-linux-gnueabihf-gcc
 export CARGO_INCREMENTAL=0 RUSTFLAGS=$flags

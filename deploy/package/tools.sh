@@ -16,6 +16,7 @@ needed=(
     "buildah buildah"
     "runc runc"
     "jq jq"
+    "/usr/share/ca-certificates/mozilla ca-certificates"
     "aarch64-linux-gnu-gcc gcc-aarch64-linux-gnu"
     "/usr/aarch64-linux-gnu/lib/libc.a libc6-dev-arm64-cross"
     "arm-linux-gnueabihf-gcc gcc-arm-linux-gnueabihf"
