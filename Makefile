@@ -14,7 +14,7 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 .PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
-	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 22
 
 build: ## Build the optimised binary, target/release/drivegate
 	commit="$$(git rev-parse --short=12 HEAD 2>/dev/null || true)"; \

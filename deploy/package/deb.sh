@@ -41,6 +41,7 @@ pack() {
     program=$(deploy/package/build.sh "$architecture" dynamic)
     check_libc "$program" "$architecture"
     install -m 755 "$program" "$stage/drivegate"
+    rm -f "$DIST"/drivegate_*_"$architecture".deb
     [ "$architecture" != amd64 ] || variant=(--variant amd64)
     cargo deb --quiet --locked --no-build --no-strip --target "$(rust_target "$architecture")" "${variant[@]}" \
         --deb-version "$(debian_version)" --output "$DIST/drivegate_$(debian_version)_$architecture.deb"

@@ -25,7 +25,7 @@ for architecture; do
         --build-context "build=$tree" --build-arg "VERSION=$(version)" --build-arg "DRIVEGATE_COMMIT=$(commit)" \
         --build-arg "SOURCE=$source" --file "$tree/Dockerfile" --tag "$name" "$tree" >/dev/null
     archive=$DIST/drivegate_$(version)_image_$architecture.tar
-    rm -f "$archive"
+    rm -f "$DIST"/drivegate_*_image_"$architecture".tar
     buildah push --quiet "$name" "docker-archive:$archive:drivegate:$(version)"
     buildah rmi --force "$name" >/dev/null
 done

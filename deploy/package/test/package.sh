@@ -12,6 +12,8 @@ work=$PWD/target/package
 base=$work/root-base
 root=$work/root
 
+lintian --fail-on error,warning --allow-root "$package"
+
 # Boots in a minute; unpacked once.
 if [ ! -e "$base/complete" ]; then
     rm -rf "$base"
