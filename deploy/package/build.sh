@@ -25,14 +25,14 @@ case $linkage in
     static)
         flags+=" -C target-feature=+crt-static"
         build=(build --target "$target")
+        # Debian's cross compilers, which bring a static glibc.
+        [ "$(uname -m)" = x86_64 ] || export CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER=x86_64-linux-gnu-gcc
+        export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
+        export CARGO_TARGET_ARMV7_UNKNOWN_LINUX_GNUEABIHF_LINKER=arm-linux-gnueabihf-gcc
         ;;
     *) fail "unknown linkage \"$linkage\"" "second argument" "dynamic or static" ;;
 esac
 
-# The cross compilers of Debian link the static binaries of ARM; zig links the dynamic ones.
-[ "$(uname -m)" = x86_64 ] || export CARGO_TARGET_X86_64_UNKNOWN_LINUX_GNU_LINKER=x86_64-linux-gnu-gcc
-export CARGO_TARGET_AARCH64_UNKNOWN_LINUX_GNU_LINKER=aarch64-linux-gnu-gcc
-export CARGO_TARGET_ARMV7_UNKNOWN_LINUX_GNUEABIHF_LINKER=arm-linux-gnueabihf-gcc
 export CARGO_INCREMENTAL=0 RUSTFLAGS=$flags
 export CFLAGS="-ffile-prefix-map=${CARGO_HOME:-$HOME/.cargo}=/cargo -ffile-prefix-map=$folder=/target"
 DRIVEGATE_COMMIT=$(commit) cargo "${build[@]}" --release --locked --bin drivegate --target-dir "$folder" >&2

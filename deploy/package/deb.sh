@@ -28,11 +28,11 @@ END
 # The newest version of glibc that the program asks for must be one that the package asks for.
 check_libc() {
     local program=$1 architecture=$2 asked
-    asked=$(objdump --dynamic-syms "$program" | grep -o 'GLIBC_[0-9.]*' | sort -uV | tail -1)
+    asked=$(readelf --version-info --wide "$program" | grep -o 'GLIBC_[0-9.]*' | sort -uV | tail -1)
     [ "$(printf '%s\n' "GLIBC_$(libc_version "$architecture")" "$asked" | sort -V | tail -1)" = "GLIBC_$(libc_version "$architecture")" ] ||
         fail "the program needs $asked" "$program" "it must run with glibc $(libc_version "$architecture"); build it with build.sh"
     local libraries
-    libraries=$(objdump --private-headers "$program" | sed -n 's/^ *NEEDED *//p' | grep -Ev '^(libc|libm|libpthread|libdl|librt|libutil|ld-linux.*)\.so' || true)
+    libraries=$(readelf --dynamic "$program" | sed -n 's/.*(NEEDED).*\[\(.*\)\]/\1/p' | grep -Ev '^(libc|libm|libpthread|libdl|librt|libutil|ld-linux.*)\.so' || true)
     [ -z "$libraries" ] || fail "the program needs $libraries" "$program" "the package depends on libc6 only"
 }
 

@@ -10,7 +10,7 @@ needed=(
     "python3 python3"
     "dpkg-deb dpkg"
     "lintian lintian"
-    "objdump binutils"
+    "readelf binutils"
     "debootstrap debootstrap"
     "systemd-nspawn systemd-container"
     "buildah buildah"

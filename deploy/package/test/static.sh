@@ -8,7 +8,7 @@ source deploy/package/common.sh
 [ $# -gt 0 ] || set -- "${ARCHITECTURES[@]}"
 for architecture; do
     program=$(deploy/package/build.sh "$architecture" static)
-    ! objdump --private-headers "$program" | grep -q ' NEEDED ' || fail "not static" "$program" "see build.sh"
+    ! readelf --dynamic "$program" | grep -q '(NEEDED)' || fail "not static" "$program" "see build.sh"
     emulator=()
     if [ "$architecture" != "$(dpkg --print-architecture)" ]; then
         case $architecture in
