@@ -27,5 +27,6 @@ for architecture; do
     archive=$DIST/drivegate_$(version)_image_$architecture.tar
     rm -f "$DIST"/drivegate_*_image_"$architecture".tar
     buildah push --quiet "$name" "docker-archive:$archive:drivegate:$(version)"
+    deploy/package/same_image.py "$archive"
     buildah rmi --force "$name" >/dev/null
 done

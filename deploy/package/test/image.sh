@@ -58,8 +58,7 @@ jq --null-input --arg configuration "$work/configuration" --arg line "$line" --a
     process: {
         user: {uid: 65532, gid: 65532}, cwd: "/", noNewPrivileges: true, env: ["PATH=/"],
         args: ($settings.Entrypoint + $settings.Cmd),
-        capabilities: {bounding: [], effective: [], permitted: []},
-        rlimits: [{type: "RLIMIT_RTPRIO", hard: 10, soft: 10}]
+        capabilities: {bounding: [], effective: [], permitted: []}
     },
     root: {path: "rootfs", readonly: true},
     mounts: [
