@@ -28,7 +28,8 @@ END
 # The newest version of glibc that the program asks for must be one that the package asks for.
 check_libc() {
     local program=$1 architecture=$2 asked
-    asked=$(readelf --version-info --wide "$program" | grep -o 'GLIBC_[0-9.]*' | sort -uV | tail -1)
+    asked=$(readelf --version-info --wide "$program" | grep -o 'GLIBC_[0-9.]*' | sort -uV | tail -1) ||
+        fail "the program names no version of glibc" "$program" "the package is for a dynamic one; build it with build.sh"
     [ "$(printf '%s\n' "GLIBC_$(libc_version "$architecture")" "$asked" | sort -V | tail -1)" = "GLIBC_$(libc_version "$architecture")" ] ||
         fail "the program needs $asked" "$program" "it must run with glibc $(libc_version "$architecture"); build it with build.sh"
     local libraries
