@@ -11,9 +11,10 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
 .PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants fleet interop clean
+.PHONY: package-tools deb image release test-package test-static test-image
 
 help: ## Show this list
-	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 22
 
 build: ## Build the optimised binary, target/release/drivegate
 	commit="$$(git rev-parse --short=12 HEAD 2>/dev/null || true)"; \
@@ -70,6 +71,29 @@ CHECKS ?=
 interop: ## Run the gateway with Home Assistant and Node-RED; installs them, which takes minutes. CHECKS=name runs one
 	tests/interop/run.sh $(CHECKS)
 
+# What ships, in dist/; docs/releasing.md. ARCHITECTURES="amd64" for one of them.
+ARCHITECTURES ?= amd64 arm64 armhf
+package-tools: ## Install what the packages need (apt, PyPI, cargo, rustup); quick when nothing is missing
+	@deploy/package/tools.sh
+
+deb: package-tools ## Build the Debian packages into dist/ for ARCHITECTURES (amd64 arm64 armhf)
+	deploy/package/deb.sh $(ARCHITECTURES)
+
+image: package-tools ## Build the container images into dist/ for ARCHITECTURES
+	deploy/package/image.sh $(ARCHITECTURES)
+
+release: package-tools ## Build all that a release consists of into dist/
+	deploy/package/release.sh $(ARCHITECTURES)
+
+test-package: package-tools ## Install, upgrade, downgrade, remove and purge the package in a booted Debian; wants root
+	machine="$$(dpkg --print-architecture)"; deploy/package/deb.sh "$$machine"; deploy/package/test/package.sh dist/drivegate_*_"$$machine".deb
+
+test-static: package-tools ## Start the static binaries of ARCHITECTURES, ARM under qemu: the demo and one command
+	deploy/package/test/static.sh $(ARCHITECTURES)
+
+test-image: package-tools ## Build the image for this machine and run it by runc; wants root
+	machine="$$(dpkg --print-architecture)"; deploy/package/image.sh "$$machine"; deploy/package/test/image.sh dist/drivegate_*_image_"$$machine".tar
+
 clean: ## Remove everything that was built or installed here
 	cargo clean
-	rm -rf .tools
+	rm -rf .tools dist

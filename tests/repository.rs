@@ -14,5 +14,6 @@ mod repository {
     mod documents;
     mod fuzz_seeds;
     mod layering;
+    mod packages;
     mod packaging;
 }

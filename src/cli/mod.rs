@@ -117,6 +117,12 @@ struct ConfigFile {
     path: PathBuf,
 }
 
+/// The whole command line, from which manual pages and completions are made.
+#[must_use]
+pub fn command_line() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
 /// Runs the command of the command line and returns its exit code.
 pub fn main() -> ExitCode {
     Cli::parse().command.run()

@@ -285,7 +285,7 @@ fn the_image_is_small_and_not_root() {
     assert!(last.contains("CMD [\"run\", \"--config\", \"/etc/drivegate/drivegate.toml\"]"));
     // What the build needs is let in.
     let ignored = read(".dockerignore");
-    for needed in ["Cargo.toml", "Cargo.lock", "src", "profiles"] {
+    for needed in ["Cargo.toml", "Cargo.lock", "src", "profiles", "deploy/package"] {
         assert!(ignored.lines().any(|line| line == format!("!{needed}")), "{needed}");
     }
 }
@@ -294,8 +294,9 @@ fn the_image_is_small_and_not_root() {
 fn the_local_socket_has_its_directory() {
     assert!(read("systemd/drivegate.service").contains("\nRuntimeDirectory=drivegate\n"));
     let image = read("deploy/Dockerfile");
-    let owned = image.lines().find(|line| line.contains("chown 65532:65532")).unwrap();
-    assert!(owned.contains("/image/run/drivegate"), "{owned}");
+    assert!(image.contains("\nCOPY --from=build --chown=65532:65532 /tree/owned/ /\n"));
+    let tree = read("deploy/package/image-tree.sh");
+    assert!(tree.contains("\"$folder\"/owned/{var/lib,run}/drivegate\n"));
     let service = &yaml("deploy/compose.yaml")["services"]["drivegate"];
     assert_eq!(service["read_only"], true);
     let writable = service["tmpfs"][0].as_str().unwrap();
