@@ -10,7 +10,7 @@ export PATH := $(CURDIR)/.tools/venv/bin:$(CURDIR)/.tools/bin:$(PATH):/usr/sbin:
 
 # The steps share cargo's lock and the machine's cores; side by side they only disturb the tests that measure time.
 .NOTPARALLEL:
-.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants clean
+.PHONY: help build test tools lint fmt deny advisories bench fuzz check world mutants soak clean
 
 help: ## Show this list
 	@sed -n 's/^\([a-z]*\):.*## \(.*\)/  make \1	\2/p' $(MAKEFILE_LIST) | expand -t 20
@@ -61,6 +61,10 @@ world: ## Run SEEDS new worlds, or with WORLD_SEED=n that one with its history
 ONLY ?=
 mutants: ## Put faults into the core on purpose; the seeded world must find each. ONLY=name runs one
 	tests/world/mutants.py $(ONLY)
+
+HOURS ?= 2
+soak: build tools ## Run the gateway for HOURS under faults, floods and hostile clients, with its figures checked every minute
+	tests/soak/soak.py --hours $(HOURS)
 
 clean: ## Remove everything that was built or installed here
 	cargo clean

@@ -185,7 +185,7 @@ impl Worker {
         while !self.stopping() {
             let spec = &self.handle.image.spec;
             let go_on = || !self.stopping();
-            match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
+            match Line::open_by(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
                 Ok((line, warnings)) => {
                     for warning in warnings {
                         tracing::warn!(bus = %spec.name, "{warning}");

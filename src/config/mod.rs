@@ -8,6 +8,7 @@ mod drive;
 mod files;
 mod key;
 mod keys;
+mod line;
 mod log;
 mod modbus_tcp;
 mod mqtt;

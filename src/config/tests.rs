@@ -121,7 +121,7 @@ buffer = { dir = "spool", max_bytes = "1MiB" }
         line.options.silence,
         crate::codec::wire::Silence::Fixed(Duration::from_millis(3))
     );
-    assert_eq!(line.options.rs485, crate::line::Rs485::KernelInverted);
+    assert_eq!(line.options.line.rs485, crate::line::Rs485::KernelInverted);
     let drive = &line.drives[0];
     assert_eq!(
         (drive.unit, drive.bus.as_str(), drive.access),
