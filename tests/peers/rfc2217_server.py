@@ -23,7 +23,11 @@ class Connection:
 
 
 class Port(serial.Serial):
-    """A port that tells which levels were set: a pseudo-terminal has no control lines."""
+    """A pseudo-terminal, which has neither formats nor control lines: the settings are kept as they were given."""
+
+    def _reconfigure_port(self, force_update=False):
+        if force_update:
+            super()._reconfigure_port(force_update)
 
     def _update_dtr_state(self):
         print("DTR", "on" if self._dtr_state else "off", flush=True)
