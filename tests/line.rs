@@ -12,6 +12,7 @@ mod support;
 mod line {
     mod n2;
     mod port;
+    mod rfc2217;
     mod rig;
     mod serial;
     mod sim_peers;

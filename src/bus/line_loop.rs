@@ -195,7 +195,7 @@ impl Worker {
             let go_on = || !self.stopping();
             // Before the try, so that nothing is missed after it.
             let watching = Arrival::of(&spec.port);
-            let arrival = match Line::open_by(&mut names, &spec.port, &spec.format, self.options.rs485, &go_on) {
+            let arrival = match Line::open_by(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
                 Ok((line, warnings)) => {
                     drop(watching);
                     for warning in warnings {

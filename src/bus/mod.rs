@@ -38,7 +38,7 @@ pub use line_loop::BusTask;
 use std::time::Duration;
 
 use crate::codec::wire::Silence;
-use crate::line::Rs485;
+use crate::line::LineOptions;
 
 /// How a bus treats its line, beside what [`crate::process_image::BusSpec`] says.
 #[derive(Debug, Clone, PartialEq)]
@@ -49,6 +49,6 @@ pub struct BusOptions {
     pub retries: u32,
     /// Silence before each request.
     pub silence: Silence,
-    /// Who switches the direction.
-    pub rs485: Rs485,
+    /// How the port is set up and waited for.
+    pub line: LineOptions,
 }

@@ -21,7 +21,7 @@ use crate::config;
 use crate::document::Finding;
 use crate::drive::profile::Profiles;
 use crate::drive::{Probe, identify};
-use crate::line::{Line, Rs485};
+use crate::line::{Line, LineOptions};
 
 /// Bauds tried by default: the factory settings of the drives of the built-in profiles.
 const USUAL_BAUDS: [u32; 3] = [9600, 19_200, 38_400];
@@ -37,7 +37,7 @@ const ALL_BAUDS: [u32; 10] = [9600, 19_200, 38_400, 57_600, 115_200, 4800, 2400,
 Once a drive has answered, no other settings are tried, unless --exhaustive.
 The configuration goes to standard output, everything else to standard error.")]
 pub(super) struct Args {
-    /// Serial device, or tcp://host:port of a device server.
+    /// Serial device, or rfc2217://host:port or tcp://host:port of a device server.
     #[arg(long, value_name = "PORT", value_parser = parse_port)]
     port: String,
     /// Protocols: modbus-rtu, modbus-ascii, n2, or all.
@@ -247,7 +247,8 @@ impl Scan<'_> {
 
     fn one(&mut self, setting: Setting) -> Result<(), String> {
         let Setting { protocol, format } = setting;
-        let (line, _) = Line::open(&self.args.port, &format, Rs485::Off).map_err(|error| error.to_string())?;
+        let (line, _) =
+            Line::open(&self.args.port, &format, &LineOptions::default()).map_err(|error| error.to_string())?;
         let silence = protocol.silence(Silence::Spec, &format);
         let timeout = self.args.timeout.unwrap_or(protocol.usual_timeout());
         let mut prober = Prober::new(&line, protocol, format, silence, timeout);
@@ -450,7 +451,7 @@ mod tests {
             ("--port tcp://foo", "write \"tcp://host:port\""),
             (
                 "--port udp://foo:1",
-                "write the path of a serial device or \"tcp://host:port\"",
+                "write the path of a serial device, \"tcp://host:port\" or \"rfc2217://host:port\"",
             ),
             (
                 "--timeout 5",

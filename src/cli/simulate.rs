@@ -133,8 +133,13 @@ pub(super) enum Speed {
 /// The endpoint that stands in for a bus's `port`: a link in the place of the device, or a listener.
 ///
 /// # Errors
-/// A `tcp://` address that is not an address to listen on.
+/// A `tcp://` address that is not an address to listen on; `rfc2217://`, which is not simulated.
 fn endpoint_for(port: &str) -> Result<EndpointOptions, String> {
+    if port.starts_with("rfc2217://") {
+        return Err(format!(
+            "`{port}` cannot be simulated; write it as tcp://127.0.0.1:4001, or as a path"
+        ));
+    }
     let Some(address) = port.strip_prefix("tcp://") else {
         return Ok(EndpointOptions::Pty {
             link: Some(PathBuf::from(port)),

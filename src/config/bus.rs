@@ -5,13 +5,12 @@ use std::time::Duration;
 
 use super::drive::{self, Surroundings};
 use super::keys::BUS;
-use super::{BusSettings, values};
+use super::{BusSettings, line, values};
 use crate::bus::BusOptions;
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
 use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
-use crate::line::Rs485;
 use crate::process_image::{BusSpec, DriveSpec};
 
 /// A longer `response_timeout` causes a warning.
@@ -98,7 +97,7 @@ fn read_options(
         response_timeout: BUS.response_timeout.written(reader).unwrap_or(protocol.usual_timeout()),
         retries: BUS.retries.written(reader).unwrap_or(default_retries(protocol)),
         silence: read_silence(reader, protocol, format),
-        rs485: BUS.rs485.get(reader),
+        line: line::read(reader, port),
     };
     if options.response_timeout > LONG_TIMEOUT {
         let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
@@ -110,33 +109,25 @@ fn read_options(
             ),
         );
     }
-    let device_server = port.is_some_and(|p| p.starts_with("tcp://"));
-    if device_server && options.rs485 != Rs485::Off {
-        reader.warning(
-            BUS.rs485.name,
-            "a device server (tcp://) switches the direction itself",
-            "write \"off\" or leave the key out",
-        );
-    }
     options
 }
 
-/// Path of a device, relative to the directory of the file, or `tcp://host:port`.
+/// Path of a device, relative to the directory of the file, or `tcp://host:port` or `rfc2217://host:port`.
 ///
 /// # Errors
 /// The text is neither.
 pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
     match text.split_once("://") {
-        Some(("tcp", server)) => match values::host_port(server, None) {
+        Some((scheme @ ("tcp" | "rfc2217"), server)) => match values::host_port(server, None) {
             Some(_) => Ok(text.to_string()),
             None => Err(Finding::new(
                 format!("`{text}` is not the address of a device server"),
-                "write \"tcp://host:port\"",
+                format!("write \"{scheme}://host:port\""),
             )),
         },
         Some((scheme, _)) => Err(Finding::new(
             format!("`{scheme}://` is not a kind of port"),
-            "write the path of a serial device or \"tcp://host:port\"",
+            "write the path of a serial device, \"tcp://host:port\" or \"rfc2217://host:port\"",
         )),
         None if text.is_empty() || text.contains('\0') => Err(Finding::new(
             "the port has no path",

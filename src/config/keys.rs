@@ -17,7 +17,7 @@ use super::mqtt::TelemetryTopic;
 use super::{bus, modbus_tcp, mqtt, north, recordings, values};
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
-use crate::line::Rs485;
+use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
 use crate::process_image::{Access, LeaseAction, OnShutdown};
@@ -81,6 +81,8 @@ pub(super) const RESPONSE_TIMEOUT: Capped = Capped {
     why: "is longer than any drive takes to begin its reply",
     until: "0.2",
 };
+/// Range of the delays of RS-485 by the kernel, in whole milliseconds.
+const RTS_DELAYS: Time = Time(Duration::ZERO..=MOST_RTS_DELAY);
 /// Range of `idle_timeout`.
 pub(super) const IDLE: Time = Time(Duration::from_secs(1)..=Duration::from_secs(7 * 86_400));
 /// Most that `frequency_range` may contain, Hz.
@@ -99,6 +101,8 @@ pub(super) const PROTOCOLS: Words<Protocol> = Words(&[
     (Protocol::ModbusAscii.name(), Protocol::ModbusAscii),
     (Protocol::N2.name(), Protocol::N2),
 ]);
+/// Levels of RTS and DTR.
+const LEVELS: Words<Level> = Words(&[("driver", Level::Driver), ("on", Level::On), ("off", Level::Off)]);
 /// The actions that are words.
 pub(super) const ACTIONS: Words<LeaseAction> = Words(&[("stop", LeaseAction::Stop), ("hold", LeaseAction::Hold)]);
 pub(super) const ROLES: Words<Role> = Words(&[("monitor", Role::Monitor), ("control", Role::Control)]);
@@ -189,9 +193,10 @@ keys! {
         /// Name of the bus, unique; metric label, MQTT topic.
         name: String = Name("-_"), required;
         /// Serial port, preferably by its persistent name under `/dev/serial/by-id`; or a device server that passes
-        /// bytes through unchanged (raw serial over TCP, not Modbus TCP). A host name is resolved each time the port is
+        /// bytes through unchanged (`tcp://`: raw serial over TCP, not Modbus TCP), or one whose port drivegate sets up with `baud`
+        /// and `format` (`rfc2217://`: telnet with RFC 2217). A host name is resolved each time the port is
         /// opened; if that fails, the last known addresses are used. Each port belongs to one bus.
-        port: String = Text("", "a path, or \"tcp://host:port\""), required;
+        port: String = Text("", "a path, \"tcp://host:port\" or \"rfc2217://host:port\""), required;
         /// Protocol of the drives; every drive's profile must support it.
         protocol: Protocol = PROTOCOLS, default "modbus-rtu";
         /// Bits per second. N2 always uses 9600 8N1; a rate that the profile does not list causes a warning.
@@ -206,6 +211,24 @@ keys! {
         rs485: Rs485 = Words(&[
             ("off", Rs485::Off), ("kernel", Rs485::Kernel), ("kernel-inverted", Rs485::KernelInverted),
         ]), default "off";
+        /// With `rs485 = "kernel"`: time between switching to sending and the first bit, in whole milliseconds. What the driver
+        /// does not take is logged when the port is opened; so for the three keys below.
+        rts_before_send: Duration = RTS_DELAYS, default "0ms";
+        /// With `rs485 = "kernel"`: time between the last bit and switching back. The drive's reply may begin 3.5 characters after the
+        /// request; what comes before the line is switched back is lost.
+        rts_after_send: Duration = RTS_DELAYS, default "0ms";
+        /// With `rs485 = "kernel"`: whether the port receives what it sends. Only for drivers that receive nothing otherwise.
+        rx_during_tx: bool = Flag, default false;
+        /// With `rs485 = "kernel"`: whether the driver switches the terminating resistor of the board on.
+        termination: bool = Flag, default false;
+        /// Level of RTS, for adapters that are powered or enabled by it; also with `rfc2217://`. `"driver"`: on, as Linux leaves
+        /// it. Not with `rs485 = "kernel"`.
+        rts: Level = LEVELS, default "driver";
+        /// Level of DTR, likewise.
+        dtr: Level = LEVELS, default "driver";
+        /// Whether the last 0.01 to 0.12 ms of a short wait are spent watching the clock, so that requests leave on time. `"auto"`: on
+        /// a machine with more than one processor. `"off"` saves processor time on small boxes; requests leave up to 0.1 ms later.
+        spin: Spin = Words(&[("auto", Spin::Auto), ("on", Spin::On), ("off", Spin::Off)]), default "auto";
         /// Target poll cycle of process data (poll class fast). If the line cannot carry it, cycles follow one another
         /// without a pause; `check` warns about this.
         cycle: Duration = TIMES, default "10ms";

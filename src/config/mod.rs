@@ -9,6 +9,7 @@ mod drive;
 mod files;
 mod key;
 mod keys;
+mod line;
 mod log;
 mod modbus_tcp;
 mod mqtt;

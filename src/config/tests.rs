@@ -76,6 +76,12 @@ port = "ttyS0"
 baud = 38400
 format = "8E1"
 rs485 = "kernel-inverted"
+rts_before_send = "1ms"
+rts_after_send = "2ms"
+rx_during_tx = true
+termination = true
+dtr = "off"
+spin = "off"
 cycle = "20ms"
 slow_cycle = "2s"
 response_timeout = "50ms"
@@ -93,7 +99,7 @@ turnaround = "0.5ms"
 frequency_range = [10, 50]
 [[bus]]
 name = "line2"
-port = "tcp://10.0.0.9:4001"
+port = "rfc2217://10.0.0.9:4001"
 [[bus.drive]]
 name = "fan"
 address = 7
@@ -123,7 +129,17 @@ sparkplug = { group = "plant", primary_host = "scada" }
         line.options.silence,
         crate::codec::wire::Silence::Fixed(Duration::from_millis(3))
     );
-    assert_eq!(line.options.rs485, crate::line::Rs485::KernelInverted);
+    let options = crate::line::LineOptions {
+        rs485: crate::line::Rs485::KernelInverted,
+        rts_before_send: Duration::from_millis(1),
+        rts_after_send: Duration::from_millis(2),
+        rx_during_tx: true,
+        termination: true,
+        rts: crate::line::Level::Driver,
+        dtr: crate::line::Level::Off,
+        spin: crate::line::Spin::Off,
+    };
+    assert_eq!(line.options.line, options);
     let drive = &line.drives[0];
     assert_eq!(
         (drive.unit, drive.bus.as_str(), drive.access),
@@ -145,7 +161,8 @@ sparkplug = { group = "plant", primary_host = "scada" }
         (fan.unit, fan.access, fan.turnaround),
         (8, Access::Monitor, fan.profile.turnaround)
     );
-    assert_eq!(all.buses[1].spec.port, "tcp://10.0.0.9:4001");
+    assert_eq!(all.buses[1].spec.port, "rfc2217://10.0.0.9:4001");
+    assert_eq!(all.buses[1].options.line, crate::line::LineOptions::default());
     let modbus = all.modbus_tcp.as_ref().unwrap();
     assert_eq!(
         modbus.listeners[0]

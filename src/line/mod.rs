@@ -1,5 +1,5 @@
-//! The half-duplex wire: a serial port or a raw serial-over-TCP device server, opened exclusively, with waits
-//! precise to tens of microseconds.
+//! The half-duplex wire: a serial port or a device server (raw serial over TCP, or RFC 2217), opened exclusively, with
+//! waits precise to tens of microseconds.
 //!
 //! The port is opened through tokio-serial's builder and then driven by the bus's own thread with `ppoll`: the timer
 //! of an async runtime ticks at a millisecond, which is longer than the silence of a frame at 38400 baud.
@@ -7,17 +7,24 @@
 mod arrival;
 mod clock;
 mod names;
+mod options;
+mod remote;
+mod rfc2217;
+mod rs485;
 mod sys;
 
 pub use arrival::Arrival;
 use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 pub use names::Names;
+pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
+use remote::{Raw, Remote};
 
 use std::cell::Cell;
 use std::fmt;
 use std::io;
 use std::net::TcpStream;
+use std::num::NonZeroUsize;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::time::{Duration, Instant};
 
@@ -31,18 +38,6 @@ use crate::codec::{LineFormat, Parity};
 const CONNECT_TIMEOUT: Duration = Duration::from_millis(800);
 /// A connection whose other end has not taken a request for that time is lost.
 const UNACKNOWLEDGED: Duration = Duration::from_secs(5);
-
-/// Who switches the direction of an RS-485 line.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub enum Rs485 {
-    /// The adapter itself.
-    #[default]
-    Off,
-    /// The kernel, RTS high while sending.
-    Kernel,
-    /// The kernel, RTS low while sending.
-    KernelInverted,
-}
 
 /// The port cannot be opened: the bus tries again with back-off.
 #[derive(Debug, thiserror::Error)]
@@ -62,6 +57,14 @@ pub enum OpenError {
         port: String,
         /// What the system says.
         reason: io::Error,
+    },
+    /// The device server is there, but cannot set up its port.
+    #[error("cannot use {port}: {reason}")]
+    Remote {
+        /// Address.
+        port: String,
+        /// Why, and what to do.
+        reason: String,
     },
     /// The kernel cannot switch the direction of this port.
     #[error("{port}: the driver cannot switch RS-485 direction ({reason}); set rs485 = \"off\" or use another adapter")]
@@ -90,8 +93,9 @@ pub enum Woken {
 }
 
 enum Port {
-    Serial(OwnedFd),
-    Tcp(TcpStream),
+    Serial(Exclusive),
+    Tcp(Raw),
+    Rfc2217(Remote),
 }
 
 impl fmt::Debug for Port {
@@ -99,6 +103,7 @@ impl fmt::Debug for Port {
         f.write_str(match self {
             Port::Serial(_) => "Serial",
             Port::Tcp(_) => "Tcp",
+            Port::Rfc2217(_) => "Rfc2217",
         })
     }
 }
@@ -108,6 +113,8 @@ impl fmt::Debug for Port {
 pub struct Line {
     port: Port,
     wake_ups: Cell<WakeUps>,
+    /// Whether the end of a precise wait is spun.
+    spins: bool,
 }
 
 impl Line {
@@ -115,8 +122,8 @@ impl Line {
     ///
     /// # Errors
     /// When the port cannot be opened or cannot do what is asked of it.
-    pub fn open(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, Vec<String>), OpenError> {
-        Line::open_by(&mut Names::default(), port, format, rs485, &|| true)
+    pub fn open(port: &str, format: &LineFormat, options: &LineOptions) -> Result<(Line, Vec<String>), OpenError> {
+        Line::open_by(&mut Names::default(), port, format, options, &|| true)
     }
 
     /// As [`Line::open`], for whoever opens the same port again and again: `names` remembers the addresses of a device
@@ -128,24 +135,47 @@ impl Line {
         names: &mut Names,
         port: &str,
         format: &LineFormat,
-        rs485: Rs485,
+        options: &LineOptions,
         go_on: &dyn Fn() -> bool,
     ) -> Result<(Line, Vec<String>), OpenError> {
-        match port.strip_prefix("tcp://") {
-            Some(address) => open_tcp(names, port, address, go_on).map(|port| (Line::new(port), Vec::new())),
-            None => open_serial(port, format, rs485),
+        let (opened, warnings) = match port.split_once("://") {
+            Some(("tcp", address)) => {
+                let stream = connect(names, port, address, go_on)?;
+                (Port::Tcp(Raw::new(stream)), Vec::new())
+            }
+            Some(("rfc2217", address)) => {
+                let stream = connect(names, port, address, go_on)?;
+                let LineOptions { rts, dtr, .. } = *options;
+                let settings = rfc2217::Settings {
+                    format: *format,
+                    rts,
+                    dtr,
+                };
+                let (remote, warnings) = Remote::open(stream, port, settings, go_on)?;
+                (Port::Rfc2217(remote), warnings)
+            }
+            _ => {
+                let (fd, warnings) = open_serial(port, format, options)?;
+                (Port::Serial(fd), warnings)
+            }
+        };
+        let processors = std::thread::available_parallelism().map_or(1, NonZeroUsize::get);
+        let line = Line {
+            port: opened,
+            wake_ups: Cell::new(WakeUps::new()),
+            spins: options.spin.holds(processors),
+        };
+        if matches!(line.port, Port::Serial(_)) {
+            line.clear();
         }
-    }
-
-    fn new(port: Port) -> Line {
-        let wake_ups = Cell::new(WakeUps::new());
-        Line { port, wake_ups }
+        Ok((line, warnings))
     }
 
     fn fd(&self) -> BorrowedFd<'_> {
         match &self.port {
             Port::Serial(fd) => fd.as_fd(),
-            Port::Tcp(stream) => stream.as_fd(),
+            Port::Tcp(raw) => raw.stream.as_fd(),
+            Port::Rfc2217(remote) => remote.stream.as_fd(),
         }
     }
 
@@ -153,44 +183,36 @@ impl Line {
     ///
     /// # Errors
     /// When the port is gone or does not take the frame within 100 ms.
-    pub fn send(&self, mut frame: &[u8]) -> Result<(), Lost> {
-        let deadline = Instant::now() + Duration::from_millis(100);
-        while !frame.is_empty() {
-            match rustix::io::write(self.fd(), frame) {
-                Ok(taken) => frame = frame.get(taken..).unwrap_or_default(),
-                Err(rustix::io::Errno::INTR) => {}
-                Err(rustix::io::Errno::AGAIN) => {
-                    if Instant::now() >= deadline {
-                        return Err(Lost("it takes no more bytes".to_string()));
-                    }
-                    let mut fds = [PollFd::from_borrowed_fd(self.fd(), PollFlags::OUT)];
-                    poll_port(&mut fds, deadline)?;
-                }
-                Err(error) => return Err(Lost(error.to_string())),
-            }
+    pub fn send(&self, frame: &[u8]) -> Result<(), Lost> {
+        match &self.port {
+            Port::Serial(_) | Port::Tcp(_) => write_all(self.fd(), frame),
+            Port::Rfc2217(remote) => remote.send(frame),
         }
-        Ok(())
     }
 
     /// Reads what is there, without waiting; 0 is nothing.
     ///
     /// # Errors
-    /// When the port is gone (an unplugged adapter reads end of file or EIO).
+    /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be a telnet port.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
-        match rustix::io::read(self.fd(), buffer) {
-            Ok(0) => Err(Lost("it reads end of file".to_string())),
-            Ok(count) => Ok(count),
-            Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
-            Err(error) => Err(Lost(error.to_string())),
+        match &self.port {
+            Port::Serial(fd) => read(fd.as_fd(), buffer),
+            Port::Tcp(raw) => {
+                let count = read(raw.stream.as_fd(), buffer)?;
+                raw.look_at(buffer.get(..count).unwrap_or_default())?;
+                Ok(count)
+            }
+            Port::Rfc2217(remote) => remote.receive(buffer),
         }
     }
 
     /// Waits for bytes, for a command where `wake` is given, or for the time. The end of the wait is met to some ten
-    /// microseconds when `precise`.
+    /// microseconds when `precise`, unless the line does not spin.
     ///
     /// # Errors
     /// When the system refuses to wait, which only a closed descriptor can cause.
     pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>, precise: bool) -> Result<Woken, Lost> {
+        let precise = precise && self.spins;
         let spin = if precise {
             self.wake_ups.get().spin()
         } else {
@@ -224,6 +246,55 @@ impl Line {
     }
 }
 
+/// A serial port that was opened exclusively.
+struct Exclusive(OwnedFd);
+
+impl AsFd for Exclusive {
+    fn as_fd(&self) -> BorrowedFd<'_> {
+        self.0.as_fd()
+    }
+}
+
+impl Drop for Exclusive {
+    /// The kernel keeps the exclusive mode of a port until its last descriptor is closed and all is sent; until then whoever
+    /// opens it anew is told that it is busy.
+    fn drop(&mut self) {
+        if let Err(error) = rustix::termios::ioctl_tiocnxcl(&self.0) {
+            // An adapter that was unplugged.
+            tracing::debug!("the exclusive mode of the port is not taken back: {error}");
+        }
+    }
+}
+
+/// Gives all bytes to a port that does not block.
+fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
+    let deadline = Instant::now() + Duration::from_millis(100);
+    while !bytes.is_empty() {
+        match rustix::io::write(port, bytes) {
+            Ok(taken) => bytes = bytes.get(taken..).unwrap_or_default(),
+            Err(rustix::io::Errno::INTR) => {}
+            Err(rustix::io::Errno::AGAIN) => {
+                if Instant::now() >= deadline {
+                    return Err(Lost("it takes no more bytes".to_string()));
+                }
+                poll_port(&mut [PollFd::from_borrowed_fd(port, PollFlags::OUT)], deadline)?;
+            }
+            Err(error) => return Err(Lost(error.to_string())),
+        }
+    }
+    Ok(())
+}
+
+/// Reads what is there; 0 is nothing.
+fn read(port: BorrowedFd<'_>, buffer: &mut [u8]) -> Result<usize, Lost> {
+    match rustix::io::read(port, buffer) {
+        Ok(0) => Err(Lost("it reads end of file".to_string())),
+        Ok(count) => Ok(count),
+        Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
+        Err(error) => Err(Lost(error.to_string())),
+    }
+}
+
 /// Waits for a command, for the time, or for the device, with no port to listen to; whether the device may have come.
 pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>, arrival: Option<&Arrival>) -> bool {
     let readable = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
@@ -239,7 +310,7 @@ fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {
     poll_until(fds, until).map_err(|error| Lost(error.to_string()))
 }
 
-fn open_tcp(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bool) -> Result<Port, OpenError> {
+fn connect(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bool) -> Result<TcpStream, OpenError> {
     let failed = |reason| OpenError::Tcp {
         port: port.to_string(),
         reason,
@@ -256,7 +327,7 @@ fn open_tcp(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bo
                 let patience = rustix::net::sockopt::set_tcp_user_timeout(&stream, UNACKNOWLEDGED.as_millis() as u32);
                 patience.map_err(|error| failed(error.into()))?;
                 stream.set_nonblocking(true).map_err(failed)?;
-                return Ok(Port::Tcp(stream));
+                return Ok(stream);
             }
             Err(error) => last = error,
         }
@@ -264,7 +335,7 @@ fn open_tcp(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bo
     Err(failed(last))
 }
 
-fn open_serial(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, Vec<String>), OpenError> {
+fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result<(Exclusive, Vec<String>), OpenError> {
     let parity = match format.parity {
         Parity::None => SerialParity::None,
         Parity::Even => SerialParity::Even,
@@ -289,19 +360,30 @@ fn open_serial(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, V
             port: port.to_string(),
             reason: explain(&error),
         })?;
-    let fd = sys::own(tty);
+    let fd = Exclusive(sys::own(tty));
     let serial = |reason: io::Error| OpenError::Serial {
         port: port.to_string(),
         reason: reason.to_string(),
     };
     rustix::fs::fcntl_setfl(&fd, rustix::fs::OFlags::NONBLOCK).map_err(|e| serial(e.into()))?;
     let mut warnings = Vec::new();
-    if rs485 != Rs485::Off {
-        sys::enable_rs485(&fd, rs485 == Rs485::KernelInverted).map_err(|e| OpenError::Rs485 {
-            port: port.to_string(),
-            reason: e.into(),
-        })?;
+    if options.rs485 != Rs485::Off {
+        let differences =
+            rs485::enable(options, |request| sys::set_rs485(&fd, request)).map_err(|reason| OpenError::Rs485 {
+                port: port.to_string(),
+                reason,
+            })?;
+        if !differences.is_empty() {
+            warnings.push(format!(
+                "{port}: the driver does not do all of RS-485 as configured: {}",
+                differences.join("; ")
+            ));
+        }
     }
+    sys::set_levels(&fd, options.rts, options.dtr).map_err(|error| OpenError::Serial {
+        port: port.to_string(),
+        reason: format!("the driver cannot set RTS and DTR ({error}); leave `rts` and `dtr` out"),
+    })?;
     if let Err(error) = sys::low_latency(&fd) {
         tracing::debug!(port, "no low-latency mode: {error}");
     }
@@ -310,9 +392,7 @@ fn open_serial(port: &str, format: &LineFormat, rs485: Rs485) -> Result<(Line, V
             "{port} reports {read_back} where {format} was asked for; check that the adapter can do it"
         ));
     }
-    let line = Line::new(Port::Serial(fd));
-    line.clear();
-    Ok((line, warnings))
+    Ok((fd, warnings))
 }
 
 impl Line {
@@ -324,7 +404,7 @@ impl Line {
 }
 
 /// The format that the port says it has.
-fn read_back(fd: &OwnedFd) -> Option<String> {
+fn read_back(fd: &Exclusive) -> Option<String> {
     let modes = tcgetattr(fd).ok()?;
     let data = if modes.control_modes.contains(ControlModes::CS8) {
         8

@@ -4,7 +4,9 @@
 use std::os::fd::{AsFd, FromRawFd, IntoRawFd, OwnedFd};
 
 use rustix::io;
-use rustix::ioctl::{Getter, Opcode, Setter, ioctl};
+use rustix::ioctl::{Getter, Opcode, Setter, Updater, ioctl};
+
+use super::options::Level;
 
 /// `TIOCSRS485` of `linux/serial.h`.
 const TIOCSRS485: Opcode = 0x542F;
@@ -12,19 +14,31 @@ const TIOCSRS485: Opcode = 0x542F;
 const TIOCGSERIAL: Opcode = 0x541E;
 const TIOCSSERIAL: Opcode = 0x541F;
 
-const SER_RS485_ENABLED: u32 = 1 << 0;
-const SER_RS485_RTS_ON_SEND: u32 = 1 << 1;
-const SER_RS485_RTS_AFTER_SEND: u32 = 1 << 2;
+/// `TIOCMBIS` and `TIOCMBIC`: set and clear control lines.
+const TIOCMBIS: Opcode = 0x5416;
+const TIOCMBIC: Opcode = 0x5417;
+
+/// `SER_RS485_ENABLED` and the further bits of the flags.
+pub(super) const ENABLED: u32 = 1 << 0;
+pub(super) const RTS_ON_SEND: u32 = 1 << 1;
+pub(super) const RTS_AFTER_SEND: u32 = 1 << 2;
+pub(super) const RX_DURING_TX: u32 = 1 << 4;
+pub(super) const TERMINATE_BUS: u32 = 1 << 5;
+/// `TIOCM_DTR` and `TIOCM_RTS`.
+const LINE_DTR: i32 = 0x002;
+const LINE_RTS: i32 = 0x004;
 const ASYNC_LOW_LATENCY: i32 = 1 << 13;
 
 /// `struct serial_rs485`.
 #[repr(C)]
-#[derive(Clone, Copy, Default)]
-struct SerialRs485 {
-    flags: u32,
-    delay_rts_before_send: u32,
-    delay_rts_after_send: u32,
-    padding: [u32; 5],
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct SerialRs485 {
+    pub(super) flags: u32,
+    /// Milliseconds.
+    pub(super) delay_rts_before_send: u32,
+    /// Milliseconds.
+    pub(super) delay_rts_after_send: u32,
+    pub(super) padding: [u32; 5],
 }
 
 /// `struct serial_struct`.
@@ -51,22 +65,35 @@ struct SerialStruct {
     iomap_base: usize,
 }
 
-/// Lets the kernel switch the direction: RTS high while sending, or low when `inverted`.
+/// Sets how the driver switches the direction; `config` becomes what it settled on.
 ///
 /// # Errors
 /// ENOTTY where the driver cannot.
-pub(super) fn enable_rs485(port: impl AsFd, inverted: bool) -> io::Result<()> {
-    let rts = if inverted {
-        SER_RS485_RTS_AFTER_SEND
-    } else {
-        SER_RS485_RTS_ON_SEND
+pub(super) fn set_rs485(port: impl AsFd, config: &mut SerialRs485) -> std::io::Result<()> {
+    // SAFETY: the request reads and writes one `struct serial_rs485`, whose layout is that of `linux/serial.h`.
+    unsafe { ioctl(port, Updater::<TIOCSRS485, SerialRs485>::new(config)) }?;
+    Ok(())
+}
+
+/// Sets RTS and DTR where a level is chosen.
+///
+/// # Errors
+/// ENOTTY or EINVAL where the driver cannot.
+pub(super) fn set_levels(port: impl AsFd, rts: Level, dtr: Level) -> std::io::Result<()> {
+    let lines = |wanted| {
+        let of = |level, line| if level == wanted { line } else { 0 };
+        of(rts, LINE_RTS) | of(dtr, LINE_DTR)
     };
-    let config = SerialRs485 {
-        flags: SER_RS485_ENABLED | rts,
-        ..SerialRs485::default()
-    };
-    // SAFETY: the request reads one `struct serial_rs485`, whose layout is that of `linux/serial.h`.
-    unsafe { ioctl(port, Setter::<TIOCSRS485, SerialRs485>::new(config)) }
+    // SAFETY: the requests read one `int`.
+    unsafe {
+        if lines(Level::On) != 0 {
+            ioctl(port.as_fd(), Setter::<TIOCMBIS, i32>::new(lines(Level::On)))?;
+        }
+        if lines(Level::Off) != 0 {
+            ioctl(port.as_fd(), Setter::<TIOCMBIC, i32>::new(lines(Level::Off)))?;
+        }
+    }
+    Ok(())
 }
 
 /// Asks the driver to hand bytes on at once (FTDI holds them for 16 ms by default).

@@ -121,7 +121,7 @@ pub enum TriggerLimit {
 pub struct BusSpec {
     /// Name, unique in the gateway.
     pub name: String,
-    /// Path of the serial port, or `tcp://host:port`.
+    /// Path of the serial port, or `tcp://host:port` or `rfc2217://host:port`.
     pub port: String,
     /// Protocol.
     pub protocol: Protocol,

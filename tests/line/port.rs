@@ -11,29 +11,17 @@ use drivegate::codec::LineFormat;
 use drivegate::command::{Interruption, Outcome};
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::EventKind;
-use drivegate::line::{Line, Rs485};
+use drivegate::line::{Line, LineOptions, Rs485};
 use drivegate::sim::endpoint::EndpointOptions;
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 
-use super::rig::{Rig, Setup};
-
-fn reason(rig: &Rig) -> String {
-    rig.bus.handle().image.health().reason.unwrap_or_default()
-}
+use super::rig::{Rig, Setup, reason, with_port};
 
 fn loopback() -> EndpointOptions {
     EndpointOptions::Tcp {
         listen: SocketAddr::from(([127, 0, 0, 1], 0)),
     }
-}
-
-/// A rig whose bus is to open something else than its line.
-fn with_port(port: &str) -> Rig {
-    Rig::of(Setup {
-        port: Some(port.to_string()),
-        ..Setup::default()
-    })
 }
 
 /// That each is read once more, and not more often, is proved in virtual time.
@@ -295,7 +283,10 @@ async fn no_server_and_no_name() {
 #[tokio::test]
 async fn rs485_by_a_driver_that_cannot() {
     let rig = Rig::of(Setup {
-        rs485: Rs485::Kernel,
+        options: LineOptions {
+            rs485: Rs485::Kernel,
+            ..LineOptions::default()
+        },
         ..Setup::default()
     });
     rig.until("it is tried", |r| !reason(r).is_empty()).await;
@@ -311,7 +302,7 @@ async fn rs485_by_a_driver_that_cannot() {
 fn a_format_that_the_port_does_not_take_is_warned_about() {
     let pty = rustix_pty();
     let even = LineFormat::new(19_200, "8E1").unwrap();
-    let (_line, warnings) = Line::open(&pty.1, &even, Rs485::Off).unwrap();
+    let (_line, warnings) = Line::open(&pty.1, &even, &LineOptions::default()).unwrap();
     assert_eq!(warnings.len(), 1, "{warnings:?}");
     assert!(
         warnings[0].contains("19200 8N1") && warnings[0].contains("19200 8E1"),
@@ -319,14 +310,52 @@ fn a_format_that_the_port_does_not_take_is_warned_about() {
     );
     drop(_line);
     let plain = LineFormat::new(19_200, "8N1").unwrap();
-    assert!(Line::open(&pty.1, &plain, Rs485::Off).unwrap().1.is_empty());
+    assert!(
+        Line::open(&pty.1, &plain, &LineOptions::default())
+            .unwrap()
+            .1
+            .is_empty()
+    );
 }
 
-fn rustix_pty() -> (OwnedFd, String) {
+pub(crate) fn rustix_pty() -> (OwnedFd, String) {
     use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
     let master = openpt(OpenptFlags::RDWR | OpenptFlags::NOCTTY).unwrap();
     grantpt(&master).unwrap();
     unlockpt(&master).unwrap();
     let name = ptsname(&master, Vec::new()).unwrap().to_string_lossy().into_owned();
     (master, name)
+}
+
+/// Opens a port as a user that may not open what another has exclusively; root may.
+fn opens_for_others(path: &str) -> bool {
+    use std::os::unix::process::CommandExt;
+    let mut other = std::process::Command::new("python3");
+    let open = "import os, sys; os.open(sys.argv[1], os.O_RDWR | os.O_NOCTTY)";
+    other.args(["-c", open, path]).stderr(std::process::Stdio::null());
+    if rustix::process::geteuid().is_root() {
+        other.uid(65_534);
+    }
+    other.status().unwrap().success()
+}
+
+#[test]
+fn a_port_that_is_closed_is_free_at_once() {
+    // The other end stays open, as a driver does that still sends: the kernel keeps the exclusive mode as long.
+    let (_master, path) = rustix_pty();
+    std::fs::set_permissions(&path, std::os::unix::fs::PermissionsExt::from_mode(0o666)).unwrap();
+    assert!(opens_for_others(&path));
+    let format = LineFormat::new(19_200, "8N1").unwrap();
+    for _ in 0..2 {
+        let opened = Line::open(&path, &format, &LineOptions::default()).unwrap();
+        assert!(!opens_for_others(&path), "it is exclusive");
+        drop(opened);
+        assert!(opens_for_others(&path), "and free again");
+    }
+    let kernel = LineOptions {
+        rs485: Rs485::Kernel,
+        ..LineOptions::default()
+    };
+    assert!(Line::open(&path, &format, &kernel).is_err());
+    assert!(opens_for_others(&path), "also after a failure");
 }

@@ -10,7 +10,7 @@ use drivegate::command::{Authority, CommandQueue, Order, Origin, Outcome, Source
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::drive::{ModelPoint, State, Value};
 use drivegate::event::Events;
-use drivegate::line::Rs485;
+use drivegate::line::LineOptions;
 use drivegate::plant::{BusHandle, DriveHandle, Plant};
 use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::drive::DriveOptions;
@@ -46,7 +46,7 @@ pub(crate) struct Setup {
     /// Where the simulated line is; the bus opens that, unless `port` says otherwise.
     pub(crate) endpoint: Option<EndpointOptions>,
     pub(crate) port: Option<String>,
-    pub(crate) rs485: Rs485,
+    pub(crate) options: LineOptions,
     pub(crate) response_timeout: Duration,
 }
 
@@ -58,7 +58,7 @@ impl Default for Setup {
             profile: Profiles::built_in().get("vacon-nx").unwrap().clone(),
             endpoint: None,
             port: None,
-            rs485: Rs485::Off,
+            options: LineOptions::default(),
             response_timeout: RESPONSE_TIMEOUT,
         }
     }
@@ -109,7 +109,7 @@ impl Rig {
             response_timeout: setup.response_timeout,
             retries: 1,
             silence: Silence::Spec,
-            rs485: setup.rs485,
+            line: setup.options,
         };
         let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
         let plant = Plant {
@@ -177,4 +177,17 @@ impl Rig {
             .await
             .outcome
     }
+}
+
+/// Why the bus is down.
+pub(crate) fn reason(rig: &Rig) -> String {
+    rig.bus.handle().image.health().reason.unwrap_or_default()
+}
+
+/// A rig whose bus is to open something else than its line.
+pub(crate) fn with_port(port: &str) -> Rig {
+    Rig::of(Setup {
+        port: Some(port.to_string()),
+        ..Setup::default()
+    })
 }

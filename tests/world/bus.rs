@@ -13,7 +13,7 @@ use drivegate::command::{CommandQueue, WriteStats};
 use drivegate::drive::Profile;
 use drivegate::drive::profile::Profiles;
 use drivegate::event::Events;
-use drivegate::line::Rs485;
+use drivegate::line::LineOptions;
 use drivegate::plant::BusHandle;
 use drivegate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec};
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
@@ -129,7 +129,7 @@ impl WorldBus {
             response_timeout: line.response_timeout,
             retries: line.retries,
             silence: parts.silence,
-            rs485: Rs485::Off,
+            line: LineOptions::default(),
         };
         let handle = handle(index, line, &profile, format);
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();

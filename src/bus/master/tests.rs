@@ -12,7 +12,7 @@ use crate::codec::{Exception, LineFormat, Reply, Table};
 use crate::command::{Answer, Authority, Command, CommandQueue, Order, Ticket, admit};
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, PollClass, Value};
-use crate::line::Rs485;
+use crate::line::LineOptions;
 use crate::process_image::{
     Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
 };
@@ -116,7 +116,7 @@ impl Rig {
             response_timeout: Duration::from_millis(100),
             retries: 1,
             silence: Silence::Spec,
-            rs485: Rs485::Off,
+            line: LineOptions::default(),
         };
         let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
         let silence = Duration::from_micros(1750);

@@ -29,7 +29,7 @@ pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Out
             Err(error) => {
                 let reason = format!("cannot connect to {}: {error}", path.display());
                 // A serial port is locked by its owner; with a device server there would be two masters on the line.
-                if target.bus.spec.port.starts_with("tcp://") {
+                if target.bus.spec.port.contains("://") {
                     return Err(format!(
                         "{reason}; bus `{}`; use sudo, or join the group of the socket",
                         target.bus.spec.name

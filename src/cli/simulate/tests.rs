@@ -169,4 +169,5 @@ fn the_endpoint_of_a_configured_bus() {
         Ok(EndpointOptions::Tcp { listen })
     );
     assert!(endpoint_for("tcp://127.0.0.1").is_err());
+    assert!(endpoint_for("rfc2217://127.0.0.1:4001").is_err());
 }

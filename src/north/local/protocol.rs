@@ -131,7 +131,7 @@ impl Expected {
 
 /// The port of a bus, the same from whatever directory and by whatever link it is named.
 pub fn port_of(bus: &BusSpec) -> String {
-    if bus.port.starts_with("tcp://") {
+    if bus.port.contains("://") {
         return bus.port.clone();
     }
     let path = Path::new(&bus.port);

@@ -1,0 +1,268 @@
+//! What a gateway takes of a small box: processor time, wake-ups, memory, and instructions an exchange, with 1 and 4 buses
+//! of a 10 ms cycle and 4 saturated buses.
+//!
+//! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The daemon and
+//! the simulator are processes of their own. Instructions are counted by callgrind in a run of its own, as they do not depend on how busy the
+//! machine is; the processor time of the other runs does. `--program` names another build of the daemon, such as an older one.
+
+mod common;
+
+use std::error::Error;
+use std::fs;
+use std::net::{SocketAddr, TcpListener};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitCode, Stdio};
+use std::time::{Duration, Instant};
+
+use common::gateway::Bus;
+use common::{option, processor_time, scrape};
+
+const PROGRAM: &str = env!("CARGO_BIN_EXE_drivegate");
+
+/// A plant: name, buses, drives of each, baud rate.
+const PLANTS: [(&str, usize, u8, u32); 3] = [
+    ("1 bus, 10 ms", 1, 1, 115_200),
+    ("4 buses, 10 ms", 4, 1, 115_200),
+    ("4 buses, saturated", 4, 10, 38_400),
+];
+
+fn main() -> ExitCode {
+    common::exit(measure())
+}
+
+fn measure() -> Result<(), Box<dyn Error>> {
+    let time = Duration::from_secs_f64(option("--seconds", 20.0)?);
+    let spin: String = option("--spin", "auto".to_string())?;
+    let program: PathBuf = option("--program", PathBuf::from(PROGRAM))?;
+    let counted: String = option("--instructions", "yes".to_string())?;
+    println!(
+        "{}, spin = \"{spin}\", {} s each; processors: {}",
+        std::env::consts::ARCH,
+        time.as_secs_f64(),
+        std::thread::available_parallelism()?
+    );
+    println!(
+        "{:<20} {:>11} {:>12} {:>17} {:>9} {:>23}",
+        "", "exchanges/s", "% of a core", "wake-ups/exchange", "RSS MiB", "instructions/exchange"
+    );
+    for (name, buses, drives, baud) in PLANTS {
+        let plant = Plant {
+            buses,
+            drives,
+            baud,
+            spin: &spin,
+        };
+        let run = native(&program, &plant, time)?;
+        let instructions = match counted.as_str() {
+            "yes" => format!("{:.0}", instructions(&program, &plant, time)?),
+            _ => "not counted".to_string(),
+        };
+        println!(
+            "{name:<20} {:>11.1} {:>12.2} {:>17.2} {:>9.2} {instructions:>23}",
+            run.rate, run.percent, run.wake_ups, run.memory
+        );
+    }
+    Ok(())
+}
+
+struct Plant<'a> {
+    buses: usize,
+    drives: u8,
+    baud: u32,
+    spin: &'a str,
+}
+
+struct Run {
+    rate: f64,
+    percent: f64,
+    wake_ups: f64,
+    memory: f64,
+}
+
+fn native(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<Run, Box<dyn Error>> {
+    let site = Site::start(plant, Command::new(program))?;
+    let process = site.daemon.0.id();
+    std::thread::sleep(Duration::from_secs(3));
+    let before = (
+        site.exchanges()?,
+        processor_time(process)?,
+        switches(process)?,
+        Instant::now(),
+    );
+    std::thread::sleep(time);
+    let after = (
+        site.exchanges()?,
+        processor_time(process)?,
+        switches(process)?,
+        Instant::now(),
+    );
+    let (seconds, exchanges) = ((after.3 - before.3).as_secs_f64(), after.0 - before.0);
+    Ok(Run {
+        rate: exchanges / seconds,
+        percent: 100.0 * (after.1 - before.1) / seconds,
+        wake_ups: (after.2 - before.2) / exchanges,
+        memory: memory(process)?,
+    })
+}
+
+/// Instructions of the daemon for each exchange, counted by callgrind after the start.
+fn instructions(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<f64, Box<dyn Error>> {
+    let directory = tempfile::tempdir()?;
+    let out = directory.path().join("callgrind");
+    let mut command = Command::new("valgrind");
+    command
+        .args(["--tool=callgrind", "--instr-atstart=no", "--fair-sched=yes"])
+        .arg(format!("--callgrind-out-file={}", out.display()))
+        .arg(program);
+    let site = Site::start(plant, command).map_err(|error| format!("{error}; apt install valgrind"))?;
+    let process = site.daemon.0.id().to_string();
+    let control = |arguments: &[&str]| -> Result<(), Box<dyn Error>> {
+        let done = Command::new("callgrind_control")
+            .args(arguments)
+            .arg(&process)
+            .output()?;
+        match done.status.success() {
+            true => Ok(()),
+            false => Err(format!("callgrind_control: {}", String::from_utf8_lossy(&done.stderr)).into()),
+        }
+    };
+    std::thread::sleep(Duration::from_secs(5));
+    let before = site.exchanges()?;
+    control(&["-i", "on"])?;
+    std::thread::sleep(time);
+    control(&["-i", "off"])?;
+    let exchanges = site.exchanges()? - before;
+    control(&["-d"])?;
+    let dump = fs::read_dir(directory.path())?
+        .filter_map(Result::ok)
+        .find(|entry| entry.file_name().to_string_lossy().starts_with("callgrind."))
+        .ok_or("callgrind wrote nothing")?;
+    let text = fs::read_to_string(dump.path())?;
+    let total = text
+        .lines()
+        .find_map(|line| line.strip_prefix("summary: ").or_else(|| line.strip_prefix("totals: ")))
+        .ok_or("callgrind wrote no total")?;
+    Ok(total.trim().parse::<f64>()? / exchanges)
+}
+
+/// A process of this bench; ended when dropped.
+struct Process(Child);
+
+impl Drop for Process {
+    fn drop(&mut self) {
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
+
+/// A simulator and a gateway at work.
+struct Site {
+    daemon: Process,
+    http: SocketAddr,
+    _simulator: Process,
+    _directory: tempfile::TempDir,
+}
+
+impl Site {
+    fn start(plant: &Plant<'_>, mut program: Command) -> Result<Site, Box<dyn Error>> {
+        let directory = tempfile::tempdir()?;
+        let config = directory.path().join("drivegate.toml");
+        let http = TcpListener::bind("127.0.0.1:0")?.local_addr()?;
+        let mut text = format!(
+            "[gateway]\nname = \"bench\"\nstate_dir = \"{0}\"\nsocket = \"{0}/socket\"\n[http]\nlisten = \"{http}\"\n",
+            directory.path().display()
+        );
+        // An older program does not know the key.
+        let spin = match plant.spin {
+            "auto" => String::new(),
+            other => format!("spin = \"{other}\"\n"),
+        };
+        for bus in 1..=plant.buses {
+            let bus = Bus {
+                name: &format!("bus{bus}"),
+                port: &directory.path().join(format!("line{bus}")).display().to_string(),
+                baud: plant.baud,
+                drives: plant.drives,
+                profile: "vacon-nx",
+                keys: &format!("response_timeout = \"1s\"\n{spin}"),
+                drive_keys: "",
+            };
+            text += &bus.toml();
+        }
+        fs::write(&config, text)?;
+        let quiet = |command: &mut Command| {
+            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+            command.spawn().map(Process)
+        };
+        let simulator = quiet(Command::new(PROGRAM).args(["simulate", "--config"]).arg(&config))?;
+        wait("the simulator", || {
+            directory.path().join(format!("line{}", plant.buses)).exists()
+        })?;
+        let daemon = quiet(program.args(["run", "--config"]).arg(&config))?;
+        let site = Site {
+            daemon,
+            http,
+            _simulator: simulator,
+            _directory: directory,
+        };
+        wait("the daemon", || site.ready())?;
+        Ok(site)
+    }
+
+    /// Whether each drive answers.
+    fn ready(&self) -> bool {
+        scrape(self.http).is_ok_and(|text| {
+            let mut drives = text
+                .lines()
+                .filter(|line| line.starts_with("drivegate_drive_up{"))
+                .peekable();
+            drives.peek().is_some() && drives.all(|line| line.ends_with(" 1"))
+        })
+    }
+
+    /// Exchanges so far.
+    fn exchanges(&self) -> Result<f64, Box<dyn Error>> {
+        let text = scrape(self.http)?;
+        let counted = text
+            .lines()
+            .filter(|line| line.starts_with("drivegate_drive_transactions_total{"))
+            .filter_map(|line| line.rsplit(' ').next()?.parse::<f64>().ok());
+        Ok(counted.sum())
+    }
+}
+
+/// How often threads of the process went to sleep so far.
+fn switches(process: u32) -> Result<f64, Box<dyn Error>> {
+    let mut all = 0.0;
+    for thread in fs::read_dir(format!("/proc/{process}/task"))? {
+        let status = fs::read_to_string(thread?.path().join("status"))?;
+        let count = status
+            .lines()
+            .find_map(|line| line.strip_prefix("voluntary_ctxt_switches:"))
+            .ok_or("no voluntary_ctxt_switches")?;
+        all += count.trim().parse::<f64>()?;
+    }
+    Ok(all)
+}
+
+/// Resident memory, MiB.
+fn memory(process: u32) -> Result<f64, Box<dyn Error>> {
+    let status = fs::read_to_string(format!("/proc/{process}/status"))?;
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))
+        .ok_or("no VmRSS")?;
+    let kilobytes: f64 = line.split_whitespace().next().unwrap_or_default().parse()?;
+    Ok(kilobytes / 1024.0)
+}
+
+fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
+    let patience = Instant::now() + Duration::from_secs(120);
+    while !there() {
+        if Instant::now() > patience {
+            return Err(format!("{what} does not come up").into());
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Ok(())
+}

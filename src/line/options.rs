@@ -1,0 +1,88 @@
+//! What can be chosen of a line, beside its port and its character format.
+
+use std::time::Duration;
+
+/// Who switches the direction of an RS-485 line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Rs485 {
+    /// The adapter itself.
+    #[default]
+    Off,
+    /// The kernel, RTS high while sending.
+    Kernel,
+    /// The kernel, RTS low while sending.
+    KernelInverted,
+}
+
+/// A control line of the port that stands at one level, for adapters that are powered or enabled by it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Level {
+    /// As the driver leaves it when the port is opened: Linux asserts RTS and DTR.
+    #[default]
+    Driver,
+    /// Asserted.
+    On,
+    /// Not asserted.
+    Off,
+}
+
+/// Whether the end of a short wait is met by watching the clock.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Spin {
+    /// On a machine with more than one processor.
+    #[default]
+    Auto,
+    /// Always.
+    On,
+    /// Never: waits end when the kernel wakes the thread, some ten to a hundred microseconds late.
+    Off,
+}
+
+impl Spin {
+    /// Whether to spin on a machine with so many processors. On a single one the drive's reply is handled by the very processor
+    /// that would spin.
+    pub(super) fn holds(self, processors: usize) -> bool {
+        match self {
+            Spin::Auto => processors > 1,
+            Spin::On => true,
+            Spin::Off => false,
+        }
+    }
+}
+
+/// How the port is set up and waited for. What the kernel does of RS-485 counts only with [`Rs485::Kernel`] and
+/// [`Rs485::KernelInverted`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LineOptions {
+    /// Who switches the direction.
+    pub rs485: Rs485,
+    /// Time between switching to sending and the first bit, whole milliseconds up to [`MOST_RTS_DELAY`].
+    pub rts_before_send: Duration,
+    /// Time between the last bit and switching back, likewise.
+    pub rts_after_send: Duration,
+    /// Whether the port receives what it sends.
+    pub rx_during_tx: bool,
+    /// Whether the driver switches the terminating resistor on.
+    pub termination: bool,
+    /// Level of RTS; not together with RS-485 by the kernel, which switches it.
+    pub rts: Level,
+    /// Level of DTR.
+    pub dtr: Level,
+    /// How precisely waits end.
+    pub spin: Spin,
+}
+
+/// Longest delay that Linux takes (`RS485_MAX_RTS_DELAY` of `serial_core.c`).
+pub const MOST_RTS_DELAY: Duration = Duration::from_millis(100);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_single_processor_does_not_spin_unless_told_to() {
+        assert_eq!([1, 2, 4].map(|count| Spin::Auto.holds(count)), [false, true, true]);
+        assert!(Spin::On.holds(1));
+        assert!(!Spin::Off.holds(4));
+    }
+}
