@@ -20,7 +20,7 @@ const TRANSIENT: [&str; 2] = ["lock", "partial"];
 /// The gateway may run. Certificates, keys, passwords and tokens are named in the backup, and are in it only with
 /// --with-keys: keep such a file as secret as the keys. Recordings are listed, not copied.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  sudo drivegate backup pump-house.tar --config /etc/drivegate/drivegate.toml")]
+#[command(after_help = "Example:\n  drivegate backup pump-house.tar --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
     /// The file to write, a tar archive; it must not exist.
     #[arg(value_name = "FILE")]

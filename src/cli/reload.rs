@@ -11,7 +11,7 @@ use crate::north::local::protocol::{Outcome, ReloadOutcome, Request};
 /// Prints what changed. If the gateway refuses the configuration, its errors are printed, the exit code is 78, and
 /// the gateway goes on with the former one.
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  sudo drivegate reload --config /etc/drivegate/drivegate.toml")]
+#[command(after_help = "Example:\n  drivegate reload --config /etc/drivegate/drivegate.toml")]
 pub(super) struct Args {
     #[command(flatten)]
     config: ConfigFile,

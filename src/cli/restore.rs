@@ -20,8 +20,8 @@ use crate::north::local::protocol::Request;
 /// the backup does not have must be in their places by then.
 #[derive(Debug, clap::Args)]
 #[command(
-    after_help = "Examples:\n  sudo drivegate restore pump-house.tar --config /etc/drivegate/drivegate.toml\n  \
-    sudo drivegate restore pump-house.tar --force\n\n\
+    after_help = "Examples:\n  drivegate restore pump-house.tar --config /etc/drivegate/drivegate.toml\n  \
+    drivegate restore pump-house.tar --force\n\n\
     Exit codes: 0 done, 1 nothing or not everything was done, 78 the configuration in the backup is invalid here."
 )]
 pub(super) struct Args {

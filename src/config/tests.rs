@@ -43,6 +43,7 @@ publish = {}
 qos = {}
 buffer = {}
 sparkplug = { group = "plant" }
+home_assistant = {}
 [http]
 hosts = ["gateway.example.com"]
 tokens_file = "DIR/tokens"
