@@ -78,7 +78,7 @@ fleet: tools build ## Run N gateways with one broker and one Prometheus on this 
 	.tools/venv/bin/python tests/fleet/fleet.py --gateways $(N)
 
 CHECKS ?=
-interop: ## Run the gateway with Home Assistant and Node-RED; installs them, which takes minutes. CHECKS=name runs one
+interop: ## Run the gateway with Home Assistant, pysparkplug and Node-RED; installs them, which takes minutes. CHECKS=name runs one
 	tests/interop/run.sh $(CHECKS)
 
 # What ships, in dist/; docs/releasing.md. ARCHITECTURES="amd64" for one of them.

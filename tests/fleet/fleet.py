@@ -128,17 +128,17 @@ def memory(pid):
 
 
 class Subscriber:
-    """Counts what arrives at the broker, and when each gateway says that it is online."""
+    """Counts what arrives, and when each gateway says that it is online."""
 
-    def __init__(self, port):
+    def __init__(self, port, topics):
         self.messages = 0
         self.payload = 0
         self.online = {}
         self.states = collections.Counter()
         self.lock = threading.Lock()
-        self.client = paho.Client(paho.CallbackAPIVersion.VERSION2, client_id="fleet-counter", protocol=paho.MQTTv5)
+        self.client = paho.Client(paho.CallbackAPIVersion.VERSION2, protocol=paho.MQTTv5)
         self.client.reconnect_delay_set(0.05, 0.05)
-        self.client.on_connect = lambda client, *_: client.subscribe("drivegate/#", 0)
+        self.client.on_connect = lambda client, *_: client.subscribe(topics, 0)
         self.client.on_message = self.received
         self.client.connect("127.0.0.1", port)
         self.client.loop_start()
@@ -150,6 +150,10 @@ class Subscriber:
             parts = message.topic.split("/")
             if parts[-1] == "status" and message.payload == b"online":
                 self.online[parts[1]] = time.monotonic()
+
+    def end(self):
+        self.client.disconnect()
+        self.client.loop_stop()
 
     def restart_count(self):
         with self.lock:
@@ -210,7 +214,7 @@ def query(port, expression):
     return float(result[0]["value"][1]) if result else float("nan")
 
 
-def steady(options, processes, subscriber, broker, gateways, simulation, prometheus, prometheus_port):
+def steady(options, subscriber, broker, gateways, simulation, prometheus, prometheus_port):
     """Rates and costs while nothing happens."""
     watched = {"broker": [broker], "prometheus": [prometheus], "lines": [simulation], "gateways": gateways}
     before = {name: sum(processor_seconds(p.pid) for p in group) for name, group in watched.items()}
@@ -299,7 +303,7 @@ def main():
             "lines", [binary, "simulate", "--config", directory / "lines.toml", "--speed", "max", "--autopilot"]
         )
         until("the simulated lines", lambda: all((directory / f"line{n}").exists() for n in range(options.gateways)), 60)
-        subscriber = Subscriber(broker_port)
+        statuses = Subscriber(broker_port, "drivegate/+/status")
         began = time.monotonic()
         gateways = []
         for number in range(options.gateways):
@@ -308,13 +312,15 @@ def main():
             command = [binary, "run", "--config", directory / f"{gateway_name(number)}.toml"]
             runtime = {"STATE_DIRECTORY": str(state), "RUNTIME_DIRECTORY": str(state)}
             gateways.append(processes.start(gateway_name(number), command, **runtime))
-        until("all gateways online", lambda: len(subscriber.names_online()) == options.gateways, 120)
+        until("all gateways online", lambda: len(statuses.names_online()) == options.gateways, 120)
         print(f"start: all gateways online after {time.monotonic() - began:.1f} s", flush=True)
         prometheus, prometheus_port = start_prometheus(processes, directory, ports)
+        everything = Subscriber(broker_port, "drivegate/#")
         time.sleep(70)
-        steady(options, processes, subscriber, broker, gateways, simulation, prometheus, prometheus_port)
+        steady(options, everything, broker, gateways, simulation, prometheus, prometheus_port)
+        everything.end()
         sys.stdout.flush()
-        broker, well = storm(options, processes, directory, subscriber, broker, broker_port, gateways)
+        broker, well = storm(options, processes, directory, statuses, broker, broker_port, gateways)
         lost = [gateway_name(n) for n, process in enumerate(gateways) if process.poll() is not None]
         if lost:
             print(f"fleet: ended by themselves: {', '.join(lost)}")

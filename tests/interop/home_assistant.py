@@ -104,8 +104,9 @@ def main():
         fewer = expected_entities(bench, drives[:2])
         until("a drive less", lambda: len(hass.entities()) == fewer)
         until("the others", lambda: hass.state("sensor.p1_state") == "ready")
-        names = hass.entities()
-        expect("p2 lost its switch with `access`", "switch.p2_run" not in names and "binary_sensor.p2_run" in names)
+        shown_only = lambda names: "switch.p2_run" not in names and "binary_sensor.p2_run" in names
+        until("the switch of p2 to go", lambda: shown_only(hass.entities()))
+        say("   ok: p2 lost its switch with `access`")
         end(line)
         until("the drive offline", lambda: hass.state("sensor.p1_state") == "offline")
         until("its values", lambda: hass.state("sensor.p1_motor_current") == "unavailable")

@@ -1,13 +1,7 @@
 #!/usr/bin/env python3
 """A session of Sparkplug B with pysparkplug as the host: births, a motor started and stopped, a refusal, a kill.
 
-Runs alone, from the root of the repository:
-
-    python3 -m venv /tmp/pysparkplug && /tmp/pysparkplug/bin/pip install pysparkplug==0.6.1
-    cargo build && /tmp/pysparkplug/bin/python tests/interop/sparkplug.py [target/debug/drivegate]
-
-pysparkplug needs paho-mqtt 1.6, the other tests need 2.2, so it has an environment of its own. Needs mosquitto. Takes about
-ten seconds; prints one line for each step.
+pysparkplug needs paho-mqtt 1.6, the other tests need 2.2, so it has an environment of its own. Prints one line for each step.
 """
 
 import os
@@ -19,8 +13,15 @@ import sys
 import tempfile
 import time
 
-import paho.mqtt.client as paho
-import pysparkplug as sparkplug
+from bench import DRIVEGATE, venv
+
+PYSPARKPLUG = "pysparkplug==0.6.1"
+try:
+    import paho.mqtt.client as paho
+    import pysparkplug as sparkplug
+except ImportError:
+    python = venv("sparkplug", [PYSPARKPLUG])
+    os.execv(python, [python, *sys.argv])
 
 PATIENCE = 60.0
 GROUP, NODE = "plant", "pump-house"
@@ -210,7 +211,7 @@ def session(host, start, line):
 
 
 def main():
-    program = os.path.abspath(sys.argv[1] if len(sys.argv) > 1 else "target/debug/drivegate")
+    program = str(DRIVEGATE)
     os.environ["PATH"] += ":/usr/sbin"
     with tempfile.TemporaryDirectory() as place:
         port = free_port()
