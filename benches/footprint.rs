@@ -16,7 +16,7 @@ use std::process::{Child, Command, ExitCode, Stdio};
 use std::time::{Duration, Instant};
 
 use common::gateway::Bus;
-use common::{option, processor_time};
+use common::{option, processor_time, resident_memory, wait};
 
 const PROGRAM: &str = env!("CARGO_BIN_EXE_drivegate");
 
@@ -102,7 +102,7 @@ fn native(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<Run, Box<
         rate: exchanges / seconds,
         percent: 100.0 * (after.1 - before.1) / seconds,
         wake_ups: (after.2 - before.2) / exchanges,
-        memory: memory(process)?,
+        memory: resident_memory(process)?,
     })
 }
 
@@ -248,26 +248,4 @@ fn switches(process: u32) -> Result<f64, Box<dyn Error>> {
         all += count.trim().parse::<f64>()?;
     }
     Ok(all)
-}
-
-/// Resident memory, MiB.
-fn memory(process: u32) -> Result<f64, Box<dyn Error>> {
-    let status = fs::read_to_string(format!("/proc/{process}/status"))?;
-    let line = status
-        .lines()
-        .find_map(|line| line.strip_prefix("VmRSS:"))
-        .ok_or("no VmRSS")?;
-    let kilobytes: f64 = line.split_whitespace().next().unwrap_or_default().parse()?;
-    Ok(kilobytes / 1024.0)
-}
-
-fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
-    let patience = Instant::now() + Duration::from_secs(120);
-    while !there() {
-        if Instant::now() > patience {
-            return Err(format!("{what} does not come up").into());
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    Ok(())
 }

@@ -14,7 +14,7 @@ use std::process::{Child, Command, ExitCode, Stdio};
 use std::time::{Duration, Instant};
 
 use common::gateway::Bus;
-use common::{Readers, median, option, processor_time, scrape};
+use common::{Readers, median, option, processor_time, resident_memory, scrape, wait};
 
 /// Drives of each bus.
 const DRIVES: u8 = 31;
@@ -91,16 +91,6 @@ impl Process {
         command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
         command.spawn().map(Process)
     }
-
-    fn memory(&self) -> Result<f64, Box<dyn Error>> {
-        let status = fs::read_to_string(format!("/proc/{}/status", self.0.id()))?;
-        let line = status
-            .lines()
-            .find_map(|line| line.strip_prefix("VmRSS:"))
-            .ok_or("no VmRSS")?;
-        let kilobytes: f64 = line.split_whitespace().next().unwrap_or_default().parse()?;
-        Ok(kilobytes / 1024.0)
-    }
 }
 
 impl Drop for Process {
@@ -138,7 +128,7 @@ fn run(buses: usize, baud: u32, time: Duration) -> Result<Run, Box<dyn Error>> {
         Instant::now(),
     );
     let seconds = after.3.duration_since(before.3).as_secs_f64();
-    let memory = daemon.memory()?;
+    let memory = resident_memory(daemon.0.id())?;
     readers.stop()?;
     let rates: Vec<f64> = after
         .0
@@ -157,17 +147,6 @@ fn run(buses: usize, baud: u32, time: Duration) -> Result<Run, Box<dyn Error>> {
         memory,
         errors: after.0.errors - before.0.errors,
     })
-}
-
-fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
-    let patience = Instant::now() + Duration::from_secs(60);
-    while !there() {
-        if Instant::now() > patience {
-            return Err(format!("{what} does not come up").into());
-        }
-        std::thread::sleep(Duration::from_millis(50));
-    }
-    Ok(())
 }
 
 /// Whether each drive answers.

@@ -12,7 +12,7 @@ use std::path::Path;
 use std::process::{Command, ExitCode};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use drivegate::sim::SimTime;
 use drivegate::sim::statistics::{Direction, Recorded};
@@ -59,6 +59,35 @@ pub fn processor_time(process: u32) -> Result<f64, Box<dyn Error>> {
             .ok_or("no time in stat")
     };
     Ok((ticks(11)? + ticks(12)?) / rustix::param::clock_ticks_per_second() as f64)
+}
+
+/// Waits up to two minutes until `there` holds.
+///
+/// # Errors
+/// It does not.
+pub fn wait(what: &str, there: impl Fn() -> bool) -> Result<(), Box<dyn Error>> {
+    let patience = Instant::now() + Duration::from_secs(120);
+    while !there() {
+        if Instant::now() > patience {
+            return Err(format!("{what} does not come up").into());
+        }
+        std::thread::sleep(Duration::from_millis(50));
+    }
+    Ok(())
+}
+
+/// Resident memory of a process, MiB.
+///
+/// # Errors
+/// There is no such process.
+pub fn resident_memory(process: u32) -> Result<f64, Box<dyn Error>> {
+    let status = std::fs::read_to_string(format!("/proc/{process}/status"))?;
+    let line = status
+        .lines()
+        .find_map(|line| line.strip_prefix("VmRSS:"))
+        .ok_or("no VmRSS")?;
+    let kilobytes: f64 = line.split_whitespace().next().unwrap_or_default().parse()?;
+    Ok(kilobytes / 1024.0)
 }
 
 /// The value of the option `name` on the command line of the bench, or `default`.

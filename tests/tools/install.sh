@@ -28,27 +28,7 @@ export PATH="$PWD/.tools/bin:$PATH:/usr/sbin:/sbin"
 say() { echo "tools: $*" >&2; }
 fail() { echo "error: $*" >&2; exit 1; }
 
-as_root() {
-    if [ "$(id -u)" = 0 ]; then
-        "$@"
-    elif command -v sudo >/dev/null; then
-        sudo "$@"
-    else
-        fail "cannot install packages; in $0, as user $(id -un) without sudo; run as root: apt-get install ${packages[*]}"
-    fi
-}
-
-missing_packages() {
-    local entry what package
-    for entry in "${needed[@]}"; do
-        read -r what package <<<"$entry"
-        case $what in
-            /*) [ -e "$what" ] || echo "$package" ;;
-            *) command -v "$what" >/dev/null || echo "$package" ;;
-        esac
-    done
-    python3 -c 'import ensurepip, venv' 2>/dev/null || echo python3-venv
-}
+. tests/tools/packages.sh
 
 # Debian starts a daemon when its package is installed. The tests run their own broker and Prometheus on free
 # ports; nothing may be left on 1883 and 9090.
