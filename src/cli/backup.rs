@@ -163,6 +163,8 @@ fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
     let mut name = file.file_name().unwrap_or_default().to_os_string();
     name.push(".partial");
     let aside = file.with_file_name(name);
+    // What a backup that was killed left behind.
+    let _ = fs::remove_file(&aside);
     let written = OpenOptions::new()
         .write(true)
         .create_new(true)

@@ -161,6 +161,7 @@ fn a_gateway_is_set_up_again_from_its_backup() {
     site.write("state/audit.jsonl", "{}\n");
     site.write("state/mqtt.lock", "");
     let file = site.path("backup.tar");
+    site.write("backup.tar.partial", "left behind by a backup that was killed");
     let made = command(&site, &["backup", &file]);
     assert_eq!(made.code, 0, "{}", made.err);
     assert!(made.out.contains("3 files"), "{}", made.out);
