@@ -95,9 +95,8 @@ impl BusCore {
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
-        let news = self.master.lost(now);
+        self.master.lost(now);
         self.report.bus_down(why);
-        self.report_all(&news, now);
     }
 
     /// The bus ends: everybody who waits is answered. What the bus that comes after has to know; the reply to an exchange

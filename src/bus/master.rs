@@ -210,12 +210,11 @@ impl Master {
     }
 
     /// The port is gone: everybody whose command was begun is answered.
-    pub fn lost(&mut self, now: Instant) -> Vec<News> {
+    pub fn lost(&mut self, now: Instant) {
         self.successor = true;
         for drive in &mut self.drives {
             drive.close(&Outcome::BusDown, Interruption::BusDown, now);
         }
-        (0..self.drives.len()).map(News::Offline).collect()
     }
 
     /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know. An exchange

@@ -212,9 +212,15 @@ impl Report {
         self.event(EventKind::BusUp, None, None, text);
     }
 
-    /// Reported once for each reason, not at every try.
+    /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
+    /// for each reason, not at every try.
     pub(super) fn bus_down(&mut self, why: &str) {
         let news = self.up || self.reason != why;
+        let drives = self.image.drives.iter().enumerate();
+        let gone: Vec<usize> = drives
+            .filter(|(_, drive)| goes_offline(drive))
+            .map(|(i, _)| i)
+            .collect();
         self.image.update_health(|h| {
             if h.up || !h.tried {
                 h.since = Some(SystemTime::now());
@@ -235,6 +241,9 @@ impl Report {
                 format!("bus {name} is down: {why}; trying again every 3 s at the latest"),
             );
         }
+        for index in gone {
+            self.offline_event(index, "its bus is down");
+        }
     }
 
     fn online(&mut self, index: usize) {
@@ -246,21 +255,13 @@ impl Report {
         self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} answers"));
     }
 
-    /// Also while the bus is down, when nothing was heard of the drive before.
-    fn offline(&mut self, index: usize) {
-        let Some(drive) = self.drive(index) else { return };
-        if matches!(drive.snapshot().link, Link::Offline(_)) {
-            return;
+    fn offline(&self, index: usize) {
+        if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
+            self.offline_event(index, "it does not answer");
         }
-        drive.update(|s| {
-            s.link = Link::Offline(SystemTime::now());
-            s.outlive();
-        });
-        let why = if self.up {
-            "it does not answer"
-        } else {
-            "its bus is down"
-        };
+    }
+
+    fn offline_event(&self, index: usize, why: &str) {
         self.drive_event(index, EventKind::Offline, None, |name| {
             format!("drive {name} is offline: {why}; it is asked again with pauses up to 10 s")
         });
@@ -480,3 +481,18 @@ fn counted(ended: &Ended) -> Counted {
         Ended::Corrupt(_) => Counted::Corrupt,
     }
 }
+
+/// Shows a drive as offline, also one of which nothing was heard before. False where it is already.
+fn goes_offline(drive: &DriveImage) -> bool {
+    if matches!(drive.snapshot().link, Link::Offline(_)) {
+        return false;
+    }
+    drive.update(|s| {
+        s.link = Link::Offline(SystemTime::now());
+        s.outlive();
+    });
+    true
+}
+
+#[cfg(test)]
+mod tests;
