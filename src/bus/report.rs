@@ -206,6 +206,7 @@ impl Report {
             h.tried = true;
             h.since = Some(SystemTime::now());
             h.reason = None;
+            h.load = None;
             h.opened += 1;
         });
         let text = format!("port {} of bus {} is open", self.image.spec.port, self.image.spec.name);
@@ -227,7 +228,7 @@ impl Report {
             }
             h.up = false;
             h.tried = true;
-            h.load = 0.0;
+            h.load = Some(0.0);
             h.reason = Some(why.to_string());
         });
         self.up = false;
@@ -466,7 +467,7 @@ impl Report {
             return;
         }
         let load = (self.busy.as_secs_f64() / window.as_secs_f64()).min(1.0);
-        self.image.update_health(|h| h.load = load);
+        self.image.update_health(|h| h.load = Some(load));
         self.window = now;
         self.busy = Duration::ZERO;
     }

@@ -148,6 +148,9 @@ struct Point<'p> {
     unit: &'p str,
     age_ms: Option<u64>,
     time: Option<Time>,
+    /// A newer state says otherwise.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    contradicted: bool,
 }
 
 impl Points<'_> {
@@ -164,6 +167,7 @@ impl Points<'_> {
             unit: &point.unit,
             age_ms: at.map(|at| millis(self.clock.age(at))),
             time: at.and_then(|at| self.clock.wall(at)),
+            contradicted: self.reading.is_contradicted(index),
         }
     }
 }
@@ -184,7 +188,8 @@ pub(super) struct Bus<'b> {
     reason: Option<String>,
     drives: usize,
     online: usize,
-    load_ratio: f64,
+    /// `null` until the port was open for a second.
+    load_ratio: Option<f64>,
     fast: Cycle,
     slow: Cycle,
     transactions: u64,
@@ -233,7 +238,7 @@ impl<'b> Bus<'b> {
             reason: health.reason.filter(|_| !health.up),
             drives: image.drives.len(),
             online: image.online(),
-            load_ratio: rounded(health.load, 10_000.0),
+            load_ratio: health.load.map(|load| rounded(load, 10_000.0)),
             fast: Cycle::new(spec.cycle, health.fast),
             slow: Cycle::new(spec.slow_cycle, health.slow),
             transactions: image.transactions_total(),

@@ -178,15 +178,15 @@ fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &
 
 fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     type Of<T> = fn(&BusImage, &BusHealth) -> T;
-    let gauges: [(&str, &str, Of<f64>); 2] = [
+    let gauges: [(&str, &str, Of<Option<f64>>); 2] = [
         (
             "drivegate_bus_up",
             "Whether the port of the bus is open: 1, else 0.",
-            |_, health| f64::from(u8::from(health.up)),
+            |_, health| Some(f64::from(u8::from(health.up))),
         ),
         (
             "drivegate_bus_load_ratio",
-            "Share of the last second that the line was in use, 0 to 1.",
+            "Share of the last second that the line was in use, 0 to 1; absent until the port was open for a second.",
             |_, health| health.load,
         ),
     ];
@@ -197,7 +197,9 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     for (name, help, value) in gauges {
         let mut family = Family::new(Kind::Gauge, name, help);
         for (labels, handle, health) in &looks {
-            family.add(labels.clone(), SeriesValue::Value(value(&handle.image, health)));
+            if let Some(value) = value(&handle.image, health) {
+                family.add(labels.clone(), SeriesValue::Value(value));
+            }
         }
         all.push(family);
     }

@@ -227,7 +227,8 @@ pub(super) struct BusState {
 /// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
-    pub(super) load: f64,
+    /// Not known until the port was open for a second.
+    pub(super) load: Option<f64>,
     pub(super) fast_cycle_ms: Option<f64>,
     pub(super) slow_cycle_ms: Option<f64>,
     pub(super) transactions: u64,
@@ -252,7 +253,7 @@ pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
         online: bus.image.online(),
     };
     let figures = BusFigures {
-        load: rounded(load, 1000.0),
+        load: load.map(|load| rounded(load, 1000.0)),
         fast_cycle_ms: fast.last.map(milliseconds),
         slow_cycle_ms: slow.last.map(milliseconds),
         transactions: bus.image.transactions_total(),

@@ -195,7 +195,7 @@ fn bus_changes_are_published_at_once_and_figures_every_second() {
     );
     assert_eq!(first["reason"], Json::Null);
     let image = bench.plant.buses[0].image.clone();
-    image.update_health(|h| h.load = 0.12345);
+    image.update_health(|h| h.load = Some(0.12345));
     assert_eq!(payload(&bench.after(500), "bus/line1"), None);
     let later: Json = serde_json::from_str(payload(&bench.after(500), "bus/line1").unwrap()).unwrap();
     assert_eq!(later["load"], 0.123);
