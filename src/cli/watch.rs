@@ -208,7 +208,8 @@ mod tests {
             row.contains("pump-1") && row.contains("25.00") && !row.contains("4.2"),
             "{text}"
         );
-        let mut warned = json!([{"name": "fan-1", "state": "ready", "points": {"warning": {"value": true, "quality": "good"}}}]);
+        let mut warned =
+            json!([{"name": "fan-1", "state": "ready", "points": {"warning": {"value": true, "quality": "good"}}}]);
         assert!(table(&warned).contains("ready, warning"));
         warned[0]["points"]["warning"]["quality"] = "stale".into();
         assert!(!table(&warned).contains("warning"), "not a fresh one");

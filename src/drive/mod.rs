@@ -9,6 +9,7 @@ pub(crate) mod plan;
 pub mod profile;
 mod profile_file;
 pub(crate) mod raw_writes;
+pub mod why;
 
 pub use derive::{Bound, Derived};
 pub(crate) use model::tidy;

@@ -26,7 +26,10 @@ impl Reading<'_> {
         let (Some(value), Some(at)) = (sample.good(), sample.at) else {
             return false;
         };
-        let newest = self.motion().filter(|(seen, _)| *seen > at).max_by_key(|(seen, _)| *seen);
+        let newest = self
+            .motion()
+            .filter(|(seen, _)| *seen > at)
+            .max_by_key(|(seen, _)| *seen);
         match (newest, speed_of(value, *certain)) {
             (Some((_, turns)), Some(turned)) => turns != turned,
             // So slow that it may be either.

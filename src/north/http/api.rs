@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::drive::why::Cause;
 use crate::drive::{self, Quality, State};
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
@@ -59,6 +60,10 @@ pub(super) struct Drive<'d> {
     since: Option<Time>,
     age_ms: Option<u64>,
     fault_text: String,
+    /// Why it does not run, in one word each.
+    blocked_by: Vec<String>,
+    /// The same with evidence and remedy.
+    why: Vec<Cause>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     points: Points<'d>,
@@ -73,6 +78,7 @@ impl<'d> Drive<'d> {
             Link::Untried => None,
             Link::Online(since) | Link::Offline(since) => Some(Time(since)),
         };
+        let why = drive.why(&reading);
         Drive {
             name: &spec.name,
             bus: &spec.bus,
@@ -89,6 +95,8 @@ impl<'d> Drive<'d> {
             since,
             age_ms: reading.age().map(millis),
             fault_text: reading.fault_text(),
+            blocked_by: why.words(),
+            why: why.causes,
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             points: Points { reading, clock },

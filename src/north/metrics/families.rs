@@ -6,7 +6,7 @@ use std::time::{Instant, SystemTime};
 
 use super::model::MODEL;
 use super::process;
-use crate::drive::{PollClass, State};
+use crate::drive::{ModelPoint, PollClass, State};
 use crate::history::TriggerKind;
 use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
@@ -90,6 +90,14 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         "drivegate_drive_state",
         "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
     );
+    let mut blocked = gauge(
+        "drivegate_drive_blocked",
+        "Why the motor does not run: 1 for each cause; absent while it runs.",
+    );
+    let mut fault_info = gauge(
+        "drivegate_drive_fault_info",
+        "Text of the active fault: 1; absent without a fault.",
+    );
     let mut age = gauge(
         "drivegate_drive_sample_age_seconds",
         "Age of the drive's process data; absent while it was never read.",
@@ -131,6 +139,14 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
                 state.add(with(&labels, "state", one.name()), flag(one == current));
             }
         }
+        for cause in drive.why(&reading).words() {
+            blocked.add(with(&labels, "reason", &cause), SeriesValue::Value(1.0));
+        }
+        let fault_text =
+            Some(reading.fault_text()).filter(|text| reading.is_set(ModelPoint::Fault) && !text.is_empty());
+        if let Some(text) = fault_text {
+            fault_info.add(with(&labels, "text", &text), SeriesValue::Value(1.0));
+        }
         if let Some(time) = reading.age() {
             age.add(labels.clone(), SeriesValue::Value(time.as_secs_f64()));
         }
@@ -143,7 +159,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
             turnaround.add(labels, SeriesValue::Value(time.as_secs_f64()));
         }
     }
-    all.extend([up, state, age]);
+    all.extend([up, state, blocked, fault_info, age]);
     all.append(&mut model);
     all.extend([point, transactions, turnaround, supervision, unsupervised]);
 }

@@ -87,7 +87,11 @@ impl BusFigures {
             u16::from(self.up),
             count(self.drives),
             if self.up { count(self.online) } else { 0 },
-            if self.up { self.load.map_or(u16::MAX, per_mille) } else { 0 },
+            if self.up {
+                self.load.map_or(u16::MAX, per_mille)
+            } else {
+                0
+            },
             cycle_high,
             cycle_low,
             done_high,

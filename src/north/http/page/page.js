@@ -88,11 +88,11 @@ function valueInto(span, unitSpan, point, ageSpan, newest) {
 
 function driveRow(name) {
   const row = { open: make("button", "open", name), where: make("span", "where"), badge: make("span", "badge"),
-    warning: make("span", "tag amber", "warning"), why: make("span", "why"), cells: [], points: new Map() };
+    warning: make("span", "tag amber", "warning"), why: make("span", "why"), blocked: make("span", "sub blocked"), causes: make("ul", "causes"), cells: [], points: new Map() };
   row.open.type = "button";
   row.open.setAttribute("aria-expanded", "false");
   const first = make("td", "", row.open, make("br"), row.where);
-  const state = make("td", "", row.badge, " ", row.warning, row.why);
+  const state = make("td", "", row.badge, " ", row.warning, row.why, row.blocked);
   const tr = make("tr", "main-row", first, state);
   for (const [title, point] of COLUMNS) {
     const cell = { point, value: make("span", "value"), unit: make("span", "unit"), age: make("span", "sub age"), extra: null };
@@ -111,7 +111,7 @@ function driveRow(name) {
   last.dataset.title = "Age";
   tr.append(last);
   row.list = make("dl", "points");
-  const detail = make("td", "", row.list);
+  const detail = make("td", "", row.causes, row.list);
   detail.colSpan = COLUMNS.length + 3;
   row.detail = make("tr", "detail", detail);
   row.detail.hidden = true;
@@ -139,6 +139,10 @@ function showDrive(row, drive) {
   const fault = !known ? "" : drive.fault_text === String(code.value) ? `fault ${code.value}` : `F${code.value} ${drive.fault_text}`;
   text(row.why, fault);
   row.why.hidden = !fault;
+  // The fault and a drive that is offline have their own words above.
+  const words = drive.blocked_by.filter((word) => word !== "fault" && word !== "offline").map((word) => word.replaceAll("_", " "));
+  text(row.blocked, words.join(", "));
+  row.blocked.hidden = words.length === 0;
   text(row.where, `${drive.bus} · address ${drive.address} · ${drive.profile}`);
   for (const cell of row.cells) {
     const point = drive.points[cell.point];
@@ -163,6 +167,14 @@ function showSpeed(extra, point, reference) {
 }
 
 function showPoints(row, drive) {
+  const causes = drive.why.map((cause) => {
+    const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${age(cause.age_ms)} ago)`;
+    return `${cause.cause.replaceAll("_", " ")}: ${cause.evidence}${since}. What to do: ${cause.remedy}.`;
+  });
+  while (row.causes.children.length > causes.length) row.causes.lastChild.remove();
+  while (row.causes.children.length < causes.length) row.causes.append(make("li"));
+  causes.forEach((cause, place) => text(row.causes.children[place], cause));
+  row.causes.hidden = causes.length === 0;
   // A reload may have given the drive another profile.
   for (const [name, entry] of row.points) {
     if (name in drive.points) continue;
