@@ -60,8 +60,7 @@ fn text(drive: &str, explanation: &Explanation) -> String {
     };
     for cause in &explanation.causes {
         let age = cause.age_ms.map_or(String::new(), |ms| {
-            let age = Duration::from_millis(ms).as_secs_f64();
-            format!(" ({age:.1} s ago)")
+            format!(" ({} ago)", seconds(Duration::from_millis(ms)))
         });
         let evidence = printable::line(&cause.evidence);
         // Writing to a String cannot fail.
@@ -75,6 +74,15 @@ fn text(drive: &str, explanation: &Explanation) -> String {
         );
     }
     text
+}
+
+/// A time for people.
+fn seconds(age: Duration) -> String {
+    match age.as_secs() {
+        0..120 => format!("{:.1} s", age.as_secs_f64()),
+        120..7200 => format!("{} min", age.as_secs() / 60),
+        _ => format!("{} h", age.as_secs() / 3600),
+    }
 }
 
 #[cfg(test)]

@@ -124,8 +124,7 @@ pub enum Giver {
 }
 
 /// What is known beside the points.
-#[derive(Debug, Clone)]
-pub struct Situation {
+pub struct Situation<'s> {
     /// When the reader looks.
     pub now: Instant,
     /// Whether the drive can be asked.
@@ -134,12 +133,12 @@ pub struct Situation {
     pub read_at: Option<Instant>,
     /// Whether this gateway may command it.
     pub is_commandable: bool,
-    /// The last order that concerns the run command.
-    pub order: Option<RunOrder>,
+    /// The last order that concerns the run command; asked for only while the motor does not run.
+    pub order: &'s dyn Fn() -> Option<RunOrder>,
 }
 
 /// Why the drive does not run; `sample` has its points, by their index in the profile.
-pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &Situation) -> Explanation {
+pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &Situation<'_>) -> Explanation {
     let look = Look {
         profile,
         sample,
@@ -147,7 +146,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
     };
     if let Some(cause) = look.unreachable() {
         let mut causes = vec![cause];
-        causes.extend(look.order_in_the_way(None));
+        causes.extend(look.order_in_the_way((situation.order)(), None));
         return Explanation {
             runs: None,
             causes,
@@ -181,7 +180,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
 struct Look<'l> {
     profile: &'l Profile,
     sample: &'l dyn Fn(usize) -> Sample,
-    situation: &'l Situation,
+    situation: &'l Situation<'l>,
 }
 
 impl Look<'_> {
@@ -331,9 +330,12 @@ impl Look<'_> {
 
     /// What is wrong with the commands.
     fn command(&self, found: &[Cause]) -> Vec<Cause> {
-        let order = self.situation.order.as_ref();
+        let order = (self.situation.order)();
         let reads = self.bit(ModelPoint::Run);
-        let taken = order.filter(|order| order.fate == Fate::Taken).map(|order| order.run);
+        let taken = order
+            .as_ref()
+            .filter(|order| order.fate == Fate::Taken)
+            .map(|order| order.run);
         match (reads, taken) {
             (Some((true, _)), _) | (None, Some(RunWish::Run)) => {
                 let zero = self.zero_reference();
@@ -342,7 +344,7 @@ impl Look<'_> {
             }
             (reads, _) => {
                 let at = reads.and_then(|(_, at)| at);
-                let in_the_way = self.order_in_the_way(at);
+                let in_the_way = self.order_in_the_way(order, at);
                 in_the_way
                     .or_else(|| reads.map(|_| self.no_order(at)))
                     .into_iter()
@@ -352,50 +354,50 @@ impl Look<'_> {
     }
 
     /// What the last order says; `read_at` is when the drive was last seen without a run command.
-    fn order_in_the_way(&self, read_at: Option<Instant>) -> Option<Cause> {
-        let order = self.situation.order.as_ref()?;
+    fn order_in_the_way(&self, order: Option<RunOrder>, read_at: Option<Instant>) -> Option<Cause> {
+        let order = order?;
         let ended = self.situation.now.checked_sub(order.age);
-        let (who, text, ago) = (&order.who, &order.text, seconds(order.age));
+        let (who, text) = (&order.who, &order.text);
         let (cause, evidence, remedy) = match (order.run, order.fate, order.by) {
             (RunWish::Run, Fate::Refused, _) => (
                 "order_refused",
-                format!("run of {who} was refused {ago} ago: {text}"),
+                format!("run of {who} was refused: {text}"),
                 "correct the order or the rights of the client",
             ),
             (RunWish::Run, Fate::NotSent, _) => (
                 "order_expired",
-                format!("run of {who} was not sent {ago} ago: {text}"),
+                format!("run of {who} was not sent: {text}"),
                 "order it again; see the load of the bus if it happens again",
             ),
             (RunWish::Run, Fate::Unsure, _) => (
                 "order_unanswered",
-                format!("run of {who} was not acknowledged {ago} ago: {text}"),
+                format!("run of {who} was not acknowledged: {text}"),
                 "look whether the drive answers, then order it again",
             ),
             (RunWish::Run, Fate::Taken, _) if read_at > ended => (
                 "other_master",
-                format!("run of {who} was acknowledged {ago} ago, and run is off in the drive now"),
+                format!("run of {who} was acknowledged, and run is off in the drive now"),
                 "look for another master that writes the control word; a drive that started anew has lost the order",
             ),
             (RunWish::Run, Fate::Taken, _) => return None,
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Supervision) => (
                 "supervision",
-                format!("its lease ran out, and it was stopped {ago} ago"),
+                "its lease ran out, and it was stopped".to_string(),
                 "let the commanding client renew the lease by orders or heartbeats, then order run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Shutdown) => (
                 "stopped_by_gateway",
-                format!("the gateway stopped it {ago} ago, because the gateway was stopped"),
+                "the gateway stopped it when it was stopped itself".to_string(),
                 "order run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",
-                format!("{who} stopped it {ago} ago"),
+                format!("{who} stopped it"),
                 "order run again if it may run",
             ),
             (RunWish::Reset, Fate::Taken | Fate::Unsure, _) => (
                 "fault_was_reset",
-                format!("{who} reset its fault {ago} ago, and a reset starts nothing"),
+                format!("{who} reset its fault, and a reset starts nothing"),
                 "order run again",
             ),
             (RunWish::Stop | RunWish::Reset, Fate::Refused | Fate::NotSent, _) => return None,
@@ -474,15 +476,6 @@ fn reads(point: &Point, value: Value) -> String {
         (None, Value::Bool(true)) => format!("{name} is on"),
         (None, Value::Bool(false)) => format!("{name} is off"),
         (None, value) => format!("{name} is {value} {}", point.unit).trim_end().to_string(),
-    }
-}
-
-/// A time for people.
-fn seconds(age: Duration) -> String {
-    match age.as_secs() {
-        0..120 => format!("{:.1} s", age.as_secs_f64()),
-        120..7200 => format!("{} min", age.as_secs() / 60),
-        _ => format!("{} h", age.as_secs() / 3600),
     }
 }
 

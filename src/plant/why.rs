@@ -9,15 +9,16 @@ use crate::process_image::{Access, BusImage, Link, Reading};
 /// Whether the drive of `reading`, on that bus, runs, and why not.
 pub(crate) fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
     let spec = reading.spec;
+    let order = || {
+        let (record, ended) = writes.audit().last_run(&spec.name)?;
+        run_order(&record, reading.now.saturating_duration_since(ended))
+    };
     let situation = Situation {
         now: reading.now,
         contact: contact(reading, bus),
         read_at: reading.snapshot.fast_at,
         is_commandable: spec.access == Access::Control,
-        order: writes.audit().last_run(&spec.name).and_then(|(record, ended)| {
-            let age = reading.now.saturating_duration_since(ended);
-            run_order(&record, age)
-        }),
+        order: &order,
     };
     why::explain(&spec.profile, &|point| reading.sample(point), &situation)
 }

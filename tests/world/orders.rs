@@ -243,7 +243,7 @@ fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
     let ranges = profile.ranges.iter().filter(|range| range.write > 0);
     let last = ranges.flat_map(|range| {
         let (first, last) = range.addresses.clone().into_inner();
-        (last.saturating_sub(8).max(first)..=last).map(|address| (range.table, address, range.write))
+        (last.saturating_sub(8).max(first)..=last).map(move |address| (range.table, address, range.write))
     });
     let named = profile.point_index("general_control_word");
     let word = named.and_then(|index| profile.points[index].raw());

@@ -63,7 +63,10 @@ fn without_comparisons(query: &str) -> String {
     let mut kept = Vec::new();
     while let Some(word) = words.next() {
         match word {
-            "==" | ">" | "<" => drop(words.next()),
+            // The figure behind it goes with it.
+            "==" | ">" | "<" => {
+                words.next();
+            }
             word => kept.push(word),
         }
     }
