@@ -31,6 +31,7 @@ mod simulate;
 mod token;
 mod trace;
 mod watch;
+mod why;
 mod write;
 
 use std::path::PathBuf;
@@ -95,6 +96,7 @@ commands! {
     Scan => scan,
     Read => read,
     Write => write,
+    Why => why,
     Record => record,
     Recordings => recordings,
     Watch => watch,

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use super::key::{Key, Number};
 use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
+use super::raw_writes;
 use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
@@ -54,6 +55,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let on_shutdown = DRIVE.on_shutdown.get(reader);
     let turnaround = DRIVE.turnaround.read(reader);
     let triggers = read_triggers(reader, profile.as_deref());
+    let raw_writes = raw_writes::read(reader, profile.as_deref());
     reader.finish();
     let spec = match (&name, address, unit, profile) {
         (Some((name, _)), Some(address), Some(unit), Some(profile)) => Some(DriveSpec {
@@ -69,6 +71,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             on_shutdown,
             frequency_range,
             triggers,
+            raw_writes,
         }),
         _ => None,
     };

@@ -285,6 +285,16 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
+        /// What raw writes may set beside the registers of writable points: nothing (`false`), everything that the profile
+        /// lets write (`true`), or ranges of PDU addresses, of registers and coils alike. A write that contains the control
+        /// word is [always admitted](modbus-tcp.md#what-raw-writes-may-set).
+        raw_writes: Present = Own {
+            schema: || json!({ "anyOf": [{ "type": "boolean" }, { "type": "array", "items": {
+                "type": "array", "items": { "type": "integer", "minimum": 0, "maximum": u16::MAX },
+                "minItems": 2, "maxItems": 2,
+            } }] }),
+            range: "true, false or ranges of PDU addresses such as [[101, 199]]",
+        }, or "`false`";
         /// Values that make a [recording](recordings.md), beside faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }

@@ -15,6 +15,7 @@ mod modbus_tcp;
 mod mqtt;
 mod named_files;
 mod north;
+mod raw_writes;
 mod recordings;
 mod shutdown;
 mod unique;

@@ -221,6 +221,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (code, text) in read_faults(reader, "faults_unverified", false) {
         faults.entry(code).or_insert(text);
     }
+    read_fault_help(reader, "fault_causes", &mut faults, |fault| &mut fault.cause);
+    read_fault_help(reader, "fault_remedies", &mut faults, |fault| &mut fault.remedy);
     let model = ModelPoint::ALL
         .iter()
         .map(|m| points.iter().position(|p| p.model == Some(*m)))
@@ -337,7 +339,13 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
         let text: Option<String> = table.optional(code);
         match (code.parse::<u16>(), text) {
             (Ok(number), Some(text)) => {
-                faults.insert(number, FaultText { text, verified });
+                let fault = FaultText {
+                    text,
+                    cause: String::new(),
+                    remedy: String::new(),
+                    verified,
+                };
+                faults.insert(number, fault);
             }
             (Err(_), _) => table.problem(
                 code,
@@ -349,6 +357,30 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
     }
     table.finish();
     faults
+}
+
+/// `fault_causes` and `fault_remedies`: more about faults that have a text.
+fn read_fault_help(
+    reader: &Reader<'_>,
+    key: &str,
+    faults: &mut BTreeMap<u16, FaultText>,
+    part: impl Fn(&mut FaultText) -> &mut String,
+) {
+    let Some(table) = reader.table(key) else { return };
+    for code in table.keys() {
+        let text: Option<String> = table.optional(code);
+        let fault = code.parse::<u16>().ok().and_then(|number| faults.get_mut(&number));
+        match (fault, text) {
+            (Some(fault), Some(text)) => *part(fault) = text,
+            (None, _) => table.problem(
+                code,
+                format!("there is no text of a fault `{code}`"),
+                "add it to [faults] or [faults_unverified]",
+            ),
+            (Some(_), None) => {}
+        }
+    }
+    table.finish();
 }
 
 /// Lower-case letters, digits and `joint`, starting with a letter.

@@ -7,11 +7,12 @@ use serde_json::Value as Json;
 
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, RecordOutcome, RecordRequest,
-    Request, Setting, WriteOutcome, WriteRequest, port_of,
+    Request, Setting, WhyRequest, WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
 use crate::document::nearest;
+use crate::drive::why::Explanation;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::mqtt::point_value;
 use crate::plant::{DriveHandle, Plant};
@@ -27,6 +28,7 @@ pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome
     let answered = match request {
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
+        Request::Why(request) => why(request, plant).map(Outcome::Why),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
         Request::Reload(_) | Request::Health(_) => {
             let message = "this is no request to a drive";
@@ -235,6 +237,11 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
     };
     let answer = placed.answered().await;
     Ok(WriteOutcome::new(&answer, placed.confirmed().await))
+}
+
+fn why(request: &WhyRequest, plant: &Plant) -> Result<Explanation, Failure> {
+    let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
+    Ok(drive.why(&drive.reading(Instant::now())))
 }
 
 async fn record(request: &RecordRequest, plant: &Plant, origin: &Origin) -> Result<RecordOutcome, Failure> {
