@@ -71,7 +71,8 @@ const LINES: [DemoLine; 5] = [
         name: "line3",
         protocol: Protocol::ModbusRtu,
         baud: 19_200,
-        format: "8N1",
+        // Of a Vacon CX; the others accept it.
+        format: "8N2",
         cadence: ["200ms", "2s"],
         drives: &[
             ("blower-1", "eaton-svx"),

@@ -3,6 +3,7 @@
 //! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
 //! line in `commands!` below.
 
+mod adapters;
 mod addresses;
 mod archive;
 mod audit;

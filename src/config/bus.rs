@@ -223,9 +223,32 @@ fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFor
     silence
 }
 
+/// A character format that the families on the line do not list. A drive that counts in longer characters takes requests
+/// for coming too early, and ignores some.
+fn check_format(reader: &Reader<'_>, format: &LineFormat, drives: &[DriveSpec]) {
+    let characters = format.characters();
+    let mut reported: Vec<&str> = Vec::new();
+    for profile in drives.iter().map(|drive| &drive.profile) {
+        let Some(usual) = profile.formats.first() else { continue };
+        if profile.formats.contains(&characters) || reported.contains(&profile.name.as_str()) {
+            continue;
+        }
+        reported.push(&profile.name);
+        reader.warning(
+            BUS.format.name,
+            format!("profile `{}` does not list the format {characters}", profile.name),
+            format!(
+                "write format = \"{usual}\", or what is set on the drives; the profile lists {}",
+                profile.formats.join(", ")
+            ),
+        );
+    }
+}
+
 /// What is valid but fits the drives badly.
 fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
     let mut reported: Vec<&str> = Vec::new();
+    check_format(reader, format, drives);
     for drive in drives {
         let profile = &drive.profile;
         let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud);
