@@ -31,6 +31,7 @@ mod schema;
 mod simulate;
 mod token;
 mod trace;
+mod trial;
 mod watch;
 mod write;
 
@@ -92,6 +93,7 @@ commands! {
     Reload => reload,
     Health => health,
     Demo => demo,
+    Try => trial,
     Check => check,
     Scan => scan,
     Read => read,

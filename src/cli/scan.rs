@@ -11,7 +11,6 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
-pub(super) use self::found::Found;
 pub(super) use self::search::{Extent, Heard, Search};
 pub(super) use self::settings::{Options, Setting, parse_port};
 use self::snippet::{Snippet, absolute};

@@ -40,33 +40,51 @@ pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::config::Settings;
+    use crate::codec::{LineFormat, Protocol};
+    use crate::drive::profile::Profiles;
 
-    fn carried_by(bus: &str, drives: &[(&str, u8)]) -> Option<(u128, u128)> {
-        let drives = drives.iter().map(|(profile, address)| {
-            format!("[[bus.drive]]\nname = \"d{address}\"\naddress = {address}\nprofile = \"{profile}\"\n")
-        });
-        let text = format!(
-            "[gateway]\nname = \"g\"\n[[bus]]\nname = \"b\"\nport = \"/dev/x\"\n{bus}\n{}",
-            drives.collect::<String>()
+    fn carried_by(protocol: Protocol, baud: u32, profiles: &[&str]) -> Option<(u128, u128)> {
+        let spec = BusSpec {
+            name: "b".into(),
+            port: "/dev/null".into(),
+            protocol,
+            format: LineFormat::new(baud, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_secs(1),
+        };
+        let drive = |(address, profile): (u8, &&str)| {
+            let profile = Profiles::built_in().get(profile).unwrap().clone();
+            DriveSpec::new("d", "b", address, profile)
+        };
+        let drives: Vec<DriveSpec> = (1..).zip(profiles).map(drive).collect();
+        let (cycle, slow_cycle) = carried(&spec, Silence::Spec, &drives)?;
+        let found = BusSpec {
+            cycle,
+            slow_cycle,
+            ..spec
+        };
+        let prediction = predict(&found, Silence::Spec, &drives);
+        assert!(
+            prediction.shortage.is_none() && prediction.load <= MOST_LOAD,
+            "{prediction:?}"
         );
-        let loaded = Settings::parse("t.toml", &text, std::iter::empty());
-        let settings = loaded.settings.unwrap_or_else(|| panic!("{:?}", loaded.errors));
-        let bus = &settings.buses[0];
-        let (cycle, slow_cycle) = carried(&bus.spec, bus.options.silence, &bus.drives)?;
         Some((cycle.as_millis(), slow_cycle.as_millis()))
     }
 
     #[test]
     fn lines_of_all_protocols() {
-        let nx = "baud = 38400";
-        assert_eq!(carried_by(nx, &[("vacon-nx", 1)]), Some((20, 1000)));
-        let ten: Vec<(&str, u8)> = (1..=10).map(|address| ("vacon-nx", address)).collect();
-        assert_eq!(carried_by(nx, &ten), Some((300, 1000)));
-        assert_eq!(carried_by("baud = 9600", &[("vacon-nx", 1)]), Some((75, 1000)));
-        let n2 = [("vacon-nx-n2", 1), ("eaton-hvx-n2", 2), ("teco-7300pa-n2", 3)];
-        assert_eq!(carried_by("protocol = \"n2\"", &n2), Some((2000, 10_000)));
-        let far: Vec<(&str, u8)> = (1..=247).map(|address| ("vacon-nx-n2", address)).collect();
-        assert_eq!(carried_by("protocol = \"n2\"", &far), None, "more than a line carries");
+        let rtu = Protocol::ModbusRtu;
+        assert_eq!(carried_by(rtu, 38_400, &["vacon-nx"]), Some((20, 1000)));
+        assert_eq!(carried_by(rtu, 38_400, &["vacon-nx"; 2]), Some((40, 1000)));
+        let slow = carried_by(rtu, 9600, &["vacon-nx"; 10]).unwrap();
+        assert!(slow.0 > 400 && slow.1 >= 1000, "{slow:?}");
+        let n2 = carried_by(Protocol::N2, 9600, &["vacon-nx-n2", "eaton-hvx-n2", "teco-7300pa-n2"]).unwrap();
+        assert!(n2.0 > 800 && n2.1 > n2.0, "{n2:?}");
+    }
+
+    #[test]
+    fn what_no_line_carries() {
+        assert_eq!(carried_by(Protocol::N2, 9600, &["vacon-nx-n2"; 247]), None);
+        assert_eq!(carried_by(Protocol::ModbusRtu, 9600, &[]), None);
     }
 }

@@ -15,7 +15,7 @@ pub(in crate::cli) struct Found {
     pub(in crate::cli) profiles: Vec<String>,
     /// Reads that tell families apart and got no answer: neither values nor a refusal.
     pub(in crate::cli) unanswered: usize,
-    /// The longest time that it took to begin a reply; absent if it gave no values.
+    /// Time that it takes to begin a reply, the median; absent if it gave no values.
     pub(in crate::cli) turnaround: Option<Duration>,
 }
 

@@ -199,12 +199,12 @@ impl<'a> Search<'a> {
     fn look_closer(&mut self, prober: &mut Prober<'_>, setting: Setting, address: u8) -> Result<Found, String> {
         let probes = identify::probes(&self.profiles, setting.protocol);
         let mut outcomes: BTreeMap<Probe, bool> = BTreeMap::new();
-        let mut turnaround: Option<Duration> = None;
+        let mut turnarounds: Vec<Duration> = Vec::new();
         for one in &probes {
             let request = Request::new(address, one.pdu());
             for _ in 0..self.options.tries.max(2) {
                 let answer = self.ask(prober, &request)?;
-                turnaround = turnaround.max(answer.turnaround);
+                turnarounds.extend(answer.turnaround);
                 match answer.ended {
                     Ended::Reply(Reply::Exception(_)) => outcomes.insert(*one, false),
                     Ended::Reply(_) => outcomes.insert(*one, true),
@@ -213,6 +213,7 @@ impl<'a> Search<'a> {
                 break;
             }
         }
+        turnarounds.sort_unstable();
         let fitting = identify::fitting(&self.profiles, setting.protocol, &outcomes);
         let fitting = fitting.iter().filter(|profile| profile.addresses.contains(&address));
         Ok(Found {
@@ -220,7 +221,7 @@ impl<'a> Search<'a> {
             address,
             profiles: fitting.map(|profile| profile.name.clone()).collect(),
             unanswered: probes.len() - outcomes.len(),
-            turnaround,
+            turnaround: turnarounds.get(turnarounds.len() / 2).copied(),
         })
     }
 
