@@ -133,8 +133,28 @@ pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
             "the port has no path",
             "write for example \"/dev/serial/by-id/usb-…\"",
         )),
+        None if is_windows_name(text) => Err(Finding::new(
+            format!("`{text}` is the name of a port on Windows"),
+            "write the path of the adapter on this machine, such as \"/dev/serial/by-id/usb-…\"; `ls /dev/serial/by-id` lists them",
+        )),
+        None if values::host_port(text, None).is_some() => Err(Finding::new(
+            format!("`{text}` is no path of a serial device"),
+            format!(
+                "did you mean \"tcp://{text}\"? Or \"rfc2217://{text}\" for a server that sets up its port over the network"
+            ),
+        )),
         None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
     }
+}
+
+/// `COM3`.
+fn is_windows_name(text: &str) -> bool {
+    let number = text
+        .get(..3)
+        .filter(|start| start.eq_ignore_ascii_case("com"))
+        .and_then(|_| text.get(3..));
+    let number = number.map(|number| number.trim_end_matches(':')).unwrap_or_default();
+    !number.is_empty() && number.chars().all(|c| c.is_ascii_digit())
 }
 
 fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
