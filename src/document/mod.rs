@@ -125,7 +125,7 @@ pub(crate) struct Document {
 }
 
 impl Document {
-    /// Parses `source`, the text of `file`. Syntax errors become problems; whatever can be read is kept.
+    /// Parses `source`, the text of `file`. The first syntax error becomes the one problem; whatever can be read is kept.
     pub(crate) fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
         let mut document = Document {
@@ -136,7 +136,8 @@ impl Document {
             warnings: RefCell::default(),
             known: RefCell::default(),
         };
-        for (line, message) in errors {
+        // One bracket that is missing makes an error of every line behind it.
+        for (line, message) in errors.into_iter().take(1) {
             let place = Place {
                 line,
                 ..Place::default()
