@@ -18,11 +18,13 @@ mod gateway {
     mod drive_access;
     mod living;
     mod local_socket;
+    mod messages;
     mod operators;
     mod recordings;
     mod reload;
     mod restart;
     mod slow_log;
     mod trace;
+    mod trying;
     mod user_profiles;
 }

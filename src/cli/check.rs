@@ -3,7 +3,7 @@
 mod as_service;
 
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -31,6 +31,9 @@ use crate::process_image::{Access, DriveSpec};
 pub(super) struct Args {
     #[command(flatten)]
     config: ConfigFile,
+    /// Configuration file, as with --config.
+    #[arg(value_name = "FILE", conflicts_with = "path")]
+    file: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -82,7 +85,7 @@ struct Request<'a> {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let path = &args.config.path;
+    let path = args.file.as_ref().unwrap_or(&args.config.path);
     let mut loaded = Settings::load(path, environment());
     if args.as_service {
         loaded.errors.extend(as_service::problems(path));

@@ -3,6 +3,7 @@
 //! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
 //! line in `commands!` below.
 
+mod adapters;
 mod addresses;
 mod archive;
 mod audit;
@@ -30,6 +31,7 @@ mod schema;
 mod simulate;
 mod token;
 mod trace;
+mod trial;
 mod watch;
 mod why;
 mod write;
@@ -92,6 +94,7 @@ commands! {
     Reload => reload,
     Health => health,
     Demo => demo,
+    Try => trial,
     Check => check,
     Scan => scan,
     Read => read,

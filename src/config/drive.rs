@@ -24,6 +24,8 @@ pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
     pub(super) unit: Option<(u8, Place)>,
+    /// The unit is the address, because none is written.
+    pub(super) unit_is_address: bool,
     pub(super) access: (Access, Place),
     /// Places of `supervision` and of a stop `on_shutdown`.
     pub(super) lease: Option<Place>,
@@ -79,6 +81,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         name,
         address: address.map(|a| (a, DRIVE.address.place(reader))),
         unit: unit.map(|u| (u, DRIVE.unit.place(reader))),
+        unit_is_address: !reader.has(DRIVE.unit.name),
         access: (access, DRIVE.access.place(reader)),
         lease: reader
             .has(DRIVE.supervision.name)

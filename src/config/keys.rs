@@ -203,7 +203,7 @@ keys! {
         baud: u32 = Number(300..=4_000_000, None), default 9600;
         /// Data bits 7 or 8, parity `N`, `E` or `O`, stop bits 1 or 2, as set on the drives. Modbus RTU needs 8 data bits.
         /// Modbus ASCII usually has 7, so that a character has 10 bits: `"7N2"` (a TECO card with all switches off),
-        /// `"7E1"`, `"7O1"`; devices with 8 exist.
+        /// `"7E1"`, `"7O1"`; devices with 8 exist. A format that the profile does not list causes a warning.
         format: String = Text("^[78][NEOneo][12]$", "a format such as \"8N1\""),
             or "`\"8N1\"`; Modbus ASCII: `\"7N2\"`";
         /// What switches the direction of the line: `"off"`: the adapter itself, as nearly all do; `"kernel"`: the port

@@ -32,6 +32,8 @@ pub struct Profile {
     pub protocols: Vec<Protocol>,
     /// Baud rates of the family; empty if any is possible.
     pub bauds: Vec<u32>,
+    /// Character formats of the family, such as `8N1`, the usual one first; empty if any is possible.
+    pub formats: Vec<String>,
     /// Addresses a drive can have.
     pub addresses: RangeInclusive<u8>,
     /// Time a drive takes to begin its reply, for the prediction only.

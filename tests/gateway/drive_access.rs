@@ -459,7 +459,7 @@ fn every_family_is_found_by_reading() {
         ("vacon-nx", "modbus-rtu", "38400", "8N1"),
         ("eaton-svx", "modbus-rtu", "38400", "8N1"),
         ("eaton-hvx", "modbus-rtu", "38400", "8N1"),
-        ("vacon-cx", "modbus-rtu", "19200", "8N1"),
+        ("vacon-cx", "modbus-rtu", "19200", "8N2"),
         ("teco-7300pa", "modbus-ascii", "19200", "7N2"),
         ("vacon-nx-n2", "n2", "9600", "8N1"),
         ("eaton-hvx-n2", "n2", "9600", "8N1"),
@@ -546,7 +546,7 @@ fn a_board_that_counts_from_one_shows_by_reading() {
     let read = |profile: &str| {
         let text = format!(
             "[gateway]\nname = \"plant\"\nprofile_dirs = [\"profiles\"]\n[[bus]]\nname = \"line1\"\nport = \"line1\"\n\
-             baud = 19200\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
+             baud = 19200\nformat = \"8N2\"\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
         );
         std::fs::write(&config, text).unwrap();
         let config = config.to_str().unwrap();

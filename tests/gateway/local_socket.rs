@@ -360,13 +360,14 @@ impl Family {
 #[test]
 fn a_command_without_run_never_carries_it_on_any_family() {
     let rtu = ("19200", "cycle = \"200ms\"\n");
+    let cx = ("19200", "format = \"8N2\"\ncycle = \"200ms\"\n");
     let ascii = ("19200", "protocol = \"modbus-ascii\"\ncycle = \"200ms\"\n");
     for some in [
         &[
             ("vacon-nx", rtu),
             ("eaton-svx", rtu),
             ("eaton-hvx", rtu),
-            ("vacon-cx", rtu),
+            ("vacon-cx", cx),
         ][..],
         &[
             ("teco-7300pa", ascii),

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use super::model::ModelPoint;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
-use crate::codec::Protocol;
+use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
@@ -234,6 +234,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         built_in,
         base,
         bauds: reader.or("bauds", Vec::new()),
+        formats: read_formats(reader),
         n2: n2::read_n2(reader, &protocols),
         protocols,
         addresses,
@@ -317,6 +318,24 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
         );
     }
     protocols
+}
+
+/// `formats`: character formats, as a bus has them.
+fn read_formats(reader: &Reader<'_>) -> Vec<String> {
+    let texts: Vec<String> = reader.or("formats", Vec::new());
+    let formats = texts.iter().map(|text| match LineFormat::new(1, text) {
+        Ok(format) => Some(format.characters()),
+        Err(_) => {
+            let what = format!("`{text}` is not a character format");
+            reader.problem(
+                "formats",
+                what,
+                "write for example [\"8N1\", \"8E1\"], the usual one first",
+            );
+            None
+        }
+    });
+    formats.flatten().collect()
 }
 
 fn read_pair<T: document::FromNode + Copy + PartialOrd>(reader: &Reader<'_>, key: &str) -> Option<RangeInclusive<T>> {

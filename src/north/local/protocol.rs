@@ -23,7 +23,7 @@ use serde_json::Value as Json;
 
 use crate::command::{Answer, CONFIRMED};
 use crate::drive::why::Explanation;
-use crate::drive::{Point, Sample};
+use crate::drive::{ModelPoint, Point, Quality, Sample};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -252,7 +252,58 @@ pub struct PointValue {
     pub why: Option<String>,
 }
 
+/// The state in one word and the text of the fault. They are no points of a profile; they are read by these names all the
+/// same, as over MQTT and HTTP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Word {
+    /// `offline`, `not_ready`, `ready`, `running` or `fault`.
+    State,
+    /// Empty without a fault.
+    FaultText,
+}
+
+impl Word {
+    /// The one of that name.
+    pub fn of(name: &str) -> Option<Word> {
+        [Word::State, Word::FaultText]
+            .into_iter()
+            .find(|word| word.name() == name)
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Word::State => "state",
+            Word::FaultText => "fault_text",
+        }
+    }
+
+    /// The points that it comes from.
+    pub fn sources(self) -> &'static [ModelPoint] {
+        match self {
+            Word::State => &[ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready],
+            Word::FaultText => &[ModelPoint::FaultCode],
+        }
+    }
+}
+
 impl PointValue {
+    /// A word, or the quality of what it comes from, and why it is not good.
+    pub(super) fn word(word: Word, value: Result<String, (Quality, String)>) -> PointValue {
+        let (value, quality, why) = match value {
+            Ok(text) => (Json::String(text), Quality::Good, None),
+            Err((quality, why)) => (Json::Null, quality, Some(why)),
+        };
+        PointValue {
+            point: word.name().to_string(),
+            value,
+            text: None,
+            unit: String::new(),
+            quality: quality.name().to_string(),
+            why,
+        }
+    }
+
     /// The point with its sample; `why` is asked only where that is not good.
     pub(super) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
         let value = sample.good();
