@@ -20,7 +20,7 @@ struct Plant {
 /// Drives `pump-1` and `pump-2` at that baud rate; `keys` are further lines of the first.
 fn plant(baud: &str, keys: &str) -> Plant {
     let bus = LINE1.replace("38400", baud);
-    let drives = controlled("pump-1", 1, keys) + &controlled("pump-2", 2, "");
+    let drives = controlled("pump-1", 1, keys) + &controlled("pump-2", 2, "raw_writes = true");
     let site = Site::of(&[&bus, &drives, MODBUS_TCP, MQTT, HTTP]);
     let simulator = site.simulate(&["--addresses", "1-2", "--baud", baud]);
     let gateway = site.run_ready();

@@ -36,7 +36,8 @@ fn site(bus: &str, profile: &str) -> Site {
     let line = LINE1.split("baud").next().unwrap();
     let drive = format!(
         "cycle = \"100ms\"\n{bus}\n\
-         [[bus.drive]]\nname = \"drive\"\naddress = 1\naccess = \"control\"\nprofile = \"{profile}\"\n"
+         [[bus.drive]]\nname = \"drive\"\naddress = 1\naccess = \"control\"\nraw_writes = true\n\
+         profile = \"{profile}\"\n"
     );
     Site::of(&[line, &drive, HTTP, MODBUS_TCP])
 }

@@ -33,7 +33,7 @@ pub(super) fn answer(asked: &RequestPdu, reply: &Reply) -> String {
             _ => super::answer(reply),
         },
         Reply::Written => "acknowledged".to_string(),
-        Reply::Exception(code) if code.0 & 0x80 != 0 => code.meaning().replacen("N2 ", "N", 1),
+        Reply::Exception(code) if code.0 & 0x80 != 0 => format!("N{:02X}: {}", code.0 & 0x7F, code.meaning()),
         // Not the drive's words: its own state was called unreliable.
         Reply::Exception(_) if matches!(asked, RequestPdu::Read { .. }) => "unreliable".to_string(),
         _ => super::answer(reply),

@@ -384,6 +384,8 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
 /// MQTT 5, and closes the connection; some close it at once.
 fn refusal(error: &ConnectionError) -> String {
     match error {
+        // Of the network or of TLS: it has words of its own.
+        ConnectionError::MqttState(StateError::Deserialization(PacketError::Io(_))) => reason(error),
         ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
             "the broker closed the connection without accepting it: it does not support MQTT 5, or expects TLS; {MQTT_5}, or \
              write mqtts:// for TLS"

@@ -233,7 +233,7 @@ fn kinds() -> Vec<(&'static str, u8, Vec<u8>, &'static str)> {
         (
             "16 the same with the control word",
             NX,
-            write(2000, &[0, 0, 5000]),
+            write(2000, &[1, 0, 5000]),
             "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
         ),
         (
