@@ -1,7 +1,7 @@
 //! `drivegate scan`: finds the drives of a line and prints a configuration for them. Only reads.
 
 mod progress;
-mod snippet;
+pub(super) mod snippet;
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -13,6 +13,7 @@ use std::time::Duration;
 use self::progress::Progress;
 use self::snippet::Found;
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use crate::bus::Mode;
 use crate::bus::prober::Prober;
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
@@ -100,7 +101,7 @@ fn settings(args: &Args) -> Result<Vec<Setting>, String> {
 }
 
 /// The port as in a configuration, relative to the working directory.
-fn parse_port(text: &str) -> Result<String, Finding> {
+pub(super) fn parse_port(text: &str) -> Result<String, Finding> {
     config::check_port(text, Path::new(""))
 }
 
@@ -125,7 +126,7 @@ fn check_addresses(args: &Args, settings: &[Setting]) -> Result<(), String> {
     ))
 }
 
-fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
+pub(super) fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
     if names.iter().any(|name| name == "all") {
         return Ok(Protocol::ALL.to_vec());
     }
@@ -212,7 +213,7 @@ fn addresses(args: &Args, setting: Setting) -> impl Iterator<Item = u8> {
 }
 
 /// Ctrl-C ends the scan; what was found is still printed.
-fn stop_on_signal(stop: Arc<AtomicBool>) {
+pub(super) fn stop_on_signal(stop: Arc<AtomicBool>) {
     std::thread::spawn(move || {
         let Ok(runtime) = super::runtime() else { return };
         // Without a handler Ctrl-C ends the process, which is harmless: nothing was written.
@@ -329,7 +330,7 @@ impl Scan<'_> {
         let printed = if self.found.is_empty() {
             ExitCode::from(EXIT_FAILED)
         } else {
-            report::print(&snippet::snippet(&self.args.port, &self.found))
+            report::print(&snippet::snippet(&self.args.port, &self.found, Mode::Master))
         };
         if let Err(message) = outcome {
             report::error(&message);

@@ -1,22 +1,23 @@
-//! The configuration that a scan prints. Pure.
+//! The configuration that `scan` and `listen` print. Pure.
 
 use std::path::Path;
 
+use crate::bus::Mode;
 use crate::codec::{LineFormat, Protocol};
 
 /// A drive that answered.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub(super) struct Found {
-    pub(super) protocol: Protocol,
-    pub(super) format: LineFormat,
-    pub(super) address: u8,
+pub(in crate::cli) struct Found {
+    pub(in crate::cli) protocol: Protocol,
+    pub(in crate::cli) format: LineFormat,
+    pub(in crate::cli) address: u8,
     /// Profiles that match its answers; none, one, or some that cannot be distinguished by reading.
-    pub(super) profiles: Vec<String>,
+    pub(in crate::cli) profiles: Vec<String>,
 }
 
 impl Found {
     /// For people.
-    pub(super) fn title(&self) -> String {
+    pub(in crate::cli) fn title(&self) -> String {
         match self.profiles.as_slice() {
             [] => "no known profile".to_string(),
             [one] => one.clone(),
@@ -26,7 +27,7 @@ impl Found {
 }
 
 /// Buses and drives as a configuration file has them.
-pub(super) fn snippet(port: &str, found: &[Found]) -> String {
+pub(in crate::cli) fn snippet(port: &str, found: &[Found], mode: Mode) -> String {
     // A configuration is read from its own directory.
     let port = if port.contains("://") {
         port.to_string()
@@ -37,6 +38,10 @@ pub(super) fn snippet(port: &str, found: &[Found]) -> String {
     let mut settings: Vec<(Protocol, LineFormat)> = found.iter().map(|f| (f.protocol, f.format)).collect();
     settings.dedup();
     let mut number = 0;
+    let mode = match mode {
+        Mode::Master => "",
+        Mode::Listen => "mode = \"listen\"\n",
+    };
     for (index, (protocol, format)) in settings.iter().enumerate() {
         if index > 0 {
             text += "\n# Drives also answered with other settings; a line has one, so choose.\n";
@@ -46,7 +51,7 @@ pub(super) fn snippet(port: &str, found: &[Found]) -> String {
         text += &commented(
             index > 0,
             &format!(
-                "\n[[bus]]\nname = \"line{}\"\nport = {port:?}\nprotocol = \"{}\"\nbaud = {}\nformat = \"{characters}\"\n",
+                "\n[[bus]]\nname = \"line{}\"\nport = {port:?}\n{mode}protocol = \"{}\"\nbaud = {}\nformat = \"{characters}\"\n",
                 index + 1,
                 protocol.name(),
                 format.baud
@@ -128,7 +133,7 @@ mod tests {
             vec![found(rtu, 1, &["vacon-nx"]), found(Protocol::N2, 1, &["vacon-nx-n2"])],
         ];
         for case in cases {
-            let text = snippet("/dev/serial/by-id/usb-\"x\"", &case);
+            let text = snippet("/dev/serial/by-id/usb-\"x\"", &case, Mode::Listen);
             let loaded = Settings::parse("found.toml", &text, std::iter::empty());
             let errors: Vec<String> = loaded.errors.iter().map(ToString::to_string).collect();
             let settings = loaded.settings.unwrap_or_else(|| panic!("{errors:?}\n{text}"));
