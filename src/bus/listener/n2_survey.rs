@@ -67,7 +67,9 @@ impl N2Survey {
 
     /// Whether the checksum of a line, a request's or an answer's with data, is what is assumed.
     fn sum(&mut self, line: &[u8]) {
-        let begin = line.iter().rposition(|byte| matches!(byte, b'>' | b'A'));
+        // An A may be a digit as well.
+        let request = line.iter().rposition(|byte| *byte == b'>');
+        let begin = request.or_else(|| line.iter().position(|byte| *byte == b'A'));
         let text = begin.and_then(|begin| line.get(begin + 1..)?.strip_suffix(b"\r"));
         let Some((body, check)) = text.and_then(|text| text.split_at_checked(text.len().checked_sub(2)?)) else {
             return;
