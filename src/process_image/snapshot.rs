@@ -41,7 +41,7 @@ pub struct Cadence(u16);
 
 impl Cadence {
     /// Longest interval that counts as one.
-    const LONGEST: Duration = Duration::from_secs(600);
+    pub const LONGEST: Duration = Duration::from_secs(600);
 
     /// Heard again after `interval`. A longer interval than so far is learned at four times the last at most, so that a pause
     /// of the other master makes no slow cadence; a shorter one by a quarter each time.
@@ -154,11 +154,14 @@ impl Snapshot {
 
     /// Words that the drive answered another master. Whether process data was among them.
     pub fn hear(&mut self, table: Table, start: u16, words: &[u16], now: Instant) -> bool {
-        let mut fast = false;
-        for span in &self.spans {
+        let (mut fast, mut before) = (false, None::<Instant>);
+        for span in self.spans.iter().filter(|span| span.class == PollClass::Fast) {
             let of = |offset: usize| start.checked_add(u16::try_from(offset).ok()?);
-            let lies_in = |address: u16| span.offset(table, address).is_some();
-            fast |= span.class == PollClass::Fast && (0..words.len()).filter_map(of).any(lies_in);
+            let places = (0..words.len()).filter_map(|offset| span.offset(table, of(offset)?));
+            for cell in places.filter_map(|place| span.cells.get(place)) {
+                fast = true;
+                before = cell.at.map(|at| before.map_or(at, |before| before.min(at))).or(before);
+            }
         }
         self.each(table, start, words.len(), |cell, offset| {
             let interval = cell.at.map(|before| now.saturating_duration_since(before));
@@ -171,7 +174,9 @@ impl Snapshot {
             };
         });
         if fast {
-            let interval = self.fast_at.map(|before| now.saturating_duration_since(before));
+            // Between two reads of the same registers: where each takes a read of its own, those of one round follow each
+            // other closely, and the pause until the next round is what counts.
+            let interval = before.map(|before| now.saturating_duration_since(before));
             let cadence = self.heard.unwrap_or_default();
             self.heard = Some(interval.map_or(cadence, |interval| cadence.after(interval)));
             self.fast_at = Some(now);

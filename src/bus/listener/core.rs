@@ -18,7 +18,7 @@ use crate::event::{EventKind, Events};
 use crate::plant::BusHandle;
 use crate::process_image::{Cadence, Outcome as Counted};
 
-/// A drive of which nothing was heard for that long, and for three times as long as usual, is offline.
+/// A drive of which nothing was heard for that long, and for three of its usual pauses, is offline.
 const SILENT: Duration = Duration::from_secs(5);
 /// Longest pause between two looks at the time.
 const LOOK: Duration = Duration::from_millis(100);
@@ -31,7 +31,8 @@ struct Known {
     unanswered: u32,
     /// When it was heard last; the opening of the port, before that.
     heard: Instant,
-    cadence: Cadence,
+    /// Longest pause between two replies of it lately: a whole round of the other master, where that asks drive after drive.
+    pause: Duration,
     commands: Commands,
     /// First addresses of its values of two registers, which are never stored in halves.
     wide: Vec<(Table, u16)>,
@@ -67,7 +68,7 @@ impl ListenCore {
                 address: drive.spec.address,
                 unanswered: 0,
                 heard: now,
-                cadence: Cadence::default(),
+                pause: Duration::ZERO,
                 commands: Commands::default(),
                 wide: wide(&drive.spec.profile),
             }
@@ -129,7 +130,7 @@ impl ListenCore {
         self.heard = heard;
         for index in 0..self.drives.len() {
             let Some(known) = self.drives.get_mut(index) else { break };
-            let silent = SILENT.max(known.cadence.good_for());
+            let silent = SILENT.max(known.pause * 3);
             let is_silent = now.saturating_duration_since(known.heard) > silent;
             let due = known.commands.due(now);
             if is_silent {
@@ -230,7 +231,7 @@ impl ListenCore {
         let is_alive = exchange.doubt.is_none() || self.bus.image.spec.protocol != Protocol::N2;
         if answered && is_alive {
             let interval = exchange.at.saturating_duration_since(known.heard);
-            known.cadence = known.cadence.after(interval);
+            known.pause = pause_after(known.pause, interval);
             (known.unanswered, known.heard) = (0, exchange.at);
             if !image.snapshot().link.is_online() {
                 self.report.apply(&News::Online(index), now);
@@ -348,6 +349,14 @@ impl ListenCore {
         let (ticket, _) = Ticket::new(origin, &image.spec.name, what, true, began, self.writes.clone());
         ticket.with_changes(changes).answer(outcome, at);
     }
+}
+
+/// The longest pause lately, after one more: a longer one counts at four times the last at most, so that a rest of the other master
+/// delays no later notice; a long one is forgotten by an eighth of the time since, however many replies came in it.
+fn pause_after(last: Duration, pause: Duration) -> Duration {
+    let most = last.max(Duration::from_secs(1)) * 4;
+    let left = last.saturating_sub(pause / 8);
+    pause.min(Cadence::LONGEST).min(most).max(left)
 }
 
 fn decoder(bus: &BusHandle) -> Decoder {
