@@ -75,7 +75,7 @@ fn measure() -> Result<(), Box<dyn Error>> {
         }
         let after = image.transactions.snapshot();
         let mean = (after.sum - before.sum) / (after.count - before.count).max(1) as f64;
-        let load = image.health().load;
+        let load = image.health().load.unwrap_or(f64::NAN);
         let waits: Vec<f64> = waits.iter().map(|wait| wait.as_secs_f64() * 1e3).collect();
         let at = |share| quantile(&waits, share);
         println!(

@@ -367,8 +367,8 @@ mod tests {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown | Recording => false,
-                ReloadRefused => true,
+                | BusDown | Recording | ReloadRefused => false,
+                ForeignCommand => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

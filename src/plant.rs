@@ -1,6 +1,7 @@
 //! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
 
 mod placed;
+mod why;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant};
@@ -13,12 +14,14 @@ use crate::command::{
     self, Answer, Authority, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
     WriteStats,
 };
+use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Events, RefusedCommand};
 use crate::history::Recordings;
 use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::placed::Placed;
+pub(crate) use self::why::explain;
 
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
@@ -65,6 +68,7 @@ pub struct DriveHandle {
 
 /// What an order sets, with the values that are known before it.
 fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
+    let is = |point: ModelPoint, index: usize| reading.spec.profile.model_index(point) == Some(index);
     match order {
         Order::Points(values) => values
             .iter()
@@ -77,10 +81,17 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
                     .map_or_else(|| format!("point {index}"), |p| p.name.clone()),
                 old: reading.sample(*index).good(),
                 new: *new,
+                run: is(ModelPoint::Run, *index).then(|| new.as_bool()),
+                resets: is(ModelPoint::FaultReset, *index) && new.as_bool(),
             })
             .collect(),
         Order::Write(pdu) => {
             let (table, items) = command::written(pdu).unwrap_or((Table::Holding, Vec::new()));
+            let run_bit = reading.spec.profile.run_bit();
+            let runs = |address: u16, word: u16| {
+                let (_, bit, invert) = run_bit.filter(|(raw, ..)| raw.table == table && raw.address == address)?;
+                Some(((word >> bit) & 1 == 1) != invert)
+            };
             let number = |word: u16| Value::Integer(i64::from(word));
             let change = |(address, word): (u16, u16)| Change {
                 point: format!("{table} {address}"),
@@ -89,6 +100,8 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
                     .ok()
                     .and_then(|words| words.first().copied().map(number)),
                 new: number(word),
+                run: runs(address, word),
+                resets: false,
             };
             items.into_iter().map(change).collect()
         }
@@ -199,6 +212,11 @@ impl DriveHandle {
     /// Stops of the drive that were taken in since its bus was started.
     pub fn stops(&self) -> u64 {
         self.bus.queue.lock().stops(self.index)
+    }
+
+    /// Whether the drive of `reading` runs, and why not.
+    pub fn why(&self, reading: &Reading<'_>) -> Explanation {
+        explain(reading, &self.bus.image, &self.writes)
     }
 
     /// Whether the bus is open.

@@ -19,6 +19,7 @@ mod gateway {
     mod listening;
     mod living;
     mod local_socket;
+    mod messages;
     mod operators;
     mod recordings;
     mod reload;
@@ -26,5 +27,6 @@ mod gateway {
     mod restart;
     mod slow_log;
     mod trace;
+    mod trying;
     mod user_profiles;
 }

@@ -188,6 +188,15 @@ impl Watch {
     }
 }
 
+/// A command that showed no effect in time.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Unconfirmed {
+    /// For people: what was not seen.
+    pub text: String,
+    /// The motor was to run, and does not.
+    pub does_not_run: bool,
+}
+
 /// The acknowledged commands of a drive that may still be confirmed.
 #[derive(Debug, Default)]
 pub struct Confirmations(Vec<Watch>);
@@ -250,7 +259,7 @@ impl Confirmations {
 
     /// What showed no effect in time, in words, each once. Of a motor that still slows down, and of a drive that was not
     /// read since, nothing is said yet, but nobody waits for it any longer.
-    pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<String> {
+    pub fn expire(&mut self, profile: &Profile, now: Instant) -> Vec<Unconfirmed> {
         let mut late = Vec::new();
         self.0.retain_mut(|watch| {
             if !watch.is_over(now) {
@@ -260,7 +269,10 @@ impl Confirmations {
                 watch.receipts.clear();
                 return true;
             }
-            late.push(watch.report(profile));
+            late.push(Unconfirmed {
+                text: watch.report(profile),
+                does_not_run: watch.was_read && watch.effects.contains(&Effect::Runs),
+            });
             false
         });
         late

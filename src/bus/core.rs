@@ -70,8 +70,8 @@ impl BusCore {
         let silence = spec.protocol.silence(options.silence, &spec.format);
         BusCore {
             line: LineState::new(spec.protocol, spec.format, silence, now),
-            master: Master::new(bus.clone(), options, silence, writes, before, now),
-            report: Report::new(bus.image.clone(), events, now),
+            master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
+            report: Report::new(bus.image.clone(), events, writes, now),
             bus,
             chosen: None,
             quiet_until: before.quiet_until,

@@ -264,7 +264,7 @@ impl Master {
                     drive.confirmations.look(&image.reading(now, drive.fresh), now);
                 }
                 let late = drive.confirmations.expire(&image.spec.profile, now);
-                news.extend(late.into_iter().map(|text| News::NotConfirmed(index, text)));
+                news.extend(late.into_iter().map(|late| News::NotConfirmed(index, late)));
             }
             if image.spec.supervision.is_some() {
                 supervise(bus, index, image, drive, writes, now, news);

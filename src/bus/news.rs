@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::confirm::Unconfirmed;
 use crate::codec::Exception;
 use crate::command::Refusal;
 use crate::drive::PlannedRead;
@@ -34,8 +35,8 @@ pub enum News {
     Unlike(usize, u8),
     /// The drive refuses these addresses.
     Unavailable(usize, PlannedRead, Exception),
-    /// An acknowledged command showed no effect in time; the text is for people.
-    NotConfirmed(usize, String),
+    /// An acknowledged command showed no effect in time.
+    NotConfirmed(usize, Unconfirmed),
     /// The lease of a drive that runs ran out.
     LeaseRanOut(usize),
     /// The action of a lease that ran out cannot be written.

@@ -4,6 +4,10 @@
 //! time when the line cannot carry that. Slow requests fill the idle time of a round as far as they fit in
 //! whole, and get [`SLOW_SHARE`] of the line at least. Requests of the class `once` cost nothing in the long run.
 
+mod cadence;
+
+pub use cadence::carried;
+
 use std::fmt;
 use std::time::Duration;
 

@@ -2,10 +2,10 @@
 
 use std::time::{Duration, Instant};
 
-use super::line_state::{LineState, Sending};
+use super::line_state::{Exchanged, LineState, Sending};
 use super::n2_late_replies::N2LateReplies;
 use super::transaction::Ended;
-use crate::codec::{LineFormat, Protocol, Request};
+use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::line::{Line, Lost, Woken};
 
 /// A line with its settings.
@@ -15,6 +15,40 @@ pub struct Prober<'l> {
     protocol: Protocol,
     timeout: Duration,
     state: LineState,
+    unasked: usize,
+}
+
+/// What came of a request.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Answer {
+    /// How the exchange ended.
+    pub ended: Ended,
+    /// Time until the reply began, as it is seen here; with values only.
+    pub turnaround: Option<Duration>,
+    /// The adapter sent the request back.
+    pub echoed: bool,
+    /// Bytes that came, beside such an echo.
+    pub bytes: usize,
+}
+
+impl Answer {
+    fn of(exchanged: Exchanged, sent: &[u8], now: Instant) -> Answer {
+        let seen = exchanged.transaction.seen();
+        let echoed = seen.starts_with(sent);
+        let values = matches!(&exchanged.ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
+        let turnaround = exchanged.transaction.first_byte().filter(|_| values).map(|first| {
+            // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
+            let by_first = first.saturating_duration_since(exchanged.sent);
+            let by_last = now.saturating_duration_since(exchanged.sent);
+            by_first.min(by_last.saturating_sub(exchanged.reply_time))
+        });
+        Answer {
+            turnaround,
+            echoed,
+            bytes: seen.len() - if echoed { sent.len() } else { 0 },
+            ended: exchanged.ended,
+        }
+    }
 }
 
 impl Prober<'_> {
@@ -31,6 +65,7 @@ impl Prober<'_> {
             protocol,
             timeout,
             state: LineState::new(protocol, format, silence, Instant::now()),
+            unasked: 0,
         }
     }
 
@@ -39,11 +74,39 @@ impl Prober<'_> {
         self.state.patience(request, self.timeout)
     }
 
+    /// The same without a line.
+    pub fn patience_of(
+        protocol: Protocol,
+        format: LineFormat,
+        silence: Duration,
+        timeout: Duration,
+        request: &Request,
+    ) -> Duration {
+        LineState::new(protocol, format, silence, Instant::now()).patience(request, timeout)
+    }
+
+    /// Bytes that came while nothing was asked for.
+    pub fn unasked(&self) -> usize {
+        self.unasked
+    }
+
+    /// Listens for `time` without a request.
+    ///
+    /// # Errors
+    /// When the port is gone.
+    pub fn listen_for(&mut self, time: Duration) -> Result<(), Lost> {
+        let until = Instant::now() + time;
+        while Instant::now() < until {
+            self.listen(until)?;
+        }
+        Ok(())
+    }
+
     /// One request and what became of it.
     ///
     /// # Errors
     /// When the port is gone.
-    pub fn ask(&mut self, request: &Request) -> Result<Ended, Lost> {
+    pub fn ask(&mut self, request: &Request) -> Result<Answer, Lost> {
         let since = Instant::now();
         while let Some(clear) = Some(self.state.clear_at(since)).filter(|clear| Instant::now() < *clear) {
             self.listen(clear)?;
@@ -60,26 +123,29 @@ impl Prober<'_> {
             .send(request.clone(), frame.clone(), sending, late, Instant::now());
         self.line.send(&frame)?;
         loop {
-            let until = match self.state.on_time(Instant::now()) {
-                Ok(exchanged) => return Ok(exchanged.ended),
+            let now = Instant::now();
+            let until = match self.state.on_time(now) {
+                Ok(exchanged) => return Ok(Answer::of(exchanged, &frame, now)),
                 Err(until) => until.unwrap_or_else(Instant::now),
             };
-            if let Some(ended) = self.listen(until)? {
-                return Ok(ended);
+            if let Some(exchanged) = self.listen(until)? {
+                return Ok(Answer::of(exchanged, &frame, Instant::now()));
             }
         }
     }
 
-    /// Listens until then, or until bytes came. How the exchange ended, if it did by them.
-    fn listen(&mut self, until: Instant) -> Result<Option<Ended>, Lost> {
+    /// Listens until then, or until bytes came. The exchange, if it ended by them.
+    fn listen(&mut self, until: Instant) -> Result<Option<Exchanged>, Lost> {
         let mut buffer = [0u8; 512];
         if self.line.wait(until, None, !self.state.is_underway())? != Woken::Readable {
             return Ok(None);
         }
         let count = self.line.receive(&mut buffer)?;
-        let exchanged = self
+        if !self.state.is_underway() {
+            self.unasked += count;
+        }
+        Ok(self
             .state
-            .heard(buffer.get(..count).unwrap_or_default(), Instant::now());
-        Ok(exchanged.map(|exchanged| exchanged.ended))
+            .heard(buffer.get(..count).unwrap_or_default(), Instant::now()))
     }
 }

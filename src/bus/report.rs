@@ -3,14 +3,17 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use super::confirm::Unconfirmed;
 use super::line_state::Exchanged;
 use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request, Table};
+use crate::command::WriteStats;
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
+use crate::plant::explain;
 use crate::process_image::{
     Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, Taped, TapedRead,
 };
@@ -47,6 +50,7 @@ const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
 pub(super) struct Report {
     image: Arc<BusImage>,
     events: Events,
+    writes: Arc<WriteStats>,
     window: Instant,
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
@@ -60,11 +64,12 @@ pub(super) struct Report {
 }
 
 impl Report {
-    pub(super) fn new(image: Arc<BusImage>, events: Events, now: Instant) -> Report {
+    pub(super) fn new(image: Arc<BusImage>, events: Events, writes: Arc<WriteStats>, now: Instant) -> Report {
         let faults = vec![None; image.drives.len()];
         Report {
             image,
             events,
+            writes,
             window: now,
             busy: Duration::ZERO,
             looked_at: vec![false; faults.len()],
@@ -86,11 +91,7 @@ impl Report {
             News::Restarted(drive) => self.restarted(*drive),
             News::Unlike(drive, device) => self.unlike(*drive, *device),
             News::Unavailable(drive, read, exception) => self.unavailable(*drive, read, *exception),
-            News::NotConfirmed(drive, text) => {
-                self.drive_event(*drive, EventKind::NotConfirmed, None, |name| {
-                    format!("drive {name} {text}")
-                });
-            }
+            News::NotConfirmed(drive, late) => self.not_confirmed(*drive, late, now),
             News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
             News::ActionRefused { drive, what, refusal } => {
                 self.drive_event(*drive, EventKind::Supervision, None, |name| {
@@ -172,6 +173,23 @@ impl Report {
         });
     }
 
+    /// A motor that was to run and does not: with the causes that are known.
+    fn not_confirmed(&self, index: usize, late: &Unconfirmed, now: Instant) {
+        let Some(drive) = self.image.drives.get(index).filter(|_| late.does_not_run) else {
+            return self.drive_event(index, EventKind::NotConfirmed, None, |name| {
+                format!("drive {name} {}", late.text)
+            });
+        };
+        let causes = explain(&drive.reading(now, RECENT), &self.image, &self.writes).causes;
+        let causes: Vec<String> = causes
+            .iter()
+            .map(|cause| format!("{} ({})", cause.cause, cause.evidence))
+            .collect();
+        self.drive_event(index, EventKind::NotConfirmed, None, |name| {
+            format!("drive {name} {}; blocked by {}", late.text, causes.join(", "))
+        });
+    }
+
     fn lease_ran_out(&self, index: usize) {
         let Some(drive) = self.drive(index) else { return };
         let Some(supervision) = &drive.spec.supervision else {
@@ -212,6 +230,7 @@ impl Report {
             h.tried = true;
             h.since = Some(SystemTime::now());
             h.reason = None;
+            h.load = None;
             h.opened += 1;
         });
         let text = format!("port {} of bus {} is open", self.image.spec.port, self.image.spec.name);
@@ -233,7 +252,7 @@ impl Report {
             }
             h.up = false;
             h.tried = true;
-            h.load = 0.0;
+            h.load = Some(0.0);
             h.reason = Some(why.to_string());
         });
         self.up = false;
@@ -518,7 +537,7 @@ impl Report {
             return;
         }
         let load = (self.busy.as_secs_f64() / window.as_secs_f64()).min(1.0);
-        self.image.update_health(|h| h.load = load);
+        self.image.update_health(|h| h.load = Some(load));
         self.window = now;
         self.busy = Duration::ZERO;
     }

@@ -3,7 +3,7 @@
 mod as_service;
 
 use std::fmt::Write;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::Duration;
 
@@ -13,8 +13,10 @@ use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::config::{BusSettings, Loaded, Settings, environment};
 use crate::document::Problem;
+use crate::drive::raw_writes;
 use crate::history::RecorderOptions;
 use crate::history::budget::Budget;
+use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
@@ -29,6 +31,9 @@ use crate::history::budget::Budget;
 pub(super) struct Args {
     #[command(flatten)]
     config: ConfigFile,
+    /// Configuration file, as with --config.
+    #[arg(value_name = "FILE", conflicts_with = "path")]
+    file: Option<PathBuf>,
     /// Print one JSON object.
     #[arg(long)]
     json: bool,
@@ -56,7 +61,17 @@ struct Bus<'a> {
     shutdown_worst_ms: f64,
     /// Memory that the recorder takes at most.
     recorder_bytes: usize,
+    /// Addresses of drives that may be commanded which `raw_writes` excludes.
+    raw_writes_refused: Vec<Refused<'a>>,
     requests: Vec<Request<'a>>,
+}
+
+#[derive(Serialize)]
+struct Refused<'a> {
+    drive: &'a str,
+    table: &'static str,
+    first: u16,
+    last: u16,
 }
 
 #[derive(Serialize)]
@@ -70,7 +85,7 @@ struct Request<'a> {
 }
 
 pub(super) fn run(args: &Args) -> ExitCode {
-    let path = &args.config.path;
+    let path = args.file.as_ref().unwrap_or(&args.config.path);
     let mut loaded = Settings::load(path, environment());
     if args.as_service {
         loaded.errors.extend(as_service::problems(path));
@@ -122,8 +137,59 @@ fn bus_report<'a>(bus: &'a BusSettings, recorder: &RecorderOptions) -> Bus<'a> {
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
         recorder_bytes: Budget::of(&bus.spec, &bus.drives, recorder).total(),
+        raw_writes_refused: commanded(bus).flat_map(refused).collect(),
         requests: prediction.requests.iter().map(request).collect(),
     }
+}
+
+/// The drives that may be commanded; to the others every write is refused.
+fn commanded(bus: &BusSettings) -> impl Iterator<Item = &DriveSpec> {
+    bus.drives.iter().filter(|drive| drive.access == Access::Control)
+}
+
+fn refused(drive: &DriveSpec) -> impl Iterator<Item = Refused<'_>> {
+    let ranges = drive.raw_writes.refused_ranges(&drive.profile);
+    ranges.into_iter().map(|(table, range)| Refused {
+        drive: &drive.name,
+        table: table.name(),
+        first: *range.start(),
+        last: *range.end(),
+    })
+}
+
+/// Most drives that a line names.
+const NAMED: usize = 4;
+
+/// What raw writes may not set, one line for the drives that have it in common; empty without Modbus TCP, by which
+/// alone raw writes come.
+fn raw_writes(bus: &BusSettings, settings: &Settings) -> String {
+    let mut alike: Vec<(&DriveSpec, Vec<&str>)> = Vec::new();
+    for drive in commanded(bus).filter(|_| settings.modbus_tcp.is_some()) {
+        let same = |other: &DriveSpec| other.profile == drive.profile && other.raw_writes == drive.raw_writes;
+        match alike.iter_mut().find(|(other, _)| same(other)) {
+            Some((_, names)) => names.push(&drive.name),
+            None => alike.push((drive, vec![&drive.name])),
+        }
+    }
+    let mut text = String::new();
+    for (drive, names) in alike {
+        let ranges = drive.raw_writes.refused_ranges(&drive.profile);
+        if ranges.is_empty() {
+            continue;
+        }
+        let first = names.iter().take(NAMED).copied().collect::<Vec<_>>().join(", ");
+        let more = match names.len().saturating_sub(NAMED) {
+            0 => String::new(),
+            more => format!(" and {more} more"),
+        };
+        let refused = raw_writes::in_words(&ranges);
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            text,
+            "  raw writes  {first}{more}: refused for {refused} (see `raw_writes`)"
+        );
+    }
+    text
 }
 
 fn drive_name<'a>(bus: &'a BusSettings, request: &PredictedRequest) -> &'a str {
@@ -138,7 +204,7 @@ fn text(path: &Path, settings: &Settings, warnings: usize) -> String {
     // Writing to a String cannot fail.
     let mut text = String::new();
     for bus in &settings.buses {
-        text += &bus_text(bus, &settings.recordings);
+        text += &bus_text(bus, settings);
         text.push('\n');
     }
     let drives: usize = settings.buses.iter().map(|bus| bus.drives.len()).sum();
@@ -165,7 +231,7 @@ fn counted(count: usize, one: &str, many: &str) -> String {
     format!("{count} {}", if count == 1 { one } else { many })
 }
 
-fn bus_text(bus: &BusSettings, recorder: &RecorderOptions) -> String {
+fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
     let spec = &bus.spec;
     let there = spec.port.contains("://") || Path::new(&spec.port).exists();
     let mut text = format!(
@@ -180,7 +246,7 @@ fn bus_text(bus: &BusSettings, recorder: &RecorderOptions) -> String {
     if bus.listens() {
         return text
             + "  listens only: another master asks these drives, and the gateway sends nothing\n"
-            + &memory(bus, recorder);
+            + &memory(bus, &settings.recordings);
     }
     let prediction = bus.predict();
     let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);
@@ -198,7 +264,7 @@ fn bus_text(bus: &BusSettings, recorder: &RecorderOptions) -> String {
     (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
-    text + &summary(bus, &prediction) + &memory(bus, recorder)
+    text + &summary(bus, &prediction) + &memory(bus, &settings.recordings) + &raw_writes(bus, settings)
 }
 
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {

@@ -1,10 +1,15 @@
 //! `drivegate demo`: the whole product with no hardware and nothing to install.
 
+mod welcome;
+mod written;
+
 use std::net::{Ipv4Addr, SocketAddr, TcpListener};
+use std::path::PathBuf;
 use std::process::ExitCode;
 
 use tokio_util::sync::CancellationToken;
 
+use self::written::Written;
 use super::{EXIT_FAILED, report};
 use crate::codec::{LineFormat, Protocol};
 use crate::config::{LogFormat, LogSettings, Settings};
@@ -18,11 +23,16 @@ use crate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 
 /// Shows the whole product with simulated drives: no hardware, nothing to install
 #[derive(Debug, clap::Args)]
-#[command(after_help = "Example:\n  drivegate demo\n  drivegate demo --speed max")]
+#[command(
+    after_help = "Example:\n  drivegate demo\n  drivegate demo --speed max\n  drivegate demo --write-config /tmp/demo"
+)]
 pub(super) struct Args {
     /// True wire times, or as fast as the programs are
     #[arg(long, value_enum, default_value_t = Speed::Real)]
     pub speed: Speed,
+    /// Leave a configuration and the ports of the lines in this directory, for the other commands
+    #[arg(long, value_name = "DIR")]
+    pub write_config: Option<PathBuf>,
     /// Log level: off, error, warn, info, debug, trace, also for each target
     #[arg(long, default_value = "error", value_name = "LEVEL", value_parser = crate::config::parse_level)]
     pub log: String,
@@ -71,7 +81,8 @@ const LINES: [DemoLine; 5] = [
         name: "line3",
         protocol: Protocol::ModbusRtu,
         baud: 19_200,
-        format: "8N1",
+        // Of a Vacon CX; the others accept it.
+        format: "8N2",
         cadence: ["200ms", "2s"],
         drives: &[
             ("blower-1", "eaton-svx"),
@@ -124,14 +135,19 @@ pub(super) fn run(args: &Args) -> ExitCode {
 }
 
 async fn demo(args: &Args) -> Result<(), String> {
-    let lines = start_lines(args.speed).map_err(|e| format!("cannot create a simulated line: {e}"))?;
-    let ports: Vec<String> = lines.iter().map(|line| line.address()).collect();
+    let written = args.write_config.as_deref().map(Written::prepare).transpose()?;
+    let lines =
+        start_lines(args.speed, written.as_ref()).map_err(|e| format!("cannot create a simulated line: {e}"))?;
+    let place = Place {
+        ports: lines.iter().map(|line| line.address()).collect(),
+        written,
+    };
     let cancel = CancellationToken::new();
-    let mut started = start(&ports, &cancel).await;
+    let mut started = start(&place, &cancel).await;
     // Another program may take a port between the check and its use.
     for _ in 0..4 {
         if started.is_err() {
-            started = start(&ports, &cancel).await;
+            started = start(&place, &cancel).await;
         }
     }
     let (daemon, broker, sides) = started?;
@@ -140,7 +156,10 @@ async fn demo(args: &Args) -> Result<(), String> {
             println!("Port {wanted} is in use; {what} listens on {} instead.", address.port());
         }
     }
-    println!("{}", welcome(&ports, &sides));
+    if let Some(written) = &place.written {
+        written.write(&configuration(&place, &sides))?;
+    }
+    println!("{}", welcome::text(&place, &sides));
     // Without a handler Ctrl-C ends the process anyway.
     let _ = tokio::signal::ctrl_c().await;
     println!("\nStopping the demo.");
@@ -148,14 +167,35 @@ async fn demo(args: &Args) -> Result<(), String> {
     cancel.cancel();
     broker.stop().await;
     lines.into_iter().for_each(SimulatedBus::stop);
-    // There is none while nothing was recorded.
-    let _ = std::fs::remove_dir_all(state_dir());
+    if place.written.is_none() {
+        // There is none while nothing was recorded.
+        let _ = std::fs::remove_dir_all(place.state_dir());
+    }
     Ok(())
 }
 
-/// Where the recordings of this demo are while it runs.
-fn state_dir() -> std::path::PathBuf {
-    std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id()))
+/// Where the demo is on this machine.
+struct Place {
+    /// Ports of the lines.
+    ports: Vec<String>,
+    /// The directory of `--write-config`.
+    written: Option<Written>,
+}
+
+impl Place {
+    /// Where the recordings of this demo are.
+    fn state_dir(&self) -> PathBuf {
+        match &self.written {
+            Some(written) => written.state_dir(),
+            None => std::env::temp_dir().join(format!("drivegate-demo-{}", std::process::id())),
+        }
+    }
+
+    /// The local socket; without a configuration file nobody could use it.
+    fn socket(&self) -> String {
+        let socket = self.written.as_ref().map(Written::socket);
+        socket.map_or_else(String::new, |socket| socket.display().to_string())
+    }
 }
 
 /// Addresses of the three north sides.
@@ -176,7 +216,7 @@ impl Sides {
     }
 }
 
-async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
+async fn start(place: &Place, cancel: &CancellationToken) -> Result<(Daemon, Broker, Sides), String> {
     let mqtt = free_port("the MQTT broker", MQTT)?;
     let broker = Broker::start(mqtt, cancel.child_token());
     let broker = broker
@@ -187,7 +227,7 @@ async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, 
         modbus: free_port("Modbus TCP", MODBUS_TCP)?,
         http: free_port("HTTP", HTTP)?,
     };
-    let loaded = Settings::parse("demo.toml", &configuration(ports, &sides), std::iter::empty());
+    let loaded = Settings::parse("demo.toml", &configuration(place, &sides), std::iter::empty());
     // Its warnings are expected: a baud beyond the family's list and a cadence beyond the line are part of the demo.
     report::errors(&loaded.errors);
     let settings = loaded.settings.ok_or("the configuration of the demo is not valid")?;
@@ -195,7 +235,7 @@ async fn start(ports: &[String], cancel: &CancellationToken) -> Result<(Daemon, 
     Ok((daemon, broker, sides))
 }
 
-fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
+fn start_lines(speed: Speed, written: Option<&Written>) -> std::io::Result<Vec<SimulatedBus>> {
     let profiles = Profiles::built_in();
     let model = |profile: &str| -> std::io::Result<ModelOptions> {
         let simulator = profiles.get(profile).and_then(|profile| profile.simulator.clone());
@@ -221,7 +261,9 @@ fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
             .collect();
         let options = SimulatedBusOptions::new(line.name, rules, drives?);
         SimulatedBus::start(SimulatedBusOptions {
-            endpoint: EndpointOptions::Pty { link: None },
+            endpoint: EndpointOptions::Pty {
+                link: written.map(|written| written.port(line.name)),
+            },
             ..options
         })
     };
@@ -229,7 +271,7 @@ fn start_lines(speed: Speed) -> std::io::Result<Vec<SimulatedBus>> {
 }
 
 /// The preferred port on loopback, or the next free one.
-fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
+pub(super) fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     for port in wanted..wanted.saturating_add(100) {
         let address = SocketAddr::from((Ipv4Addr::LOCALHOST, port));
         if TcpListener::bind(address).is_ok() {
@@ -242,18 +284,18 @@ fn free_port(what: &str, wanted: u16) -> Result<SocketAddr, String> {
     ))
 }
 
-fn configuration(ports: &[String], sides: &Sides) -> String {
+fn configuration(place: &Place, sides: &Sides) -> String {
     let Sides { mqtt, modbus, http } = sides;
-    // The demo has no configuration file, which `read` and `write` would need to find its drives.
     let mut text = format!(
-        "[gateway]\nname = \"demo\"\nsocket = \"\"\nstate_dir = \"{}\"\n",
-        state_dir().display()
+        "[gateway]\nname = \"demo\"\nsocket = {:?}\nstate_dir = {:?}\n",
+        place.socket(),
+        place.state_dir().display().to_string()
     );
     let mut unit = 0;
-    for (line, port) in LINES.iter().zip(ports) {
+    for (line, port) in LINES.iter().zip(&place.ports) {
         let DemoLine { name, baud, format, .. } = line;
         let ([cycle, slow_cycle], protocol) = (line.cadence, line.protocol.name());
-        text += &format!("\n[[bus]]\nname = \"{name}\"\nport = \"{port}\"\nprotocol = \"{protocol}\"\nbaud = {baud}\n");
+        text += &format!("\n[[bus]]\nname = \"{name}\"\nport = {port:?}\nprotocol = \"{protocol}\"\nbaud = {baud}\n");
         text += &format!("format = \"{format}\"\ncycle = \"{cycle}\"\nslow_cycle = \"{slow_cycle}\"\n");
         if line.protocol == Protocol::ModbusRtu {
             text += "silence = \"chars\"\n";
@@ -270,60 +312,4 @@ fn configuration(ports: &[String], sides: &Sides) -> String {
     text += &format!("\n[modbus_tcp]\nlisten = [\"{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n");
     text += &format!("\n[mqtt]\nurl = \"mqtt://{mqtt}\"\nclient_id = \"drivegate-demo\"\ncommands = true\n");
     text + &format!("\n[http]\nlisten = \"{http}\"\n")
-}
-
-fn welcome(ports: &[String], sides: &Sides) -> String {
-    let http = sides.http;
-    let mut unit = 0;
-    let lines: Vec<String> = LINES
-        .iter()
-        .zip(ports)
-        .map(|(line, port)| {
-            let drives = line.drives.iter().map(|(name, profile)| {
-                unit += 1;
-                format!("{name} ({profile}, unit {unit})")
-            });
-            let drives: Vec<String> = drives.collect();
-            let protocol = line.protocol.name();
-            format!(
-                "  {}  {protocol} {} {} on {port}\n         {}",
-                line.name,
-                line.baud,
-                line.format,
-                drives.join(", ")
-            )
-        })
-        .collect();
-    let (modbus, mqtt) = (sides.modbus.port(), sides.mqtt.port());
-    format!(
-        "\
-drivegate {version} demo: simulated drives of every family and protocol, true wire timing, no hardware.
-{lines}
-The drives start, stop, ramp and occasionally fault on their own until you command them.
-mbpoll and the mosquitto clients are separate programs: apt install mbpoll mosquitto-clients
-
-Look
-  http://{http}/                       status page in a browser
-  {program} watch --url http://{http}
-  curl -s http://{http}/metrics | grep output_frequency
-  curl -s http://{http}/api/v1/drives/pump-1
-  curl -s http://{http}/api/v1/recordings             what happened before each fault
-  mosquitto_sub -h 127.0.0.1 -p {mqtt} -v -t 'drivegate/#'
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 32768 -c 19 -1 127.0.0.1          common model of pump-1 (unit 1)
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 2100 -c 11 -1 127.0.0.1           its own registers, IDs 2101 to 2111
-  mbpoll -m tcp -p {modbus} -a 7 -0 -r 32768 -c 19 -1 127.0.0.1          the same of conveyor-1, a TECO on Modbus ASCII
-  mbpoll -m tcp -p {modbus} -a 8 -0 -r 32768 -c 19 -1 127.0.0.1          the same of ahu-1, a Vacon NX on Metasys N2
-
-Command pump-1
-  mosquitto_pub -h 127.0.0.1 -p {mqtt} -q 1 -t drivegate/demo/drive/pump-1/set -m '{{\"run\": true, \"speed_reference\": 50}}'
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33025 127.0.0.1 5000              speed reference 50.00 %
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 1                 run
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 4                 stop, and reset a fault
-  mbpoll -m tcp -p {modbus} -a 1 -0 -r 33024 127.0.0.1 0                 stop
-
-Ctrl-C ends the demo.",
-        version = env!("CARGO_PKG_VERSION"),
-        lines = lines.join("\n"),
-        program = std::env::current_exe().map_or_else(|_| "drivegate".to_string(), |path| path.display().to_string()),
-    )
 }

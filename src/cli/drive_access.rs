@@ -12,7 +12,7 @@ use std::process::ExitCode;
 use self::direct::Direct;
 use super::{EXIT_CONFIG, EXIT_USAGE, report};
 use crate::config::{BusSettings, LogFormat, LogSettings, Settings, environment};
-use crate::document::nearest;
+use crate::document::{candidates, nearest};
 use crate::north::local::protocol::{Expected, Outcome, Request};
 use crate::process_image::DriveSpec;
 
@@ -66,11 +66,10 @@ impl Target {
     pub(super) fn point(&self, name: &str) -> Result<usize, String> {
         let profile = &self.spec.profile;
         profile.point_index(name).ok_or_else(|| {
-            let near = nearest(name, profile.points.iter().map(|p| p.name.as_str()));
-            let remedy = near.map_or_else(
-                || format!("`drivegate profiles show {}` lists them", profile.name),
-                |near| format!("did you mean `{near}`?"),
-            );
+            let remedy = match candidates(name, profile.points.iter().map(|p| p.name.as_str())).as_slice() {
+                [] => format!("`drivegate profiles show {}` lists them", profile.name),
+                near => format!("did you mean `{}`?", near.join("`, `")),
+            };
             format!(
                 "profile `{}` has no point `{name}`; command line; {remedy}",
                 profile.name

@@ -8,8 +8,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use super::scan::snippet::{Found, snippet};
-use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report, scan};
+use super::adapters::persistent_name;
+use super::scan::{self, Found, Setting, Snippet, absolute};
+use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::bus::Mode;
 use crate::bus::listener::guess::Guess;
 use crate::bus::listener::n2_survey::N2Survey;
@@ -154,10 +155,11 @@ impl Ear<'_> {
         let addresses = survey.addresses.iter().filter(|(_, seen)| seen.answered > 0);
         let found: Vec<Found> = addresses
             .map(|(address, seen)| Found {
-                protocol,
-                format,
+                setting: Setting { protocol, format },
                 address: *address,
                 profiles: seen.fitting(profiles, protocol),
+                unanswered: 0,
+                turnaround: None,
             })
             .collect();
         if found.is_empty() {
@@ -167,7 +169,16 @@ impl Ear<'_> {
             ));
             return Ok(ExitCode::from(EXIT_FAILED));
         }
-        Ok(report::print(&snippet(&self.args.port, &found, Mode::Listen)))
+        let directory = |dir: &PathBuf| std::path::absolute(dir).unwrap_or_else(|_| dir.clone());
+        let snippet = Snippet {
+            port: &persistent_name(&absolute(&self.args.port)),
+            found: &found,
+            profiles,
+            profile_dirs: self.args.profile_dir.iter().map(directory).collect(),
+            timeout: None,
+            mode: Mode::Listen,
+        };
+        Ok(report::print(&snippet.text()))
     }
 
     /// Protocol and format of the line; nothing where no requests were heard with any setting.

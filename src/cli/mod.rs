@@ -3,6 +3,7 @@
 //! A command is a module with `Args` (its options, its help, an example) and `run(&Args) -> ExitCode`, and a
 //! line in `commands!` below.
 
+mod adapters;
 mod addresses;
 mod archive;
 mod audit;
@@ -32,7 +33,9 @@ mod schema;
 mod simulate;
 mod token;
 mod trace;
+mod trial;
 mod watch;
+mod why;
 mod write;
 
 use std::path::PathBuf;
@@ -95,11 +98,13 @@ commands! {
     Reload => reload,
     Health => health,
     Demo => demo,
+    Try => trial,
     Check => check,
     Scan => scan,
     Listen => listen,
     Read => read,
     Write => write,
+    Why => why,
     Record => record,
     Recordings => recordings,
     Watch => watch,

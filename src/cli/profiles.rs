@@ -114,6 +114,7 @@ fn show(profile: &Profile) -> String {
         ("source", profile.source.clone()),
         ("protocols", protocols(profile)),
         ("baud rates", bauds),
+        ("formats", formats_of(profile)),
         (
             "addresses",
             format!("{} to {}", profile.addresses.start(), profile.addresses.end()),
@@ -170,6 +171,15 @@ fn show(profile: &Profile) -> String {
         text += &assumptions(profile);
     }
     text
+}
+
+/// The usual format, then the others.
+fn formats_of(profile: &Profile) -> String {
+    match profile.formats.as_slice() {
+        [] => "any".to_string(),
+        [one] => one.clone(),
+        [usual, others @ ..] => format!("{usual}, or {}", others.join(", ")),
+    }
 }
 
 fn assumptions(profile: &Profile) -> String {

@@ -4,15 +4,16 @@ use std::process::ExitCode;
 
 use super::drive_access::{Target, target};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
-use crate::north::local::protocol::{Outcome, PointValue, ReadRequest, Request};
+use crate::north::local::protocol::{Outcome, PointValue, ReadRequest, Request, Word};
 
 /// Reads points of a drive once, through the running gateway or directly.
 #[derive(Debug, clap::Args)]
 #[command(after_help = "Examples:
   drivegate read --config drivegate.toml pump-1
   drivegate read --config drivegate.toml pump-1 output_frequency motor_current
+  drivegate read --config drivegate.toml pump-1 state fault_text
 
-Without points: all that are polled. A running gateway is asked through its local socket; without one the command opens
+Without points: all that are polled. state and fault_text are made of points. A running gateway is asked through its local socket; without one the command opens
 the port itself.")]
 pub(super) struct Args {
     #[command(flatten)]
@@ -31,7 +32,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Ok(target) => target,
         Err(code) => return code,
     };
-    if let Some(message) = args.points.iter().find_map(|name| target.point(name).err()) {
+    let unknown = |name: &String| target.point(name).err().filter(|_| Word::of(name).is_none());
+    if let Some(message) = args.points.iter().find_map(unknown) {
         report::error(&message);
         return ExitCode::from(EXIT_USAGE);
     }
@@ -90,6 +92,7 @@ fn table(rows: &[PointValue]) -> String {
     for row in rows {
         let value = match (&row.value, &row.text) {
             (serde_json::Value::Null, _) => String::new(),
+            (serde_json::Value::String(word), _) => word.clone(),
             (value, Some(text)) => format!("{value} ({text})"),
             (value, None) => value.to_string(),
         };

@@ -76,12 +76,19 @@ fn line(kind: &str, message: &str) {
     let _ = writeln!(io::stderr().lock(), "{kind}: {}", printable::line(message));
 }
 
+/// Columns of a terminal that does not say how many it has.
+const USUAL_WIDTH: u16 = 80;
+
 /// A table without a frame, as wide as the terminal at most.
 pub(super) fn table<T: AsRef<str>>(header: impl IntoIterator<Item = T>) -> TextTable {
     let mut table = Table::new();
     table.load_preset(presets::NOTHING);
     table.set_style(TableComponent::HeaderLines, '─');
     table.set_content_arrangement(ContentArrangement::Dynamic);
+    // Consoles on a serial line, and terminals that were never given a size, say that they have no columns.
+    if table.width() == Some(0) {
+        table.set_width(USUAL_WIDTH);
+    }
     table.set_header(header.into_iter().map(|cell| printable::line(cell.as_ref())));
     TextTable(table)
 }

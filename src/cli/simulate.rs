@@ -57,7 +57,7 @@ pub(super) struct Args {
     /// Bits a second [default: 38400, or the next lower rate that the drives support]
     #[arg(long, value_name = "BAUD", value_parser = clap::value_parser!(u32).range(300..=4_000_000))]
     pub baud: Option<u32>,
-    /// Data bits, parity and stop bits [default: 8N1, with modbus-ascii 7N2]
+    /// Data bits, parity and stop bits [default: the usual one of the profile]
     #[arg(long, value_name = "FORMAT")]
     pub format: Option<String>,
     /// Time between the end of a request and the reply [default: that of the drive's manual, else 0.5ms]
@@ -263,7 +263,8 @@ impl Args {
         }
         let usual = profile.bauds.iter().copied().filter(|baud| *baud <= USUAL_BAUD).max();
         let baud = self.baud.or(usual).unwrap_or(USUAL_BAUD);
-        let format = self.format.as_deref().unwrap_or(default_format(protocol));
+        let usual = profile.formats.first().map_or(default_format(protocol), String::as_str);
+        let format = self.format.as_deref().unwrap_or(usual);
         let format = LineFormat::new(baud, format).map_err(|error| format!("{error}; in --format"))?;
         let drives = self.addresses.0.iter();
         let drives = drives.map(|&address| DriveOptions::new(address, model.clone()));

@@ -97,7 +97,7 @@ fn lines(buses: &Value) -> String {
         "queue",
     ]);
     for bus in buses.as_array().into_iter().flatten() {
-        let load = at(bus, "/load_ratio").as_f64().unwrap_or_default();
+        let load = at(bus, "/load_ratio").as_f64();
         table.add_row([
             text(at(bus, "/name")),
             text(at(bus, "/state")),
@@ -107,7 +107,7 @@ fn lines(buses: &Value) -> String {
                 text(at(bus, "/baud")),
                 text(at(bus, "/format"))
             ),
-            format!("{:.1} %", load * 100.0),
+            load.map_or_else(String::new, |load| format!("{:.1} %", load * 100.0)),
             fixed(at(bus, "/fast/cycle_ms"), 1),
             fixed(at(bus, "/slow/cycle_ms"), 0),
             format!("{} of {}", text(at(bus, "/online")), text(at(bus, "/drives"))),
@@ -136,8 +136,8 @@ fn table(drives: &Value) -> String {
     for drive in drives.as_array().into_iter().flatten() {
         let good = |name: &str, digits: usize| {
             let point = at(drive, &format!("/points/{name}"));
-            // Only good values are shown.
-            if at(point, "/quality") == "good" {
+            // Only good values are shown, and none that a newer state contradicts.
+            if at(point, "/quality") == "good" && at(point, "/contradicted") != true {
                 fixed(at(point, "/value"), digits)
             } else {
                 String::new()
@@ -147,7 +147,7 @@ fn table(drives: &Value) -> String {
             text(at(drive, "/name")),
             text(at(drive, "/unit")),
             text(at(drive, "/profile")),
-            at(drive, "/state").as_str().unwrap_or("unknown").to_string(),
+            state(drive),
             text(at(drive, "/age_ms")),
             good("output_frequency", 2),
             good("motor_speed", 0),
@@ -158,6 +158,15 @@ fn table(drives: &Value) -> String {
         ]);
     }
     report::lines(&table)
+}
+
+/// The state, with the warning that the drive reports beside it.
+fn state(drive: &Value) -> String {
+    let state = at(drive, "/state").as_str().unwrap_or("unknown");
+    let warning = at(drive, "/points/warning");
+    let is_warned = at(warning, "/quality") == "good" && at(warning, "/value") == true;
+    let warned = if is_warned { ", warning" } else { "" };
+    format!("{state}{warned}")
 }
 
 /// The value there, or null.
@@ -199,6 +208,11 @@ mod tests {
             row.contains("pump-1") && row.contains("25.00") && !row.contains("4.2"),
             "{text}"
         );
+        let mut warned =
+            json!([{"name": "fan-1", "state": "ready", "points": {"warning": {"value": true, "quality": "good"}}}]);
+        assert!(table(&warned).contains("ready, warning"));
+        warned[0]["points"]["warning"]["quality"] = "stale".into();
+        assert!(!table(&warned).contains("warning"), "not a fresh one");
         let unknown = json!([{"name": "fan-1", "state": null}]);
         assert!(table(&unknown).contains("unknown"), "a state that is not known");
     }
@@ -209,5 +223,8 @@ mod tests {
             "load_ratio": 0.0, "fast": {"cycle_ms": null}, "slow": {"cycle_ms": null}, "transactions": 0, "errors": 0, "queue_depth": 0}]);
         let text = lines(&buses);
         assert!(text.contains("n2 9600 8N1") && text.contains("0 of 2"), "{text}");
+        assert!(text.contains("0.0 %"), "a bus that is down has no load");
+        let opened = json!([{"name": "line1", "state": "up", "load_ratio": null}]);
+        assert!(!lines(&opened).contains('%'), "not known in the first second");
     }
 }

@@ -69,6 +69,16 @@ impl LineFormat {
         })
     }
 
+    /// The character format alone: `8N1`.
+    pub fn characters(&self) -> String {
+        let parity = match self.parity {
+            Parity::None => 'N',
+            Parity::Even => 'E',
+            Parity::Odd => 'O',
+        };
+        format!("{}{parity}{}", self.data_bits, self.stop_bits)
+    }
+
     /// Bits of one character on the wire: start, data, parity, stop.
     pub fn bits_per_char(&self) -> u32 {
         1 + u32::from(self.data_bits) + u32::from(self.parity != Parity::None) + u32::from(self.stop_bits)
@@ -98,12 +108,7 @@ impl LineFormat {
 impl fmt::Display for LineFormat {
     /// `38400 8N1`.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let parity = match self.parity {
-            Parity::None => 'N',
-            Parity::Even => 'E',
-            Parity::Odd => 'O',
-        };
-        write!(f, "{} {}{}{}", self.baud, self.data_bits, parity, self.stop_bits)
+        write!(f, "{} {}", self.baud, self.characters())
     }
 }
 

@@ -292,6 +292,7 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
             drive.spec.name
         )));
     }
+    raw_rule(drive, table, &items)?;
     if profile.protocols.contains(&Protocol::N2) {
         one_object(table, *first, items.len())?;
     }
@@ -302,6 +303,20 @@ fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
         )));
     }
     raw_values(drive, table, &items)
+}
+
+/// The registers beyond those of writable points that the drive's configuration does not admit.
+fn raw_rule(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+    let spec = drive.spec;
+    let addresses = items.iter().map(|(address, _)| *address);
+    match spec.raw_writes.refused(&spec.profile, table, addresses) {
+        None => Ok(()),
+        Some(address) => Err(Refusal::NotWritable(format!(
+            "{table} {address} of `{}` belongs to no writable point; add [{address}, {address}] to `raw_writes` of the \
+             drive to write it raw",
+            spec.name
+        ))),
+    }
 }
 
 /// On N2 a write goes to one object and sets all of it: an address at which none begins is no address, another length

@@ -6,6 +6,7 @@
 pub mod chain;
 mod file;
 
+use std::collections::HashMap;
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
@@ -36,6 +37,12 @@ pub struct Change {
     /// The value asked for.
     #[serde(serialize_with = "bare")]
     pub new: Value,
+    /// What it makes of the run command: run or stop, if anything.
+    #[serde(skip)]
+    pub run: Option<bool>,
+    /// It resets a fault.
+    #[serde(skip)]
+    pub resets: bool,
 }
 
 /// One command and what became of it.
@@ -102,6 +109,16 @@ pub(super) enum Reach {
 }
 
 impl AuditRecord {
+    /// What it makes of the run command: run or stop, if anything.
+    pub(crate) fn run(&self) -> Option<bool> {
+        self.points.iter().rev().find_map(|change| change.run)
+    }
+
+    /// Whether it resets a fault.
+    pub(crate) fn resets(&self) -> bool {
+        self.points.iter().any(|change| change.resets)
+    }
+
     /// Writes it to the log under target `audit`, one structured line.
     fn log(&self, sent: bool) {
         let points: Vec<String> = self
@@ -151,6 +168,9 @@ struct Records {
     number: u64,
     sent: FairRing<Arc<str>, Arc<AuditRecord>>,
     unsent: FairRing<Arc<str>, Arc<AuditRecord>>,
+    /// By drive the last command that concerns its run command, or that reset its fault, and when it ended. As many as
+    /// there are drives.
+    runs: HashMap<String, (Arc<AuditRecord>, Instant)>,
     refusals: RefusalLimit<AuditRecord>,
 }
 
@@ -160,6 +180,7 @@ impl Default for Records {
             number: 0,
             sent: FairRing::new(AUDIT_KEPT),
             unsent: FairRing::new(UNSENT_KEPT),
+            runs: HashMap::new(),
             refusals: RefusalLimit::default(),
         }
     }
@@ -190,7 +211,7 @@ impl Audit {
     pub(super) fn record(&self, record: AuditRecord, reach: Reach, now: Instant) {
         let mut records = self.records();
         if reach != Reach::Refused {
-            return self.keep(&mut records, record, reach == Reach::Sent);
+            return self.keep(&mut records, record, reach == Reach::Sent, now);
         }
         // Names of drives that do not exist are invented by the client.
         let drive = (record.result != super::Refusal::UNKNOWN_DRIVE).then(|| record.drive.clone());
@@ -198,7 +219,7 @@ impl Audit {
         let passed = records.refusals.admit(&share, result, drive.as_deref(), record, now);
         passed
             .into_iter()
-            .for_each(|passed| self.keep_counted(&mut records, passed));
+            .for_each(|passed| self.keep_counted(&mut records, passed, now));
     }
 
     /// Records the refusals that waited long enough for their count.
@@ -206,20 +227,24 @@ impl Audit {
         let mut records = self.records();
         let due = records.refusals.due(now);
         due.into_iter()
-            .for_each(|passed| self.keep_counted(&mut records, passed));
+            .for_each(|passed| self.keep_counted(&mut records, passed, now));
     }
 
-    fn keep_counted(&self, records: &mut Records, (mut record, count): (AuditRecord, u64)) {
+    fn keep_counted(&self, records: &mut Records, (mut record, count): (AuditRecord, u64), now: Instant) {
         record.count = count;
         if count > 1 {
             record.text = format!("{} ({count} commands of this client were refused)", record.text);
         }
-        self.keep(records, record, false);
+        self.keep(records, record, false, now);
     }
 
-    fn keep(&self, records: &mut Records, record: AuditRecord, sent: bool) {
+    fn keep(&self, records: &mut Records, record: AuditRecord, sent: bool, now: Instant) {
         record.log(sent);
         let record = Arc::new(record);
+        let concerns_run = record.run().is_some() || (sent && record.resets());
+        if concerns_run && record.result != super::Refusal::UNKNOWN_DRIVE {
+            records.runs.insert(record.drive.clone(), (record.clone(), now));
+        }
         records.number += 1;
         let number = records.number;
         let ring = if sent { &mut records.sent } else { &mut records.unsent };
@@ -231,6 +256,11 @@ impl Audit {
         if let Some(file) = &*self.file.load() {
             file.push(record, sent);
         }
+    }
+
+    /// The last command to that drive that concerns its run command or was sent to reset its fault, and when it ended.
+    pub fn last_run(&self, drive: &str) -> Option<(Arc<AuditRecord>, Instant)> {
+        self.records().runs.get(drive).cloned()
     }
 
     /// All that are kept, oldest first.
@@ -257,6 +287,8 @@ mod tests {
                 point: "run".to_string(),
                 old: None,
                 new: Value::Bool(true),
+                run: Some(true),
+                resets: false,
             }],
             result: "acknowledged",
             text: String::new(),

@@ -181,8 +181,28 @@ pub(crate) fn check_port(text: &str, base: &Path) -> Result<String, Finding> {
             "the port has no path",
             "write for example \"/dev/serial/by-id/usb-…\"",
         )),
+        None if is_windows_name(text) => Err(Finding::new(
+            format!("`{text}` is the name of a port on Windows"),
+            "write the path of the adapter on this machine, such as \"/dev/serial/by-id/usb-…\"; `ls /dev/serial/by-id` lists them",
+        )),
+        None if values::host_port(text, None).is_some() => Err(Finding::new(
+            format!("`{text}` is no path of a serial device"),
+            format!(
+                "did you mean \"tcp://{text}\"? Or \"rfc2217://{text}\" for a server that sets up its port over the network"
+            ),
+        )),
         None => Ok(values::resolved(base, PathBuf::from(text)).display().to_string()),
     }
+}
+
+/// `COM3`.
+fn is_windows_name(text: &str) -> bool {
+    let number = text
+        .get(..3)
+        .filter(|start| start.eq_ignore_ascii_case("com"))
+        .and_then(|_| text.get(3..));
+    let number = number.map(|number| number.trim_end_matches(':')).unwrap_or_default();
+    !number.is_empty() && number.chars().all(|c| c.is_ascii_digit())
 }
 
 fn read_format(reader: &Reader<'_>, protocol: Protocol) -> Option<LineFormat> {
@@ -271,9 +291,32 @@ fn read_silence(reader: &Reader<'_>, protocol: Protocol, format: Option<&LineFor
     silence
 }
 
+/// A character format that the families on the line do not list. A drive that counts in longer characters takes requests
+/// for coming too early, and ignores some.
+fn check_format(reader: &Reader<'_>, format: &LineFormat, drives: &[DriveSpec]) {
+    let characters = format.characters();
+    let mut reported: Vec<&str> = Vec::new();
+    for profile in drives.iter().map(|drive| &drive.profile) {
+        let Some(usual) = profile.formats.first() else { continue };
+        if profile.formats.contains(&characters) || reported.contains(&profile.name.as_str()) {
+            continue;
+        }
+        reported.push(&profile.name);
+        reader.warning(
+            BUS.format.name,
+            format!("profile `{}` does not list the format {characters}", profile.name),
+            format!(
+                "write format = \"{usual}\", or what is set on the drives; the profile lists {}",
+                profile.formats.join(", ")
+            ),
+        );
+    }
+}
+
 /// What is valid but fits the drives badly.
 fn check_fit(reader: &Reader<'_>, format: &LineFormat, options: &BusOptions, drives: &[DriveSpec]) {
     let mut reported: Vec<&str> = Vec::new();
+    check_format(reader, format, drives);
     for drive in drives {
         let profile = &drive.profile;
         let listed = profile.bauds.is_empty() || profile.bauds.contains(&format.baud);

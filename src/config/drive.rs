@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use super::key::{Key, Number};
 use super::keys::{ACTIONS, DRIVE, MODBUS_ADDRESSES, MOST_HERTZ, N2_ADDRESSES, REFERENCE, SUPERVISION, TRIGGER};
+use super::raw_writes;
 use crate::codec::Protocol;
 use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
@@ -23,6 +24,8 @@ pub(super) struct Found {
     pub(super) name: Option<(String, Place)>,
     pub(super) address: Option<(u8, Place)>,
     pub(super) unit: Option<(u8, Place)>,
+    /// The unit is the address, because none is written.
+    pub(super) unit_is_address: bool,
     pub(super) access: (Access, Place),
     /// Places of `supervision` and of a stop `on_shutdown`.
     pub(super) lease: Option<Place>,
@@ -54,6 +57,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let on_shutdown = DRIVE.on_shutdown.get(reader);
     let turnaround = DRIVE.turnaround.read(reader);
     let triggers = read_triggers(reader, profile.as_deref());
+    let raw_writes = raw_writes::read(reader, profile.as_deref());
     reader.finish();
     let spec = match (&name, address, unit, profile) {
         (Some((name, _)), Some(address), Some(unit), Some(profile)) => Some(DriveSpec {
@@ -69,6 +73,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             on_shutdown,
             frequency_range,
             triggers,
+            raw_writes,
         }),
         _ => None,
     };
@@ -76,6 +81,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
         name,
         address: address.map(|a| (a, DRIVE.address.place(reader))),
         unit: unit.map(|u| (u, DRIVE.unit.place(reader))),
+        unit_is_address: !reader.has(DRIVE.unit.name),
         access: (access, DRIVE.access.place(reader)),
         lease: reader
             .has(DRIVE.supervision.name)

@@ -208,7 +208,7 @@ keys! {
         baud: u32 = Number(300..=4_000_000, None), default 9600;
         /// Data bits 7 or 8, parity `N`, `E` or `O`, stop bits 1 or 2, as set on the drives. Modbus RTU needs 8 data bits.
         /// Modbus ASCII usually has 7, so that a character has 10 bits: `"7N2"` (a TECO card with all switches off),
-        /// `"7E1"`, `"7O1"`; devices with 8 exist.
+        /// `"7E1"`, `"7O1"`; devices with 8 exist. A format that the profile does not list causes a warning.
         format: String = Text("^[78][NEOneo][12]$", "a format such as \"8N1\""),
             or "`\"8N1\"`; Modbus ASCII: `\"7N2\"`";
         /// What switches the direction of the line: `"off"`: the adapter itself, as nearly all do; `"kernel"`: the port
@@ -290,6 +290,16 @@ keys! {
             schema: || number_pair(Some(0.0), Some(MOST_HERTZ)),
             range: "[lowest, highest], Hz",
         }, or "none";
+        /// What raw writes may set beside the registers of writable points: nothing (`false`), everything that the profile
+        /// lets write (`true`), or ranges of PDU addresses, of registers and coils alike. A write that contains the control
+        /// word is [always admitted](modbus-tcp.md#what-raw-writes-may-set).
+        raw_writes: Present = Own {
+            schema: || json!({ "anyOf": [{ "type": "boolean" }, { "type": "array", "items": {
+                "type": "array", "items": { "type": "integer", "minimum": 0, "maximum": u16::MAX },
+                "minItems": 2, "maxItems": 2,
+            } }] }),
+            range: "true, false or ranges of PDU addresses such as [[101, 199]]",
+        }, or "`false`";
         /// Values that make a [recording](recordings.md), beside faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }

@@ -15,6 +15,7 @@ mod modbus_tcp;
 mod mqtt;
 mod named_files;
 mod north;
+mod raw_writes;
 mod recordings;
 mod shutdown;
 mod unique;
@@ -190,9 +191,12 @@ fn parse(path: &Path, source: &str, env: impl Iterator<Item = (String, String)>)
     let base = path.parent().unwrap_or(Path::new(""));
     let settings = read(&document.reader(), base, &mut profile_errors);
     let known = document.known_keys().into_iter().collect();
+    let is_toml = document.is_toml();
     let (mut errors, warnings) = document.into_findings();
-    errors.extend(profile_errors);
-    errors.extend(broken.iter().map(|(name, _)| not_text(name)));
+    if is_toml {
+        errors.extend(profile_errors);
+        errors.extend(broken.iter().map(|(name, _)| not_text(name)));
+    }
     let loaded = Loaded {
         settings: settings.filter(|_| errors.is_empty()),
         errors,
@@ -292,13 +296,15 @@ fn judge(
     warn_of_emptiness(reader);
     let commanded =
         modbus_tcp.is_some_and(|m| m.commands) || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
-    if commanded {
-        warn_of_missing_leases(reader, buses);
-    } else {
+    if !commanded {
         warn_of_idle_control(reader, buses);
     }
     if reader.document().is_sound() {
-        // Besides errors, a default may stand in for a wrong value; a warning about it would mislead.
+        // Besides errors, a default may stand in for a wrong value, or an unknown key for the one that is missed; a warning
+        // about it would mislead.
+        if commanded {
+            warn_of_missing_leases(reader, buses);
+        }
         warn_of_idle_stops(reader, buses);
         warn_of_long_shutdowns(reader, buses);
         let written = modbus_tcp.filter(|m| m.stale_written);

@@ -114,23 +114,31 @@ fn owner(drive: &super::drive::Found) -> String {
 pub(super) fn check_units(document: &Document, buses: &[Found], selections: &[Option<Vec<String>>]) {
     let mut reported: Vec<(Option<usize>, u8)> = Vec::new();
     for selection in selections {
-        let is_shown = |bus: &&Found| match (selection, &bus.name) {
+        let is_shown = |bus: &Found| match (selection, &bus.name) {
             (Some(names), Some((name, _))) => names.contains(name),
             (Some(_), None) => false,
             (None, _) => true,
         };
-        let drives = || buses.iter().filter(is_shown).flat_map(|bus| &bus.drives);
+        let drives = || {
+            let shown = buses.iter().enumerate().filter(|(_, bus)| is_shown(bus));
+            shown.flat_map(|(index, bus)| bus.drives.iter().map(move |drive| (index, drive)))
+        };
         let mut used: Vec<u8> = drives()
-            .filter_map(|d| d.unit.as_ref())
+            .filter_map(|(_, d)| d.unit.as_ref())
             .map(|(unit, _)| *unit)
             .collect();
-        let mut seen: BTreeMap<u8, String> = BTreeMap::new();
-        for drive in drives() {
+        let mut seen: BTreeMap<u8, (usize, &super::drive::Found)> = BTreeMap::new();
+        for (bus, drive) in drives() {
             let Some((unit, place)) = &drive.unit else { continue };
-            let Some(first) = seen.get(unit) else {
-                seen.insert(*unit, owner(drive));
+            let Some((other_bus, other)) = seen.get(unit) else {
+                seen.insert(*unit, (bus, drive));
                 continue;
             };
+            // Two drives with one address on a bus are reported as such.
+            if bus == *other_bus && drive.unit_is_address && other.unit_is_address {
+                continue;
+            }
+            let first = owner(other);
             // What two listeners show alike is reported once.
             if place.line.is_some() && reported.contains(&(place.line, *unit)) {
                 continue;

@@ -20,7 +20,7 @@ use serde::{Serialize, Serializer};
 use tree::{OverrideError, entries};
 
 pub(crate) use file::read_file;
-pub(crate) use reader::{Reader, nearest};
+pub(crate) use reader::{Reader, candidates, nearest};
 pub(crate) use tree::{Entry, Node, Raw};
 pub(crate) use value::{FromNode, format_duration, parse_duration, parse_size};
 
@@ -117,28 +117,33 @@ pub(crate) struct Place {
 pub(crate) struct Document {
     file: String,
     root: Node,
+    /// What is not TOML. Whatever else is found then may come of that alone.
+    syntax: Vec<Problem>,
     problems: RefCell<Vec<Problem>>,
     warnings: RefCell<Vec<Problem>>,
     known: RefCell<BTreeSet<String>>,
 }
 
 impl Document {
-    /// Parses `source`, the text of `file`. Syntax errors become problems; whatever can be read is kept.
+    /// Parses `source`, the text of `file`. The first syntax error becomes the one problem; whatever can be read is kept.
     pub(crate) fn parse(file: impl Into<String>, source: &str) -> Document {
         let (root, errors) = tree::parse(source);
-        let document = Document {
+        let mut document = Document {
             file: file.into(),
             root,
+            syntax: Vec::new(),
             problems: RefCell::default(),
             warnings: RefCell::default(),
             known: RefCell::default(),
         };
-        for (line, message) in errors {
+        // One bracket that is missing makes an error of every line behind it.
+        for (line, message) in errors.into_iter().take(1) {
             let place = Place {
                 line,
                 ..Place::default()
             };
-            document.problem(&place, format!("not valid TOML: {message}"), "");
+            let problem = document.at(&place, Finding::new(format!("not valid TOML: {message}"), ""));
+            document.syntax.push(problem);
         }
         document
     }
@@ -239,7 +244,12 @@ impl Document {
 
     /// Whether no problem was found so far.
     pub(crate) fn is_sound(&self) -> bool {
-        self.problems.borrow().is_empty()
+        self.is_toml() && self.problems.borrow().is_empty()
+    }
+
+    /// Whether the file is TOML.
+    pub(crate) fn is_toml(&self) -> bool {
+        self.syntax.is_empty()
     }
 
     /// The problems, in the order of the lines.
@@ -247,8 +257,11 @@ impl Document {
         self.into_findings().0
     }
 
-    /// Problems and warnings, each in the order of the lines.
+    /// Problems and warnings, each in the order of the lines; of a file that is not TOML, only where it is not.
     pub(crate) fn into_findings(self) -> (Vec<Problem>, Vec<Problem>) {
+        if !self.is_toml() {
+            return (self.syntax, Vec::new());
+        }
         let sorted = |mut found: Vec<Problem>| {
             found.sort_by_key(|p| p.line.unwrap_or(usize::MAX));
             found
@@ -296,9 +309,10 @@ mod tests {
     #[test]
     fn syntax_errors_have_lines() {
         let found = problems("a = 1\nb = = 2\n", |r| {
-            let _: Option<i64> = r.optional("a");
-            let _ = r.raw("b");
+            let _: Option<String> = r.optional("a");
+            let _: Option<String> = r.required("c");
         });
+        assert_eq!(found.len(), 1, "{found:?}");
         assert!(found[0].contains("f.toml:2"), "{found:?}");
     }
 

@@ -224,15 +224,79 @@ fn without_numbers(path: &str) -> String {
     path.chars().filter(keep).collect()
 }
 
-/// The known word nearest to `word`, if one is close enough to be a misspelling.
+/// The known word nearest to `word`, if one is close enough to be a misspelling, or the only one that has its parts.
 pub(crate) fn nearest<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Option<&'a str> {
+    match candidates(word, known).as_slice() {
+        [only] => Some(only),
+        _ => None,
+    }
+}
+
+/// The known words that `word` may stand for: the one it is a misspelling of, else those that have its parts (`speed_ref` is
+/// part of `speed_reference`), the shortest first, four at most.
+pub(crate) fn candidates<'a>(word: &str, known: impl Iterator<Item = &'a str>) -> Vec<&'a str> {
+    let known: Vec<&str> = known.collect();
     let mut best: Option<(usize, &str)> = None;
-    for candidate in known {
+    for candidate in &known {
         let distance = strsim::damerau_levenshtein(word, candidate);
         let near = distance <= 1 + candidate.len() / 4;
         if near && best.is_none_or(|(least, _)| distance < least) {
             best = Some((distance, candidate));
         }
     }
-    best.map(|(_, candidate)| candidate)
+    if let Some((_, candidate)) = best {
+        return vec![candidate];
+    }
+    let mut having = known;
+    having.retain(|candidate| has_parts(candidate, word));
+    having.sort_by_key(|candidate| candidate.len());
+    having.truncate(MOST_CANDIDATES);
+    having
+}
+
+/// Most words that a message proposes.
+const MOST_CANDIDATES: usize = 4;
+/// Shortest part of a word that says something.
+const LEAST_PART: usize = 3;
+
+/// Whether each part of `word` begins a part of `candidate`.
+fn has_parts(candidate: &str, word: &str) -> bool {
+    let parts = |text: &str| -> Vec<String> { text.split(['-', '_', ' ']).map(str::to_lowercase).collect() };
+    let (wanted, own) = (parts(word), parts(candidate));
+    let begins = |part: &String| part.len() >= LEAST_PART && own.iter().any(|own| own.starts_with(part.as_str()));
+    wanted.iter().all(begins)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn words_that_are_meant() {
+        let points = [
+            "speed_reference",
+            "frequency_reference",
+            "actual_speed",
+            "motor_speed",
+            "motor_current",
+            "zero_speed",
+        ];
+        let near = |word: &str| nearest(word, points.into_iter());
+        assert_eq!(near("motor_curent"), Some("motor_current"));
+        assert_eq!(near("speed_ref"), Some("speed_reference"));
+        assert_eq!(near("current"), Some("motor_current"));
+        assert_eq!(
+            (near("speed"), near("x"), near(""), near("of")),
+            (None, None, None, None)
+        );
+        let several = candidates("speed", points.into_iter());
+        assert_eq!(
+            several,
+            ["zero_speed", "motor_speed", "actual_speed", "speed_reference"]
+        );
+        let protocols = ["modbus-rtu", "modbus-ascii", "n2"];
+        assert_eq!(nearest("rtu", protocols.into_iter()), Some("modbus-rtu"));
+        assert_eq!(nearest("modbus", protocols.into_iter()), None);
+        assert_eq!(nearest("Modbus RTU", protocols.into_iter()), Some("modbus-rtu"));
+    }
 }

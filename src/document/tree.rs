@@ -85,7 +85,7 @@ pub(crate) enum Raw {
 
 impl Raw {
     /// The type, for messages: `an integer`.
-    pub(super) fn kind(&self) -> &'static str {
+    pub(crate) fn kind(&self) -> &'static str {
         match self {
             Raw::Text(_) | Raw::Env(_) => "a string",
             Raw::Integer(_) => "an integer",

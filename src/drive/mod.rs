@@ -8,12 +8,15 @@ pub mod model;
 pub(crate) mod plan;
 pub mod profile;
 mod profile_file;
+pub(crate) mod raw_writes;
+pub mod why;
 
 pub use derive::{Bound, Derived};
 pub(crate) use model::tidy;
 pub use model::{ModelPoint, Quality, Sample, State, Value};
 pub(crate) use plan::{Plan, PlannedRead};
 pub use profile::{Point, PollClass, Probe, Profile, Raw, Source};
+pub use raw_writes::RawWrites;
 
 /// Name of the point with the drive's own response to a silent master; 0 is no response. For Vacon NX parameter
 /// P2.7.22.

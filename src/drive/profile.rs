@@ -32,6 +32,8 @@ pub struct Profile {
     pub protocols: Vec<Protocol>,
     /// Baud rates of the family; empty if any is possible.
     pub bauds: Vec<u32>,
+    /// Character formats of the family, such as `8N1`, the usual one first; empty if any is possible.
+    pub formats: Vec<String>,
     /// Addresses a drive can have.
     pub addresses: RangeInclusive<u8>,
     /// Time a drive takes to begin its reply, for the prediction only.
@@ -69,6 +71,10 @@ pub struct Profile {
 pub struct FaultText {
     /// What the fault is.
     pub text: String,
+    /// What causes it; empty where no available manual says.
+    pub cause: String,
+    /// What to do; empty likewise.
+    pub remedy: String,
     /// Whether an available manual confirms it.
     pub verified: bool,
 }
@@ -176,10 +182,23 @@ pub struct Point {
     pub range: Option<RangeInclusive<f64>>,
     /// Texts of the values of an enumeration.
     pub texts: BTreeMap<i64, String>,
+    /// A state of the point that keeps the motor from running.
+    pub blocks: Option<Blocks>,
     /// Whether an available manual confirms the address.
     pub verified: bool,
     /// Note for the user.
     pub note: String,
+}
+
+/// A state of a point that keeps the motor from running.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Blocks {
+    /// The cause in one word, for programs.
+    pub cause: String,
+    /// The state in which it does: true or not zero, or false.
+    pub when: bool,
+    /// What to do.
+    pub remedy: String,
 }
 
 /// Where a value comes from.

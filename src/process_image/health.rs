@@ -54,8 +54,9 @@ pub struct BusHealth {
     pub since: Option<SystemTime>,
     /// Why the port is not open; what the bus does next.
     pub reason: Option<String>,
-    /// Share of the last second that the line was in use (frames, turnaround, silence), 0..=1.
-    pub load: f64,
+    /// Share of the last second that the line was in use (frames, turnaround, silence), 0..=1; `None` until the port was
+    /// open for a second.
+    pub load: Option<f64>,
     /// Rounds of the fast class.
     pub fast: PollCycle,
     /// Rounds of the slow class.

@@ -3,6 +3,7 @@
 //! The writer replaces a drive's [`Snapshot`] as a whole after each exchange, so a reader always sees the
 //! registers of one poll together: a torn 32-bit value is impossible, and nobody waits for anybody.
 
+mod contradiction;
 mod health;
 mod snapshot;
 mod tape;
@@ -23,7 +24,7 @@ use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
 use crate::codec::{LineFormat, Protocol};
-use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, Value};
+use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
 
 /// Whether a drive may be commanded.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -96,6 +97,8 @@ pub struct DriveSpec {
     pub frequency_range: Option<RangeInclusive<f64>>,
     /// Values beside faults at which a recording is made.
     pub triggers: Vec<PointTrigger>,
+    /// What raw writes may set beside writable points.
+    pub raw_writes: RawWrites,
 }
 
 /// A value that makes a recording when it holds for a time.
@@ -388,6 +391,7 @@ impl DriveSpec {
             on_shutdown: OnShutdown::Hold,
             frequency_range: None,
             triggers: Vec::new(),
+            raw_writes: RawWrites::Points,
         }
     }
 

@@ -169,6 +169,7 @@ fn the_report_of_a_sound_configuration() {
             "fast_cycle_ms",
             "load_ratio",
             "name",
+            "raw_writes_refused",
             "recorder_bytes",
             "requests",
             "shutdown_ms",
@@ -207,6 +208,57 @@ fn the_report_of_a_sound_configuration() {
     assert_eq!(
         requests.iter().filter(|r| r["drive"] == "pump-2").count(),
         requests.len() / 2
+    );
+}
+
+#[test]
+fn what_raw_writes_may_not_set_is_listed() {
+    let drive = |name: &str, address: u8, keys: &str| {
+        format!("[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\n{keys}\n")
+    };
+    let control = "access = \"control\"\nsupervision = { timeout = \"5s\" }\n";
+    let text = "[gateway]\nname = \"raw\"\n[modbus_tcp]\nwrite = [\"127.0.0.1/32\"]\n[[bus]]\nname = \"line1\"\nport = \"/dev/null\"\ncycle = \"1s\"\nslow_cycle = \"10s\"\n"
+        .to_string()
+        + &drive("closed-1", 1, control)
+        + &drive("closed-2", 2, control)
+        + &drive("partly", 3, &format!("{control}raw_writes = [[100, 731], [2001, 2001]]"))
+        + &drive("open", 4, &format!("{control}raw_writes = true"))
+        + &drive("monitored", 5, "");
+    let dir = tempfile::tempdir().unwrap();
+    let path = dir.path().join("raw.toml");
+    fs::write(&path, text).unwrap();
+    let path = path.display().to_string();
+    let checked = run(&["check", "--config", &path]);
+    assert_eq!(checked.code, Some(0), "{}", checked.err);
+    let listed: Vec<&str> = checked.out.lines().filter(|line| line.contains("raw writes")).collect();
+    let wanted = [
+        "  raw writes  closed-1, closed-2: refused for holding 100 to 731, 734 to 1998, 2001 (see `raw_writes`)",
+        "  raw writes  partly: refused for holding 734 to 1998 (see `raw_writes`)",
+    ];
+    assert_eq!(listed, wanted);
+    let report = json(&run(&["check", "--json", "--config", &path]));
+    let refused = report["buses"][0]["raw_writes_refused"].as_array().unwrap();
+    assert_eq!(refused.len(), 3 + 3 + 1);
+    let last = serde_json::json!({ "drive": "partly", "table": "holding", "first": 734, "last": 1998 });
+    assert_eq!(refused[6], last);
+    let map = run(&["map", "--csv", "--config", &path]).out;
+    let access = |unit: u8, address: u16| {
+        let row = map.lines().find(|row| {
+            let is_raw = row.contains(&format!(",raw,\"holding, input\",{address},"));
+            is_raw && row.starts_with(&format!("{unit},"))
+        });
+        row.unwrap().contains("\"read, write\"")
+    };
+    // Control word, general control word, minimum frequency, response to a silent master.
+    assert_eq!(
+        [2000, 2001, 100, 732].map(|at| access(1, at)),
+        [true, false, false, true]
+    );
+    assert_eq!([2000, 2001, 100, 732].map(|at| access(3, at)), [true, true, true, true]);
+    assert_eq!([2000, 2001, 100, 732].map(|at| access(5, at)), [false; 4]);
+    assert!(
+        map.contains("written raw only in one request with the control word"),
+        "{map}"
     );
 }
 

@@ -1,11 +1,11 @@
 //! `drivegate demo`, as the README promises it.
 
-use std::process::Command;
+use std::process::{Command, Output};
 
 use crate::support::process::{
-    Running, api, get, mbpoll_read, point, read_registers, until, until_ready, write_registers,
+    Running, api, drivegate, free_port, get, mbpoll_read, point, read_registers, until, until_ready, write_registers,
 };
-use crate::support::tools::tool;
+use crate::support::tools::{root, tool};
 
 /// The number behind `mark` in what the demo printed.
 fn port(printed: &str, mark: &str) -> u16 {
@@ -91,4 +91,91 @@ fn a_second_demo_takes_other_ports() {
     }
     assert!(printed.contains(" is in use; "), "it says so:\n{printed}");
     until_ready(port(&printed, "http://127.0.0.1:"));
+}
+
+/// Runs a line as it is pasted into a shell; what has no end is ended.
+fn pasted(line: &str) -> Output {
+    let own = [".tools/venv/bin", ".tools/bin"].map(|dir| root().join(dir).display().to_string());
+    let path = format!("{}:{}", own.join(":"), std::env::var("PATH").unwrap_or_default());
+    let mut shell = Command::new("timeout");
+    shell.args(["10", "bash", "-c", line]).env("PATH", path);
+    shell.output().unwrap()
+}
+
+#[test]
+fn every_line_that_it_prints_can_be_pasted_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let dir = folder.path().join("my demo");
+    let mut demo = Running::drivegate(&["demo", "--write-config", dir.to_str().unwrap()]);
+    let printed = demo.until_printed("Ctrl-C ends the demo.");
+    let http = port(&printed, "http://127.0.0.1:");
+    until_ready(http);
+    let lines: Vec<&str> = printed
+        .lines()
+        .filter_map(|line| line.strip_prefix("  ").filter(|rest| !rest.starts_with(' ')))
+        .collect();
+    assert!(lines.len() > 15, "{printed}");
+    for line in &lines {
+        until(line, || {
+            let output = pasted(line);
+            // The one that shows topics as they come ends by the time limit.
+            let endless = line.starts_with("mosquitto_sub ") && output.status.code() == Some(124);
+            (endless && !output.stdout.is_empty() || output.status.success()).then_some(())
+        });
+    }
+    until("pump-1 stopped by the last of its lines", || {
+        (api(http, "pump-1")["state"] == "ready").then_some(())
+    });
+
+    // The other commands find the demo by its configuration, also under another name of the directory.
+    let config = dir.join("drivegate.toml").display().to_string();
+    let read = drivegate(&["read", "--config", &config, "--json", "pump-1", "state", "fault_text"])
+        .output()
+        .unwrap();
+    let values: Vec<serde_json::Value> = serde_json::from_slice(&read.stdout).unwrap();
+    assert_eq!(
+        (&values[0]["value"], &values[1]["value"]),
+        (&"ready".into(), &"".into())
+    );
+    let url = format!("http://127.0.0.1:{http}");
+    let watched = drivegate(&["watch", "--once", "--url", &url]).output().unwrap();
+    assert!(String::from_utf8_lossy(&watched.stdout).contains("ahu-3"));
+
+    demo.signal("INT");
+    assert!(demo.ended().success());
+    assert!(!dir.join("line1").exists(), "the ports end with the demo");
+    // A configuration that is no demo's is left as it is.
+    std::fs::write(&config, "[gateway]\n").unwrap();
+    let refused = drivegate(&["demo", "--write-config", dir.to_str().unwrap()])
+        .output()
+        .unwrap();
+    assert_eq!(refused.status.code(), Some(1));
+    assert_eq!(std::fs::read_to_string(&config).unwrap(), "[gateway]\n");
+}
+
+#[test]
+fn the_demo_of_the_compose_file_has_its_drives() {
+    let config = root().join("deploy/compose/demo/drivegate.toml").display().to_string();
+    let compose = std::fs::read_to_string(root().join("deploy/compose.yaml")).unwrap();
+    let ports: Vec<u16> = (0..4).map(|_| free_port()).collect();
+    let environment = |bus: usize| format!("DRIVEGATE__BUS__{bus}__PORT");
+    let mut simulate = drivegate(&["simulate", "--config", &config, "--autopilot"]);
+    let mut run = drivegate(&["run", "--config", &config]);
+    let (modbus, http) = (free_port(), free_port());
+    for (bus, port) in ports.iter().enumerate() {
+        let given = format!("{}: tcp://0.0.0.0:400{}", environment(bus), bus + 1);
+        assert!(compose.contains(&given), "compose.yaml lacks {given}");
+        simulate.env(environment(bus), format!("tcp://127.0.0.1:{port}"));
+        run.env(environment(bus), format!("tcp://127.0.0.1:{port}"));
+    }
+    run.env("DRIVEGATE__HTTP__LISTEN", format!("127.0.0.1:{http}"));
+    run.env("DRIVEGATE__MODBUS_TCP__LISTEN", format!("127.0.0.1:{modbus}"));
+    run.env("DRIVEGATE__MQTT__URL", "mqtt://127.0.0.1:1");
+    run.env("DRIVEGATE__GATEWAY__SOCKET", "");
+    let _lines = Running::spawn(&mut simulate);
+    let _gateway = Running::spawn(&mut run);
+    until("all drives of all families", || {
+        let drives: Vec<serde_json::Value> = serde_json::from_str(&get(http, "/api/v1/drives")?.1).ok()?;
+        (drives.len() == 8 && drives.iter().all(|drive| drive["online"] == true)).then_some(())
+    });
 }

@@ -52,7 +52,7 @@ impl Line {
             "[gateway]\nname = \"plant\"\nsocket = \"own.sock\"\n\
              [[bus]]\nname = \"line1\"\nport = \"line1\"\nbaud = 38400\nresponse_timeout = \"1s\"\n\
              [[bus.drive]]\nname = \"pump-1\"\naddress = 1\nprofile = \"vacon-nx\"\naccess = \"control\"\n\
-             limits = {{ speed_reference = [0.0, 80.0] }}\n\
+             limits = {{ speed_reference = [0.0, 80.0] }}\nraw_writes = [[1998, 1998]]\n\
              [[bus.drive]]\nname = \"pump-5\"\naddress = 5\nprofile = \"vacon-nx\"\n\
              [modbus_tcp]\nlisten = [\"127.0.0.1:{}\"]\nwrite = [\"127.0.0.1/32\"]\nstale_after = \"1min\"\n",
             line.modbus
@@ -123,6 +123,24 @@ impl Line {
         );
     }
 
+    /// Why the motor stands: run is still on in the drive.
+    fn is_explained(&self) {
+        let why = self.command("why", &["pump-1"]);
+        assert_eq!(why.code, 0, "{}", why.err);
+        assert!(why.out.starts_with("pump-1 does not run\n\n  "), "{}", why.out);
+        let json = self.command("why", &["pump-1", "--json"]);
+        let json: serde_json::Value = serde_json::from_str(&json.out).unwrap();
+        assert_eq!(json["runs"], false);
+        let cause = &json["causes"][0];
+        assert!(
+            why.out.contains(cause["cause"].as_str().unwrap()),
+            "{cause}\n{}",
+            why.out
+        );
+        assert!(!cause["remedy"].as_str().unwrap().is_empty());
+        assert_eq!(json["not_told"], serde_json::json!(["interlock", "enable input"]));
+    }
+
     /// Start, look, refuse, stop: the same whoever has the port.
     fn operate(&self) {
         let all = self.command("read", &["pump-1"]);
@@ -181,6 +199,7 @@ impl Line {
         assert_eq!(reset.code, 0, "{}", reset.err);
         until("no fault", || (self.value("fault") == false).then_some(()));
         assert_eq!(self.value("running"), false, "a reset starts nothing");
+        self.is_explained();
         let stopped = self.written(&["pump-1", "run=Off"]);
         assert_eq!(stopped.code, 0, "{}", stopped.err);
         until("a motor that stands", || (self.value("running") == false).then_some(()));
@@ -440,7 +459,7 @@ fn every_family_is_found_by_reading() {
         ("vacon-nx", "modbus-rtu", "38400", "8N1"),
         ("eaton-svx", "modbus-rtu", "38400", "8N1"),
         ("eaton-hvx", "modbus-rtu", "38400", "8N1"),
-        ("vacon-cx", "modbus-rtu", "19200", "8N1"),
+        ("vacon-cx", "modbus-rtu", "19200", "8N2"),
         ("teco-7300pa", "modbus-ascii", "19200", "7N2"),
         ("vacon-nx-n2", "n2", "9600", "8N1"),
         ("eaton-hvx-n2", "n2", "9600", "8N1"),
@@ -527,7 +546,7 @@ fn a_board_that_counts_from_one_shows_by_reading() {
     let read = |profile: &str| {
         let text = format!(
             "[gateway]\nname = \"plant\"\nprofile_dirs = [\"profiles\"]\n[[bus]]\nname = \"line1\"\nport = \"line1\"\n\
-             baud = 19200\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
+             baud = 19200\nformat = \"8N2\"\n[[bus.drive]]\nname = \"fan-1\"\naddress = 1\nprofile = \"{profile}\"\n[http]\n"
         );
         std::fs::write(&config, text).unwrap();
         let config = config.to_str().unwrap();

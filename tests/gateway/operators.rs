@@ -15,7 +15,11 @@ struct Plant {
 const TRIP: u16 = 1998;
 
 fn plant() -> Plant {
-    let drives = controlled("pump-1", 1, "limits = { speed_reference = [0.0, 80.0] }") + &drive("pump-2", 2, "");
+    let drives = controlled(
+        "pump-1",
+        1,
+        "limits = { speed_reference = [0.0, 80.0] }\nraw_writes = [[1998, 1998]]",
+    ) + &drive("pump-2", 2, "");
     let site = Site::of(&[LINE1, &drives, MODBUS_TCP, MQTT, HTTP]);
     let others = [site.simulate(&["--addresses", "1-2", "--baud", "38400"]), site.broker()];
     let gateway = site.run_ready();

@@ -256,3 +256,66 @@ fn every_fault_of_the_world_fits_the_core_and_is_listed() {
         }
     }
 }
+
+/// What is pasted whole must be a command: a description stands behind `#` or on a line of its own.
+#[test]
+fn examples_can_be_pasted_whole() {
+    let mut wrong = Vec::new();
+    let mut seen = 0;
+    for document in documents() {
+        let text = read(&document);
+        let shell = blocks(&text, "sh")
+            .into_iter()
+            .map(|block| block.lines().map(String::from).collect());
+        let console = blocks(&text, "console").into_iter().map(|block| {
+            let commands = block.lines().filter_map(|line| line.strip_prefix("$ "));
+            commands.map(String::from).collect()
+        });
+        let lines: Vec<Vec<String>> = shell.chain(console).collect();
+        for line in lines.concat() {
+            seen += 1;
+            if has_trailing_prose(&line) {
+                wrong.push(format!("{}: {line}", document.display()));
+            }
+        }
+    }
+    assert!(seen > 100, "{seen}");
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+/// Words behind two blanks or more, that are neither a comment nor inside quotes nor the rest of a continued line.
+fn has_trailing_prose(line: &str) -> bool {
+    let mut quote = None;
+    let mut blanks = 0;
+    for c in line.trim_start().chars() {
+        match (quote, c) {
+            (Some(open), _) if open == c => quote = None,
+            (Some(_), _) => {}
+            (None, '\'' | '"') if blanks < 2 => quote = Some(c),
+            (None, '#') if blanks > 0 => return false,
+            (None, ' ') => {
+                blanks += 1;
+                continue;
+            }
+            (None, '\\') => {}
+            (None, _) if blanks >= 2 => return true,
+            (None, _) => {}
+        }
+        blanks = 0;
+    }
+    false
+}
+
+#[test]
+fn prose_behind_a_command_is_noticed() {
+    for pasted in ["a  # b", "a -m 'x  y'", "  a \\", "a | b", "# a  b", "a \"x  y\" z"] {
+        assert!(!has_trailing_prose(pasted), "{pasted}");
+    }
+    for wrong in [
+        "mbpoll 127.0.0.1 5000              speed reference",
+        "a -m 'x'   what it does",
+        "a  b",
+    ] {
+        assert!(has_trailing_prose(wrong), "{wrong}");
+    }
+}

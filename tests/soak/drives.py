@@ -52,6 +52,7 @@ class Drive:
         self.said = {}  # step -> time of the last reply that carried it
         self.received = {}  # reference, in counts -> time of the last write
         self.control, self.reference, self.fault = 0, 0, 0
+        self.warning = False
         self.silent_until = self.noisy_until = 0.0
         self.trips = 0
 
@@ -66,7 +67,7 @@ class Drive:
         """What the drive says for these registers, and the step if there is one among them."""
         step = int(now / STEP_SECONDS) % STEPS
         running = self.running()
-        status = 0b1 | running << 1 | bool(self.fault) << 3 | running << 5 | (not running) << 6
+        status = 0b1 | running << 1 | bool(self.fault) << 3 | self.warning << 4 | running << 5 | (not running) << 6
         fixed = {
             2100: status, 2101: 1 << 13, 2110: self.fault, 98: self.fault, 2000: self.control, 2001: 0,
             REFERENCE: self.reference, 100: 0, 101: 5000,

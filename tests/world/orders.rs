@@ -24,6 +24,8 @@ pub enum Wish {
     /// A parameter of the drive, which it stores: the acceleration time (N2).
     Parameter,
     RawRead,
+    /// By function 5, 6 or 16, registers of which the last is of no point, or of one that is not writable.
+    RawOther,
     /// A speed in the unit that is not the drive's own: Hz of one that knows percent, percent of one that knows Hz.
     Converted,
 }
@@ -216,6 +218,7 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             let index = profile.model_index(point).filter(writes)?;
             Some((Order::Points(vec![(index, value)]), None))
         }
+        Wish::RawOther => Some((Order::Write(raw_other(profile, number)?), None)),
         Wish::RawRead => {
             let (table, start, count) = match profile.name.as_str() {
                 "vacon-nx" => (Table::Holding, 1500, 1),
@@ -225,6 +228,48 @@ pub fn order_of(profile: &Profile, wish: Wish, number: usize) -> Option<(Order, 
             Some((Order::Read(RequestPdu::Read { table, start, count }), None))
         }
     }
+}
+
+/// Whether a command to a point sets that register or coil.
+pub fn is_of_writable_point(profile: &Profile, table: Table, address: u16) -> bool {
+    let sets = |point: &Point| point.write && point.write_to.is_none();
+    let mut points = profile.points.iter().filter(|point| sets(point));
+    points.any(|point| point.raw().is_some_and(|raw| raw.covers(table, address)))
+}
+
+/// A write of what no writable point has and the family lets write: near the end of a range, where a simulated drive
+/// has nothing that decides about its motor, or the general control word; alone, or behind a writable register.
+fn raw_other(profile: &Profile, number: usize) -> Option<RequestPdu> {
+    let ranges = profile.ranges.iter().filter(|range| range.write > 0);
+    let last = ranges.flat_map(|range| {
+        let (first, last) = range.addresses.clone().into_inner();
+        (last.saturating_sub(8).max(first)..=last).map(move |address| (range.table, address, range.write))
+    });
+    let named = profile.point_index("general_control_word");
+    let word = named.and_then(|index| profile.points[index].raw());
+    let word = word.map(|raw| (raw.table, raw.address, 20));
+    let is_point = |table, address| {
+        let mut points = profile.points.iter();
+        points.any(|point| point.raw().is_some_and(|raw| raw.covers(table, address)))
+    };
+    let candidates: Vec<_> = last
+        .filter(|(table, address, _)| !is_point(*table, *address))
+        .chain(word)
+        .collect();
+    let (table, address, most) = *candidates.get(number % candidates.len().max(1))?;
+    Some(match table {
+        Table::Coil => RequestPdu::WriteCoil { address, on: true },
+        _ if profile.name.ends_with("n2") => RequestPdu::WriteRegisters {
+            start: address - address % 2,
+            values: vec![0; 2],
+        },
+        // The process data behind the general control word.
+        _ if most > 1 && number % 2 == 0 => RequestPdu::WriteRegisters {
+            start: address,
+            values: vec![0; 2],
+        },
+        _ => RequestPdu::WriteRegister { address, value: 0 },
+    })
 }
 
 /// Whether a write sets just these words.

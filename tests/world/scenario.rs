@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use drivegate::codec::Protocol;
+use drivegate::drive::RawWrites;
 use drivegate::process_image::{DriveSpec, LeaseAction, OnShutdown, Supervision};
 use drivegate::sim::random::Random;
 
@@ -206,7 +207,12 @@ impl Line {
                 Vec::new()
             },
             refuses: (!calm && dice.chance(0.15)).then_some("running"),
-            spec: |_| {},
+            // Without the dice: the rest of the world is the same.
+            spec: match drives % 3 {
+                0 => |spec| spec.raw_writes = RawWrites::All,
+                1 => |_| {},
+                _ => |spec| spec.raw_writes = RawWrites::Ranges(vec![0..=1_994, 9_893..=9_893]),
+            },
         }
     }
 

@@ -16,8 +16,8 @@ use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu};
-use drivegate::command::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats};
-use drivegate::drive::{ModelPoint, Quality, Value};
+use drivegate::command::{Authority, CAPACITY, Order, Origin, Outcome, SourceKind, WriteStats, written};
+use drivegate::drive::{ModelPoint, Quality, RawWrites, Value};
 use drivegate::event::{EventKind, Events};
 use drivegate::north::mqtt::Incoming;
 use drivegate::plant::{Plant, SharedPlant};
@@ -30,7 +30,9 @@ use super::bus::{Asked, Parts, Seen, WorldBus};
 use super::clients::{Client, Servers, Waiting, Way, address, answers, write_frame};
 use super::drives::{AFTERMATH, Truth};
 use super::history::History;
-use super::orders::{Record, Unique, Wish, converted, order_of, percent_reference, run_command, sets};
+use super::orders::{
+    Record, Unique, Wish, converted, is_of_writable_point, order_of, percent_reference, run_command, sets,
+};
 use super::scenario::{Habit, Scenario};
 
 /// Time in which an order is answered behind its expiry: its last exchange, a pulse, a late reply.

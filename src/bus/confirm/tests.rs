@@ -70,7 +70,8 @@ impl Bench {
     }
 
     fn expired(&mut self) -> Vec<String> {
-        self.confirmations.expire(&self.drive.spec.profile, self.now)
+        let late = self.confirmations.expire(&self.drive.spec.profile, self.now);
+        late.into_iter().map(|late| late.text).collect()
     }
 
     /// The motor runs, at that speed.

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use crate::bus::transaction::Ended;
 use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
 use crate::command::{Change, Outcome, written};
+use crate::drive::ModelPoint;
 use crate::drive::model::Kind;
 use crate::process_image::DriveSpec;
 
@@ -104,6 +105,7 @@ impl Commands {
     fn changes(&self, spec: &DriveSpec, table: Table, items: &[(u16, u16)], fresh: &[u16]) -> (Vec<Change>, bool) {
         let (mut changes, mut switches) = (Vec::new(), false);
         let written = spec.profile.points.iter().filter(|point| point.write);
+        let is = |of: ModelPoint, name: &str| spec.profile.model_point(of).is_some_and(|point| point.name == name);
         for (point, raw) in written.filter_map(|point| Some((point, point.raw()?))) {
             let words = |of: &dyn Fn(u16) -> Option<u16>| raw.addresses().map(of).collect::<Option<Vec<u16>>>();
             let of_write = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
@@ -118,8 +120,16 @@ impl Commands {
             let old = words(&of_last).and_then(|words| raw.decode(&words, point.kind()));
             if old != Some(new) {
                 switches |= point.kind() == Kind::Bool;
+                let run = is(ModelPoint::Run, &point.name).then(|| new.as_bool());
+                let resets = is(ModelPoint::FaultReset, &point.name) && new.as_bool();
                 let point = point.name.clone();
-                changes.push(Change { point, old, new });
+                changes.push(Change {
+                    point,
+                    old,
+                    new,
+                    run,
+                    resets,
+                });
             }
         }
         (changes, switches)

@@ -76,7 +76,7 @@ impl ListenCore {
         ListenCore {
             drives: bus.image.drives.iter().map(known).collect(),
             decoder: decoder(&bus),
-            report: Report::new(bus.image.clone(), events, now),
+            report: Report::new(bus.image.clone(), events, writes.clone(), now),
             bus,
             writes,
             retries: options.retries,
@@ -372,4 +372,26 @@ fn wide(profile: &Profile) -> Vec<(Table, u16)> {
     raw.filter(|raw| raw.form.items() == 2)
         .map(|raw| (raw.table, raw.address))
         .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pause_of_a_round_outlasts_the_reads_of_one_drive() {
+        let seconds = Duration::from_secs;
+        let mut pause = Duration::ZERO;
+        // Forty reads of this drive, then forty seconds of the other drives.
+        for _ in 0..4 {
+            pause = pause_after(pause, seconds(40));
+            pause = (0..40).fold(pause, |pause, _| pause_after(pause, Duration::from_millis(30)));
+        }
+        assert!(pause > seconds(39) && pause <= seconds(40), "{pause:?}");
+        // Read all the time, after a rest of an hour.
+        let rested = pause_after(Duration::from_millis(30), seconds(3600));
+        assert_eq!(rested, seconds(4));
+        let later = (0..2000).fold(rested, |pause, _| pause_after(pause, Duration::from_millis(30)));
+        assert_eq!(later, Duration::from_millis(30));
+    }
 }

@@ -27,7 +27,7 @@ fn image(drives: u8) -> Arc<BusImage> {
 fn whoever_sees_the_bus_down_sees_every_drive_offline() {
     let image = image(200);
     let now = Instant::now();
-    let mut report = Report::new(image.clone(), Events::default(), now);
+    let mut report = Report::new(image.clone(), Events::default(), Default::default(), now);
     for _ in 0..20 {
         report.bus_up(now);
         for index in 0..image.drives.len() {
@@ -51,7 +51,7 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
     let image = image(2);
     let now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image, events.clone(), now);
+    let mut report = Report::new(image, events.clone(), Default::default(), now);
     report.bus_up(now);
     report.apply(&News::Online(0), now);
     report.bus_down("unplugged");

@@ -8,7 +8,7 @@ use crate::command::{Origin, SourceKind};
 use crate::config::{BusSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{Point, PollClass, Profile, Quality, Source};
-use crate::north::local::protocol::{Outcome, Request};
+use crate::north::local::protocol::{Outcome, Request, Word};
 use crate::north::local::{SocketPath, answer};
 use crate::plant::DriveHandle;
 use crate::process_image::{OnShutdown, Reading};
@@ -102,7 +102,16 @@ impl Direct {
         let index = |name: &str| profile.point_index(name);
         let awaited: Vec<usize> = match request {
             Request::Read(request) if !request.points.is_empty() => {
-                request.points.iter().filter_map(|name| index(name)).collect()
+                let of = |name: &String| match (index(name), Word::of(name)) {
+                    (Some(index), _) => vec![index],
+                    (None, Some(word)) => word
+                        .sources()
+                        .iter()
+                        .filter_map(|point| profile.model_index(*point))
+                        .collect(),
+                    (None, None) => Vec::new(),
+                };
+                request.points.iter().flat_map(of).collect()
             }
             // What a command is turned into, and whether it is needed at all, depends on what the drive has.
             Request::Write(request) if !request.points.iter().any(|set| is_derived(profile, index(&set.point))) => {

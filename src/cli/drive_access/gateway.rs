@@ -59,7 +59,9 @@ pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Out
 
 fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
     let remedy = match request {
-        Request::Read(_) | Request::Record(_) | Request::Reload(_) | Request::Health(_) => "try again",
+        Request::Read(_) | Request::Why(_) | Request::Record(_) | Request::Reload(_) | Request::Health(_) => {
+            "try again"
+        }
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };
     format!("the gateway did not answer: {error}; {}; {remedy}", path.display())

@@ -1,24 +1,33 @@
 //! The map for programs: CSV for a spreadsheet or an import, JSON for the rest.
 
 use std::fmt::Write as _;
+use std::ops::RangeInclusive;
 
 use serde_json::{Map as Object, Value, json};
 
 use super::Map;
 use super::rows::{COLUMNS, Row, drive_rows};
+use crate::codec::Table;
 use crate::north::register_map::GATEWAY_UNIT;
-use crate::process_image::Access;
+use crate::process_image::{Access, DriveSpec};
 
 /// Rows of all units, with unit and drive.
 fn rows(map: &Map<'_>) -> Vec<(u8, String, Row)> {
     let mut all = Vec::new();
     for drive in &map.drives {
         let spec = &drive.image.spec;
-        let rows = drive_rows(&spec.profile, &drive.image.plan, spec.access);
+        let rows = drive_rows(&spec.profile, &drive.image.plan, spec.access, &spec.raw_writes);
         all.extend(rows.into_iter().map(|row| (spec.unit, spec.name.clone(), row)));
     }
     all.extend(map.gateway.iter().map(|row| (GATEWAY_UNIT, String::new(), row.clone())));
     all
+}
+
+/// The addresses that the profile lets write and `raw_writes` of the drive does not.
+fn refused(spec: &DriveSpec) -> Vec<Value> {
+    let ranges = spec.raw_writes.refused_ranges(&spec.profile);
+    let range = |(table, range): &(Table, RangeInclusive<u16>)| json!({ "table": table.name(), "first": range.start(), "last": range.end() });
+    ranges.iter().map(range).collect()
 }
 
 /// One line for each register of each unit.
@@ -56,6 +65,7 @@ pub(super) fn json(map: &Map<'_>) -> String {
             "address": spec.address,
             "profile": spec.profile.name,
             "access": if spec.access == Access::Control { "control" } else { "monitor" },
+            "raw_writes_refused": refused(spec),
         })
     });
     let registers = rows(map).into_iter().map(|(unit, drive, row)| {

@@ -2,7 +2,7 @@
 
 use crate::codec::Table;
 use crate::drive::profile::{Form as RawForm, Raw};
-use crate::drive::{ModelPoint, Plan, Point, Profile};
+use crate::drive::{ModelPoint, Plan, Point, Profile, RawWrites};
 use crate::north::register_map::{BLOCKS, BUS_BLOCK, BUS_REGISTERS, Content, Entry};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::Access;
@@ -69,16 +69,21 @@ impl Row {
 }
 
 /// The registers of one unit: the blocks of the common model, then the drive's own.
-pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access) -> Vec<Row> {
+pub(super) fn drive_rows(profile: &Profile, plan: &Plan, access: Access, raw_writes: &RawWrites) -> Vec<Row> {
     let entries = BLOCKS
         .into_iter()
         .flatten()
         .map(|entry| entry_row(profile, plan, entry, access));
     let mut raw: Vec<(&Point, &Raw)> = profile.points.iter().filter_map(|p| Some((p, p.raw()?))).collect();
     raw.sort_by_key(|(_, raw)| (raw.table, raw.address));
-    let raw = raw
-        .into_iter()
-        .map(|(point, raw)| raw_row(profile, plan, point, raw, access));
+    let raw = raw.into_iter().map(|(point, raw)| Row {
+        access: if access == Access::Control && is_written_raw(profile, raw_writes, raw) {
+            "read, write"
+        } else {
+            "read"
+        },
+        ..raw_row(profile, plan, point, raw, raw_writes)
+    });
     entries.chain(raw).collect()
 }
 
@@ -183,7 +188,29 @@ fn polled(plan: &Plan, point: &Point, raw: &Raw) -> String {
     }
 }
 
-fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Access) -> Row {
+/// Whether a raw write may set the point alone.
+fn is_written_raw(profile: &Profile, raw_writes: &RawWrites, raw: &Raw) -> bool {
+    has_writable_range(profile, raw) && raw_writes.refused(profile, raw.table, raw.addresses()).is_none()
+}
+
+fn has_writable_range(profile: &Profile, raw: &Raw) -> bool {
+    profile
+        .range(raw.table, raw.address)
+        .is_some_and(|range| range.write > 0)
+}
+
+/// Whether one raw write can set the point and the control word.
+fn shares_a_block_with_the_control_word(profile: &Profile, raw: &Raw) -> bool {
+    let run = profile.run_bit().map(|(run, ..)| run);
+    let range = profile.range(raw.table, raw.address);
+    let pair = run.zip(range).filter(|(run, _)| run.table == raw.table);
+    pair.is_some_and(|(run, range)| {
+        let span = run.address.abs_diff(raw.address).saturating_add(raw.form.items());
+        range.addresses.contains(&run.address) && span <= range.write
+    })
+}
+
+fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, raw_writes: &RawWrites) -> Row {
     let kind = match raw.form {
         RawForm::Bit { .. } if raw.table.is_bits() => "bit".to_string(),
         RawForm::Bit { bit, .. } => format!("bit {bit}"),
@@ -203,7 +230,12 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Acc
     if !point.note.is_empty() {
         notes.push(point.note.clone());
     }
-    let range_writes = profile.range(raw.table, raw.address).is_some_and(|r| r.write > 0);
+    if has_writable_range(profile, raw) && !is_written_raw(profile, raw_writes, raw) {
+        notes.push(match shares_a_block_with_the_control_word(profile, raw) {
+            true => "written raw only in one request with the control word".to_string(),
+            false => "raw writes refused, see raw_writes".to_string(),
+        });
+    }
     let both = raw.table == Table::Holding && profile.input_is_holding;
     Row {
         view: "raw",
@@ -216,11 +248,7 @@ fn raw_row(profile: &Profile, plan: &Plan, point: &Point, raw: &Raw, access: Acc
         scale: raw.scale.to_string(),
         unit: point.unit.clone(),
         not_available: "",
-        access: if range_writes && access == Access::Control {
-            "read, write"
-        } else {
-            "read"
-        },
+        access: "read",
         source: polled(plan, point, raw),
         note: notes.join("; "),
     }
@@ -243,7 +271,8 @@ pub(super) fn gateway_rows(plant: &Plant, shown: Option<&[String]>) -> Vec<Row> 
                 kind: register.form.name().to_string(),
                 scale: register.scale.to_string(),
                 unit: register.unit.to_string(),
-                not_available: if register.unit == "ms" {
+                // Figures that take time to measure; counts and states are known at once.
+                not_available: if !register.unit.is_empty() {
                     register.form.not_available()
                 } else {
                     ""

@@ -51,7 +51,7 @@ fn csv_has_one_line_a_register() {
         "2,pump-2,command,\"holding, input\",33025,0x8101,433026,1,speed_reference,i16,0.01,%,0x8000,read,\"holding 2002, polled slow\",",
         "1,pump-1,float,\"holding, input\",33282,0x8202,433283,2,output_frequency,f32,1,Hz,NaN,read,\"holding 2103, polled fast\",",
         "1,pump-1,raw,\"holding, input\",2103,0x0837,402104,1,output_frequency,i16,0.01,Hz,,read,polled fast,",
-        "255,,gateway,\"input, holding\",3,0x0003,300004,1,line1: line load,u16,0.1,%,,read,gateway,",
+        "255,,gateway,\"input, holding\",3,0x0003,300004,1,line1: line load,u16,0.1,%,0xFFFF,read,gateway,",
     ] {
         assert!(csv.lines().any(|line| line == wanted), "{wanted} is missing in\n{csv}");
     }

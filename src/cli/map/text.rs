@@ -8,7 +8,7 @@ use super::rows::{COLUMNS, Row, drive_rows};
 use super::{Listener, Map};
 use crate::cli::printable;
 use crate::codec::Table;
-use crate::drive::Profile;
+use crate::drive::raw_writes;
 use crate::north::register_map::GATEWAY_UNIT;
 use crate::process_image::{Access, DriveSpec};
 
@@ -23,16 +23,18 @@ pub(super) fn render(map: &Map<'_>) -> String {
     }
     out += "\nAddresses are PDU addresses, from 0. Functions 03 and 04 read both tables of the blocks from 0x8000 on;\n\
             32-bit values lie high word first; age and state show why a value is not available.\n";
-    let mut seen: Vec<&str> = Vec::new();
+    let mut seen: Vec<&DriveSpec> = Vec::new();
     for drive in &map.drives {
-        let profile = &drive.image.spec.profile;
-        if seen.contains(&profile.name.as_str()) {
+        let spec = &drive.image.spec;
+        let profile = &spec.profile;
+        let is_same = |other: &DriveSpec| other.profile.name == profile.name && other.raw_writes == spec.raw_writes;
+        if seen.iter().any(|other| is_same(other)) {
             continue;
         }
-        seen.push(&profile.name);
+        seen.push(spec);
         let units: Vec<String> = specs
             .iter()
-            .filter(|s| s.profile.name == profile.name)
+            .filter(|other| is_same(other))
             .map(|s| s.unit.to_string())
             .collect();
         let _ = write!(
@@ -43,9 +45,14 @@ pub(super) fn render(map: &Map<'_>) -> String {
             units.join(", ")
         );
         // What a unit of this profile can have; the table above shows which units can be written.
-        out += &rows(&drive_rows(profile, &drive.image.plan, Access::Control));
+        out += &rows(&drive_rows(
+            profile,
+            &drive.image.plan,
+            Access::Control,
+            &spec.raw_writes,
+        ));
         let _ = write!(out, "\nAddresses of the drive itself, profile {}\n", profile.name);
-        out += &ranges(profile);
+        out += &ranges(spec);
     }
     out += "\nThe gateway itself, unit 255\n";
     out += &rows(&map.gateway);
@@ -105,8 +112,18 @@ fn table(header: &[&str], rows: impl Iterator<Item = Vec<String>>) -> String {
 }
 
 /// Addresses of the raw view beyond the points.
-fn ranges(profile: &Profile) -> String {
-    let header = ["table", "first", "last", "read at once", "written at once", "note"];
+fn ranges(spec: &DriveSpec) -> String {
+    let header = [
+        "table",
+        "first",
+        "last",
+        "read at once",
+        "written at once",
+        "raw writes refused",
+        "note",
+    ];
+    let profile = &spec.profile;
+    let refused = spec.raw_writes.refused_ranges(profile);
     let rows = profile.ranges.iter().map(|range| {
         let table = match range.table {
             Table::Holding if profile.input_is_holding => "holding, input",
@@ -119,12 +136,18 @@ fn ranges(profile: &Profile) -> String {
         };
         let (first, last) = range.addresses.clone().into_inner();
         let note = range.note.clone();
+        let refused: Vec<_> = refused
+            .iter()
+            .filter(|(table, lost)| *table == range.table && lost.start() <= &last && &first <= lost.end())
+            .map(|(table, lost)| (*table, first.max(*lost.start())..=last.min(*lost.end())))
+            .collect();
         vec![
             table.to_string(),
             first.to_string(),
             last.to_string(),
             range.read.to_string(),
             written,
+            raw_writes::addresses_in_words(&refused),
             note,
         ]
     });

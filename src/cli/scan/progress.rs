@@ -22,7 +22,10 @@ const REMEMBERED: usize = 32;
 pub(super) struct Progress {
     total: usize,
     done: usize,
-    steps: VecDeque<Duration>,
+    /// Time of all remaining steps if nobody answers.
+    patience: Duration,
+    /// What the last steps took, and what they would have taken at most.
+    steps: VecDeque<(Duration, Duration)>,
     begun: Instant,
     shown: Option<Instant>,
     live: bool,
@@ -30,10 +33,11 @@ pub(super) struct Progress {
 }
 
 impl Progress {
-    pub(super) fn new(total: usize, stop: Arc<AtomicBool>) -> Progress {
+    pub(super) fn new(stop: Arc<AtomicBool>) -> Progress {
         Progress {
-            total,
+            total: 0,
             done: 0,
+            patience: Duration::ZERO,
             steps: VecDeque::new(),
             begun: Instant::now(),
             shown: None,
@@ -42,8 +46,14 @@ impl Progress {
         }
     }
 
-    /// Shows what is tried now, which takes `patience` at most.
-    pub(super) fn show(&mut self, what: &str, patience: Duration) {
+    /// From now on so many steps remain, which take `patience` at most.
+    pub(super) fn plan(&mut self, steps: usize, patience: Duration) {
+        self.total = self.done + steps;
+        self.patience = patience;
+    }
+
+    /// Shows what is tried now.
+    pub(super) fn show(&mut self, what: &str) {
         let now = Instant::now();
         self.begun = now;
         let pause = if self.live { PAUSE } else { LINE_PAUSE };
@@ -51,19 +61,15 @@ impl Progress {
             return;
         }
         self.shown = Some(now);
-        let text = line(
-            self.done,
-            self.total,
-            left(&self.steps, self.total - self.done, patience),
-            what,
-        );
+        let text = line(self.done, self.total, left(&self.steps, self.patience), what);
         self.print(&text);
     }
 
-    /// One address is done.
-    pub(super) fn step(&mut self) {
+    /// One address is done, which could have taken `patience`.
+    pub(super) fn step(&mut self, patience: Duration) {
         self.done = (self.done + 1).min(self.total);
-        self.steps.push_back(self.begun.elapsed());
+        self.patience = self.patience.saturating_sub(patience);
+        self.steps.push_back((self.begun.elapsed(), patience));
         if self.steps.len() > REMEMBERED {
             self.steps.pop_front();
         }
@@ -98,12 +104,13 @@ impl Progress {
     }
 }
 
-/// Estimated time for the remaining addresses: by the mean of the last ones, or by the longest time of the first.
-fn left(steps: &VecDeque<Duration>, remaining: usize, patience: Duration) -> Duration {
-    let remaining = u32::try_from(remaining).unwrap_or(u32::MAX);
-    match u32::try_from(steps.len()) {
-        Ok(count) if count > 0 => steps.iter().sum::<Duration>() / count * remaining,
-        _ => patience * remaining,
+/// Estimated time for the remaining steps, which take `patience` at most: as the last ones took of theirs.
+fn left(steps: &VecDeque<(Duration, Duration)>, patience: Duration) -> Duration {
+    let took: Duration = steps.iter().map(|(took, _)| *took).sum();
+    let most: Duration = steps.iter().map(|(_, most)| *most).sum();
+    match most.is_zero() {
+        true => patience,
+        false => patience.mul_f64(took.as_secs_f64() / most.as_secs_f64()),
     }
 }
 
@@ -135,7 +142,18 @@ mod tests {
     #[test]
     fn the_estimate_follows_what_was_measured() {
         let ms = Duration::from_millis;
-        assert_eq!(left(&VecDeque::new(), 10, ms(120)), ms(1200));
-        assert_eq!(left(&VecDeque::from([ms(10), ms(30)]), 10, ms(120)), ms(200));
+        assert_eq!(left(&VecDeque::new(), ms(1200)), ms(1200));
+        let steps = VecDeque::from([(ms(10), ms(40)), (ms(30), ms(40))]);
+        assert_eq!(left(&steps, ms(1200)), ms(600));
+    }
+
+    #[test]
+    fn a_plan_can_change() {
+        let mut progress = Progress::new(Arc::default());
+        progress.plan(100, Duration::from_secs(10));
+        progress.step(Duration::from_millis(100));
+        progress.plan(9, Duration::from_secs(1));
+        assert_eq!((progress.done, progress.total), (1, 10));
+        assert_eq!(progress.patience, Duration::from_secs(1));
     }
 }

@@ -150,7 +150,7 @@ fn every_built_in_profile_can_be_simulated() {
     let teco = line("--profile teco-7300pa --turnaround 3ms");
     assert_eq!(teco.drives[0].model.turnaround(), None);
     assert_eq!(teco.rules.turnaround, Duration::from_millis(3));
-    assert_eq!(line("--profile vacon-cx").rules.format.to_string(), "19200 8N1");
+    assert_eq!(line("--profile vacon-cx").rules.format.to_string(), "19200 8N2");
     assert_eq!(line("--profile vacon-nx-n2").rules.format.to_string(), "9600 8N1");
     assert_eq!(line("").rules.format.to_string(), "38400 8N1");
 }

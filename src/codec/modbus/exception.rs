@@ -49,21 +49,60 @@ impl Exception {
             0x0B => "device behind the gateway does not answer",
             0x21 => "data value error (TECO)",
             0x22 => "register write error: only in PRGM mode (TECO)",
-            0x80 => "N2 00: the drive has restarted and waits for Identify",
-            0x81 => "N2 01: command not understood",
-            0x82 => "N2 02: checksum error",
-            0x83 => "N2 03: message too long",
-            0x85 => "N2 05: field size wrong for the command",
-            0x90 => "N2 10: invalid data, out of the expected range",
-            0x91 => "N2 11: invalid command for the data type, or only in PRGM mode (TECO)",
-            0x92 => "N2 12: the value is read-only",
+            0x80 => "the drive has restarted and waits for Identify",
+            0x81 => "command not understood",
+            0x82 => "checksum error",
+            0x83 => "message too long",
+            0x85 => "field size wrong for the command",
+            0x90 => "invalid data, out of the expected range",
+            0x91 => "invalid command for the data type, or only in PRGM mode (TECO)",
+            0x92 => "the value is read-only",
             _ => "unknown exception",
         }
     }
 }
 
 impl fmt::Display for Exception {
+    /// As the manuals print it: the codes of Modbus with two digits, those of a family in hexadecimal with H (TECO: 22H), N2
+    /// errors with their own two digits.
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(f, "exception {:02X} ({})", self.0, self.meaning())
+        let meaning = self.meaning();
+        match self.0 {
+            code @ 0x80.. => write!(f, "N2 error {:02X} ({meaning})", code & 0x7F),
+            code @ 0x10.. => write!(f, "exception {code:02X}H ({meaning})"),
+            code => write!(f, "exception {code:02X} ({meaning})"),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn codes_are_printed_as_in_the_manuals() {
+        for (code, wanted) in [
+            (Exception::ADDRESS, "exception 02 (illegal data address)"),
+            (
+                Exception::GATEWAY_TARGET,
+                "exception 0B (device behind the gateway does not answer)",
+            ),
+            (
+                Exception(0x22),
+                "exception 22H (register write error: only in PRGM mode (TECO))",
+            ),
+            (Exception(0x33), "exception 33H (unknown exception)"),
+            (Exception::n2(0x05), "N2 error 05 (field size wrong for the command)"),
+            (
+                Exception::n2(0x11),
+                "N2 error 11 (invalid command for the data type, or only in PRGM mode (TECO))",
+            ),
+            (
+                Exception::N2_RESTARTED,
+                "N2 error 00 (the drive has restarted and waits for Identify)",
+            ),
+        ] {
+            assert_eq!(code.to_string(), wanted);
+        }
     }
 }

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use super::*;
 use crate::codec::Exception;
+use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
 use crate::process_image::{DriveImage, DriveSpec, Link};
 
@@ -141,7 +142,7 @@ fn addresses_and_counts() {
         "past the range"
     );
     assert_eq!(
-        try_order(many(200, 2)).unwrap_err().exception(),
+        try_order(many(732, 2)).unwrap_err().exception(),
         Exception::VALUE,
         "one parameter a message"
     );
@@ -281,10 +282,49 @@ fn a_command_goes_where_the_drive_takes_it_within_the_limits_of_the_other_unit()
 }
 
 #[test]
+fn registers_without_a_writable_point_need_the_configuration() {
+    let image = drive(Access::Control);
+    let mut open = image.spec.clone();
+    open.raw_writes = RawWrites::Ranges(vec![101..=101]);
+    let open = DriveImage::new(open, Duration::from_secs(1));
+    let asked = |image: &DriveImage, order| {
+        let reading = image.reading(Instant::now(), Duration::from_secs(1));
+        admit(order, &reading, Authority::Write).map(|admitted| admitted.urgency)
+    };
+    let block = |start, values: &[u16]| {
+        Order::Write(RequestPdu::WriteRegisters {
+            start,
+            values: values.to_vec(),
+        })
+    };
+    let refused = asked(&image, write(101, 10_000)).unwrap_err();
+    assert_eq!(
+        (refused.exception(), refused.code()),
+        (Exception::ADDRESS, "not_writable")
+    );
+    assert!(
+        refused.to_string().contains("add [101, 101] to `raw_writes`"),
+        "{refused}"
+    );
+    assert_eq!(asked(&open, write(101, 6_000)), Ok(Urgency::Command));
+    assert!(asked(&open, write(100, 0)).is_err());
+    // A part of the block is refused: all of it is.
+    assert!(asked(&image, block(2001, &[0, 5000])).is_err());
+    // With the control word it goes out, a stop as one, and within the limits all the same.
+    assert_eq!(asked(&image, block(2000, &[1, 0, 5000])), Ok(Urgency::Command));
+    assert_eq!(asked(&image, block(2000, &[0, 0, 5000])), Ok(Urgency::Stop));
+    assert_eq!(
+        asked(&image, block(2000, &[1, 0, 8001])).unwrap_err().exception(),
+        Exception::VALUE
+    );
+}
+
+#[test]
 fn a_write_on_n2_is_one_whole_object() {
     let profile = Profiles::built_in().get("eaton-hvx-n2").unwrap().clone();
     let spec = DriveSpec {
         access: Access::Control,
+        raw_writes: RawWrites::All,
         ..DriveSpec::new("ahu-1", "line4", 1, profile)
     };
     let image = DriveImage::new(spec, Duration::from_secs(1));

@@ -198,7 +198,7 @@ impl Raw {
     }
 
     /// The addresses of its registers or bits.
-    pub(crate) fn addresses(&self) -> impl Iterator<Item = u16> + use<> {
+    pub(crate) fn addresses(&self) -> impl Iterator<Item = u16> + Clone + use<> {
         let start = self.address;
         (0..self.form.items()).filter_map(move |item| start.checked_add(item))
     }

@@ -18,7 +18,7 @@ use std::time::Duration;
 
 use super::model::ModelPoint;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
-use crate::codec::Protocol;
+use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
@@ -221,6 +221,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     for (code, text) in read_faults(reader, "faults_unverified", false) {
         faults.entry(code).or_insert(text);
     }
+    read_fault_help(reader, "fault_causes", &mut faults, |fault| &mut fault.cause);
+    read_fault_help(reader, "fault_remedies", &mut faults, |fault| &mut fault.remedy);
     let model = ModelPoint::ALL
         .iter()
         .map(|m| points.iter().position(|p| p.model == Some(*m)))
@@ -232,6 +234,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         built_in,
         base,
         bauds: reader.or("bauds", Vec::new()),
+        formats: read_formats(reader),
         n2: n2::read_n2(reader, &protocols),
         protocols,
         addresses,
@@ -317,6 +320,24 @@ fn read_protocols(reader: &Reader<'_>) -> Vec<Protocol> {
     protocols
 }
 
+/// `formats`: character formats, as a bus has them.
+fn read_formats(reader: &Reader<'_>) -> Vec<String> {
+    let texts: Vec<String> = reader.or("formats", Vec::new());
+    let formats = texts.iter().map(|text| match LineFormat::new(1, text) {
+        Ok(format) => Some(format.characters()),
+        Err(_) => {
+            let what = format!("`{text}` is not a character format");
+            reader.problem(
+                "formats",
+                what,
+                "write for example [\"8N1\", \"8E1\"], the usual one first",
+            );
+            None
+        }
+    });
+    formats.flatten().collect()
+}
+
 fn read_pair<T: document::FromNode + Copy + PartialOrd>(reader: &Reader<'_>, key: &str) -> Option<RangeInclusive<T>> {
     let pair: Vec<T> = reader.optional(key)?;
     match pair.as_slice() {
@@ -337,7 +358,13 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
         let text: Option<String> = table.optional(code);
         match (code.parse::<u16>(), text) {
             (Ok(number), Some(text)) => {
-                faults.insert(number, FaultText { text, verified });
+                let fault = FaultText {
+                    text,
+                    cause: String::new(),
+                    remedy: String::new(),
+                    verified,
+                };
+                faults.insert(number, fault);
             }
             (Err(_), _) => table.problem(
                 code,
@@ -349,6 +376,30 @@ fn read_faults(reader: &Reader<'_>, key: &str, verified: bool) -> BTreeMap<u16, 
     }
     table.finish();
     faults
+}
+
+/// `fault_causes` and `fault_remedies`: more about faults that have a text.
+fn read_fault_help(
+    reader: &Reader<'_>,
+    key: &str,
+    faults: &mut BTreeMap<u16, FaultText>,
+    part: impl Fn(&mut FaultText) -> &mut String,
+) {
+    let Some(table) = reader.table(key) else { return };
+    for code in table.keys() {
+        let text: Option<String> = table.optional(code);
+        let fault = code.parse::<u16>().ok().and_then(|number| faults.get_mut(&number));
+        match (fault, text) {
+            (Some(fault), Some(text)) => *part(fault) = text,
+            (None, _) => table.problem(
+                code,
+                format!("there is no text of a fault `{code}`"),
+                "add it to [faults] or [faults_unverified]",
+            ),
+            (Some(_), None) => {}
+        }
+    }
+    table.finish();
 }
 
 /// Lower-case letters, digits and `joint`, starting with a letter.

@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 use super::super::derive::Derived;
 use super::super::model::{Kind, ModelPoint};
-use super::super::profile::{AddressRange, Form, Point, PollClass, Source, WordOrder};
+use super::super::profile::{AddressRange, Blocks, Form, Point, PollClass, Source, WordOrder};
 use super::derived::{point_of, read_derived};
 use super::place::read_raw;
 use super::ranges::Offsets;
@@ -68,6 +68,7 @@ pub(super) fn read_point(
         on_change: reader.or("on_change", false),
         range: read_pair::<f64>(reader, "range"),
         texts: read_texts(reader),
+        blocks: read_blocks(reader),
         verified: reader.or("verified", true),
         note: reader.or("note", String::new()),
         source: source.unwrap_or(Source::Derived(Derived::All { of: Vec::new() })),
@@ -117,6 +118,35 @@ pub(super) fn check_target(reader: &Reader<'_>, index: usize, points: &[Point]) 
             "name a point with values of the same type",
         );
     }
+}
+
+/// `blocks`, `blocks_when` and `remedy`: a state that keeps the motor from running.
+fn read_blocks(reader: &Reader<'_>) -> Option<Blocks> {
+    let cause: Option<String> = reader.optional("blocks");
+    let when = reader.or("blocks_when", true);
+    let remedy: Option<String> = reader.optional("remedy");
+    let Some(cause) = cause else {
+        for key in ["blocks_when", "remedy"].into_iter().filter(|key| reader.has(key)) {
+            reader.problem(key, "without `blocks` it has no effect", "add `blocks = \"cause\"`");
+        }
+        return None;
+    };
+    if !is_name(&cause, '_') {
+        let what = format!("`{cause}` is not a valid cause");
+        reader.problem("blocks", what, "write a-z, 0-9 and _, starting with a letter");
+    }
+    if remedy.as_deref().unwrap_or_default().is_empty() {
+        reader.problem(
+            "remedy",
+            "a cause needs a remedy",
+            "write what to do as `remedy = \"…\"`",
+        );
+    }
+    Some(Blocks {
+        cause,
+        when,
+        remedy: remedy?,
+    })
 }
 
 /// `[point.texts]`: what the values of an enumeration mean.

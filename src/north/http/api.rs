@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::drive::why::Cause;
 use crate::drive::{self, Quality, State};
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
@@ -59,6 +60,10 @@ pub(super) struct Drive<'d> {
     since: Option<Time>,
     age_ms: Option<u64>,
     fault_text: String,
+    /// Why it does not run, in one word each.
+    blocked_by: Vec<String>,
+    /// The same with evidence and remedy.
+    why: Vec<Cause>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     points: Points<'d>,
@@ -73,6 +78,7 @@ impl<'d> Drive<'d> {
             Link::Untried => None,
             Link::Online(since) | Link::Offline(since) => Some(Time(since)),
         };
+        let why = drive.why(&reading);
         Drive {
             name: &spec.name,
             bus: &spec.bus,
@@ -89,6 +95,8 @@ impl<'d> Drive<'d> {
             since,
             age_ms: reading.age().map(millis),
             fault_text: reading.fault_text(),
+            blocked_by: why.words(),
+            why: why.causes,
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             points: Points { reading, clock },
@@ -148,6 +156,9 @@ struct Point<'p> {
     unit: &'p str,
     age_ms: Option<u64>,
     time: Option<Time>,
+    /// A newer state says otherwise.
+    #[serde(skip_serializing_if = "std::ops::Not::not")]
+    contradicted: bool,
 }
 
 impl Points<'_> {
@@ -164,6 +175,7 @@ impl Points<'_> {
             unit: &point.unit,
             age_ms: at.map(|at| millis(self.clock.age(at))),
             time: at.and_then(|at| self.clock.wall(at)),
+            contradicted: self.reading.is_contradicted(index),
         }
     }
 }
@@ -184,7 +196,8 @@ pub(super) struct Bus<'b> {
     reason: Option<String>,
     drives: usize,
     online: usize,
-    load_ratio: f64,
+    /// `null` until the port was open for a second.
+    load_ratio: Option<f64>,
     fast: Cycle,
     slow: Cycle,
     transactions: u64,
@@ -236,7 +249,7 @@ impl<'b> Bus<'b> {
             reason: health.reason.filter(|_| !health.up),
             drives: image.drives.len(),
             online: image.online(),
-            load_ratio: rounded(health.load, 10_000.0),
+            load_ratio: health.load.map(|load| rounded(load, 10_000.0)),
             fast: Cycle::new(spec.cycle, health.fast),
             slow: Cycle::new(spec.slow_cycle, health.slow),
             transactions: image.transactions_total(),

@@ -7,11 +7,12 @@ use serde_json::Value as Json;
 
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, RecordOutcome, RecordRequest,
-    Request, Setting, WriteOutcome, WriteRequest, port_of,
+    Request, Setting, WhyRequest, Word, WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
 use crate::document::nearest;
+use crate::drive::why::Explanation;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::mqtt::point_value;
 use crate::plant::{DriveHandle, Plant};
@@ -27,6 +28,7 @@ pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome
     let answered = match request {
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
+        Request::Why(request) => why(request, plant).map(Outcome::Why),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
         Request::Reload(_) | Request::Health(_) => {
             let message = "this is no request to a drive";
@@ -89,12 +91,19 @@ fn is_expected(plant: &Plant, name: &str, drive: Option<&DriveHandle>, expect: &
 async fn read(request: &ReadRequest, plant: &Plant, origin: &Origin) -> Result<ReadOutcome, Failure> {
     let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
     let profile = &drive.image.spec.profile;
-    let indices = indices(profile, &request.points)?;
+    let wanted = wanted(profile, &request.points)?;
     let now = Instant::now();
     // One look at the image, so that all values of one poll are of one poll.
     let reading = drive.reading(now);
-    let mut points = Vec::with_capacity(indices.len());
-    for index in indices {
+    let mut points = Vec::with_capacity(wanted.len());
+    for one in wanted {
+        let index = match one {
+            Wanted::Word(word) => {
+                points.push(PointValue::word(word, word_of(word, &drive, &reading)));
+                continue;
+            }
+            Wanted::Point(index) => index,
+        };
         let Some(point) = profile.points.get(index) else {
             continue;
         };
@@ -106,21 +115,61 @@ async fn read(request: &ReadRequest, plant: &Plant, origin: &Origin) -> Result<R
     Ok(ReadOutcome { points })
 }
 
-fn indices(profile: &Profile, names: &[String]) -> Result<Vec<usize>, Failure> {
+/// What is asked for by a name.
+#[derive(Debug, Clone, Copy)]
+enum Wanted {
+    /// A point, by its index.
+    Point(usize),
+    Word(Word),
+}
+
+/// The word, or the quality of what it comes from, and why it is not good.
+fn word_of(word: Word, drive: &DriveHandle, reading: &Reading<'_>) -> Result<String, (Quality, String)> {
+    let profile = &reading.spec.profile;
+    let bad = word
+        .sources()
+        .iter()
+        .filter_map(|point| profile.model_index(*point))
+        .find(|index| {
+            let sample = reading.sample(*index);
+            sample.good().is_none()
+        });
+    let not_good = || {
+        let index = bad.unwrap_or_default();
+        (reading.sample(index).quality, why_not_good(drive, reading, index))
+    };
+    match word {
+        Word::State => reading
+            .state()
+            .map(|state| state.name().to_string())
+            .ok_or_else(not_good),
+        Word::FaultText if bad.is_some() => Err(not_good()),
+        Word::FaultText => Ok(reading.fault_text()),
+    }
+}
+
+fn wanted(profile: &Profile, names: &[String]) -> Result<Vec<Wanted>, Failure> {
     if names.len() > MAX_POINTS {
         let message = format!("{} points are asked for; {MAX_POINTS} are allowed", names.len());
         return Err(Failure::new(FailureCode::BadRequest, message));
     }
     if names.is_empty() {
-        return Ok(public_points(profile).into_iter().map(|(index, _)| index).collect());
+        let all = public_points(profile).into_iter();
+        return Ok(all.map(|(index, _)| Wanted::Point(index)).collect());
     }
-    let index = |name: &String| {
-        profile.point_index(name).ok_or_else(|| {
-            let message = format!("profile `{}` has no point `{name}`", profile.name);
-            Failure::new(FailureCode::UnknownPoint, message)
-        })
+    let of = |name: &String| {
+        let has = |word: &Word| word.sources().iter().any(|point| profile.model_index(*point).is_some());
+        let word = || Word::of(name).filter(has).map(Wanted::Word);
+        profile
+            .point_index(name)
+            .map(Wanted::Point)
+            .or_else(word)
+            .ok_or_else(|| {
+                let message = format!("profile `{}` has no point `{name}`", profile.name);
+                Failure::new(FailureCode::UnknownPoint, message)
+            })
     };
-    names.iter().map(index).collect()
+    names.iter().map(of).collect()
 }
 
 /// A point that is not polled: the drive is asked for it.
@@ -235,6 +284,11 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
     };
     let answer = placed.answered().await;
     Ok(WriteOutcome::new(&answer, placed.confirmed().await))
+}
+
+fn why(request: &WhyRequest, plant: &Plant) -> Result<Explanation, Failure> {
+    let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
+    Ok(drive.why(&drive.reading(Instant::now())))
 }
 
 async fn record(request: &RecordRequest, plant: &Plant, origin: &Origin) -> Result<RecordOutcome, Failure> {

@@ -2,7 +2,8 @@
 //!
 //! Who may connect is decided by the permissions of the socket's file, and whoever may connect may command, as far as the
 //! drives allow it. Commands go the way of all others ([`crate::plant::DriveHandle::place`]) and are audited with the user
-//! id of the client's process. A client can hold a place and nothing else: lines, places and times are bounded.
+//! id of the client's process. Lines, connections and times are bounded; when there are too many connections, one that waits
+//! for no response is closed in favour of the newcomer.
 
 mod answer;
 mod control;
@@ -10,21 +11,22 @@ mod path;
 pub mod protocol;
 
 use std::io;
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
-use tokio::sync::{OwnedSemaphorePermit, Semaphore};
 use tokio::task::JoinHandle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 
 use self::path::Bound;
 use self::protocol::{Failure, FailureCode, MAX_REQUEST, Outcome, Request, Response, VERSION};
-use crate::command::{Origin, SourceKind};
+use crate::command::{Authority, Origin, SourceKind};
 use crate::north::NorthStats;
+use crate::north::connection_limit::{CloseReason, ConnectionLimit, ConnectionPermit, Limits, Newcomer};
 use crate::plant::{Plant, SharedPlant};
 
 pub use answer::answer;
@@ -33,6 +35,8 @@ pub use path::{RuntimeDirectories, SocketPath};
 
 /// Clients at one time.
 const MAX_CLIENTS: usize = 32;
+/// All clients are of this machine and share one limit.
+const THIS_MACHINE: IpAddr = IpAddr::V4(Ipv4Addr::LOCALHOST);
 /// Time for a request to arrive, counted from the connection or from the response before.
 const REQUEST_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for a client to take its response.
@@ -118,11 +122,16 @@ pub async fn start(
 }
 
 async fn accept(bound: Bound, asked: Arc<Asked>, cancel: CancellationToken) {
-    let places = Arc::new(Semaphore::new(MAX_CLIENTS));
+    let limit = ConnectionLimit::new(Limits::new(MAX_CLIENTS, MAX_CLIENTS));
+    let newcomer = Newcomer {
+        address: THIS_MACHINE,
+        listener: 0,
+        cancel: &cancel,
+    };
     while let Some(accepted) = cancel.run_until_cancelled(bound.listener.accept()).await {
         match accepted {
-            Ok((stream, _)) => match places.clone().try_acquire_owned() {
-                Ok(place) => drop(tokio::spawn(serve(stream, asked.clone(), cancel.clone(), place))),
+            Ok((stream, _)) => match limit.acquire(newcomer, Instant::now(), || Some(Authority::Write)) {
+                Ok((permit, _)) => drop(tokio::spawn(serve(stream, asked.clone(), permit))),
                 Err(_) => turn_away(&stream, &asked.plant.load()),
             },
             Err(error) => {
@@ -133,7 +142,7 @@ async fn accept(bound: Bound, asked: Arc<Asked>, cancel: CancellationToken) {
     }
 }
 
-/// Answers a client there is no place for. What does not fit the socket's buffer at once is dropped.
+/// Answers a client that is too many. What does not fit the socket's buffer at once is dropped.
 fn turn_away(stream: &UnixStream, plant: &Plant) {
     let message = format!("{MAX_CLIENTS} local clients are connected already; try again");
     let failure = Failure::new(FailureCode::Busy, message);
@@ -148,18 +157,21 @@ fn response(plant: &Plant, result: Outcome) -> Vec<u8> {
     })
 }
 
-/// Serves one client until it leaves, falls silent or takes no response.
-async fn serve(mut stream: UnixStream, asked: Arc<Asked>, cancel: CancellationToken, place: OwnedSemaphorePermit) {
+/// Serves one client until it leaves, falls silent, takes no response or yields to another one.
+async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPermit) {
     // Without a user id there is nobody to hold the command against.
     let Ok(peer) = stream.peer_cred() else { return };
+    let place = permit.place();
     let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
     let (read_half, mut write_half) = stream.split();
     let mut reader = BufReader::new(read_half);
     loop {
+        place.use_at(Instant::now(), false);
         let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader));
-        let Some(Ok(Ok(line))) = cancel.run_until_cancelled(request).await else {
+        let Some(Ok(Ok(line))) = place.closing().run_until_cancelled(request).await else {
             break;
         };
+        place.use_at(Instant::now(), true);
         let (result, goes_on) = match line {
             Line::End => break,
             Line::TooLong => {
@@ -177,7 +189,9 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, cancel: CancellationTo
             break;
         }
     }
-    drop(place);
+    if place.close_reason() == Some(CloseReason::Displaced) {
+        turn_away(&stream, &asked.plant.load());
+    }
 }
 
 enum Line {

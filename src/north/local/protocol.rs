@@ -4,6 +4,8 @@
 //! {"v":1,"read":{"drive":"pump-1","points":["output_frequency"]}}
 //! {"v":1,"gateway":"plant","read":{"points":[{"point":"output_frequency","value":25.0,"unit":"Hz","quality":"good"}]}}
 //! {"v":1,"write":{"drive":"pump-1","points":[{"point":"run","value":false}]}}
+//! {"v":1,"why":{"drive":"pump-1"}}
+//! {"v":1,"gateway":"plant","why":{"runs":false,"causes":[{"cause":"interlocked","evidence":"…","age_ms":12,"remedy":"…"}],"not_told":[]}}
 //! {"v":1,"record":{"drive":"pump-1"}}
 //! {"v":1,"gateway":"plant","record":{"id":"20260302T074012.118Z-pump-1","after_s":10.0}}
 //! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
@@ -20,7 +22,8 @@ use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
 
 use crate::command::{Answer, CONFIRMED};
-use crate::drive::{Point, Sample};
+use crate::drive::why::Explanation;
+use crate::drive::{ModelPoint, Point, Quality, Sample};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -38,6 +41,8 @@ pub enum Request {
     Read(ReadRequest),
     /// Points of one drive set as one command.
     Write(WriteRequest),
+    /// Why a drive does not run.
+    Why(WhyRequest),
     /// A recording of one drive.
     Record(RecordRequest),
     /// The gateway reads its configuration anew.
@@ -53,6 +58,17 @@ pub struct OfGateway {
     /// The one that runs with this configuration file, an absolute path without links; absent: whichever answers.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub config: Option<String>,
+}
+
+/// Why a drive does not run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WhyRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
 }
 
 /// A recording of one drive.
@@ -159,6 +175,8 @@ pub enum Outcome {
     Read(ReadOutcome),
     /// The command was carried out, or refused.
     Write(WriteOutcome),
+    /// Whether the drive runs, and why not.
+    Why(Explanation),
     /// A recording goes on.
     Record(RecordOutcome),
     /// The configuration was read anew.
@@ -234,7 +252,58 @@ pub struct PointValue {
     pub why: Option<String>,
 }
 
+/// The state in one word and the text of the fault. They are no points of a profile; they are read by these names all the
+/// same, as over MQTT and HTTP.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Word {
+    /// `offline`, `not_ready`, `ready`, `running` or `fault`.
+    State,
+    /// Empty without a fault.
+    FaultText,
+}
+
+impl Word {
+    /// The one of that name.
+    pub fn of(name: &str) -> Option<Word> {
+        [Word::State, Word::FaultText]
+            .into_iter()
+            .find(|word| word.name() == name)
+    }
+
+    /// Its name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Word::State => "state",
+            Word::FaultText => "fault_text",
+        }
+    }
+
+    /// The points that it comes from.
+    pub fn sources(self) -> &'static [ModelPoint] {
+        match self {
+            Word::State => &[ModelPoint::Fault, ModelPoint::Running, ModelPoint::Ready],
+            Word::FaultText => &[ModelPoint::FaultCode],
+        }
+    }
+}
+
 impl PointValue {
+    /// A word, or the quality of what it comes from, and why it is not good.
+    pub(super) fn word(word: Word, value: Result<String, (Quality, String)>) -> PointValue {
+        let (value, quality, why) = match value {
+            Ok(text) => (Json::String(text), Quality::Good, None),
+            Err((quality, why)) => (Json::Null, quality, Some(why)),
+        };
+        PointValue {
+            point: word.name().to_string(),
+            value,
+            text: None,
+            unit: String::new(),
+            quality: quality.name().to_string(),
+            why,
+        }
+    }
+
     /// The point with its sample; `why` is asked only where that is not good.
     pub(super) fn new(point: &Point, sample: &Sample, why: impl FnOnce() -> String) -> PointValue {
         let value = sample.good();

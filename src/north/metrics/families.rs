@@ -6,7 +6,7 @@ use std::time::{Instant, SystemTime};
 
 use super::model::MODEL;
 use super::process;
-use crate::drive::{PollClass, State};
+use crate::drive::{ModelPoint, PollClass, State};
 use crate::history::TriggerKind;
 use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
@@ -90,6 +90,14 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         "drivegate_drive_state",
         "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
     );
+    let mut blocked = gauge(
+        "drivegate_drive_blocked",
+        "Why the motor does not run: 1 for each cause; absent while it runs.",
+    );
+    let mut fault_info = gauge(
+        "drivegate_drive_fault_info",
+        "Text of the active fault: 1; absent without a fault.",
+    );
     let mut age = gauge(
         "drivegate_drive_sample_age_seconds",
         "Age of the drive's process data; absent while it was never read.",
@@ -131,6 +139,14 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
                 state.add(with(&labels, "state", one.name()), flag(one == current));
             }
         }
+        for cause in drive.why(&reading).words() {
+            blocked.add(with(&labels, "reason", &cause), SeriesValue::Value(1.0));
+        }
+        let fault_text =
+            Some(reading.fault_text()).filter(|text| reading.is_set(ModelPoint::Fault) && !text.is_empty());
+        if let Some(text) = fault_text {
+            fault_info.add(with(&labels, "text", &text), SeriesValue::Value(1.0));
+        }
         if let Some(time) = reading.age() {
             age.add(labels.clone(), SeriesValue::Value(time.as_secs_f64()));
         }
@@ -143,7 +159,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
             turnaround.add(labels, SeriesValue::Value(time.as_secs_f64()));
         }
     }
-    all.extend([up, state, age]);
+    all.extend([up, state, blocked, fault_info, age]);
     all.append(&mut model);
     all.extend([point, transactions, turnaround, supervision, unsupervised]);
 }
@@ -178,15 +194,15 @@ fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &
 
 fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     type Of<T> = fn(&BusImage, &BusHealth) -> T;
-    let gauges: [(&str, &str, Of<f64>); 2] = [
+    let gauges: [(&str, &str, Of<Option<f64>>); 2] = [
         (
             "drivegate_bus_up",
             "Whether the port of the bus is open: 1, else 0.",
-            |_, health| f64::from(u8::from(health.up)),
+            |_, health| Some(f64::from(u8::from(health.up))),
         ),
         (
             "drivegate_bus_load_ratio",
-            "Share of the last second that the line was in use, 0 to 1.",
+            "Share of the last second that the line was in use, 0 to 1; absent until the port was open for a second.",
             |_, health| health.load,
         ),
     ];
@@ -197,7 +213,9 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     for (name, help, value) in gauges {
         let mut family = Family::new(Kind::Gauge, name, help);
         for (labels, handle, health) in &looks {
-            family.add(labels.clone(), SeriesValue::Value(value(&handle.image, health)));
+            if let Some(value) = value(&handle.image, health) {
+                family.add(labels.clone(), SeriesValue::Value(value));
+            }
         }
         all.push(family);
     }

@@ -326,6 +326,7 @@ fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<
 
 /// Polls until the first error and reports the events.
 async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, backlog: Arc<Backlog>) {
+    let mut accepted = false;
     loop {
         let item = match eventloop.poll().await {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
@@ -339,9 +340,11 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
                 (packet != 0).then_some(ConnectionEvent::Sent(packet))
             }
             Ok(event) => interpret(event),
-            Err(error) => Some(ConnectionEvent::Lost(reason(&error))),
+            Err(error) if accepted => Some(ConnectionEvent::Lost(reason(&error))),
+            Err(error) => Some(ConnectionEvent::Lost(refusal(&error))),
         };
         let Some(item) = item else { continue };
+        accepted |= matches!(item, ConnectionEvent::Connected(_));
         let end = matches!(item, ConnectionEvent::Lost(_));
         if event.send(item).await.is_err() || end {
             return;
@@ -377,8 +380,26 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
     }
 }
 
+/// Why there is no connection yet. A broker without MQTT 5 answers in the form of an older version, which is no packet of
+/// MQTT 5, and closes the connection; some close it at once.
+fn refusal(error: &ConnectionError) -> String {
+    match error {
+        ConnectionError::MqttState(StateError::ConnectionAborted | StateError::Deserialization(_)) => format!(
+            "the broker closed the connection without accepting it: it does not support MQTT 5, or expects TLS; {MQTT_5}, or \
+             write mqtts:// for TLS"
+        ),
+        _ => reason(error),
+    }
+}
+
+/// What to do about a broker of an older version.
+const MQTT_5: &str = "the gateway requires MQTT 5: use Mosquitto 1.6 or later, or another broker that supports it";
+
 fn reason(error: &ConnectionError) -> String {
-    use ConnectReturnCode::{BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported};
+    use ConnectReturnCode::{
+        BadUserNamePassword, Banned, ClientIdentifierNotValid, NotAuthorized, RetainNotSupported,
+        UnsupportedProtocolVersion,
+    };
     let ConnectionError::ConnectionRefused(code) = error else {
         return match error {
             ConnectionError::Timeout(_) => "timed out".to_string(),
@@ -387,6 +408,9 @@ fn reason(error: &ConnectionError) -> String {
             _ => error.to_string(),
         };
     };
+    if *code == UnsupportedProtocolVersion {
+        return format!("the broker refuses the protocol version ({code:?}); {MQTT_5}");
+    }
     let advice = match code {
         BadUserNamePassword | NotAuthorized | Banned => {
             "; check mqtt.username, mqtt.password_file and the permissions at the broker"

@@ -11,8 +11,9 @@ use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, Reading, value_or_null};
 
 /// Keys of the state object that are not points; a profile point of that name is omitted.
-const STATE_KEYS: [&str; 7] = [
+const STATE_KEYS: [&str; 8] = [
     "state",
+    "blocked_by",
     "quality",
     "time",
     "age_ms",
@@ -91,6 +92,8 @@ pub(super) struct StateContent {
     /// `None` while it is not known.
     pub(super) state: Option<State>,
     pub(super) quality: Quality,
+    /// Why the motor does not run, in one word each.
+    pub(super) blocked_by: Vec<String>,
     /// Value (only if good) and quality of each published point.
     pub(super) points: Vec<(Option<Value>, Quality)>,
 }
@@ -102,7 +105,11 @@ pub(super) fn text_beside(point: &Point, value: Option<Value>) -> Option<(String
 }
 
 impl StateContent {
-    pub(super) fn of(reading: &Reading<'_>, points: impl Iterator<Item = usize>) -> StateContent {
+    pub(super) fn of(
+        reading: &Reading<'_>,
+        points: impl Iterator<Item = usize>,
+        blocked_by: Vec<String>,
+    ) -> StateContent {
         let shown = |index| {
             let sample = reading.sample(index);
             (sample.good(), sample.quality)
@@ -110,6 +117,7 @@ impl StateContent {
         StateContent {
             state: reading.state(),
             quality: reading.overall(),
+            blocked_by,
             points: points.map(shown).collect(),
         }
     }
@@ -143,6 +151,7 @@ impl Serialize for StateObject<'_> {
         map.serialize_entry("time", &read_at.map(rfc3339))?;
         map.serialize_entry("age_ms", &self.age.map(|a| a.as_millis() as u64))?;
         map.serialize_entry("fault_text", &self.fault_text)?;
+        map.serialize_entry("blocked_by", &self.shown.blocked_by)?;
         let points = || self.names.iter().zip(&self.shown.points);
         for (name, (value, _)) in points() {
             map.serialize_entry(name, &value_or_null(value.map(tidy)))?;
@@ -227,7 +236,8 @@ pub(super) struct BusState {
 /// The part of a bus message that changes all the time.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct BusFigures {
-    pub(super) load: f64,
+    /// Not known until the port was open for a second.
+    pub(super) load: Option<f64>,
     pub(super) fast_cycle_ms: Option<f64>,
     pub(super) slow_cycle_ms: Option<f64>,
     pub(super) transactions: u64,
@@ -252,7 +262,7 @@ pub(super) fn bus_now(bus: &BusHandle) -> (BusState, BusFigures) {
         online: bus.image.online(),
     };
     let figures = BusFigures {
-        load: rounded(load, 1000.0),
+        load: load.map(|load| rounded(load, 1000.0)),
         fast_cycle_ms: fast.last.map(milliseconds),
         slow_cycle_ms: slow.last.map(milliseconds),
         transactions: bus.image.transactions_total(),
@@ -381,6 +391,7 @@ mod tests {
             let shown = StateContent {
                 state: Some(State::NotReady),
                 quality: Quality::Good,
+                blocked_by: Vec::new(),
                 points: vec![(value.map(Value::Integer), Quality::Good)],
             };
             let object = StateObject {
@@ -422,7 +433,7 @@ mod tests {
         });
         let running = cx.point_index("running").unwrap();
         let ready = cx.point_index("ready").unwrap();
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
         let object = StateObject {
             shown: &shown,
             names: &["running".to_string(), "ready".to_string()],
@@ -445,7 +456,7 @@ mod tests {
         assert_eq!(object["point_quality"], serde_json::json!({"ready": "good"}));
         assert_eq!(PointPayload::state(shown.state), PointPayload::Nothing);
         image.update(|s| s.store(Table::DiscreteInput, 2, &[0], now));
-        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter());
+        let shown = StateContent::of(&image.reading(now, second), [running, ready].into_iter(), Vec::new());
         assert_eq!((shown.state, shown.quality), (Some(State::Ready), Quality::Good));
     }
 

@@ -228,7 +228,7 @@ impl Publisher {
             let fresh = drive.is_fresh();
             let (names, indices) = (&drive.names, &drive.indices);
             let reading = drive.drive.reading(now);
-            let shown = StateContent::of(&reading, indices.iter().copied());
+            let shown = StateContent::of(&reading, indices.iter().copied(), drive.drive.why(&reading).words());
             let render = |shown: &StateContent| render(names, indices, &reading, shown, wall, true);
             let wait = drive.recorder.record(mode, pace.min, shown, fresh, render, now);
             drive.seen = Some(reading.snapshot);
@@ -317,7 +317,7 @@ impl DriveTopics {
 
     fn tick(&mut self, pace: PublishInterval, now: Instant, wall: SystemTime, updates: &mut Vec<Update>) {
         let reading = self.drive.reading(now);
-        let shown = StateContent::of(&reading, self.indices.iter().copied());
+        let shown = StateContent::of(&reading, self.indices.iter().copied(), self.drive.why(&reading).words());
         let mut look_at = now + LOOK.min(pace.max);
         for point in &mut self.points {
             let payload = match point.source {

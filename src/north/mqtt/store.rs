@@ -7,9 +7,9 @@
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::sync::mpsc::{Receiver, RecvTimeoutError, SyncSender, TrySendError, sync_channel};
 use std::time::{Duration, Instant};
 
+use flume::{Receiver, RecvTimeoutError, Sender, TrySendError};
 use tokio::sync::mpsc;
 
 use super::Buffer;
@@ -81,7 +81,7 @@ pub(super) struct Store {
 #[derive(Debug)]
 struct Disk {
     lost: LostCount,
-    jobs: SyncSender<Job>,
+    jobs: Sender<Job>,
     loaded: mpsc::Receiver<Loaded>,
     ended: tokio::sync::oneshot::Receiver<()>,
 }
@@ -93,7 +93,8 @@ impl Store {
         let Some(buffer) = buffer else {
             return Store::default();
         };
-        let (jobs, todo) = sync_channel(JOBS);
+        // Takes memory as it fills: the channel of the standard library would hold the space of all jobs from the start.
+        let (jobs, todo) = flume::bounded(JOBS);
         let (sender, loaded) = mpsc::channel(4);
         let (end, ended) = tokio::sync::oneshot::channel();
         let of_thread = lost.clone();

@@ -17,8 +17,8 @@ pub(crate) struct BusFigures {
     pub(crate) drives: usize,
     /// Drives online.
     pub(crate) online: usize,
-    /// Line load, 0 to 1.
-    pub(crate) load: f64,
+    /// Line load, 0 to 1; unknown until the port was open for a second.
+    pub(crate) load: Option<f64>,
     /// Achieved cycle of the fast poll class.
     pub(crate) cycle: Option<Duration>,
     /// Exchanges so far.
@@ -74,10 +74,11 @@ pub(crate) const BUS_REGISTERS: [BusRegister; 8] = [
 ];
 
 impl BusFigures {
-    /// The block of the bus. A bus that is down has no drives online and no load; a cycle that was never measured is
-    /// 0xFFFFFFFF; counters are modulo 2^32; reserved registers are 0.
+    /// The block of the bus. A bus that is down has no drives online and no load; a load that was not measured yet is 0xFFFF, such
+    /// a cycle 0xFFFFFFFF; counters are modulo 2^32; reserved registers are 0.
     pub(crate) fn registers(&self) -> [u16; BUS_BLOCK as usize] {
         let count = |n: usize| n.min(usize::from(u16::MAX - 1)) as u16;
+        let per_mille = |load: f64| (load.clamp(0.0, 1.0) * 1000.0).round() as u16;
         let ms = |cycle: Duration| (cycle.as_secs_f64() * 1000.0).round().min(f64::from(u32::MAX - 1)) as u32;
         let [cycle_high, cycle_low] = high_low(self.cycle.map_or(u32::MAX, ms));
         let [done_high, done_low] = high_low(self.transactions as u32);
@@ -87,7 +88,7 @@ impl BusFigures {
             count(self.drives),
             if self.up { count(self.online) } else { 0 },
             if self.up {
-                (self.load.clamp(0.0, 1.0) * 1000.0).round() as u16
+                self.load.map_or(u16::MAX, per_mille)
             } else {
                 0
             },

@@ -428,7 +428,7 @@ fn the_gateway_itself() {
             up: place == 0,
             drives: 3,
             online: 2,
-            load: 0.9876,
+            load: Some(0.9876),
             cycle: (place == 0).then_some(Duration::from_micros(70_123)),
             transactions: 0x1_0002_0003,
             errors: 5,
@@ -441,6 +441,9 @@ fn the_gateway_itself() {
     assert_eq!(gateway(0, 32, bus), Ok(all.clone()));
     assert_eq!(gateway(14, 4, bus), Ok(all[14..18].to_vec()));
     assert_eq!(gateway(31, 1, bus), Ok(vec![0]));
+    let opened = |place| bus(place).map(|figures| BusFigures { load: None, ..figures });
+    assert_eq!(gateway(3, 1, opened), Ok(vec![0xFFFF]), "not known in the first second");
+    assert_eq!(gateway(19, 1, opened), Ok(vec![0]), "a bus that is down has none");
     for (start, count) in [(31, 2), (32, 1), (0x8000, 1), (65_535, 1)] {
         assert_eq!(gateway(start, count, bus), Err(Exception::ADDRESS), "{start}+{count}");
     }

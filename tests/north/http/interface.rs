@@ -158,7 +158,7 @@ async fn a_good_drive() {
         timeless(reply),
         json!({
             "name": "pump-1", "bus": "line1", "address": 1, "unit": 1, "profile": "vacon-nx", "access": "monitor",
-            "state": "running", "quality": "good", "online": true, "since": "…", "age_ms": "…", "fault_text": "",
+            "state": "running", "quality": "good", "online": true, "since": "…", "age_ms": "…", "fault_text": "", "blocked_by": [], "why": [],
             "turnaround_ms": 1.9, "transactions": {"ok": 1, "exception": 0, "timeout": 0, "corrupt": 0},
         })
     );
@@ -225,6 +225,15 @@ async fn values_that_are_not_good_say_so() {
         (&json!("fault"), &json!("saturation trip"))
     );
     assert_eq!(fault["points"]["fault_code"]["value"], json!(7));
+    assert_eq!(
+        (&fault["blocked_by"][0], &fault["why"][0]["cause"]),
+        (&json!("fault"), &json!("fault"))
+    );
+    assert_eq!(
+        fault["why"][0]["evidence"],
+        json!("fault 7: saturation trip, text not verified")
+    );
+    assert_eq!(never["blocked_by"], json!(["offline"]));
 }
 
 #[tokio::test]

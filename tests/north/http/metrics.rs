@@ -12,7 +12,7 @@ use crate::support::tools::{feed, tool};
 
 /// Every metric with its type and labels. Dashboards and alerts rest on these: a new metric is added here, none is
 /// renamed, retyped or removed.
-const FROZEN: [&str; 50] = [
+const FROZEN: [&str; 52] = [
     "drivegate_build_info gauge commit,gateway,version",
     "drivegate_bus_cycle_seconds histogram bus,class",
     "drivegate_bus_load_ratio gauge bus",
@@ -23,10 +23,12 @@ const FROZEN: [&str; 50] = [
     "drivegate_config_last_reload_timestamp_seconds gauge ",
     "drivegate_drive_actual_speed_percent gauge bus,drive",
     "drivegate_drive_at_reference gauge bus,drive",
+    "drivegate_drive_blocked gauge bus,drive,reason",
     "drivegate_drive_dc_link_voltage_volts gauge bus,drive",
     "drivegate_drive_energy_kilowatthours gauge bus,drive",
     "drivegate_drive_fault gauge bus,drive",
     "drivegate_drive_fault_code gauge bus,drive",
+    "drivegate_drive_fault_info gauge bus,drive,text",
     "drivegate_drive_heatsink_temperature_celsius gauge bus,drive",
     "drivegate_drive_motor_current_amperes gauge bus,drive",
     "drivegate_drive_motor_power_percent gauge bus,drive",
@@ -137,11 +139,12 @@ fn value(text: &str, name: &str, labels: &str) -> Option<f64> {
     found.first().copied()
 }
 
-/// A plant whose one drive has every point there is.
-async fn everything() -> Server {
+/// A plant with a drive that has every point there is, and one that was never asked.
+pub(super) async fn everything() -> Server {
     let image = plant::drive("line1", "all", 1, &plant::everything());
     plant::answer(&image, Instant::now(), |address| if address == 41 { 50 } else { 1 });
-    let bus = plant::bus("line1", vec![image]);
+    let untried = plant::drive("line1", "untried", 2, &plant::everything());
+    let bus = plant::bus("line1", vec![image, untried]);
     plant::open(&bus);
     let plant = plant::plant(vec![bus]);
     plant::count_a_write(&plant);
@@ -300,6 +303,8 @@ async fn what_is_not_good_has_no_sample() {
         "drivegate_drive_up",
         "drivegate_drive_state",
         "drivegate_drive_transactions_total",
+        // Offline is a cause.
+        "drivegate_drive_blocked",
     ];
     let never: BTreeSet<String> = known.map(String::from).into();
     let mut stale = never.clone();
@@ -395,19 +400,21 @@ async fn promtool_has_no_complaint() {
     );
 }
 
-struct Prometheus {
+pub(super) struct Prometheus {
     program: Running,
     port: u16,
     _directory: tempfile::TempDir,
 }
 
 impl Prometheus {
-    fn scraping(target: SocketAddr) -> Prometheus {
+    pub(super) fn scraping(targets: &[SocketAddr]) -> Prometheus {
         let directory = tempfile::tempdir().unwrap();
         let port = free_port();
         let place = |name: &str| directory.path().join(name).display().to_string();
+        let targets: Vec<String> = targets.iter().map(|target| format!("\"{target}\"")).collect();
+        let targets = targets.join(", ");
         let settings = format!(
-            "global: {{ scrape_interval: 1s }}\nscrape_configs:\n- job_name: drivegate\n  static_configs: [{{ targets: [\"{target}\"] }}]\n"
+            "global: {{ scrape_interval: 1s }}\nscrape_configs:\n- job_name: drivegate\n  static_configs: [{{ targets: [{targets}] }}]\n"
         );
         fs::write(place("prometheus.yml"), settings).unwrap();
         let arguments = [
@@ -424,20 +431,31 @@ impl Prometheus {
 
     /// Value of the only series that a query finds, once there is one.
     async fn ask(&self, query: &str) -> String {
+        let found = self.find(query, |found| !found.is_empty()).await;
+        found[0]["value"][1].as_str().expect("a value").to_string()
+    }
+
+    /// The series that a query (as part of a URL) finds, once they are what is wanted.
+    pub(super) async fn find(
+        &self,
+        query: &str,
+        wanted: impl Fn(&[serde_json::Value]) -> bool,
+    ) -> Vec<serde_json::Value> {
         let address = SocketAddr::from(([127, 0, 0, 1], self.port));
         let path = format!("/api/v1/query?query={query}");
         let deadline = Instant::now() + PATIENCE;
+        let mut last = String::new();
         while Instant::now() < deadline {
             if tokio::net::TcpStream::connect(address).await.is_ok() {
-                let reply = get(address, &path).await;
-                let answer: serde_json::Value = serde_json::from_str(&reply.body).unwrap_or_default();
-                if let Some(value) = answer["data"]["result"][0]["value"][1].as_str() {
-                    return value.to_string();
+                last = get(address, &path).await.body;
+                let answer: serde_json::Value = serde_json::from_str(&last).unwrap_or_default();
+                if let Some(found) = answer["data"]["result"].as_array().filter(|found| wanted(found)) {
+                    return found.clone();
                 }
             }
             tokio::time::sleep(Duration::from_millis(200)).await;
         }
-        panic!("Prometheus has no answer to {query}:\n{}", self.program.output());
+        panic!("Prometheus answers {query} with {last}\n{}", self.program.output());
     }
 }
 
@@ -446,7 +464,7 @@ async fn a_real_prometheus_scrapes_it() {
     let plant = plant::mixed();
     plant::count_a_write(&plant);
     let server = Server::of(plant).await;
-    let prometheus = Prometheus::scraping(server.address);
+    let prometheus = Prometheus::scraping(&[server.address]);
     assert_eq!(
         prometheus
             .ask("drivegate_drive_output_frequency_hertz%7Bdrive=%22pump-1%22%7D")

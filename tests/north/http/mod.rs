@@ -3,6 +3,7 @@
 
 mod access;
 mod client;
+mod dashboards;
 mod interface;
 mod limits;
 mod metrics;

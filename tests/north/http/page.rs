@@ -1,7 +1,7 @@
 //! The status page in a real browser.
 
 use super::plant::{self, Server, event};
-use crate::support::tools::{run, tool};
+use crate::support::tools::{root, run, tool};
 
 use drivegate::event::EventKind;
 
@@ -80,4 +80,13 @@ async fn the_page_shows_the_plant() {
     ] {
         assert!(document.contains(wanted), "{wanted}\nis missing in\n{document}");
     }
+}
+
+/// What a row shows of points that a reload replaced, of texts, ages, speeds that a newer state contradicts, and causes.
+#[test]
+fn rows_follow_their_drive() {
+    let here = root().join("tests/north/http/page_rows.js");
+    let script = root().join("src/north/http/page/page.js");
+    let output = run(&tool("node"), &[here.to_str().unwrap(), script.to_str().unwrap()]);
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
 }

@@ -121,7 +121,7 @@ pub(crate) fn open(bus: &BusHandle) {
         health.up = true;
         health.tried = true;
         health.since = Some(SystemTime::now());
-        health.load = 0.4375;
+        health.load = Some(0.4375);
         health.opened += 1;
         let cycle = |ms, rounds| PollCycle {
             last: Some(Duration::from_micros(ms)),

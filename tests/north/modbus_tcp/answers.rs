@@ -219,6 +219,24 @@ fn kinds() -> Vec<(&'static str, u8, Vec<u8>, &'static str)> {
             "02 01 01 02 0A 02 02 02 02 02 02 02",
         ),
         (
+            "06 raw register of no writable point",
+            NX,
+            words(6, &[101, 10_000]),
+            "02 01 01 02 0A 02 02 02 02 02 02 02",
+        ),
+        (
+            "16 raw registers, one of no writable point",
+            NX,
+            write(2001, &[0, 5000]),
+            "02 01 01 02 0A 02 02 02 02 02 02 02",
+        ),
+        (
+            "16 the same with the control word",
+            NX,
+            write(2000, &[0, 0, 5000]),
+            "ok 01 01 ok 0A 0B ok 0A 06 02 0B 04",
+        ),
+        (
             "06 raw register, unmapped",
             NX,
             words(6, &[7000, 1]),
@@ -626,7 +644,19 @@ fn examples() -> Vec<(&'static str, u8, Vec<u8>, Vec<u8>)> {
             refused(6, no_value),
         ),
         ("beyond the range", 1, words(6, &[0x8101, 10_001]), refused(6, no_value)),
-        ("two parameters", 1, write(200, &[1, 2]), refused(16, no_value)),
+        ("two parameters", 1, write(732, &[1, 2]), refused(16, no_value)),
+        (
+            "maximum frequency, raw",
+            1,
+            words(6, &[101, 10_000]),
+            refused(6, no_address),
+        ),
+        (
+            "general control word alone",
+            1,
+            words(6, &[2001, 0]),
+            refused(6, no_address),
+        ),
         ("command bits", 1, words(6, &[0x8100, 8]), refused(6, no_value)),
         ("two references", 1, write(0x8101, &[5000, 2500]), refused(16, no_value)),
         (

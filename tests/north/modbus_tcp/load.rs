@@ -65,11 +65,9 @@ async fn a_thousand_connections() {
     let mut idle = Vec::new();
     for n in 0..999 {
         let mut client = rig.client().await;
-        // One in three has never asked anything, one has asked, one is in the middle of a frame.
-        match n % 3 {
-            0 => {}
-            1 => assert_eq!(client.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000])),
-            _ => client.send(&[0, 1, 0]).await,
+        // One in three has asked.
+        if n % 3 == 1 {
+            assert_eq!(client.ask(1, &words(3, &[2102, 1])).await, registers(3, &[5000]));
         }
         idle.push(client);
     }
@@ -79,6 +77,10 @@ async fn a_thousand_connections() {
         assert_eq!(worker.ask(1, &words(6, &[2003, value])).await, words(6, &[2003, value]));
     }
     until("all are in", || rig.stats.modbus_tcp.connections() == 1000).await;
+    // One in three is in the middle of a frame, for the ten seconds that it has for the rest.
+    for client in idle.iter_mut().skip(2).step_by(3) {
+        client.send(&[0, 1, 0]).await;
+    }
     let mut beyond = rig.client().await;
     let answer = beyond.ask(1, &words(3, &[2102, 1])).await;
     assert_eq!(answer, registers(3, &[5000]), "in place of one that never asked");
@@ -238,7 +240,7 @@ async fn disorder_leaves_nothing_behind() {
         tokio::time::timeout(PATIENCE, vandal).await.unwrap().unwrap();
     }
     until("they are gone", || rig.stats.modbus_tcp.connections() == 1).await;
-    assert_eq!(rig.buses[0].waiting(), 0);
+    until("what was accepted is carried out", || rig.buses[0].waiting() == 0).await;
     rig.end().await;
 }
 

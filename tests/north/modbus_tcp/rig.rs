@@ -9,6 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Command, CommandQueue, Order, Outcome};
+use drivegate::drive::RawWrites;
 use drivegate::drive::profile::{Profile, Profiles};
 use drivegate::north::modbus_tcp::{self, Listener, Options, Server, Uncached};
 use drivegate::north::{NorthStats, ServerError};
@@ -204,7 +205,7 @@ fn supervised(name: &str, bus: &str, unit: u8, profile: &Arc<Profile>, access: A
 
 fn bus(name: &str, protocol: Protocol, drives: Vec<DriveSpec>) -> BusHandle {
     let bus = plant::bus(name, protocol, drives.into_iter().map(plant::image).collect());
-    bus.image.update_health(|h| (h.up, h.load) = (true, 0.5));
+    bus.image.update_health(|h| (h.up, h.load) = (true, Some(0.5)));
     bus
 }
 
@@ -249,7 +250,11 @@ pub(crate) fn plant_where(change: impl Fn(&mut DriveSpec)) -> Plant {
             supervised("spare", "line1", 3, nx, Access::Control),
         ],
     );
-    let line2 = bus("line2", vec![supervised("meter", "line2", 4, &meter, Access::Control)]);
+    let meter = DriveSpec {
+        raw_writes: RawWrites::Ranges(vec![0..=99]),
+        ..supervised("meter", "line2", 4, &meter, Access::Control)
+    };
+    let line2 = bus("line2", vec![meter]);
     fill(&line1.image.drives[0]);
     fill(&line1.image.drives[1]);
     line2.image.drives[0].update(|s| {

@@ -111,7 +111,10 @@ impl World {
                 self.plain(index, bus, drive, wish, ms(2_000));
             }
             Habit::Floods => {
-                let wish = Wish::of(&mut self.dice);
+                let wish = match Wish::of(&mut self.dice) {
+                    Wish::RawRead if self.records.len() % 2 == 0 => Wish::RawOther,
+                    wish => wish,
+                };
                 self.plain(index, bus, drive, wish, ms(2_000));
             }
             Habit::Plain => {
@@ -120,6 +123,11 @@ impl World {
                     Wish::Converted
                 } else {
                     Wish::of(&mut self.dice)
+                };
+                // Without the dice: the rest of the world is the same.
+                let wish = match wish {
+                    Wish::RawRead if self.records.len() % 2 == 0 => Wish::RawOther,
+                    wish => wish,
                 };
                 // One that is over soon may run out while the line falls silent before it.
                 let short = ms(self.dice.within(3..=80));

@@ -163,6 +163,10 @@ impl World {
             !(code == "queue_full" && record.wish.is_stop()),
             "a stop was refused for want of room"
         );
+        assert!(
+            !(code == "not_writable" && record.wish.is_stop()),
+            "a stop was refused for the registers that it sets"
+        );
         let bare_stop = matches!(record.wish, Wish::Stop | Wish::RawStop);
         assert!(
             !(code == "offline" && bare_stop),

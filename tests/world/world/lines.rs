@@ -45,6 +45,7 @@ impl World {
         if !pdu.is_write() {
             return;
         }
+        self.check_raw_rule(bus, drive, pdu);
         let profile = self.buses[bus].profile.clone();
         let open = self.open.get(&(bus, drive)).cloned().unwrap_or_default();
         let client_waits = !open.is_empty();
@@ -95,6 +96,28 @@ impl World {
             }
         }
         self.check_unique(bus, drive, pdu);
+    }
+
+    /// A write contains the control word, or sets only what writable points and the configuration name.
+    fn check_raw_rule(&self, bus: usize, drive: usize, pdu: &RequestPdu) {
+        let spec = &self.buses[bus].handle.image.drives[drive].spec;
+        let profile = &spec.profile;
+        let (table, items) = written(pdu).expect("a write that the drives have");
+        if run_command(profile, pdu).is_some() {
+            return;
+        }
+        for (address, _) in items {
+            let is_admitted = match &spec.raw_writes {
+                RawWrites::All => true,
+                RawWrites::Ranges(ranges) => ranges.iter().any(|range| range.contains(&address)),
+                RawWrites::Points => false,
+            };
+            assert!(
+                is_admitted || is_of_writable_point(profile, table, address),
+                "{table} {address} of a {} goes out, which raw_writes does not admit: {pdu:?}",
+                profile.name
+            );
+        }
     }
 
     /// A run goes out: no stop that was accepted before it is still to be answered.

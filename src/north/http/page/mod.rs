@@ -55,14 +55,16 @@ fn buses(out: &mut String, plant: &Plant) -> fmt::Result {
             (Some(reason), false) => format!("down: {reason}"),
             (None, false) => "down".to_string(),
         };
+        let load = health
+            .load
+            .map_or("–".to_string(), |load| format!("{:.0} %", load * 100.0));
         write!(
             out,
-            "<tr><td>{}<td>{}<td>{} of {} online<td>{:.0} %</tr>",
+            "<tr><td>{}<td>{}<td>{} of {} online<td>{load}</tr>",
             Escaped(&image.spec.name),
             Escaped(&state),
             image.online(),
             image.drives.len(),
-            health.load * 100.0
         )?;
     }
     out.write_str("</tbody></table>")

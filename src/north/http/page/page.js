@@ -5,6 +5,7 @@ const PERIOD_MS = 1000;
 const LOST_MS = 3500;
 const FETCH_MS = 4000;
 const EVENTS_SHOWN = 100;
+const OLDER_MS = 500;
 
 const $ = (id) => document.getElementById(id);
 
@@ -68,27 +69,34 @@ const COLUMNS = [
 
 const rows = new Map();
 
-function valueInto(span, unitSpan, point) {
+// `newest` is the age of the process data: a good value that is much older shows its own.
+function valueInto(span, unitSpan, point, ageSpan, newest) {
   const shown = point && point.value !== null;
-  const quality = point ? point.quality : "absent";
-  text(span, shown ? figure(point.value, point.unit) : point ? "—" : "");
-  text(unitSpan, shown && point.unit ? ` ${point.unit}` : "");
+  const quality = !point ? "absent" : point.contradicted ? "contradicted" : point.quality;
+  text(span, shown ? (point.text ?? figure(point.value, point.unit)) : point ? "—" : "");
+  text(unitSpan, shown && point.unit && !point.text ? ` ${point.unit}` : "");
   className(span, `value ${quality === "good" ? "main" : quality}`);
-  const title = { stale: `stale, ${age(point && point.age_ms)} old`, bad: "bad: refused by the drive or never read" }[quality];
+  const title = {
+    stale: `stale, ${age(point && point.age_ms)} old`, bad: "bad: refused by the drive or never read",
+    contradicted: `read ${age(point && point.age_ms)} ago; a newer state says otherwise`,
+  }[quality];
   if (title) span.title = title; else span.removeAttribute("title");
+  if (!ageSpan) return;
+  const older = shown && point.age_ms !== null && (newest === null || point.age_ms > newest + OLDER_MS);
+  text(ageSpan, older ? `${age(point.age_ms)} old` : "");
 }
 
 function driveRow(name) {
   const row = { open: make("button", "open", name), where: make("span", "where"), badge: make("span", "badge"),
-    warning: make("span", "tag amber", "warning"), why: make("span", "why"), cells: [], points: new Map() };
+    warning: make("span", "tag amber", "warning"), why: make("span", "why"), blocked: make("span", "sub blocked"), causes: make("ul", "causes"), cells: [], points: new Map() };
   row.open.type = "button";
   row.open.setAttribute("aria-expanded", "false");
   const first = make("td", "", row.open, make("br"), row.where);
-  const state = make("td", "", row.badge, " ", row.warning, row.why);
+  const state = make("td", "", row.badge, " ", row.warning, row.why, row.blocked);
   const tr = make("tr", "main-row", first, state);
   for (const [title, point] of COLUMNS) {
-    const cell = { point, value: make("span", "value"), unit: make("span", "unit"), extra: null };
-    cell.td = make("td", "n", cell.value, cell.unit);
+    const cell = { point, value: make("span", "value"), unit: make("span", "unit"), age: make("span", "sub age"), extra: null };
+    cell.td = make("td", "n", cell.value, cell.unit, cell.age);
     cell.td.dataset.title = title;
     if (point === "actual_speed") {
       cell.extra = { fill: make("i"), reference: make("span", "sub") };
@@ -103,7 +111,7 @@ function driveRow(name) {
   last.dataset.title = "Age";
   tr.append(last);
   row.list = make("dl", "points");
-  const detail = make("td", "", row.list);
+  const detail = make("td", "", row.causes, row.list);
   detail.colSpan = COLUMNS.length + 3;
   row.detail = make("tr", "detail", detail);
   row.detail.hidden = true;
@@ -131,10 +139,14 @@ function showDrive(row, drive) {
   const fault = !known ? "" : drive.fault_text === String(code.value) ? `fault ${code.value}` : `F${code.value} ${drive.fault_text}`;
   text(row.why, fault);
   row.why.hidden = !fault;
+  // The fault and a drive that is offline have their own words above.
+  const words = drive.blocked_by.filter((word) => word !== "fault" && word !== "offline").map((word) => word.replaceAll("_", " "));
+  text(row.blocked, words.join(", "));
+  row.blocked.hidden = words.length === 0;
   text(row.where, `${drive.bus} · address ${drive.address} · ${drive.profile}`);
   for (const cell of row.cells) {
     const point = drive.points[cell.point];
-    valueInto(cell.value, cell.unit, point);
+    valueInto(cell.value, cell.unit, point, cell.age, drive.age_ms);
     cell.td.classList.toggle("absent", !point);
     if (cell.extra) showSpeed(cell.extra, point, drive.points.speed_reference);
   }
@@ -155,15 +167,30 @@ function showSpeed(extra, point, reference) {
 }
 
 function showPoints(row, drive) {
+  const causes = drive.why.map((cause) => {
+    const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${age(cause.age_ms)} ago)`;
+    return `${cause.cause.replaceAll("_", " ")}: ${cause.evidence}${since}. What to do: ${cause.remedy}.`;
+  });
+  while (row.causes.children.length > causes.length) row.causes.lastChild.remove();
+  while (row.causes.children.length < causes.length) row.causes.append(make("li"));
+  causes.forEach((cause, place) => text(row.causes.children[place], cause));
+  row.causes.hidden = causes.length === 0;
+  // A reload may have given the drive another profile.
+  for (const [name, entry] of row.points) {
+    if (name in drive.points) continue;
+    entry.element.remove();
+    row.points.delete(name);
+  }
   for (const [name, point] of Object.entries(drive.points)) {
     let entry = row.points.get(name);
     if (!entry) {
       entry = { value: make("span"), unit: make("span", "unit"), note: make("span", "sub") };
-      row.list.append(make("div", "", make("dt", "", name.replaceAll("_", " ")), make("dd", "", entry.value, entry.unit, entry.note)));
+      entry.element = make("div", "", make("dt", "", name.replaceAll("_", " ")), make("dd", "", entry.value, entry.unit, entry.note));
+      row.list.append(entry.element);
       row.points.set(name, entry);
     }
     valueInto(entry.value, entry.unit, point);
-    text(entry.note, point.quality === "good" ? age(point.age_ms) : point.quality === "bad" ? "bad" : `stale, ${age(point.age_ms)}`);
+    text(entry.note, point.contradicted ? `${age(point.age_ms)}, contradicted since` : point.quality === "good" ? age(point.age_ms) : point.quality === "bad" ? "bad" : `stale, ${age(point.age_ms)}`);
   }
 }
 
@@ -195,8 +222,8 @@ function showBus(card, bus, now) {
   text(card.where, `${bus.port} · ${bus.protocol} · ${bus.baud} ${bus.format}`);
   text(card.why, bus.reason || "");
   card.why.hidden = !bus.reason;
-  card.fill.style.width = `${Math.min(100, bus.load_ratio * 100)}%`;
-  text(card.values["Line load"], `${(bus.load_ratio * 100).toFixed(1)} %`);
+  card.fill.style.width = `${Math.min(100, (bus.load_ratio ?? 0) * 100)}%`;
+  text(card.values["Line load"], bus.load_ratio === null ? "—" : `${(bus.load_ratio * 100).toFixed(1)} %`);
   cycle(card.values["Fast cycle"], bus.fast, up);
   cycle(card.values["Slow cycle"], bus.slow, up);
   text(card.values["Exchanges"], rate(card, bus, now));

@@ -100,7 +100,7 @@ pub(super) fn of_gateway(sources: &Sources, id: &str, buses: &[String]) -> Entit
                 Platform::Sensor,
                 "load",
                 "load",
-                "(value_json['load'] * 100) | round(1)",
+                "(value_json['load'] * 100) | round(1) if value_json['load'] is not none else none",
                 measured("%"),
             ),
             entity(

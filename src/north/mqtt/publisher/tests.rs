@@ -75,6 +75,7 @@ fn the_state_object_has_values_quality_and_time() {
     assert_eq!(state["time"], "2023-11-14T22:13:20.500Z");
     assert_eq!(state["age_ms"], 20);
     assert_eq!(state["fault_text"], "");
+    assert_eq!(state["blocked_by"], serde_json::json!([]), "it runs");
     assert_eq!(state["output_frequency"], 25.0);
     assert_eq!(state["running"], true);
     assert_eq!(state["fault_code"], 0);
@@ -85,6 +86,7 @@ fn the_state_object_has_values_quality_and_time() {
     let other: Json = serde_json::from_str(payload(&all, "drive/p2/state").unwrap()).unwrap();
     assert_eq!((&other["state"], &other["quality"]), (&"offline".into(), &"bad".into()));
     assert_eq!((&other["time"], &other["age_ms"]), (&Json::Null, &Json::Null));
+    assert_eq!(other["blocked_by"], serde_json::json!(["offline"]));
     assert_eq!(other.get("point_quality"), None, "all are bad, as the drive");
 }
 
@@ -195,7 +197,7 @@ fn bus_changes_are_published_at_once_and_figures_every_second() {
     );
     assert_eq!(first["reason"], Json::Null);
     let image = bench.plant.buses[0].image.clone();
-    image.update_health(|h| h.load = 0.12345);
+    image.update_health(|h| h.load = Some(0.12345));
     assert_eq!(payload(&bench.after(500), "bus/line1"), None);
     let later: Json = serde_json::from_str(payload(&bench.after(500), "bus/line1").unwrap()).unwrap();
     assert_eq!(later["load"], 0.123);

@@ -230,8 +230,8 @@ pub(super) fn node_samples(plant: &Plant, moment: Moment) -> Vec<Sample> {
     let of_bus = |bus: &BusHandle| {
         let (state, figures) = payload::bus_now(bus);
         let count = |count: u64| moment.known(Datum::Integer(i64::try_from(count).unwrap_or(i64::MAX)));
-        let cycle = |cycle: Option<f64>| match cycle {
-            Some(cycle) => moment.known(Datum::Number(cycle)),
+        let figure = |figure: Option<f64>| match figure {
+            Some(figure) => moment.known(Datum::Number(figure)),
             None => Sample {
                 value: None,
                 quality: Quality::Bad,
@@ -244,9 +244,9 @@ pub(super) fn node_samples(plant: &Plant, moment: Moment) -> Vec<Sample> {
             moment.known(Datum::Text(state.reason.unwrap_or_default())),
             count(state.drives as u64),
             count(state.online as u64),
-            moment.known(Datum::Number(figures.load)),
-            cycle(figures.fast_cycle_ms),
-            cycle(figures.slow_cycle_ms),
+            figure(figures.load),
+            figure(figures.fast_cycle_ms),
+            figure(figures.slow_cycle_ms),
             count(figures.transactions),
             count(figures.errors),
             count(figures.queue as u64),

@@ -14,7 +14,7 @@ fn event(n: usize) -> Message {
 
 /// A store whose disk does nothing until the test wants it.
 fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, LostCount) {
-    let (jobs, todo) = sync_channel(JOBS);
+    let (jobs, todo) = flume::bounded(JOBS);
     let (report, loaded) = mpsc::channel(4);
     let lost = count();
     let store = Store {

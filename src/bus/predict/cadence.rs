@@ -1,0 +1,90 @@
+//! The cadences that a line carries with something to spare. Pure.
+
+use std::time::Duration;
+
+use super::predict;
+use crate::codec::wire::Silence;
+use crate::process_image::{BusSpec, DriveSpec};
+
+/// Cadences to choose from, ms.
+const STEPS: [u64; 17] = [
+    10, 20, 30, 40, 50, 75, 100, 150, 200, 300, 500, 750, 1000, 1500, 2000, 3000, 5000,
+];
+/// Slow cadences to choose from, ms.
+const SLOW_STEPS: [u64; 7] = [1000, 2000, 5000, 10_000, 20_000, 30_000, 60_000];
+/// A slow cadence is at most so many times the fast one, or the shortest.
+const MOST_RATIO: u32 = 10;
+/// Share of the line that is used at most: the rest is for commands, retries and drives slower than their profile says.
+const MOST_LOAD: f64 = 0.8;
+
+/// `cycle` and `slow_cycle` for that bus: the shortest cadences that leave a fifth of the line free. `None` if the line does
+/// not carry the longest ones, or there is nothing to read.
+pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option<(Duration, Duration)> {
+    let all = STEPS.iter().flat_map(|cycle| {
+        let cycle = Duration::from_millis(*cycle);
+        let slow = SLOW_STEPS.into_iter().map(Duration::from_millis);
+        let slow = slow.filter(move |slow| *slow >= cycle && *slow <= (cycle * MOST_RATIO).max(Duration::from_secs(1)));
+        slow.map(move |slow| (cycle, slow))
+    });
+    all.into_iter().find(|(cycle, slow_cycle)| {
+        let spec = BusSpec {
+            cycle: *cycle,
+            slow_cycle: *slow_cycle,
+            ..spec.clone()
+        };
+        let prediction = predict(&spec, silence, drives);
+        prediction.shortage.is_none() && prediction.demand <= MOST_LOAD && !prediction.requests.is_empty()
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::codec::{LineFormat, Protocol};
+    use crate::drive::profile::Profiles;
+
+    fn carried_by(protocol: Protocol, baud: u32, profiles: &[&str]) -> Option<(u128, u128)> {
+        let spec = BusSpec {
+            name: "b".into(),
+            port: "/dev/null".into(),
+            protocol,
+            format: LineFormat::new(baud, "8N1").unwrap(),
+            cycle: Duration::from_millis(10),
+            slow_cycle: Duration::from_secs(1),
+        };
+        let drive = |(address, profile): (u8, &&str)| {
+            let profile = Profiles::built_in().get(profile).unwrap().clone();
+            DriveSpec::new("d", "b", address, profile)
+        };
+        let drives: Vec<DriveSpec> = (1..).zip(profiles).map(drive).collect();
+        let (cycle, slow_cycle) = carried(&spec, Silence::Spec, &drives)?;
+        let found = BusSpec {
+            cycle,
+            slow_cycle,
+            ..spec
+        };
+        let prediction = predict(&found, Silence::Spec, &drives);
+        assert!(
+            prediction.shortage.is_none() && prediction.load <= MOST_LOAD,
+            "{prediction:?}"
+        );
+        Some((cycle.as_millis(), slow_cycle.as_millis()))
+    }
+
+    #[test]
+    fn lines_of_all_protocols() {
+        let rtu = Protocol::ModbusRtu;
+        assert_eq!(carried_by(rtu, 38_400, &["vacon-nx"]), Some((20, 1000)));
+        assert_eq!(carried_by(rtu, 38_400, &["vacon-nx"; 2]), Some((40, 1000)));
+        let slow = carried_by(rtu, 9600, &["vacon-nx"; 10]).unwrap();
+        assert!(slow.0 > 400 && slow.1 >= 1000, "{slow:?}");
+        let n2 = carried_by(Protocol::N2, 9600, &["vacon-nx-n2", "eaton-hvx-n2", "teco-7300pa-n2"]).unwrap();
+        assert!(n2.0 > 800 && n2.1 > n2.0, "{n2:?}");
+    }
+
+    #[test]
+    fn what_no_line_carries() {
+        assert_eq!(carried_by(Protocol::N2, 9600, &["vacon-nx-n2"; 247]), None);
+        assert_eq!(carried_by(Protocol::ModbusRtu, 9600, &[]), None);
+    }
+}

@@ -1,0 +1,127 @@
+//! `drivegate try`: from an adapter to values on a page, without a file. Only reads.
+
+mod dialog;
+mod serving;
+mod verdict;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::Duration;
+
+use tokio::signal::unix::{SignalKind, signal};
+use tokio_util::sync::CancellationToken;
+
+use self::dialog::{check_new, choose_port};
+use super::scan::{self, Extent, Options, Search, parse_port};
+use super::{EXIT_FAILED, EXIT_USAGE, report};
+
+/// How long the line is listened to before anything is sent.
+const LISTEN: Duration = Duration::from_secs(1);
+
+/// Finds the drives of a line, shows their values on a page, offers to write a configuration; only reads.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  drivegate try
+  drivegate try --port /dev/ttyUSB0
+  drivegate try --port tcp://192.168.1.7:4001 --protocol modbus-rtu --baud 19200
+  drivegate try --port /dev/ttyUSB0 --addresses 1-31 --write drivegate.toml
+
+Addresses 1 to 10 are tried first with all settings, then the rest. The status page is on the loopback only, and nothing is
+ever written to a drive. Ctrl-C ends it.")]
+pub(super) struct Args {
+    /// Serial device, or rfc2217://host:port or tcp://host:port of a device server [default: asks which adapter].
+    #[arg(long, value_name = "PORT", value_parser = parse_port)]
+    port: Option<String>,
+    #[command(flatten)]
+    options: Options,
+    /// Write the configuration to this new file, without asking.
+    #[arg(long, value_name = "FILE")]
+    write: Option<PathBuf>,
+}
+
+/// Whether a signal has asked for the end.
+#[derive(Debug, Clone, Default)]
+struct Stop {
+    flag: Arc<AtomicBool>,
+    token: CancellationToken,
+}
+
+impl Stop {
+    /// Set by Ctrl-C, SIGTERM, and when the terminal is closed.
+    fn on_signals() -> Result<Stop, String> {
+        let stop = Stop::default();
+        let runtime = super::runtime()?;
+        let mut signals = Vec::new();
+        for kind in [SignalKind::interrupt(), SignalKind::terminate(), SignalKind::hangup()] {
+            let _inside = runtime.enter();
+            let handler = signal(kind).map_err(|why| format!("cannot handle signals: {why}; the system; try again"))?;
+            signals.push(handler);
+        }
+        let asked = stop.clone();
+        std::thread::spawn(move || {
+            runtime.block_on(async {
+                let each = signals.iter_mut().map(|signal| Box::pin(signal.recv()));
+                futures_util::future::select_all(each).await;
+            });
+            asked.flag.store(true, Ordering::Relaxed);
+            asked.token.cancel();
+        });
+        Ok(stop)
+    }
+
+    fn is_wanted(&self) -> bool {
+        self.flag.load(Ordering::Relaxed)
+    }
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    match Stop::on_signals() {
+        Ok(stop) => attempt(args, &stop).unwrap_or_else(|code| code),
+        Err(message) => failed(EXIT_FAILED, &message),
+    }
+}
+
+fn failed(code: u8, message: &str) -> ExitCode {
+    report::error(message);
+    ExitCode::from(code)
+}
+
+/// The end before anything was found.
+fn stopped() -> ExitCode {
+    report::note("stopped; nothing was written");
+    ExitCode::from(EXIT_FAILED)
+}
+
+fn attempt(args: &Args, stop: &Stop) -> Result<ExitCode, ExitCode> {
+    if let Some(file) = &args.write {
+        check_new(file).map_err(|message| failed(EXIT_USAGE, &message))?;
+    }
+    let port = match &args.port {
+        Some(port) => port.clone(),
+        None => choose_port(stop)?.ok_or_else(stopped)?,
+    };
+    let (settings, profiles) = scan::prepare(&args.options, &port)?;
+    report::note(&format!(
+        "looking for drives on {port}; nothing is written to them, and Ctrl-C ends it"
+    ));
+    let mut search = Search::new(&port, &args.options, profiles, stop.flag.clone());
+    let outcome = match settings.first() {
+        Some(first) => search.listen(*first, LISTEN),
+        None => Ok(()),
+    };
+    let outcome = outcome.and_then(|()| match verdict::somebody_speaks(&search.heard, &port, LISTEN) {
+        Some(message) => Err(message),
+        None if stop.is_wanted() => Ok(()),
+        None => search.run(&settings, Extent::OneSetting),
+    });
+    outcome.map_err(|message| failed(EXIT_FAILED, &message))?;
+    if stop.is_wanted() {
+        return Err(stopped());
+    }
+    if search.found.is_empty() {
+        return Err(failed(EXIT_FAILED, &verdict::nobody_answers(&search.heard, &port)));
+    }
+    serving::serve(args, stop, &scan::configuration(&port, &args.options, &search))
+}

@@ -1,0 +1,483 @@
+//! Why a drive does not run: causes from its points, from what its profile says of them and from the last order. Pure: what
+//! is known and the time are arguments.
+//!
+//! A profile names the bits of its family that keep a motor from running (`blocks` of a point); the rest follows from the
+//! common model. What a family does not tell is said to be not told, rather than taken for granted.
+
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use super::model::{ModelPoint, Sample, Value};
+use super::profile::{Point, Profile};
+
+/// A DC link below this, in V, is not charged: the least supply of these families is 200 V, rectified 280 V.
+const UNCHARGED: f64 = 50.0;
+
+/// Control place, as `blocks` of a point names it.
+const LOCAL_CONTROL: &str = "local_control";
+/// Interlock, likewise.
+const INTERLOCKED: &str = "interlocked";
+
+/// One reason why a motor does not run.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Cause {
+    /// The reason in one word, for programs.
+    pub cause: String,
+    /// What shows it.
+    pub evidence: String,
+    /// How old that is, ms; absent where it is no reading.
+    pub age_ms: Option<u64>,
+    /// What to do.
+    pub remedy: String,
+}
+
+/// Whether a motor runs, and why not.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct Explanation {
+    /// Whether it runs; `None` while that is not known.
+    pub runs: Option<bool>,
+    /// Why it does not, the most telling first; empty while it runs.
+    pub causes: Vec<Cause>,
+    /// What the family does not tell, so that it can be a cause nobody sees.
+    pub not_told: Vec<String>,
+}
+
+impl Explanation {
+    /// The causes in one word each, in their order, each once.
+    pub fn words(&self) -> Vec<String> {
+        let mut words: Vec<String> = Vec::new();
+        for Cause { cause, .. } in &self.causes {
+            if !words.contains(cause) {
+                words.push(cause.clone());
+            }
+        }
+        words
+    }
+}
+
+/// Whether the drive can be asked.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Contact {
+    /// Its process data is fresh.
+    Fresh,
+    /// It answers, but its process data is older than it may be.
+    Stale,
+    /// It does not answer.
+    Silent,
+    /// It was not asked yet.
+    Untried,
+    /// The port is not open, and why.
+    BusDown(Option<String>),
+}
+
+/// The last order that concerns the run command.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RunOrder {
+    /// What it wanted of the motor.
+    pub run: RunWish,
+    /// What became of it.
+    pub fate: Fate,
+    /// Who gave it.
+    pub by: Giver,
+    /// Source and client, for people.
+    pub who: String,
+    /// The outcome for people.
+    pub text: String,
+    /// How long ago it ended.
+    pub age: Duration,
+}
+
+/// What an order wants of the motor.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RunWish {
+    /// To run.
+    Run,
+    /// To stop.
+    Stop,
+    /// To have no fault any more; a reset starts nothing.
+    Reset,
+}
+
+/// What became of an order.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Fate {
+    /// The drive acknowledged it.
+    Taken,
+    /// The gateway or the drive refused it.
+    Refused,
+    /// It was accepted and not sent.
+    NotSent,
+    /// It was sent; whether the drive took it is not known.
+    Unsure,
+}
+
+/// Who gives orders.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Giver {
+    /// A client.
+    Client,
+    /// A lease that ran out.
+    Supervision,
+    /// The gateway, when it stopped.
+    Shutdown,
+}
+
+/// What is known beside the points.
+pub struct Situation<'s> {
+    /// When the reader looks.
+    pub now: Instant,
+    /// Whether the drive can be asked.
+    pub contact: Contact,
+    /// When its process data was last read.
+    pub read_at: Option<Instant>,
+    /// Whether this gateway may command it.
+    pub is_commandable: bool,
+    /// The last order that concerns the run command; asked for only while the motor does not run.
+    pub order: &'s dyn Fn() -> Option<RunOrder>,
+}
+
+/// Why the drive does not run; `sample` has its points, by their index in the profile.
+pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &Situation<'_>) -> Explanation {
+    let look = Look {
+        profile,
+        sample,
+        situation,
+    };
+    if let Some(cause) = look.unreachable() {
+        let mut causes = vec![cause];
+        causes.extend(look.order_in_the_way((situation.order)(), None));
+        return Explanation {
+            runs: None,
+            causes,
+            not_told: Vec::new(),
+        };
+    }
+    let runs = look.bit(ModelPoint::Running).map(|(running, _)| running);
+    if runs == Some(true) && look.turns() != Some(false) {
+        return Explanation {
+            runs,
+            ..Explanation::default()
+        };
+    }
+    let mut causes: Vec<Cause> = look.fault().into_iter().chain(look.blocking_points()).collect();
+    causes.extend(look.local_control(&causes));
+    causes.extend(look.uncharged());
+    causes.extend(look.not_ready(&causes));
+    causes.extend(look.command(&causes));
+    causes.extend(look.warning());
+    if causes.is_empty() && runs == Some(false) {
+        causes.push(look.unknown());
+    }
+    Explanation {
+        // It is enabled and stands: as good as not running.
+        runs: runs.map(|running| running && causes.is_empty()),
+        causes,
+        not_told: look.not_told(),
+    }
+}
+
+struct Look<'l> {
+    profile: &'l Profile,
+    sample: &'l dyn Fn(usize) -> Sample,
+    situation: &'l Situation<'l>,
+}
+
+impl Look<'_> {
+    fn age(&self, at: Option<Instant>) -> Option<u64> {
+        let age = self.situation.now.saturating_duration_since(at?);
+        Some(u64::try_from(age.as_millis()).unwrap_or(u64::MAX))
+    }
+
+    fn cause(&self, cause: &str, evidence: String, at: Option<Instant>, remedy: &str) -> Cause {
+        Cause {
+            cause: cause.to_string(),
+            evidence,
+            age_ms: self.age(at),
+            remedy: remedy.to_string(),
+        }
+    }
+
+    fn model(&self, point: ModelPoint) -> Option<(Value, Option<Instant>)> {
+        let sample = (self.sample)(self.profile.model_index(point)?);
+        Some((sample.good()?, sample.at))
+    }
+
+    fn bit(&self, point: ModelPoint) -> Option<(bool, Option<Instant>)> {
+        self.model(point).map(|(value, at)| (value.as_bool(), at))
+    }
+
+    /// Whether a speed is not zero; `None` where none is known.
+    fn turns(&self) -> Option<bool> {
+        let speeds = [
+            ModelPoint::OutputFrequency,
+            ModelPoint::ActualSpeed,
+            ModelPoint::MotorSpeed,
+        ];
+        let known = speeds.into_iter().filter_map(|speed| self.model(speed));
+        known.map(|(value, _)| value.as_f64() != 0.0).reduce(|a, b| a || b)
+    }
+
+    /// The drive cannot be asked.
+    fn unreachable(&self) -> Option<Cause> {
+        let read_at = self.situation.read_at;
+        let (cause, evidence, remedy) = match &self.situation.contact {
+            Contact::Fresh => return None,
+            Contact::Stale => (
+                "stale",
+                "its process data is too old to say anything".to_string(),
+                "see load and errors of the bus: the line may be overloaded or disturbed",
+            ),
+            Contact::Silent => (
+                "offline",
+                "it does not answer".to_string(),
+                "check its supply, the wiring and its address; a drive whose control board has no supply is silent",
+            ),
+            Contact::Untried => (
+                "offline",
+                "it was not asked yet".to_string(),
+                "wait until the bus has polled it",
+            ),
+            Contact::BusDown(why) => (
+                "bus_down",
+                why.clone()
+                    .unwrap_or_else(|| "the port of its bus is not open".to_string()),
+                "check the adapter and the port of the bus",
+            ),
+        };
+        Some(self.cause(cause, evidence, read_at, remedy))
+    }
+
+    fn fault(&self) -> Option<Cause> {
+        let (_, at) = self.bit(ModelPoint::Fault).filter(|(fault, _)| *fault)?;
+        let code = match self.model(ModelPoint::FaultCode) {
+            Some((Value::Integer(code), _)) if code != 0 => Some(code),
+            _ => None,
+        };
+        let known = code.and_then(|code| self.profile.faults.get(&u16::try_from(code).ok()?));
+        let evidence = match (code, known) {
+            (Some(code), Some(fault)) => {
+                let because = match fault.cause.as_str() {
+                    "" => String::new(),
+                    cause => format!(" ({cause})"),
+                };
+                let unsure = if fault.verified { "" } else { ", text not verified" };
+                format!("fault {code}: {}{because}{unsure}", fault.text)
+            }
+            (Some(code), None) => format!("fault {code}, of which the profile has no text"),
+            (None, _) => "a fault is active; its code is not known".to_string(),
+        };
+        let reset = match self
+            .profile
+            .model_point(ModelPoint::FaultReset)
+            .filter(|point| point.write)
+        {
+            Some(_) => "then write fault_reset",
+            None => "then reset the drive at its panel",
+        };
+        let remedy = match known
+            .map(|fault| fault.remedy.as_str())
+            .filter(|remedy| !remedy.is_empty())
+        {
+            Some(remedy) => format!("{remedy}; {reset}"),
+            None => format!("remove what caused it, as the manual of the drive says; {reset}"),
+        };
+        Some(self.cause("fault", evidence, at, &remedy))
+    }
+
+    /// Points of which the profile says that they keep the motor from running.
+    fn blocking_points(&self) -> impl Iterator<Item = Cause> + '_ {
+        let points = (0..).zip(&self.profile.points);
+        points.filter_map(|(index, point)| {
+            let blocks = point.blocks.as_ref()?;
+            let sample = (self.sample)(index);
+            let value = sample.good().filter(|value| value.as_bool() == blocks.when)?;
+            let unsure = if point.verified { "" } else { ", address not verified" };
+            let evidence = format!("{}{unsure}", reads(point, value));
+            Some(self.cause(&blocks.cause, evidence, sample.at, &blocks.remedy))
+        })
+    }
+
+    /// Another control place, where no point of the profile has told which.
+    fn local_control(&self, found: &[Cause]) -> Option<Cause> {
+        let (_, at) = self.bit(ModelPoint::Remote).filter(|(remote, _)| !remote)?;
+        if found.iter().any(|cause| cause.cause == LOCAL_CONTROL) {
+            return None;
+        }
+        let evidence = "remote is off: the drive obeys its panel or its terminals".to_string();
+        Some(self.cause(LOCAL_CONTROL, evidence, at, "select the fieldbus as its control place"))
+    }
+
+    fn uncharged(&self) -> Option<Cause> {
+        let (voltage, at) = self.model(ModelPoint::DcLinkVoltage)?;
+        let volts = voltage.as_f64();
+        (volts < UNCHARGED).then(|| {
+            let remedy = "switch the mains on; check fuses, contactor and charging circuit";
+            self.cause("no_dc_link", format!("dc_link_voltage is {volts} V"), at, remedy)
+        })
+    }
+
+    fn not_ready(&self, found: &[Cause]) -> Option<Cause> {
+        let (_, at) = self.bit(ModelPoint::Ready).filter(|(ready, _)| !ready)?;
+        // Another control place does not make a drive unready.
+        if found.iter().any(|cause| cause.cause != LOCAL_CONTROL) {
+            return None;
+        }
+        let evidence = "ready is off, and the drive does not tell why".to_string();
+        let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
+        Some(self.cause("not_ready", evidence, at, remedy))
+    }
+
+    /// What is wrong with the commands.
+    fn command(&self, found: &[Cause]) -> Vec<Cause> {
+        let order = (self.situation.order)();
+        let reads = self.bit(ModelPoint::Run);
+        let taken = order
+            .as_ref()
+            .filter(|order| order.fate == Fate::Taken)
+            .map(|order| order.run);
+        match (reads, taken) {
+            (Some((true, _)), _) | (None, Some(RunWish::Run)) => {
+                let zero = self.zero_reference();
+                let direction = self.direction(found).filter(|_| zero.is_none());
+                zero.into_iter().chain(direction).collect()
+            }
+            (reads, _) => {
+                let at = reads.and_then(|(_, at)| at);
+                let in_the_way = self.order_in_the_way(order, at);
+                in_the_way
+                    .or_else(|| reads.map(|_| self.no_order(at)))
+                    .into_iter()
+                    .collect()
+            }
+        }
+    }
+
+    /// What the last order says; `read_at` is when the drive was last seen without a run command.
+    fn order_in_the_way(&self, order: Option<RunOrder>, read_at: Option<Instant>) -> Option<Cause> {
+        let order = order?;
+        let ended = self.situation.now.checked_sub(order.age);
+        let (who, text) = (&order.who, &order.text);
+        let (cause, evidence, remedy) = match (order.run, order.fate, order.by) {
+            (RunWish::Run, Fate::Refused, _) => (
+                "order_refused",
+                format!("run of {who} was refused: {text}"),
+                "correct the order or the rights of the client",
+            ),
+            (RunWish::Run, Fate::NotSent, _) => (
+                "order_expired",
+                format!("run of {who} was not sent: {text}"),
+                "order it again; see the load of the bus if it happens again",
+            ),
+            (RunWish::Run, Fate::Unsure, _) => (
+                "order_unanswered",
+                format!("run of {who} was not acknowledged: {text}"),
+                "look whether the drive answers, then order it again",
+            ),
+            (RunWish::Run, Fate::Taken, _) if read_at > ended => (
+                "other_master",
+                format!("run of {who} was acknowledged, and run is off in the drive now"),
+                "look for another master that writes the control word; a drive that started anew has lost the order",
+            ),
+            (RunWish::Run, Fate::Taken, _) => return None,
+            (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Supervision) => (
+                "supervision",
+                "its lease ran out, and it was stopped".to_string(),
+                "let the commanding client renew the lease by orders or heartbeats, then order run again",
+            ),
+            (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Shutdown) => (
+                "stopped_by_gateway",
+                "the gateway stopped it when it was stopped itself".to_string(),
+                "order run again",
+            ),
+            (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
+                "stopped_by_order",
+                format!("{who} stopped it"),
+                "order run again if it may run",
+            ),
+            (RunWish::Reset, Fate::Taken | Fate::Unsure, _) => (
+                "fault_was_reset",
+                format!("{who} reset its fault, and a reset starts nothing"),
+                "order run again",
+            ),
+            (RunWish::Stop | RunWish::Reset, Fate::Refused | Fate::NotSent, _) => return None,
+        };
+        Some(self.cause(cause, evidence, ended, remedy))
+    }
+
+    fn no_order(&self, at: Option<Instant>) -> Cause {
+        let evidence = "run is off in the drive, and no order of this gateway is known".to_string();
+        let remedy = match self.situation.is_commandable {
+            true => "order run",
+            false => "this gateway only monitors it: whoever commands it must start it",
+        };
+        self.cause("no_run_order", evidence, at, remedy)
+    }
+
+    fn zero_reference(&self) -> Option<Cause> {
+        // In Hz first: zero percent may be the minimum frequency.
+        let references = [ModelPoint::FrequencyReference, ModelPoint::SpeedReference];
+        let known = |point| self.model(point).map(|(value, at)| (point, value, at));
+        let (point, value, at) = references.into_iter().find_map(known)?;
+        (value.as_f64() == 0.0).then(|| {
+            let evidence = format!("run is on, and {} is 0 {}", point.name(), point.unit());
+            self.cause("reference_zero", evidence, at, "order a reference above zero")
+        })
+    }
+
+    /// Nothing is in the way but that it shall turn in reverse, which a parameter can forbid.
+    fn direction(&self, found: &[Cause]) -> Option<Cause> {
+        let (_, at) = self.bit(ModelPoint::Reverse).filter(|(reverse, _)| *reverse)?;
+        let (reversed, _) = self.bit(ModelPoint::Reversed)?;
+        let is_ready = self.bit(ModelPoint::Ready).is_some_and(|(ready, _)| ready);
+        (found.is_empty() && is_ready && !reversed).then(|| {
+            let evidence = "run and reverse are on, the drive is ready and does not turn in reverse".to_string();
+            let remedy = "order reverse = false, or allow the direction by the parameter of the drive";
+            self.cause("direction_blocked", evidence, at, remedy)
+        })
+    }
+
+    fn warning(&self) -> Option<Cause> {
+        let (_, at) = self.bit(ModelPoint::Warning).filter(|(warning, _)| *warning)?;
+        let evidence = "the drive reports a warning".to_string();
+        Some(self.cause("warning", evidence, at, "read it at the display of the drive"))
+    }
+
+    fn unknown(&self) -> Cause {
+        let (_, at) = self.bit(ModelPoint::Running).unzip();
+        let evidence = "nothing that the drive tells keeps it from running".to_string();
+        let remedy = "look at its display; check what it does not tell";
+        self.cause("not_known", evidence, at.flatten(), remedy)
+    }
+
+    fn not_told(&self) -> Vec<String> {
+        let has = |point| self.profile.model_index(point).is_some();
+        let blocks = |word: &str| {
+            let mut rules = self.profile.points.iter().filter_map(|point| point.blocks.as_ref());
+            rules.any(|blocks| blocks.cause == word)
+        };
+        let told = [
+            ("control place", has(ModelPoint::Remote) || blocks(LOCAL_CONTROL)),
+            ("interlock", blocks(INTERLOCKED)),
+            ("enable input", blocks("no_enable")),
+            ("warning", has(ModelPoint::Warning)),
+            ("run command", self.bit(ModelPoint::Run).is_some()),
+        ];
+        let untold = told.into_iter().filter(|(_, told)| !told);
+        untold.map(|(what, _)| what.to_string()).collect()
+    }
+}
+
+/// What a point reads, in words.
+fn reads(point: &Point, value: Value) -> String {
+    let name = &point.name;
+    match (point.text_of(value), value) {
+        (Some(text), _) => format!("{name} is {text}"),
+        (None, Value::Bool(true)) => format!("{name} is on"),
+        (None, Value::Bool(false)) => format!("{name} is off"),
+        (None, value) => format!("{name} is {value} {}", point.unit).trim_end().to_string(),
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,65 @@
+//! Gathers what is known of a drive beside its points, for the causes why it does not run.
+
+use std::time::Duration;
+
+use crate::command::{AuditRecord, CONFIRMED, SourceKind, WriteStats};
+use crate::drive::why::{self, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
+use crate::process_image::{Access, BusImage, Link, Reading};
+
+/// Whether the drive of `reading`, on that bus, runs, and why not.
+pub(crate) fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
+    let spec = reading.spec;
+    let order = || {
+        let (record, ended) = writes.audit().last_run(&spec.name)?;
+        run_order(&record, reading.now.saturating_duration_since(ended))
+    };
+    let situation = Situation {
+        now: reading.now,
+        contact: contact(reading, bus),
+        read_at: reading.snapshot.fast_at,
+        is_commandable: spec.access == Access::Control,
+        order: &order,
+    };
+    why::explain(&spec.profile, &|point| reading.sample(point), &situation)
+}
+
+fn contact(reading: &Reading<'_>, bus: &BusImage) -> Contact {
+    match reading.snapshot.link {
+        _ if !bus.is_up() => Contact::BusDown(bus.health().reason),
+        Link::Untried => Contact::Untried,
+        Link::Offline(_) => Contact::Silent,
+        Link::Online(_) if reading.is_stale() => Contact::Stale,
+        Link::Online(_) => Contact::Fresh,
+    }
+}
+
+fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
+    let by = match record.source {
+        source if source == SourceKind::Supervision.name() => Giver::Supervision,
+        source if source == SourceKind::Shutdown.name() => Giver::Shutdown,
+        _ => Giver::Client,
+    };
+    Some(RunOrder {
+        run: match record.run() {
+            Some(true) => RunWish::Run,
+            Some(false) => RunWish::Stop,
+            None if record.resets() => RunWish::Reset,
+            None => return None,
+        },
+        fate: fate(record.result),
+        by,
+        who: format!("{} {}", record.source, record.client),
+        text: record.text.clone(),
+        age,
+    })
+}
+
+/// What a result code says of the order.
+fn fate(result: &str) -> Fate {
+    match result {
+        "acknowledged" | CONFIRMED => Fate::Taken,
+        "timeout" | "garbled" | "interrupted" => Fate::Unsure,
+        "not_allowed" | "not_writable" | "bad_value" | "refused_by_drive" => Fate::Refused,
+        _ => Fate::NotSent,
+    }
+}
