@@ -182,7 +182,8 @@ fn read_pcapng(file: &[u8]) -> Result<Vec<Packet>, CaptureError> {
             bytes.big = match file.get(at + 8..at + 12) {
                 Some([0x1A, 0x2B, 0x3C, 0x4D]) => true,
                 Some([0x4D, 0x3C, 0x2B, 0x1A]) => false,
-                _ => return Err(error(at + 8, "the section has no byte order")),
+                Some(_) => return Err(error(at + 8, "the section has no byte order")),
+                None => return Err(error(at, "the file ends in the middle of a block")),
             };
             interfaces.clear();
         }

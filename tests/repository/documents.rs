@@ -286,7 +286,8 @@ fn examples_can_be_pasted_whole() {
 /// Words behind two blanks or more, that are neither a comment nor inside quotes nor the rest of a continued line.
 fn has_trailing_prose(line: &str) -> bool {
     let mut quote = None;
-    let mut blanks = 0;
+    // The line's begin, where a comment may stand as behind a blank.
+    let mut blanks = 1;
     for c in line.trim_start().chars() {
         match (quote, c) {
             (Some(open), _) if open == c => quote = None,
