@@ -62,11 +62,13 @@ pub enum EventKind {
     Recording,
     /// A new configuration was not applied; the former one goes on.
     ReloadRefused,
+    /// The other master of a line commands a drive.
+    ForeignCommand,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 19] = [
+    pub const ALL: [EventKind; 20] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -86,6 +88,7 @@ impl EventKind {
         EventKind::BusDown,
         EventKind::Recording,
         EventKind::ReloadRefused,
+        EventKind::ForeignCommand,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -109,7 +112,8 @@ impl EventKind {
             | EventKind::Restarted
             | EventKind::RefusedCommand
             | EventKind::BusUp
-            | EventKind::Recording => false,
+            | EventKind::Recording
+            | EventKind::ForeignCommand => false,
         }
     }
 
@@ -135,6 +139,7 @@ impl EventKind {
             EventKind::BusDown => "bus_down",
             EventKind::Recording => "recording",
             EventKind::ReloadRefused => "reload_refused",
+            EventKind::ForeignCommand => "foreign_command",
         }
     }
 }
@@ -362,8 +367,8 @@ mod tests {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown | Recording => false,
-                ReloadRefused => true,
+                | BusDown | Recording | ReloadRefused => false,
+                ForeignCommand => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

@@ -241,7 +241,10 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
             Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, now),
             Err(refusal) => {
-                self.publish_refusal(&what, &refusal, ticket.origin(), now);
+                // Reads that nothing answers are no commands.
+                if write {
+                    self.publish_refusal(&what, &refusal, ticket.origin(), now);
+                }
                 ticket.answer(Outcome::Refused(refusal), now);
             }
             Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),

@@ -16,12 +16,14 @@ mod gateway {
     mod commands;
     mod demo;
     mod drive_access;
+    mod listening;
     mod living;
     mod local_socket;
     mod messages;
     mod operators;
     mod recordings;
     mod reload;
+    mod replay;
     mod restart;
     mod slow_log;
     mod trace;

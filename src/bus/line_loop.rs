@@ -6,12 +6,14 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use super::BusOptions;
 use super::core::{Action, BusCore};
+use super::listener::ListenCore;
 use super::master::Handover;
+use super::{BusOptions, Mode};
+use crate::codec::LineFormat;
 use crate::command::{Outcome, WriteStats};
 use crate::event::Events;
-use crate::line::{self, Arrival, Line, Lost, Names, Woken};
+use crate::line::{self, Arrival, Line, LineOptions, Lost, Names, OpenError, Receiver, Woken};
 use crate::plant::BusHandle;
 
 /// First and longest pause between two tries to open the port.
@@ -74,7 +76,10 @@ impl BusTask {
             let Ok(before) = begun.recv() else {
                 return Handover::default();
             };
-            or_end_the_process(|| worker.run(events, writes, &before))
+            or_end_the_process(|| match worker.options.mode {
+                Mode::Master => worker.run(events, writes, &before),
+                Mode::Listen => worker.listen(events, writes),
+            })
         })?;
         Ok(BusTask {
             handle,
@@ -186,7 +191,20 @@ struct Worker {
 impl Worker {
     fn run(self, events: Events, writes: Arc<WriteStats>, before: &Handover) -> Handover {
         let handle = self.handle.clone();
-        let mut core = BusCore::new(handle, &self.options, events, writes, before, Instant::now());
+        let core = BusCore::new(handle, &self.options, events, writes, before, Instant::now());
+        self.keep_open(core).ended(Instant::now())
+    }
+
+    fn listen(self, events: Events, writes: Arc<WriteStats>) -> Handover {
+        let handle = self.handle.clone();
+        let core = ListenCore::new(handle, &self.options, events, writes, Instant::now());
+        self.keep_open(core);
+        // Drives of such a bus have no leases, and nothing was asked.
+        Handover::default()
+    }
+
+    /// Serves the port as long as it is there and opens it again and again, until the bus is to stop.
+    fn keep_open<C: Core>(&self, mut core: C) -> C {
         line::sharpen_timers();
         let mut pauses = ReopenPauses::default();
         let mut names = Names::default();
@@ -195,7 +213,7 @@ impl Worker {
             let go_on = || !self.stopping();
             // Before the try, so that nothing is missed after it.
             let watching = Arrival::of(&spec.port);
-            let arrival = match Line::open_by(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
+            let arrival = match C::open(&mut names, &spec.port, &spec.format, &self.options.line, &go_on) {
                 Ok((line, warnings)) => {
                     drop(watching);
                     for warning in warnings {
@@ -203,7 +221,7 @@ impl Worker {
                     }
                     let opened = Instant::now();
                     core.opened(opened);
-                    let why = self.serve(&mut core, &line);
+                    let why = core.serve(self, &line);
                     pauses.was_open_for(opened.elapsed());
                     if let Err(lost) = why {
                         core.lost(&lost.to_string(), Instant::now());
@@ -221,7 +239,7 @@ impl Worker {
                 pauses.begin_anew();
             }
         }
-        core.ended(Instant::now())
+        core
     }
 
     fn stopping(&self) -> bool {
@@ -246,7 +264,7 @@ impl Worker {
         came
     }
 
-    fn serve(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
+    fn serve_as_master(&self, core: &mut BusCore, line: &Line) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         let mut break_off = None;
         // The exchange on the line is ended first: whoever comes after would talk into its reply.
@@ -290,6 +308,97 @@ impl Worker {
             }
         }
         Ok(())
+    }
+
+    fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
+        let mut buffer = [0u8; 512];
+        while !self.stopping() {
+            let now = Instant::now();
+            let until = core.on_time(now).min(now + BEAT);
+            match line.wait(until, Some(self.handle.queue.wake_fd()))? {
+                Woken::Readable => {
+                    let count = line.receive(&mut buffer)?;
+                    core.on_bytes(buffer.get(..count).unwrap_or_default(), Instant::now());
+                }
+                Woken::Command => {
+                    self.handle.queue.clear_wake();
+                    core.refuse_all(Instant::now());
+                }
+                Woken::Time => {}
+            }
+        }
+        Ok(())
+    }
+}
+
+/// What a core does with its port.
+type Opened<L> = Result<(L, Vec<String>), OpenError>;
+
+/// A bus without its thread, and the kind of line that it needs.
+trait Core {
+    type Line;
+
+    fn open(
+        names: &mut Names,
+        port: &str,
+        format: &LineFormat,
+        options: &LineOptions,
+        go_on: &dyn Fn() -> bool,
+    ) -> Opened<Self::Line>;
+    fn opened(&mut self, now: Instant);
+    fn lost(&mut self, why: &str, now: Instant);
+    fn serve(&mut self, worker: &Worker, line: &Self::Line) -> Result<(), Lost>;
+}
+
+impl Core for BusCore {
+    type Line = Line;
+
+    fn open(
+        names: &mut Names,
+        port: &str,
+        format: &LineFormat,
+        options: &LineOptions,
+        go_on: &dyn Fn() -> bool,
+    ) -> Opened<Line> {
+        Line::open_by(names, port, format, options, go_on)
+    }
+
+    fn opened(&mut self, now: Instant) {
+        BusCore::opened(self, now);
+    }
+
+    fn lost(&mut self, why: &str, now: Instant) {
+        BusCore::lost(self, why, now);
+    }
+
+    fn serve(&mut self, worker: &Worker, line: &Line) -> Result<(), Lost> {
+        worker.serve_as_master(self, line)
+    }
+}
+
+impl Core for ListenCore {
+    type Line = Receiver;
+
+    fn open(
+        names: &mut Names,
+        port: &str,
+        format: &LineFormat,
+        _: &LineOptions,
+        go_on: &dyn Fn() -> bool,
+    ) -> Opened<Receiver> {
+        Receiver::open_by(names, port, format, go_on)
+    }
+
+    fn opened(&mut self, now: Instant) {
+        ListenCore::opened(self, now);
+    }
+
+    fn lost(&mut self, why: &str, now: Instant) {
+        ListenCore::lost(self, why, now);
+    }
+
+    fn serve(&mut self, worker: &Worker, line: &Receiver) -> Result<(), Lost> {
+        worker.only_listen(self, line)
     }
 }
 

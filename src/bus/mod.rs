@@ -9,6 +9,7 @@
 //!   ([`command_run`]), what they still have to show ([`confirm`]), its lease ([`supervision`]), the replies that it may
 //!   still send ([`late_replies`]).
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
+//! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
@@ -21,6 +22,7 @@ mod drive_state;
 pub mod late_replies;
 mod line_loop;
 pub mod line_state;
+pub mod listener;
 pub mod master;
 pub mod n2_late_replies;
 pub mod n2_session;
@@ -51,4 +53,16 @@ pub struct BusOptions {
     pub silence: Silence,
     /// How the port is set up and waited for.
     pub line: LineOptions,
+    /// Whose line it is.
+    pub mode: Mode,
+}
+
+/// Whose line it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Mode {
+    /// The gateway's: it asks, the drives answer.
+    #[default]
+    Master,
+    /// Another master's: the gateway listens and never sends.
+    Listen,
 }

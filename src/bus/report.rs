@@ -9,7 +9,7 @@ use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
 use super::transaction::Ended;
-use crate::codec::{Exception, Reply, Request};
+use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
@@ -123,7 +123,13 @@ impl Report {
     }
 
     /// Reports an event of a drive; `text` makes the words from its name.
-    fn drive_event(&self, index: usize, kind: EventKind, fault_code: Option<i64>, text: impl FnOnce(&str) -> String) {
+    pub(super) fn drive_event(
+        &self,
+        index: usize,
+        kind: EventKind,
+        fault_code: Option<i64>,
+        text: impl FnOnce(&str) -> String,
+    ) {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
@@ -274,6 +280,15 @@ impl Report {
         self.drive_event(index, EventKind::Online, None, |name| format!("drive {name} answers"));
     }
 
+    /// Shows a drive as offline for a reason of its own.
+    pub(super) fn gone(&self, index: usize, why: &str) {
+        if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
+            self.drive_event(index, EventKind::Offline, None, |name| {
+                format!("drive {name} is offline: {why}")
+            });
+        }
+    }
+
     fn offline(&self, index: usize) {
         if self.drive(index).is_some_and(|drive| goes_offline(&drive)) {
             self.offline_event(index, "it does not answer");
@@ -324,7 +339,7 @@ impl Report {
         let (Some(drive), Some(looked_at)) = (self.image.drives.get(index), self.looked_at.get_mut(index)) else {
             return;
         };
-        if *looked_at || drive.spec.access == Access::Monitor {
+        if *looked_at || drive.spec.access != Access::Control {
             return;
         }
         let response = own_response(&drive.reading(now, RECENT));
@@ -400,7 +415,7 @@ impl Report {
         }
     }
 
-    fn fast_round(&self, cycle: Option<Duration>) {
+    pub(super) fn fast_round(&self, cycle: Option<Duration>) {
         if let Some(cycle) = cycle {
             self.image.fast_cycles.observe(cycle);
         }
@@ -428,7 +443,7 @@ impl Report {
     /// line at `began`, which had been silent since `quiet_since`.
     pub(super) fn tap(
         &self,
-        index: usize,
+        index: Option<usize>,
         request: &Request,
         frame: &[u8],
         quiet_since: Instant,
@@ -451,6 +466,43 @@ impl Report {
     pub(super) fn noise(&self, bytes: &[u8], quiet_since: Instant, now: Instant) {
         self.foreign();
         tap::noise(&self.image, bytes, quiet_since, now);
+    }
+
+    /// The line was in use for so long by one exchange.
+    pub(super) fn in_use(&mut self, took: Duration) {
+        self.busy += took;
+        self.image.transactions.observe(took);
+    }
+
+    /// Another master read a drive.
+    pub(super) fn heard(
+        &mut self,
+        index: usize,
+        (table, start): (Table, u16),
+        words: &[u16],
+        at: Instant,
+        now: Instant,
+    ) -> bool {
+        let Some(drive) = self.image.drives.get(index) else {
+            return false;
+        };
+        self.image.tape.append(|| {
+            let words = words.into();
+            Taped::Read(
+                index,
+                TapedRead {
+                    at,
+                    table,
+                    start,
+                    words,
+                },
+            )
+        });
+        let mut fast = false;
+        drive.update(|snapshot| fast = snapshot.hear(table, start, words, at));
+        self.look_at_fault(index, now);
+        self.look_at_state(index, now);
+        fast
     }
 
     /// An exchange is over: counters, turnaround, load.

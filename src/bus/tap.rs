@@ -18,7 +18,7 @@ const KEPT: usize = 2048;
 #[derive(Debug)]
 pub(super) struct Tap {
     image: Arc<BusImage>,
-    index: usize,
+    index: Option<usize>,
     drive: Option<String>,
     request: Request,
     frame: Vec<u8>,
@@ -29,9 +29,16 @@ pub(super) struct Tap {
 
 impl Tap {
     /// The exchange whose request was given to the line at `began`.
-    pub(super) fn new(image: Arc<BusImage>, index: usize, request: Request, frame: Vec<u8>, began: Instant) -> Tap {
+    pub(super) fn new(
+        image: Arc<BusImage>,
+        index: Option<usize>,
+        request: Request,
+        frame: Vec<u8>,
+        began: Instant,
+    ) -> Tap {
         let format = image.spec.format;
-        let drive = image.drives.get(index).map(|drive| drive.spec.name.clone());
+        let drive = index.and_then(|index| image.drives.get(index));
+        let drive = drive.map(|drive| drive.spec.name.clone());
         Tap {
             traced: image.trace.wanted(),
             image,
@@ -92,7 +99,7 @@ impl Tap {
     }
 
     fn tape(&self, bytes: &[u8], verdict: Verdict, at: Instant) {
-        self.image.tape.append(|| frame(Some(self.index), bytes, verdict, at));
+        self.image.tape.append(|| frame(self.index, bytes, verdict, at));
     }
 
     fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {

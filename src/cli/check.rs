@@ -243,6 +243,11 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
         spec.format,
         milliseconds(spec.protocol.silence(bus.options.silence, &spec.format)),
     );
+    if bus.listens() {
+        return text
+            + "  listens only: another master asks these drives, and the gateway sends nothing\n"
+            + &memory(bus, &settings.recordings);
+    }
     let prediction = bus.predict();
     let mut table = report::table(["drive", "class", "function", "address", "count", "wire ms"]);
     for request in &prediction.requests {

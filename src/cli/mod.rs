@@ -13,6 +13,7 @@ mod client;
 mod demo;
 mod drive_access;
 mod health;
+mod listen;
 mod loading;
 mod local_client;
 mod log;
@@ -23,6 +24,7 @@ mod read;
 mod record;
 mod recordings;
 mod reload;
+mod replay;
 mod report;
 mod restore;
 mod run;
@@ -48,6 +50,8 @@ use crate::north::metrics::COMMIT;
 pub const EXIT_FAILED: u8 = 1;
 /// Exit code of a wrong command line, the same as clap's.
 pub const EXIT_USAGE: u8 = 2;
+/// Exit code of input data that cannot be read as what it should be (sysexits EX_DATAERR).
+pub const EXIT_DATA: u8 = 65;
 /// Exit code of a bad configuration (sysexits EX_CONFIG).
 pub const EXIT_CONFIG: u8 = 78;
 /// Default path of the configuration.
@@ -97,6 +101,7 @@ commands! {
     Try => trial,
     Check => check,
     Scan => scan,
+    Listen => listen,
     Read => read,
     Write => write,
     Why => why,
@@ -104,6 +109,7 @@ commands! {
     Recordings => recordings,
     Watch => watch,
     Trace => trace,
+    Replay => replay,
     Simulate => simulate,
     Profiles => profiles,
     Map => map,

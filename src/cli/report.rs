@@ -50,6 +50,12 @@ pub(super) fn note(message: &str) {
     line("note", message);
 }
 
+/// Prints the lines of `text`, harmless for a terminal, to stderr.
+pub(super) fn lines_to_stderr(text: &str) {
+    // With stderr gone there is nowhere left to report that.
+    let _ = io::stderr().lock().write_all(printable::lines(text).as_bytes());
+}
+
 /// Prints errors to stderr.
 pub(super) fn errors(problems: &[Problem]) {
     for problem in problems {

@@ -11,11 +11,13 @@ use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 
+pub(super) use self::found::Found;
 pub(super) use self::search::{Extent, Heard, Search};
-pub(super) use self::settings::{Options, Setting, parse_port};
-use self::snippet::{Snippet, absolute};
+pub(super) use self::settings::{Options, Setting, parse_port, protocols};
+pub(super) use self::snippet::{Snippet, absolute};
 use super::adapters::persistent_name;
 use super::{EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
+use crate::bus::Mode;
 use crate::drive::profile::Profiles;
 
 /// Finds the drives of a line and prints a configuration for them; only reads.
@@ -71,7 +73,7 @@ pub(super) fn prepare(options: &Options, port: &str) -> Result<(Vec<Setting>, Pr
 }
 
 /// Ctrl-C ends the scan; what was found is still printed.
-fn stop_on_signal(stop: Arc<AtomicBool>) {
+pub(super) fn stop_on_signal(stop: Arc<AtomicBool>) {
     std::thread::spawn(move || {
         let Ok(runtime) = super::runtime() else { return };
         // Without a handler Ctrl-C ends the process, which is harmless: nothing was written.
@@ -90,6 +92,7 @@ pub(super) fn configuration(port: &str, options: &Options, search: &Search<'_>) 
         profiles: &search.profiles,
         profile_dirs: options.profile_dir.iter().map(directory).collect(),
         timeout: options.timeout,
+        mode: Mode::Master,
     };
     snippet.text()
 }

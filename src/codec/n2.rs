@@ -93,6 +93,36 @@ pub fn command_of(pdu: &RequestPdu) -> Option<Command> {
     }
 }
 
+/// The request that a master's command means, as [`command_of`] the other way round; `None` where this master has none for it:
+/// attributes that are no value, objects that no table has, times, memory, uploads.
+pub fn pdu_of(command: &Command) -> Option<RequestPdu> {
+    match command {
+        Command::Identify => Some(RequestPdu::N2(Session::Identify)),
+        Command::Poll { again } => Some(RequestPdu::N2(Session::Poll { again: *again })),
+        Command::Read { object, attribute } if *attribute == object.region.value_attribute() => {
+            let (table, start) = object.place()?;
+            let count = object.items();
+            Some(RequestPdu::Read { table, start, count })
+        }
+        Command::Override { object, data } => match (object.place()?, data.as_slice()) {
+            ((Table::Coil, address), [value]) => Some(RequestPdu::WriteCoil {
+                address,
+                on: *value != 0,
+            }),
+            ((Table::Holding, start), [a, b, c, d]) => Some(RequestPdu::WriteRegisters {
+                start,
+                values: vec![u16::from_be_bytes([*a, *b]), u16::from_be_bytes([*c, *d])],
+            }),
+            _ => None,
+        },
+        Command::Release { object } => {
+            let (table, address) = object.place()?;
+            Some(RequestPdu::N2(Session::Release { table, address }))
+        }
+        _ => None,
+    }
+}
+
 fn switch(address: u16, on: bool) -> Option<Command> {
     let object = Object::at(Table::Coil, address)?;
     let data = vec![u8::from(on)];

@@ -27,6 +27,7 @@ pub struct Admitted {
 /// The refusal, in the order authority, address, value; nothing is clamped.
 pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Admitted, Refusal> {
     match order {
+        Order::Read(_) if drive.spec.access == Access::Listen => Err(Refusal::NotWritable(listens(drive))),
         Order::Read(pdu) => Ok(Admitted {
             order: Order::Read(pdu),
             urgency: Urgency::Read,
@@ -53,7 +54,18 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
     }
 }
 
+/// Why nothing goes out on a line that another master owns.
+fn listens(drive: &Reading<'_>) -> String {
+    format!(
+        "bus `{}` only listens (mode = \"listen\"), another master owns its line; nothing is sent to `{}`",
+        drive.spec.bus, drive.spec.name
+    )
+}
+
 fn authority(drive: &Reading<'_>, client: Authority) -> Result<(), Refusal> {
+    if drive.spec.access == Access::Listen {
+        return Err(Refusal::NotAllowed(listens(drive)));
+    }
     if client == Authority::ReadOnly {
         return Err(Refusal::NotAllowed(
             "this client may not write: its address is not in `write`, or, with TLS, its certificate has no role that \

@@ -48,11 +48,13 @@ pub enum SourceKind {
     LocalSocket,
     /// `drivegate write`, without a gateway.
     CommandLine,
+    /// The other master of a line on which the gateway only listens.
+    OtherMaster,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 7] = [
+    pub const ALL: [SourceKind; 8] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -60,6 +62,7 @@ impl SourceKind {
         SourceKind::Shutdown,
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
+        SourceKind::OtherMaster,
     ];
 
     /// The label of metrics and audit lines.
@@ -72,6 +75,7 @@ impl SourceKind {
             SourceKind::Shutdown => "shutdown",
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
+            SourceKind::OtherMaster => "other_master",
         }
     }
 }

@@ -37,7 +37,10 @@ impl WriteStats {
     fn note(&self, source: SourceKind, answer: &Answer) {
         let mut results = self.results.lock().unwrap_or_else(PoisonError::into_inner);
         *results.entry((source, answer.outcome.code())).or_default() += 1;
-        self.seconds.observe(answer.latency);
+        // How long another master waits is not the gateway's doing.
+        if source != SourceKind::OtherMaster {
+            self.seconds.observe(answer.latency);
+        }
     }
 }
 

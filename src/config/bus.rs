@@ -6,12 +6,12 @@ use std::time::Duration;
 use super::drive::{self, Surroundings};
 use super::keys::BUS;
 use super::{BusSettings, line, values};
-use crate::bus::BusOptions;
+use crate::bus::{BusOptions, Mode};
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
 use crate::document::{Finding, Place, Reader, format_duration};
 use crate::drive::profile::Profiles;
-use crate::process_image::{BusSpec, DriveSpec};
+use crate::process_image::{Access, BusSpec, DriveSpec};
 
 /// A longer `response_timeout` causes a warning.
 const LONG_TIMEOUT: Duration = Duration::from_secs(1);
@@ -48,8 +48,18 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
         reader.warning(BUS.drive.name, "the bus has no drive", "write [[bus.drive]] for each");
     }
     let drives: Vec<drive::Found> = tables.iter().map(|table| drive::read(table, &around)).collect();
+    if options.mode == Mode::Listen {
+        check_listening(reader, &drives);
+    }
     reader.finish();
-    let specs: Option<Vec<DriveSpec>> = drives.iter().map(|d| d.spec.clone()).collect();
+    let access = |mut spec: DriveSpec| {
+        if options.mode == Mode::Listen {
+            spec.access = Access::Listen;
+        }
+        spec
+    };
+    let specs = drives.iter().map(|d| d.spec.clone().map(access));
+    let specs: Option<Vec<DriveSpec>> = specs.collect();
     let settings = match (&name, &port, format, specs) {
         (Some((name, _)), Some(port), Some(format), Some(drives)) => {
             check_fit(reader, &format, &options, &drives);
@@ -98,6 +108,7 @@ fn read_options(
         retries: BUS.retries.written(reader).unwrap_or(default_retries(protocol)),
         silence: read_silence(reader, protocol, format),
         line: line::read(reader, port),
+        mode: BUS.mode.get(reader),
     };
     if options.response_timeout > LONG_TIMEOUT {
         let [timeout, limit] = [options.response_timeout, LONG_TIMEOUT].map(format_duration);
@@ -110,6 +121,43 @@ fn read_options(
         );
     }
     options
+}
+
+/// What asks for a frame of the gateway on a line where it sends none is an error; what only says how it would ask has no effect.
+fn check_listening(reader: &Reader<'_>, drives: &[drive::Found]) {
+    for drive in drives {
+        let name = drive.name.as_ref().map_or("?", |(name, _)| name);
+        let control = (drive.access.0 == Access::Control).then_some(&drive.access.1);
+        let wishes = [
+            (control, "access = \"control\"", "access"),
+            (drive.lease.as_ref(), "supervision", "supervision"),
+            (drive.shutdown_stop.as_ref(), "on_shutdown = \"stop\"", "on_shutdown"),
+        ];
+        for (place, wish, key) in wishes {
+            let Some(place) = place else { continue };
+            reader.document().problem(
+                place,
+                format!("`{wish}` of drive `{name}` needs a gateway that writes, and this bus only listens (mode = \"listen\")"),
+                format!("leave {key} out, or make the gateway the only master of the line and write mode = \"master\""),
+            );
+        }
+    }
+    let keys = [
+        BUS.cycle.name,
+        BUS.slow_cycle.name,
+        BUS.response_timeout.name,
+        BUS.silence.name,
+        BUS.rs485.name,
+        BUS.rts.name,
+        BUS.spin.name,
+    ];
+    for key in keys.into_iter().filter(|key| reader.has(key)) {
+        reader.warning(
+            key,
+            format!("`{key}` has no effect on a bus that only listens: the gateway sends nothing and leaves RTS low"),
+            "leave the key out",
+        );
+    }
 }
 
 /// Path of a device, relative to the directory of the file, or `tcp://host:port` or `rfc2217://host:port`.

@@ -15,6 +15,7 @@ use super::key::{
 use super::log::{self, LogFormat};
 use super::mqtt::TelemetryTopic;
 use super::{bus, modbus_tcp, mqtt, north, recordings, values};
+use crate::bus::Mode;
 use crate::codec::Protocol;
 use crate::codec::wire::Silence;
 use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
@@ -197,6 +198,10 @@ keys! {
         /// and `format` (`rfc2217://`: telnet with RFC 2217). A host name is resolved each time the port is
         /// opened; if that fails, the last known addresses are used. Each port belongs to one bus.
         port: String = Text("", "a path, \"tcp://host:port\" or \"rfc2217://host:port\""), required;
+        /// `"master"`: the gateway asks the drives. `"listen"`: another master owns the line; the gateway sends nothing and shows what
+        /// that master reads, see [Listening](listening.md). Its drives cannot have `access = "control"`, `supervision` or
+        /// `on_shutdown = "stop"`.
+        mode: Mode = Words(&[("master", Mode::Master), ("listen", Mode::Listen)]), default "master";
         /// Protocol of the drives; every drive's profile must support it.
         protocol: Protocol = PROTOCOLS, default "modbus-rtu";
         /// Bits per second. N2 always uses 9600 8N1; a rate that the profile does not list causes a warning.

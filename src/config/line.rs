@@ -15,6 +15,7 @@ pub(super) fn read(reader: &Reader<'_>, port: Option<&str>) -> LineOptions {
         rts: BUS.rts.get(reader),
         dtr: BUS.dtr.get(reader),
         spin: BUS.spin.get(reader),
+        receives_only: false,
     };
     let scheme = port.and_then(|port| port.split_once("://")).map(|(scheme, _)| scheme);
     if scheme.is_some() && options.rs485 != Rs485::Off {

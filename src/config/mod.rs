@@ -32,8 +32,8 @@ pub(crate) use named_files::{FileKind, NamedFile, named_files};
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use crate::bus::BusOptions;
 use crate::bus::predict::{self, Prediction};
+use crate::bus::{BusOptions, Mode};
 use crate::command::AuditFileOptions;
 use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
@@ -96,6 +96,9 @@ impl BusSettings {
     /// The fast and slow cadence that staleness is measured by: those of the configuration, or the best the line can
     /// carry.
     pub(crate) fn achievable(&self) -> (Duration, Duration) {
+        if self.listens() {
+            return (Duration::ZERO, Duration::ZERO);
+        }
         let prediction = self.predict();
         let spec = &self.spec;
         (
@@ -104,9 +107,15 @@ impl BusSettings {
         )
     }
 
-    /// Expected wire times, cycles and load.
+    /// Expected wire times, cycles and load; nothing where the gateway sends nothing.
     pub(crate) fn predict(&self) -> Prediction {
-        predict::predict(&self.spec, self.options.silence, &self.drives)
+        let asked: &[DriveSpec] = if self.listens() { &[] } else { &self.drives };
+        predict::predict(&self.spec, self.options.silence, asked)
+    }
+
+    /// Whether another master owns the line.
+    pub(crate) fn listens(&self) -> bool {
+        self.options.mode == Mode::Listen
     }
 }
 

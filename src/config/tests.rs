@@ -139,6 +139,7 @@ sparkplug = { group = "plant", primary_host = "scada" }
         rts: crate::line::Level::Driver,
         dtr: crate::line::Level::Off,
         spin: crate::line::Spin::Off,
+        receives_only: false,
     };
     assert_eq!(line.options.line, options);
     let drive = &line.drives[0];

@@ -3,6 +3,7 @@
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
 //! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
+//! - [`capture`]: reads captures of lines, its own and others, for `drivegate replay`.
 //! - [`budget`]: how much memory the rings take at most.
 //! - [`assemble`]: the raw words of a ring as points, and what they show in one sentence (`summary`).
 //! - [`recording`]: the form of a file, its parts and its faults; [`export`] and [`pcapng`] turn one into other forms.
@@ -12,6 +13,7 @@
 
 pub mod assemble;
 pub mod budget;
+pub mod capture;
 pub mod export;
 pub mod pcapng;
 pub mod recorder;

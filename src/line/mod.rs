@@ -8,6 +8,7 @@ mod arrival;
 mod clock;
 mod names;
 mod options;
+mod receiver;
 mod remote;
 mod rfc2217;
 mod rs485;
@@ -18,6 +19,7 @@ use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 pub use names::Names;
 pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
+pub use receiver::Receiver;
 use remote::{Raw, Remote};
 
 use std::cell::Cell;
@@ -380,10 +382,14 @@ fn open_serial(port: &str, format: &LineFormat, options: &LineOptions) -> Result
             ));
         }
     }
-    sys::set_levels(&fd, options.rts, options.dtr).map_err(|error| OpenError::Serial {
-        port: port.to_string(),
-        reason: format!("the driver cannot set RTS and DTR ({error}); leave `rts` and `dtr` out"),
-    })?;
+    if let Err(error) = sys::set_levels(&fd, options.rts, options.dtr)
+        && !options.receives_only
+    {
+        return Err(OpenError::Serial {
+            port: port.to_string(),
+            reason: format!("the driver cannot set RTS and DTR ({error}); leave `rts` and `dtr` out"),
+        });
+    }
     if let Err(error) = sys::low_latency(&fd) {
         tracing::debug!(port, "no low-latency mode: {error}");
     }

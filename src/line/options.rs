@@ -70,6 +70,8 @@ pub struct LineOptions {
     pub dtr: Level,
     /// How precisely waits end.
     pub spin: Spin,
+    /// Nothing is ever sent: a port without RTS needs none to be lowered.
+    pub receives_only: bool,
 }
 
 /// Longest delay that Linux takes (`RS485_MAX_RTS_DELAY` of `serial_core.c`).

@@ -65,6 +65,9 @@ pub struct BusHealth {
     pub foreign: u64,
     /// Times the port was opened.
     pub opened: u64,
+    /// On a line that another master owns: addresses that answer it and have no entry in the configuration; `None` where the
+    /// gateway is the master.
+    pub unknown: Option<Vec<u8>>,
 }
 
 /// Upper bounds of the buckets, s: from a frame at 115200 baud to a dead line.

@@ -10,7 +10,7 @@ mod tape;
 mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
-pub use snapshot::{Link, Reading, Snapshot, Unavailable};
+pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
 pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
@@ -34,6 +34,8 @@ pub enum Access {
     Monitor,
     /// Writes are passed on.
     Control,
+    /// Another master owns the line (`mode = "listen"` of the bus): nothing is ever sent.
+    Listen,
 }
 
 /// What is done when a drive's lease runs out.

@@ -34,6 +34,31 @@ impl Link {
     }
 }
 
+/// How often something is heard on a line that another master owns, learned from the times between; tenths of a second, 0 is
+/// not known.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Cadence(u16);
+
+impl Cadence {
+    /// Longest interval that counts as one.
+    pub const LONGEST: Duration = Duration::from_secs(600);
+
+    /// Heard again after `interval`. A longer interval than so far is learned at four times the last at most, so that a pause
+    /// of the other master makes no slow cadence; a shorter one by a quarter each time.
+    #[must_use]
+    pub fn after(self, interval: Duration) -> Cadence {
+        let tenths = |time: Duration| u16::try_from(time.as_millis().div_ceil(100)).unwrap_or(u16::MAX);
+        let interval = tenths(interval.min(Cadence::LONGEST));
+        let most = self.0.max(10).saturating_mul(4);
+        Cadence(interval.max(self.0 - self.0.div_ceil(4)).min(most))
+    }
+
+    /// Three intervals: what was not heard again within is not good any more.
+    pub fn good_for(self) -> Duration {
+        Duration::from_millis(300) * u32::from(self.0)
+    }
+}
+
 /// One register (or bit as 0 and 1) of the drive.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 struct Cell {
@@ -42,12 +67,15 @@ struct Cell {
     refused: Option<Exception>,
     /// Read before the drive went away, and not since.
     outlived: bool,
+    /// How often another master reads it, where one does.
+    cadence: Cadence,
 }
 
 impl Cell {
     /// Whether everything but the word is the same.
     fn is_like(&self, other: &Cell) -> bool {
-        (self.at, self.refused, self.outlived) == (other.at, other.refused, other.outlived)
+        let alike = |cell: &Cell| (cell.at, cell.refused, cell.outlived, cell.cadence);
+        alike(self) == alike(other)
     }
 }
 
@@ -74,6 +102,8 @@ pub struct Snapshot {
     pub link: Link,
     /// When the process data (fast class) was last read.
     pub fast_at: Option<Instant>,
+    /// Filled by what another master reads: how often it reads process data.
+    pub heard: Option<Cadence>,
     /// Shared with the snapshots before, as far as nothing in them changed.
     spans: Vec<Arc<Span>>,
 }
@@ -103,6 +133,7 @@ impl Snapshot {
         Snapshot {
             link: Link::Untried,
             fast_at: None,
+            heard: None,
             spans: spans.collect(),
         }
     }
@@ -116,8 +147,41 @@ impl Snapshot {
                 at: Some(now),
                 refused: None,
                 outlived: false,
+                cadence: Cadence::default(),
             };
         });
+    }
+
+    /// Words that the drive answered another master. Whether process data was among them.
+    pub fn hear(&mut self, table: Table, start: u16, words: &[u16], now: Instant) -> bool {
+        let (mut fast, mut before) = (false, None::<Instant>);
+        for span in self.spans.iter().filter(|span| span.class == PollClass::Fast) {
+            let of = |offset: usize| start.checked_add(u16::try_from(offset).ok()?);
+            let places = (0..words.len()).filter_map(|offset| span.offset(table, of(offset)?));
+            for cell in places.filter_map(|place| span.cells.get(place)) {
+                fast = true;
+                before = cell.at.map(|at| before.map_or(at, |before| before.min(at))).or(before);
+            }
+        }
+        self.each(table, start, words.len(), |cell, offset| {
+            let interval = cell.at.map(|before| now.saturating_duration_since(before));
+            *cell = Cell {
+                word: words.get(offset).copied().unwrap_or_default(),
+                at: Some(now),
+                refused: None,
+                outlived: false,
+                cadence: interval.map_or(cell.cadence, |interval| cell.cadence.after(interval)),
+            };
+        });
+        if fast {
+            // Between two reads of the same registers: where each takes a read of its own, those of one round follow each
+            // other closely, and the pause until the next round is what counts.
+            let interval = before.map(|before| now.saturating_duration_since(before));
+            let cadence = self.heard.unwrap_or_default();
+            self.heard = Some(interval.map_or(cadence, |interval| cadence.after(interval)));
+            self.fast_at = Some(now);
+        }
+        fast
     }
 
     /// The drive refused these addresses.
@@ -201,7 +265,11 @@ impl Reading<'_> {
             _ if !self.snapshot.link.is_online() || cell.outlived => Quality::Stale,
             (None, Some(at)) => {
                 let age = self.now.saturating_duration_since(at);
-                let old = self.age_limit(class).is_some_and(|limit| age > limit);
+                let limit = match self.snapshot.heard {
+                    Some(_) => Some(self.stale_after.max(cell.cadence.good_for())),
+                    None => self.age_limit(class),
+                };
+                let old = limit.is_some_and(|limit| age > limit);
                 if old { Quality::Stale } else { Quality::Good }
             }
         }
@@ -372,7 +440,9 @@ impl Reading<'_> {
 
     /// Whether the process data is too old or the drive is offline.
     pub fn is_stale(&self) -> bool {
-        !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > self.stale_after)
+        let cadence = self.snapshot.heard.unwrap_or_default();
+        let limit = self.stale_after.max(cadence.good_for());
+        !self.snapshot.link.is_online() || self.age().is_none_or(|age| age > limit)
     }
 
     /// The drive in one word; `None` while it answers and a point that decides is not good.

@@ -110,6 +110,7 @@ impl Rig {
             retries: 1,
             silence: Silence::Spec,
             line: setup.options,
+            mode: Default::default(),
         };
         let bus = BusTask::start(handle.clone(), options, writes.clone(), events.clone()).unwrap();
         let plant = Plant {

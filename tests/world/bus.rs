@@ -130,6 +130,7 @@ impl WorldBus {
             retries: line.retries,
             silence: parts.silence,
             line: LineOptions::default(),
+            mode: Default::default(),
         };
         let handle = handle(index, line, &profile, format);
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
@@ -340,7 +341,7 @@ impl WorldBus {
     }
 }
 
-fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat) -> BusHandle {
+pub fn handle(index: usize, line: &Line, profile: &Arc<Profile>, format: LineFormat) -> BusHandle {
     let name = format!("line{index}");
     let spec = BusSpec {
         name: name.clone(),

@@ -21,6 +21,8 @@ mod cost;
 mod drives;
 mod families;
 mod history;
+mod listener;
+mod listening;
 mod matrix;
 mod n2;
 mod one_bus;

@@ -270,7 +270,7 @@ fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
             supervision: supervised(LeaseAction::Stop, PATIENCE).filter(|_| lease),
             spec: match access {
                 Access::Control => |_| {},
-                Access::Monitor => |spec| spec.access = Access::Monitor,
+                Access::Monitor | Access::Listen => |spec| spec.access = Access::Monitor,
             },
             ..nx(115_200, 1)
         };

@@ -117,6 +117,7 @@ impl Rig {
             retries: 1,
             silence: Silence::Spec,
             line: LineOptions::default(),
+            mode: Default::default(),
         };
         let (stats, now): (Arc<WriteStats>, _) = (Arc::default(), Instant::now());
         let silence = Duration::from_micros(1750);

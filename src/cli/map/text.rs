@@ -64,6 +64,7 @@ fn units(specs: &[&DriveSpec]) -> String {
         let access = match s.access {
             Access::Monitor => "monitor: every write is refused",
             Access::Control => "control",
+            Access::Listen => "listens only: every write is refused",
         };
         let address = s.address.to_string();
         vec![

@@ -144,7 +144,8 @@ fn check_addresses(args: &Options, settings: &[Setting]) -> Result<(), String> {
     ))
 }
 
-fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
+/// The protocols of these names; `all` is all of them.
+pub(in crate::cli) fn protocols(names: &[String]) -> Result<Vec<Protocol>, String> {
     if names.iter().any(|name| name == "all") {
         return Ok(Protocol::ALL.to_vec());
     }

@@ -1,11 +1,11 @@
-//! The configuration of what a search found: it passes `check`, and the line carries it. Pure.
+//! The configuration of what `scan`, `try` or `listen` found: it passes `check`, and the line carries it. Pure.
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
 use super::found::Found;
 use super::settings::Setting;
-use crate::bus::predict;
+use crate::bus::{Mode, predict};
 use crate::config::{BusSettings, Settings};
 use crate::document::format_duration;
 use crate::drive::profile::Profiles;
@@ -25,6 +25,8 @@ pub(in crate::cli) struct Snippet<'a> {
     pub(in crate::cli) profile_dirs: Vec<PathBuf>,
     /// Time for the first byte of a reply, if it was chosen.
     pub(in crate::cli) timeout: Option<Duration>,
+    /// Whether the gateway is to poll the drives or only to listen.
+    pub(in crate::cli) mode: Mode,
 }
 
 /// A port as a configuration names it: a configuration is read from its own directory.
@@ -39,6 +41,9 @@ impl Snippet<'_> {
     /// The text.
     pub(in crate::cli) fn text(&self) -> String {
         let draft = self.with_cadence("");
+        if self.mode == Mode::Listen {
+            return draft;
+        }
         let loaded = Settings::parse("found.toml", &draft, std::iter::empty());
         let bus = loaded.settings.as_ref().and_then(|settings| settings.buses.first());
         self.with_cadence(&bus.map_or_else(String::new, cadence))
@@ -74,8 +79,12 @@ impl Snippet<'_> {
 
     fn bus(&self, Setting { protocol, format }: Setting, number: usize, cadence: &str) -> String {
         let port = self.port;
+        let mode = match self.mode {
+            Mode::Master => "",
+            Mode::Listen => "mode = \"listen\"\n",
+        };
         let mut text = format!(
-            "\n[[bus]]\nname = \"line{number}\"\nport = {port:?}\nprotocol = \"{}\"\n",
+            "\n[[bus]]\nname = \"line{number}\"\nport = {port:?}\n{mode}protocol = \"{}\"\n",
             protocol.name()
         );
         if port.starts_with("tcp://") {
@@ -196,12 +205,17 @@ mod tests {
     }
 
     fn text_of(port: &str, found: &[Found]) -> String {
+        text_in(Mode::Master, port, found)
+    }
+
+    fn text_in(mode: Mode, port: &str, found: &[Found]) -> String {
         let snippet = Snippet {
             port,
             found,
             profiles: &Profiles::built_in(),
             profile_dirs: Vec::new(),
             timeout: None,
+            mode,
         };
         snippet.text()
     }
@@ -219,8 +233,9 @@ mod tests {
             ],
             vec![found(rtu, 1, &["vacon-nx"]), found(Protocol::N2, 1, &["vacon-nx-n2"])],
         ];
-        for case in cases {
-            let text = text_of("/dev/serial/by-id/usb-\"x\"", &case);
+        let modes = [Mode::Master, Mode::Listen];
+        for (case, mode) in cases.iter().flat_map(|case| modes.map(|mode| (case, mode))) {
+            let text = text_in(mode, "/dev/serial/by-id/usb-\"x\"", case);
             let loaded = Settings::parse("found.toml", &text, std::iter::empty());
             let problems: Vec<String> = [&loaded.errors, &loaded.warnings]
                 .into_iter()
@@ -229,6 +244,10 @@ mod tests {
                 .collect();
             assert_eq!(problems, [""; 0], "{text}");
             let settings = loaded.settings.unwrap();
+            assert!(
+                settings.buses.iter().all(|bus| bus.listens() == (mode == Mode::Listen)),
+                "{text}"
+            );
             let drives = settings.buses.iter().flat_map(|b| &b.drives);
             let known = case
                 .iter()
@@ -273,6 +292,7 @@ mod tests {
             profiles: &Profiles::built_in(),
             profile_dirs: vec![PathBuf::from("/etc/profiles")],
             timeout: Some(Duration::from_millis(500)),
+            mode: Mode::Master,
         };
         let text = snippet.with_cadence("");
         assert!(

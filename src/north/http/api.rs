@@ -86,7 +86,7 @@ impl<'d> Drive<'d> {
             unit: spec.unit,
             profile: &spec.profile.name,
             access: match spec.access {
-                Access::Monitor => "monitor",
+                Access::Monitor | Access::Listen => "monitor",
                 Access::Control => "control",
             },
             state: reading.state(),
@@ -206,6 +206,9 @@ pub(super) struct Bus<'b> {
     foreign_frames: u64,
     opened: u64,
     queue_depth: usize,
+    /// On a line that another master owns: addresses that answer it and have no entry.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    unknown_drives: Option<Vec<u8>>,
 }
 
 /// Cadence of a poll class.
@@ -254,6 +257,7 @@ impl<'b> Bus<'b> {
             outcomes: Outcomes::new(|outcome| image.drives.iter().map(|d| d.counted(outcome)).sum()),
             foreign_frames: health.foreign,
             opened: health.opened,
+            unknown_drives: health.unknown,
             queue_depth: handle.queue.lock().len(),
         }
     }

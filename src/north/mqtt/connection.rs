@@ -9,8 +9,8 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
 use std::time::Duration;
 
-use rumqttc::mqttbytes::QoS;
 use rumqttc::mqttbytes::v5::Filter;
+use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
     AsyncClient, ConnAck, ConnectProperties, ConnectReturnCode, ConnectionError, Event, EventLoop, LastWill,
     MqttOptions, NetworkOptions, Outgoing, Packet, PubAckReason, PublishProperties, RetainForwardRule, StateError,

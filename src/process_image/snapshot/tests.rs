@@ -121,3 +121,30 @@ fn what_a_family_lacks_decides_nothing() {
         assert_eq!((reading.state(), reading.overall()), (Some(state), Quality::Good));
     }
 }
+
+/// Another master that reads register after register, then other drives for six seconds.
+#[test]
+fn what_counts_is_the_pause_between_reads_of_the_same_registers() {
+    let nx = Profiles::built_in().get("vacon-nx").unwrap().clone();
+    let image = DriveImage::new(DriveSpec::new("fan-1", "line1", 1, nx), Duration::from_secs(1));
+    let read = image
+        .plan
+        .reads
+        .iter()
+        .find(|read| read.class == PollClass::Fast)
+        .unwrap();
+    let addresses: Vec<u16> = (read.start..).take(usize::from(read.count)).collect();
+    assert!(addresses.len() > 3, "more than one");
+    image.update(|s| (s.link, s.heard) = (Link::Online(SystemTime::now()), Some(Cadence::default())));
+    let mut now = Instant::now();
+    let is_stale = |now| image.reading(now, Duration::from_secs(1)).is_stale();
+    for _ in 0..4 {
+        for address in &addresses {
+            now += Duration::from_millis(50);
+            image.update(|s| assert!(s.hear(read.table, *address, &[1], now)));
+        }
+        now += Duration::from_secs(6);
+    }
+    assert!(!is_stale(now), "three rounds are over");
+    assert!(!is_stale(now + Duration::from_secs(10)) && is_stale(now + Duration::from_secs(16)));
+}

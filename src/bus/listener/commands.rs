@@ -1,0 +1,164 @@
+//! What another master commands: told when it changes, so that a master that writes the same words in every cycle fills neither
+//! audit nor log. Commands that switch are told at once, references once a second at most, the last one in any case. Pure: time
+//! is an argument.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use crate::bus::transaction::Ended;
+use crate::codec::{Protocol, Reply, RequestPdu, Table, describe};
+use crate::command::{Change, Outcome, written};
+use crate::drive::ModelPoint;
+use crate::drive::model::Kind;
+use crate::process_image::DriveSpec;
+
+/// Least time between two references of a drive that are told.
+const PAUSE: Duration = Duration::from_secs(1);
+/// Registers of one drive whose last written values are known.
+const KEPT: usize = 256;
+
+/// A command of the other master that is to be told.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Commanded {
+    /// The command in one line.
+    pub what: String,
+    /// What it sets.
+    pub changes: Vec<Change>,
+    /// What became of it.
+    pub outcome: Outcome,
+    /// When it began.
+    pub began: Instant,
+    /// When its outcome was known.
+    pub at: Instant,
+}
+
+/// What the other master wrote to one drive.
+#[derive(Debug, Default)]
+pub struct Commands {
+    words: BTreeMap<(Table, u16), u16>,
+    /// Code of the last outcome.
+    outcome: Option<&'static str>,
+    told: Option<Instant>,
+    waiting: Option<Commanded>,
+}
+
+impl Commands {
+    /// A write was heard, from `began` to `at`; what is to be told of it now.
+    pub fn heard(
+        &mut self,
+        (spec, protocol): (&DriveSpec, Protocol),
+        pdu: &RequestPdu,
+        ended: Option<&Ended>,
+        (began, at): (Instant, Instant),
+    ) -> Option<Commanded> {
+        let outcome = outcome(ended);
+        let (table, items) = items(pdu);
+        let is_new = |(address, word): &&(u16, u16)| self.words.get(&(table, *address)) != Some(word);
+        let fresh: Vec<u16> = items.iter().filter(is_new).map(|(address, _)| *address).collect();
+        let is_repeated = fresh.is_empty() && !items.is_empty() && self.outcome == Some(outcome.code());
+        if is_repeated {
+            return None;
+        }
+        let (changes, switches) = self.changes(spec, table, &items, &fresh);
+        self.outcome = Some(outcome.code());
+        for (address, word) in items {
+            if self.words.len() < KEPT || self.words.contains_key(&(table, address)) {
+                self.words.insert((table, address), word);
+            }
+        }
+        let what = if changes.is_empty() {
+            describe::request_on(protocol, pdu)
+        } else {
+            let one = |change: &Change| format!("{}={}", change.point, change.new);
+            changes.iter().map(one).collect::<Vec<_>>().join(" ")
+        };
+        let commanded = Commanded {
+            what,
+            changes,
+            outcome,
+            began,
+            at,
+        };
+        if switches || self.told.is_none_or(|told| at >= told + PAUSE) {
+            self.told = Some(at);
+            self.waiting = None;
+            return Some(commanded);
+        }
+        self.waiting = Some(commanded);
+        None
+    }
+
+    /// What waited and is due.
+    pub fn due(&mut self, now: Instant) -> Option<Commanded> {
+        let told = self.told.filter(|told| now >= *told + PAUSE)?;
+        let waiting = self.waiting.take()?;
+        self.told = Some(now.max(told));
+        Some(waiting)
+    }
+
+    /// When something is due.
+    pub fn due_at(&self) -> Option<Instant> {
+        self.waiting.as_ref().and(self.told).map(|told| told + PAUSE)
+    }
+
+    /// The points that a write changes, and whether it switches something.
+    fn changes(&self, spec: &DriveSpec, table: Table, items: &[(u16, u16)], fresh: &[u16]) -> (Vec<Change>, bool) {
+        let (mut changes, mut switches) = (Vec::new(), false);
+        let written = spec.profile.points.iter().filter(|point| point.write);
+        let is = |of: ModelPoint, name: &str| spec.profile.model_point(of).is_some_and(|point| point.name == name);
+        for (point, raw) in written.filter_map(|point| Some((point, point.raw()?))) {
+            let words = |of: &dyn Fn(u16) -> Option<u16>| raw.addresses().map(of).collect::<Option<Vec<u16>>>();
+            let of_write = |address| items.iter().find(|(at, _)| *at == address).map(|(_, word)| *word);
+            let touched = raw.table == spec.profile.canonical(table) && raw.addresses().any(|at| fresh.contains(&at));
+            let Some(new) = words(&of_write)
+                .filter(|_| touched)
+                .and_then(|words| raw.decode(&words, point.kind()))
+            else {
+                continue;
+            };
+            let of_last = |address| self.words.get(&(table, address)).copied();
+            let old = words(&of_last).and_then(|words| raw.decode(&words, point.kind()));
+            if old != Some(new) {
+                switches |= point.kind() == Kind::Bool;
+                let run = is(ModelPoint::Run, &point.name).then(|| new.as_bool());
+                let resets = is(ModelPoint::FaultReset, &point.name) && new.as_bool();
+                let point = point.name.clone();
+                changes.push(Change {
+                    point,
+                    old,
+                    new,
+                    run,
+                    resets,
+                });
+            }
+        }
+        (changes, switches)
+    }
+}
+
+fn outcome(ended: Option<&Ended>) -> Outcome {
+    match ended {
+        Some(Ended::Reply(Reply::Exception(code))) => Outcome::Exception(*code),
+        Some(Ended::Reply(reply)) => Outcome::Acknowledged(reply.clone()),
+        Some(Ended::Corrupt(_)) => Outcome::Garbled,
+        // Nobody answers a broadcast.
+        Some(Ended::Silent) | None => Outcome::TimedOut,
+    }
+}
+
+/// The registers or coils that a write sets; none where that depends on what the drive has.
+fn items(pdu: &RequestPdu) -> (Table, Vec<(u16, u16)>) {
+    match pdu {
+        RequestPdu::ReadWrite {
+            write_start, values, ..
+        } => {
+            let start = *write_start;
+            let pdu = RequestPdu::WriteRegisters {
+                start,
+                values: values.clone(),
+            };
+            written(&pdu).unwrap_or((Table::Holding, Vec::new()))
+        }
+        _ => written(pdu).unwrap_or((Table::Holding, Vec::new())),
+    }
+}

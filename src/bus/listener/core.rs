@@ -1,0 +1,397 @@
+//! A bus that only listens, without its thread: what another master and its drives say goes into the process image, events and
+//! the audit. Pure: bytes and time are arguments, and nothing goes out.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use super::commands::{Commanded, Commands};
+use super::decoder::{Decoder, Exchange, Heard};
+use crate::bus::BusOptions;
+use crate::bus::news::News;
+use crate::bus::report::Report;
+use crate::bus::transaction::Ended;
+use crate::codec::{Exception, Protocol, Reply, RequestPdu, Table};
+use crate::command::{Origin, Outcome, Refusal, SourceKind, Ticket, WriteStats};
+use crate::drive::Profile;
+use crate::event::{EventKind, Events};
+use crate::plant::BusHandle;
+use crate::process_image::{Cadence, Outcome as Counted};
+
+/// A drive of which nothing was heard for that long, and for three of its usual pauses, is offline.
+const SILENT: Duration = Duration::from_secs(5);
+/// Longest pause between two looks at the time.
+const LOOK: Duration = Duration::from_millis(100);
+
+/// What is known of one drive beside its image.
+#[derive(Debug)]
+struct Known {
+    address: u8,
+    /// Requests in a row that got no reply.
+    unanswered: u32,
+    /// When it was heard last; the opening of the port, before that.
+    heard: Instant,
+    /// Longest pause between two replies of it lately: a whole round of the other master, where that asks drive after drive.
+    pause: Duration,
+    commands: Commands,
+    /// First addresses of its values of two registers, which are never stored in halves.
+    wide: Vec<(Table, u16)>,
+}
+
+/// A bus that only listens, without its thread.
+#[derive(Debug)]
+pub struct ListenCore {
+    bus: BusHandle,
+    decoder: Decoder,
+    report: Report,
+    writes: Arc<WriteStats>,
+    drives: Vec<Known>,
+    /// Tries of the other master, after the first, before a drive is offline.
+    retries: u32,
+    /// Reads of process data in this round of the other master, and when it began.
+    round: (Vec<(usize, Table, u16)>, Option<Instant>),
+    heard: Vec<Heard>,
+}
+
+impl ListenCore {
+    /// A bus whose port is not open yet.
+    pub fn new(
+        bus: BusHandle,
+        options: &BusOptions,
+        events: Events,
+        writes: Arc<WriteStats>,
+        now: Instant,
+    ) -> ListenCore {
+        let known = |drive: &Arc<crate::process_image::DriveImage>| {
+            drive.update(|snapshot| snapshot.heard = Some(Cadence::default()));
+            Known {
+                address: drive.spec.address,
+                unanswered: 0,
+                heard: now,
+                pause: Duration::ZERO,
+                commands: Commands::default(),
+                wide: wide(&drive.spec.profile),
+            }
+        };
+        ListenCore {
+            drives: bus.image.drives.iter().map(known).collect(),
+            decoder: decoder(&bus),
+            report: Report::new(bus.image.clone(), events, writes.clone(), now),
+            bus,
+            writes,
+            retries: options.retries,
+            round: (Vec::new(), None),
+            heard: Vec::new(),
+        }
+    }
+
+    /// The port was opened.
+    pub fn opened(&mut self, now: Instant) {
+        self.decoder = decoder(&self.bus);
+        for known in &mut self.drives {
+            (known.unanswered, known.heard) = (0, now);
+        }
+        self.round = (Vec::new(), None);
+        self.report.bus_up(now);
+        self.bus.image.update_health(|health| health.unknown = Some(Vec::new()));
+        self.refuse_all(now);
+    }
+
+    /// The port is gone or cannot be opened.
+    pub fn lost(&mut self, why: &str, now: Instant) {
+        self.refuse_all(now);
+        self.report.bus_down(why);
+    }
+
+    /// Answers whatever came into the queue all the same, which [`crate::command::admit`] prevents, and a gateway that is about to
+    /// end: there is nothing to stop.
+    pub fn refuse_all(&mut self, now: Instant) {
+        let name = &self.bus.image.spec.name;
+        let refusal = Refusal::NotAllowed(format!("bus `{name}` only listens; nothing is sent"));
+        self.bus.queue.close(Outcome::Refused(refusal), now);
+        if let Some(stopping) = self.bus.queue.lock().take_stopping() {
+            stopping.report(Vec::new());
+        }
+    }
+
+    /// Bytes came in at `now`.
+    pub fn on_bytes(&mut self, bytes: &[u8], now: Instant) {
+        let mut heard = std::mem::take(&mut self.heard);
+        self.decoder.on_bytes(bytes, now, &mut heard);
+        self.take(&mut heard, now);
+        self.heard = heard;
+    }
+
+    /// Time went by; until when nothing else is to be done.
+    pub fn on_time(&mut self, now: Instant) -> Instant {
+        let mut heard = std::mem::take(&mut self.heard);
+        self.decoder.on_time(now, &mut heard);
+        self.take(&mut heard, now);
+        self.heard = heard;
+        for index in 0..self.drives.len() {
+            let Some(known) = self.drives.get_mut(index) else { break };
+            let silent = SILENT.max(known.pause * 3);
+            let is_silent = now.saturating_duration_since(known.heard) > silent;
+            let due = known.commands.due(now);
+            if is_silent {
+                let why = format!("nothing was heard of it for {} s", silent.as_secs());
+                self.report.gone(index, &why);
+            }
+            if let Some(commanded) = due {
+                self.tell(index, commanded);
+            }
+        }
+        self.report.tick(now);
+        let due = self.drives.iter().filter_map(|known| known.commands.due_at());
+        let wake = due.chain(self.decoder.wake_at()).min();
+        wake.unwrap_or(now + LOOK).clamp(now, now + LOOK)
+    }
+
+    fn take(&mut self, heard: &mut Vec<Heard>, now: Instant) {
+        for one in heard.drain(..) {
+            match one {
+                Heard::Stray { bytes, at, quiet_since } => self.report.noise(&bytes, quiet_since, at),
+                Heard::Exchange(exchange) => self.exchange(&exchange, now),
+            }
+        }
+    }
+
+    fn exchange(&mut self, exchange: &Exchange, now: Instant) {
+        let index = self.drives.iter().position(|known| known.address == exchange.address);
+        self.show(index, exchange);
+        self.report
+            .in_use(exchange.at.saturating_duration_since(exchange.began).min(LOOK * 10));
+        if exchange.address == 0 {
+            (0..self.drives.len()).for_each(|drive| self.commanded(drive, exchange));
+            return;
+        }
+        match index {
+            Some(index) => self.of_drive(index, exchange, now),
+            None if matches!(exchange.ended, Some(Ended::Reply(_))) => self.unknown(exchange.address),
+            None => {}
+        }
+    }
+
+    /// The frames, for the trace and the recorder.
+    fn show(&self, index: Option<usize>, exchange: &Exchange) {
+        let Some(request) = &exchange.request else {
+            self.report.noise(&exchange.frame, exchange.quiet_since, exchange.sent);
+            if !exchange.heard.is_empty() {
+                self.report.noise(&exchange.heard, exchange.sent, exchange.at);
+            }
+            return;
+        };
+        let (quiet_since, began) = (exchange.quiet_since, exchange.began);
+        let Some(mut tap) = self.report.tap(index, request, &exchange.frame, quiet_since, began) else {
+            return;
+        };
+        tap.heard(&exchange.heard, exchange.at);
+        match (&exchange.ended, exchange.doubt) {
+            (Some(Ended::Reply(_)), Some(doubt)) => tap.ended(&Ended::Corrupt(doubt), exchange.at),
+            (Some(ended), _) => tap.ended(ended, exchange.at),
+            (None, _) => {}
+        }
+    }
+
+    fn unknown(&mut self, address: u8) {
+        let mut new = false;
+        self.bus.image.update_health(|health| {
+            let unknown = health.unknown.get_or_insert_default();
+            if let Err(place) = unknown.binary_search(&address) {
+                unknown.insert(place, address);
+                new = true;
+            }
+        });
+        if new {
+            tracing::info!(
+                bus = %self.bus.image.spec.name, address,
+                "a drive without an entry answers the other master at address {address}; write [[bus.drive]] for it to see its \
+                 values, `drivegate listen` shows what is read of it"
+            );
+        }
+    }
+
+    fn of_drive(&mut self, index: usize, exchange: &Exchange, now: Instant) {
+        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
+            return;
+        };
+        let answered = matches!(exchange.ended, Some(Ended::Reply(_)));
+        // Bytes behind a command that is not known may be its reply.
+        let is_known = exchange.request.is_some();
+        if let Some(ended) = exchange.ended.as_ref().filter(|_| is_known) {
+            image.count(match ended {
+                _ if exchange.doubt.is_some() => Counted::Corrupt,
+                Ended::Reply(Reply::Exception(_)) => Counted::Exception,
+                Ended::Reply(_) => Counted::Ok,
+                Ended::Silent => Counted::Timeout,
+                Ended::Corrupt(_) => Counted::Corrupt,
+            });
+        }
+        // A Modbus reply names its drive, whatever it answers.
+        let is_alive = exchange.doubt.is_none() || self.bus.image.spec.protocol != Protocol::N2;
+        if answered && is_alive {
+            let interval = exchange.at.saturating_duration_since(known.heard);
+            known.pause = pause_after(known.pause, interval);
+            (known.unanswered, known.heard) = (0, exchange.at);
+            if !image.snapshot().link.is_online() {
+                self.report.apply(&News::Online(index), now);
+            }
+            if exchange.doubt.is_none() {
+                let spec = &self.bus.image.spec;
+                let replied = exchange.replied.unwrap_or(exchange.at);
+                // By so much silence a drive knows that a request is over, which is no part of its turnaround.
+                let recognition = spec.protocol.recognition(&spec.format);
+                image.set_turnaround(replied.saturating_duration_since(exchange.sent + recognition));
+            }
+        } else if is_known && exchange.ended == Some(Ended::Silent) {
+            known.unanswered = known.unanswered.saturating_add(1);
+            if known.unanswered > self.retries {
+                let times = known.unanswered;
+                self.report.gone(
+                    index,
+                    &format!("it left {times} requests of the other master unanswered"),
+                );
+            }
+        }
+        if let Some((request, reply)) = exchange.believed() {
+            self.believed(index, &request.pdu, reply, exchange, now);
+        }
+        self.commanded(index, exchange);
+    }
+
+    fn believed(&mut self, index: usize, pdu: &RequestPdu, reply: &Reply, exchange: &Exchange, now: Instant) {
+        let (table, start) = match pdu {
+            RequestPdu::Read { table, start, .. } => (*table, *start),
+            RequestPdu::ReadWrite { read_start, .. } => (Table::Holding, *read_start),
+            _ => return,
+        };
+        match reply {
+            Reply::Exception(Exception::N2_RESTARTED) => {
+                self.report.apply(&News::Restarted(index), now);
+            }
+            reply => {
+                if let Some(words) = reply.words() {
+                    self.read(index, (table, start), &words, exchange.asked_by, now);
+                }
+            }
+        }
+    }
+
+    /// Stores what was read, whole values only.
+    fn read(&mut self, index: usize, (table, start): (Table, u16), words: &[u16], at: Instant, now: Instant) {
+        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get(index)) else {
+            return;
+        };
+        let table = image.spec.profile.canonical(table);
+        let mut words = words;
+        let mut start = start;
+        let is_wide = |address: Option<u16>| address.is_some_and(|address| known.wide.contains(&(table, address)));
+        // The second half of a value, and the first one.
+        if is_wide(start.checked_sub(1)) {
+            let Some(next) = start.checked_add(1) else { return };
+            (start, words) = (next, words.get(1..).unwrap_or_default());
+        }
+        let last = u16::try_from(words.len())
+            .ok()
+            .and_then(|count| start.checked_add(count.checked_sub(1)?));
+        if is_wide(last) {
+            words = words.get(..words.len() - 1).unwrap_or_default();
+        }
+        if words.is_empty() || !self.report.heard(index, (table, start), words, at, now) {
+            return;
+        }
+        let key = (index, table, start);
+        let (seen, began) = &mut self.round;
+        if seen.contains(&key) || began.is_none() {
+            let cycle = began.replace(at).map(|before| at.saturating_duration_since(before));
+            seen.clear();
+            self.report.fast_round(cycle);
+        }
+        // A master whose reads never repeat has no cycle.
+        if self.round.0.len() < 4096 {
+            self.round.0.push(key);
+        }
+    }
+
+    /// Tells of a write of the other master.
+    fn commanded(&mut self, index: usize, exchange: &Exchange) {
+        let Some(request) = exchange.request.as_ref().filter(|request| request.pdu.is_write()) else {
+            return;
+        };
+        let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
+            return;
+        };
+        let of = (&image.spec, self.bus.image.spec.protocol);
+        let ended = exchange.ended.as_ref();
+        let commanded = known
+            .commands
+            .heard(of, &request.pdu, ended, (exchange.began, exchange.at));
+        if let Some(commanded) = commanded {
+            self.tell(index, commanded);
+        }
+    }
+
+    fn tell(&self, index: usize, commanded: Commanded) {
+        let Some(image) = self.bus.image.drives.get(index) else {
+            return;
+        };
+        let Commanded {
+            what,
+            changes,
+            outcome,
+            began,
+            at,
+        } = commanded;
+        self.report.drive_event(index, EventKind::ForeignCommand, None, |name| {
+            format!("the other master commands {name}: {what}; {outcome}")
+        });
+        let origin = Origin::new(SourceKind::OtherMaster, self.bus.image.spec.name.clone());
+        let (ticket, _) = Ticket::new(origin, &image.spec.name, what, true, began, self.writes.clone());
+        ticket.with_changes(changes).answer(outcome, at);
+    }
+}
+
+/// The longest pause lately, after one more: a longer one counts at four times the last at most, so that a rest of the other master
+/// delays no later notice; a long one is forgotten by an eighth of the time since, however many replies came in it.
+fn pause_after(last: Duration, pause: Duration) -> Duration {
+    let most = last.max(Duration::from_secs(1)) * 4;
+    let left = last.saturating_sub(pause / 8);
+    pause.min(Cadence::LONGEST).min(most).max(left)
+}
+
+fn decoder(bus: &BusHandle) -> Decoder {
+    let spec = &bus.image.spec;
+    let drives = bus.image.drives.iter();
+    let n2: BTreeMap<_, _> = drives.map(|d| (d.spec.address, d.spec.profile.n2)).collect();
+    Decoder::new(spec.protocol, spec.format, n2)
+}
+
+/// First addresses of the values of two registers.
+fn wide(profile: &Profile) -> Vec<(Table, u16)> {
+    let raw = profile.points.iter().filter_map(|point| point.raw());
+    raw.filter(|raw| raw.form.items() == 2)
+        .map(|raw| (raw.table, raw.address))
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_pause_of_a_round_outlasts_the_reads_of_one_drive() {
+        let seconds = Duration::from_secs;
+        let mut pause = Duration::ZERO;
+        // Forty reads of this drive, then forty seconds of the other drives.
+        for _ in 0..4 {
+            pause = pause_after(pause, seconds(40));
+            pause = (0..40).fold(pause, |pause, _| pause_after(pause, Duration::from_millis(30)));
+        }
+        assert!(pause > seconds(39) && pause <= seconds(40), "{pause:?}");
+        // Read all the time, after a rest of an hour.
+        let rested = pause_after(Duration::from_millis(30), seconds(3600));
+        assert_eq!(rested, seconds(4));
+        let later = (0..2000).fold(rested, |pause, _| pause_after(pause, Duration::from_millis(30)));
+        assert_eq!(later, Duration::from_millis(30));
+    }
+}

@@ -1,0 +1,321 @@
+//! What another master and its drives say, exchange by exchange. Pure: bytes and time are arguments.
+//!
+//! A reply is believed only where it is sure which request it answers:
+//!
+//! - its request came directly before it, with at most the glitch of a line that changes direction between them: a request that
+//!   was mangled on the way may be among more;
+//! - address, function, length, echo and check code fit it;
+//! - it could not be a request itself (a read of 17 to 24 bits has replies of that form);
+//! - no reply that looks the same is still to come. The other master sends its next request after its own time limit, and the
+//!   late reply to the one before looks like the reply to this one. So for a second after a request that got no reply, replies
+//!   that look like its reply are not believed ([`LateReplies`], [`N2LateReplies`]); the same request again is, as either
+//!   reply is true of it.
+//!
+//! What is not believed is counted and shown in the trace, and enters nothing. A mid-stream start, lost bytes and collisions cost
+//! the exchanges that they hit: the next sound request begins anew.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use super::frames::{Cut, Frames, GLITCH, Piece, are_sound, may_be_request};
+use crate::bus::late_replies::{FORGOTTEN_AFTER, LateReplies};
+use crate::bus::n2_late_replies::{N2LateReplies, Taken};
+use crate::bus::transaction::{Ended, MAY_BE_LATE};
+use crate::codec::n2::{self, N2Options};
+use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu};
+
+/// A request without a reply is over after that time, unless the next request comes first: the longest `response_timeout`.
+const PATIENCE: Duration = Duration::from_secs(5);
+/// No late reply of N2 comes after that time: that of the gateway as a master.
+const N2_LATE: Duration = n2::RESPONSE_TIMEOUT.saturating_mul(3);
+/// Bytes of garbage that are kept of one exchange.
+const KEPT: usize = 512;
+
+const NO_REPLY_IN_FRONT: &str = "something that is no frame came between request and reply";
+const AMBIGUOUS: &str = "it could be a request as well";
+const BEHIND_MANGLED: &str = "it may be the late reply to a request that was mangled";
+
+/// Something that was heard.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Heard {
+    /// A request, and what became of it.
+    Exchange(Box<Exchange>),
+    /// Bytes that belong to no exchange.
+    Stray {
+        /// The bytes.
+        bytes: Vec<u8>,
+        /// When they had come.
+        at: Instant,
+        /// Since when the line had been silent.
+        quiet_since: Instant,
+    },
+}
+
+/// A request of the other master, and what became of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Exchange {
+    /// Who was asked; 0 is the broadcast.
+    pub address: u8,
+    /// What was asked; `None` for a command that the codec has no request for.
+    pub request: Option<Request>,
+    /// The frame of the request.
+    pub frame: Vec<u8>,
+    /// Since when the line had been silent before it.
+    pub quiet_since: Instant,
+    /// When the request began.
+    pub began: Instant,
+    /// When it was over.
+    pub sent: Instant,
+    /// All that came behind it.
+    pub heard: Vec<u8>,
+    /// When the first byte of the reply began; none where nothing came.
+    pub replied: Option<Instant>,
+    /// When the exchange was over.
+    pub at: Instant,
+    /// When the drive was asked at the latest for what it said: earlier than `at`, where an earlier try may have been answered.
+    pub asked_by: Instant,
+    /// How it ended; `None` for a broadcast, which nobody answers.
+    pub ended: Option<Ended>,
+    /// Why a reply is not believed.
+    pub doubt: Option<&'static str>,
+}
+
+impl Exchange {
+    /// What the drive said, where it is sure that it answered this request.
+    pub fn believed(&self) -> Option<(&Request, &Reply)> {
+        match (&self.request, &self.ended, self.doubt) {
+            (Some(request), Some(Ended::Reply(reply)), None) => Some((request, reply)),
+            _ => None,
+        }
+    }
+}
+
+/// A request whose reply may come.
+#[derive(Debug)]
+struct Open {
+    address: u8,
+    request: Option<Request>,
+    frame: Vec<u8>,
+    quiet_since: Instant,
+    began: Instant,
+    sent: Instant,
+    /// What came behind it and is no frame.
+    garbage: Vec<u8>,
+    /// The request could be a reply: in which case the next request looks like its reply.
+    ambiguous: bool,
+}
+
+/// Decodes a line that another master owns.
+#[derive(Debug)]
+pub struct Decoder {
+    protocol: Protocol,
+    frames: Frames,
+    /// What is known of the N2 of a drive, by address.
+    n2: BTreeMap<u8, N2Options>,
+    open: Option<Open>,
+    /// Garbage since the last sound frame, while no request is open.
+    garbage: Vec<u8>,
+    quiet_since: Option<Instant>,
+    late: BTreeMap<u8, LateReplies>,
+    n2_late: N2LateReplies,
+    /// Until when the reply to a request that was mangled may come.
+    mangled_until: Option<Instant>,
+}
+
+impl Decoder {
+    /// A line of which nothing was heard so far. `n2` is what is known of its drives, by address.
+    pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
+        Decoder {
+            protocol,
+            frames: Frames::new(protocol, format),
+            n2,
+            open: None,
+            garbage: Vec::new(),
+            quiet_since: None,
+            late: BTreeMap::new(),
+            n2_late: N2LateReplies::default(),
+            mangled_until: None,
+        }
+    }
+
+    /// When [`Decoder::on_time`] has something to do.
+    pub fn wake_at(&self) -> Option<Instant> {
+        let over = self.open.as_ref().map(|open| open.sent + PATIENCE);
+        over.into_iter().chain(self.frames.patience()).min()
+    }
+
+    /// Bytes arrived at `now`, the last of them just then.
+    pub fn on_bytes(&mut self, bytes: &[u8], now: Instant, heard: &mut Vec<Heard>) {
+        // What waited for its rest until a time that is over is cut before.
+        self.on_time(now.checked_sub(Duration::from_nanos(1)).unwrap_or(now), heard);
+        self.frames.add(bytes, now);
+        self.cut(now, heard);
+    }
+
+    /// Time went by.
+    pub fn on_time(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+        self.cut(now, heard);
+        if self.open.as_ref().is_some_and(|open| now >= open.sent + PATIENCE) {
+            self.give_up(now, heard);
+        }
+    }
+
+    fn cut(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+        loop {
+            let open = self.open.as_ref().filter(|open| open.garbage.len() <= GLITCH);
+            let request = open.and_then(|open| open.request.as_ref());
+            let Some(piece) = self.frames.next(request, now) else {
+                return;
+            };
+            let quiet_since = self.quiet_since.replace(piece.ended).unwrap_or(piece.began);
+            match &piece.cut {
+                Cut::Request { .. } => self.asked(piece, quiet_since, heard),
+                Cut::Reply { .. } => self.answered(piece, heard),
+                Cut::Garbage => self.garbage(piece, quiet_since, heard),
+            }
+        }
+    }
+
+    fn asked(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Heard>) {
+        self.give_up(piece.began, heard);
+        let Cut::Request { address, pdu } = piece.cut else {
+            return;
+        };
+        let garbage = std::mem::take(&mut self.garbage);
+        if may_be_request(self.protocol, garbage.len()) && !are_sound(self.protocol, &garbage) {
+            self.mangled_until = Some(piece.began + FORGOTTEN_AFTER);
+        }
+        let n2 = self.n2.get(&address).copied().unwrap_or_default();
+        let open = Open {
+            address,
+            ambiguous: pdu.as_ref().is_some_and(|pdu| self.could_be_reply(pdu)),
+            request: pdu.map(|pdu| Request { address, pdu, n2 }),
+            frame: piece.bytes,
+            quiet_since,
+            began: piece.began,
+            sent: piece.ended,
+            garbage: Vec::new(),
+        };
+        let is_broadcast = open.address == 0;
+        self.open = Some(open);
+        if is_broadcast {
+            self.over(None, piece.ended, None, None, heard);
+        }
+    }
+
+    /// Whether the frame of a request could be a reply to the request before it: 24 bits, or a list of registers.
+    fn could_be_reply(&self, pdu: &RequestPdu) -> bool {
+        let mut bytes = Vec::new();
+        pdu.encode(&mut bytes);
+        let announced = bytes.get(1).map_or(0, |byte| usize::from(*byte));
+        let fits = self.protocol != Protocol::N2 && announced + 2 == bytes.len();
+        match pdu {
+            RequestPdu::Read { table, .. } => fits && table.is_bits(),
+            RequestPdu::ReadWrite { .. } => fits && announced.is_multiple_of(2),
+            _ => false,
+        }
+    }
+
+    fn answered(&mut self, piece: Piece, heard: &mut Vec<Heard>) {
+        let Cut::Reply { reply, ambiguous } = piece.cut else {
+            return;
+        };
+        let Some(open) = &mut self.open else { return };
+        open.garbage.extend_from_slice(&piece.bytes);
+        let (began, at) = (piece.began, piece.ended);
+        let doubt = match () {
+            () if ambiguous || open.ambiguous => Some(AMBIGUOUS),
+            () if self.mangled_until.is_some_and(|until| began < until) => Some(BEHIND_MANGLED),
+            () => self.late(&piece.bytes, at),
+        };
+        self.over(Some(Ended::Reply(reply)), at, Some(began), doubt, heard);
+    }
+
+    /// Why the reply in `bytes` may be the late one to an earlier request.
+    fn late(&mut self, bytes: &[u8], at: Instant) -> Option<&'static str> {
+        let request = self.open.as_ref()?.request.as_ref()?;
+        let may_be_late = match self.protocol {
+            Protocol::N2 => self.n2_late.take(&request.pdu, bytes, at) != Taken::Reply,
+            Protocol::ModbusRtu | Protocol::ModbusAscii => {
+                let late = self.late.get_mut(&request.address);
+                late.is_some_and(|late| late.blocks(&request.pdu, at).is_some())
+            }
+        };
+        may_be_late.then_some(MAY_BE_LATE)
+    }
+
+    fn garbage(&mut self, piece: Piece, quiet_since: Instant, heard: &mut Vec<Heard>) {
+        if let Some(open) = &mut self.open {
+            let room = KEPT.saturating_sub(open.garbage.len());
+            open.garbage.extend(piece.bytes.iter().take(room));
+            return;
+        }
+        let room = KEPT.saturating_sub(self.garbage.len());
+        self.garbage.extend(piece.bytes.iter().take(room));
+        heard.push(Heard::Stray {
+            bytes: piece.bytes,
+            at: piece.ended,
+            quiet_since,
+        });
+    }
+
+    /// No reply came to the request that is open: the next request came at `now`, or its time is over.
+    fn give_up(&mut self, now: Instant, heard: &mut Vec<Heard>) {
+        let Some(open) = &self.open else { return };
+        let mangled = open
+            .request
+            .as_ref()
+            .is_some_and(|request| self.protocol.begins_reply(request, &open.garbage) && open.garbage.len() > GLITCH);
+        let ended = if open.garbage.len() > GLITCH {
+            Ended::Corrupt(NO_REPLY_IN_FRONT)
+        } else {
+            Ended::Silent
+        };
+        if let Some(request) = open.request.as_ref().filter(|_| !mangled) {
+            match self.protocol {
+                Protocol::N2 => {
+                    let device = request.n2.device_type;
+                    self.n2_late.given_up(&request.pdu, device, N2_LATE, now);
+                }
+                Protocol::ModbusRtu | Protocol::ModbusAscii => {
+                    let late = self.late.entry(request.address).or_default();
+                    late.given_up(&request.pdu, open.began, now);
+                }
+            }
+        }
+        self.over(Some(ended), now, None, None, heard);
+    }
+
+    /// The exchange of the request that is open is over.
+    fn over(
+        &mut self,
+        ended: Option<Ended>,
+        at: Instant,
+        replied: Option<Instant>,
+        doubt: Option<&'static str>,
+        heard: &mut Vec<Heard>,
+    ) {
+        let Some(open) = self.open.take() else { return };
+        let mut asked_by = at;
+        if let (Some(request), Some(Ended::Reply(_)), None) = (&open.request, &ended, doubt)
+            && let Some(late) = self.late.get_mut(&request.address)
+        {
+            asked_by = late.asked_by(&request.pdu, at);
+            late.answered(&request.pdu, at);
+        }
+        heard.push(Heard::Exchange(Box::new(Exchange {
+            address: open.address,
+            request: open.request,
+            frame: open.frame,
+            quiet_since: open.quiet_since,
+            began: open.began,
+            sent: open.sent,
+            heard: open.garbage,
+            replied,
+            at,
+            asked_by,
+            ended,
+            doubt,
+        })));
+    }
+}

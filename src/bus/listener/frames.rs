@@ -1,0 +1,353 @@
+//! Cuts what is heard on a line into requests, replies and what is neither. Pure: time is an argument.
+//!
+//! Drivers and adapters hand bytes over late and in lumps, so silence decides little. A frame is known by its content: a
+//! request by function, length and check code; a reply by the request before it. Only what stays incomplete is given up by
+//! silence.
+
+use std::time::{Duration, Instant};
+
+use crate::codec::n2::{self, Command};
+use crate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
+
+/// Silence behind an incomplete frame, on top of 3.5 characters, after which the rest is not expected any more: longer than a
+/// USB adapter holds bytes back.
+const HELD_BACK: Duration = Duration::from_millis(30);
+/// Bytes that are kept while no frame is found among them; no frame is longer.
+const MOST_BYTES: usize = 1024;
+/// So few characters before a reply are the glitch of a line that changes direction, and no request that was mangled.
+pub(super) const GLITCH: usize = 2;
+
+/// What stands at the beginning of the bytes.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Cut {
+    /// A request of the other master; the PDU is `None` where the codec has none for it.
+    Request {
+        /// Who is asked; 0 is the broadcast.
+        address: u8,
+        /// What is asked.
+        pdu: Option<RequestPdu>,
+    },
+    /// The reply to the request that is open.
+    Reply {
+        /// What it says.
+        reply: Reply,
+        /// It could be a request as well.
+        ambiguous: bool,
+    },
+    /// Neither.
+    Garbage,
+}
+
+/// A piece of what was heard.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Piece {
+    pub(super) cut: Cut,
+    pub(super) bytes: Vec<u8>,
+    /// Beginning of its first and end of its last character on the wire, as far as arrival shows it.
+    pub(super) began: Instant,
+    pub(super) ended: Instant,
+}
+
+/// What the bytes at one place are.
+enum Look {
+    Is(usize, Cut),
+    /// It may become a frame. `true`: what is there already makes it likely.
+    MayBecome(bool),
+    Nothing,
+}
+
+/// The bytes that are not cut yet, with their times.
+#[derive(Debug)]
+pub(super) struct Frames {
+    protocol: Protocol,
+    format: LineFormat,
+    bytes: Vec<u8>,
+    /// End of each character.
+    times: Vec<Instant>,
+    last: Option<Instant>,
+}
+
+impl Frames {
+    pub(super) fn new(protocol: Protocol, format: LineFormat) -> Frames {
+        Frames {
+            protocol,
+            format,
+            bytes: Vec::new(),
+            times: Vec::new(),
+            last: None,
+        }
+    }
+
+    /// Bytes arrived at `now`: the last of them just then, the others as much earlier as the wire takes, but not before those
+    /// that came before.
+    pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
+        for (place, byte) in bytes.iter().enumerate() {
+            let behind = self.format.chars(bytes.len() - 1 - place);
+            let at = now.checked_sub(behind).unwrap_or(now);
+            let at = self.last.map_or(at, |last| at.max(last));
+            self.last = Some(at);
+            self.bytes.push(*byte);
+            self.times.push(at);
+        }
+    }
+
+    /// When the bytes that wait for more are given up.
+    pub(super) fn patience(&self) -> Option<Instant> {
+        let last = self.last.filter(|_| !self.bytes.is_empty())?;
+        Some(last + self.format.silence_chars() + HELD_BACK)
+    }
+
+    /// The next piece, if one can be cut by `now`; `open` is the request whose reply may come.
+    pub(super) fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
+        if self.bytes.is_empty() {
+            return None;
+        }
+        let silent = self.patience().is_some_and(|until| now >= until) || self.bytes.len() > MOST_BYTES;
+        match self.protocol {
+            Protocol::ModbusRtu => self.next_rtu(open, silent),
+            Protocol::ModbusAscii => self.next_line(b'\n', ascii::LONGEST, open, silent),
+            Protocol::N2 => self.next_line(b'\r', n2::LONGEST, open, silent),
+        }
+    }
+
+    fn next_rtu(&mut self, open: Option<&Request>, silent: bool) -> Option<Piece> {
+        let mut incomplete = false;
+        for at in 0..self.bytes.len() {
+            let rest = self.bytes.get(at..).unwrap_or_default();
+            // Behind more than a glitch no reply is believed: the request that it belongs to may be among the garbage.
+            let open = open.filter(|_| at <= GLITCH);
+            match rtu_at(rest, open) {
+                Look::Is(length, cut) if at <= GLITCH && matches!(cut, Cut::Reply { .. }) => {
+                    return self.cut(at + length, cut);
+                }
+                Look::Is(..) if at > 0 => return self.cut(at, Cut::Garbage),
+                Look::Is(length, cut) => return self.cut(length, cut),
+                Look::MayBecome(true) if !silent => {
+                    incomplete = true;
+                    break;
+                }
+                Look::MayBecome(false) if !silent => incomplete = true,
+                _ => {}
+            }
+        }
+        // What is no frame so far waits for the next frame, or for silence, and is one piece then.
+        if incomplete {
+            None
+        } else {
+            self.cut(self.bytes.len(), Cut::Garbage)
+        }
+    }
+
+    /// The next piece of a protocol whose frames are lines that end with `end`.
+    fn next_line(&mut self, end: u8, longest: usize, open: Option<&Request>, silent: bool) -> Option<Piece> {
+        let Some(length) = self.bytes.iter().position(|byte| *byte == end).map(|at| at + 1) else {
+            if silent || self.bytes.len() > longest {
+                return self.cut(self.bytes.len(), Cut::Garbage);
+            }
+            return None;
+        };
+        let line = self.bytes.get(..length).unwrap_or_default();
+        let begin = begin_of(self.protocol, line);
+        let frame = line.get(begin..).unwrap_or_default();
+        let cut = line_cut(self.protocol, frame, open.filter(|_| begin <= GLITCH));
+        // What stands before a request is a piece of its own.
+        if begin > 0 && !matches!(cut, Cut::Reply { .. } | Cut::Garbage) {
+            return self.cut(begin, Cut::Garbage);
+        }
+        self.cut(length, cut)
+    }
+
+    fn cut(&mut self, length: usize, cut: Cut) -> Option<Piece> {
+        let length = length.min(self.bytes.len());
+        let bytes: Vec<u8> = self.bytes.drain(..length).collect();
+        let times: Vec<Instant> = self.times.drain(..length).collect();
+        let (first, last) = (times.first().copied()?, times.last().copied()?);
+        Some(Piece {
+            cut,
+            bytes,
+            began: first.checked_sub(self.format.chars(1)).unwrap_or(first),
+            ended: last,
+        })
+    }
+}
+
+/// What stands at the beginning of `bytes` on a Modbus RTU line.
+fn rtu_at(bytes: &[u8], open: Option<&Request>) -> Look {
+    let reply = open.map_or(Look::Nothing, |open| rtu_reply(bytes, open));
+    match (reply, rtu_request(bytes)) {
+        (Look::Is(length, cut), _) => Look::Is(length, cut),
+        // Its head fits what was asked; a request has another one.
+        (Look::MayBecome(true), _) => Look::MayBecome(true),
+        (_, Look::Is(length, cut)) => Look::Is(length, cut),
+        (Look::MayBecome(_), _) => Look::MayBecome(false),
+        (Look::Nothing, request) => request,
+    }
+}
+
+fn rtu_reply(bytes: &[u8], open: &Request) -> Look {
+    let head = [Some(open.address), Some(open.pdu.function()), announced(&open.pdu)];
+    let refusal = [Some(open.address), Some(open.pdu.function() | 0x80), None];
+    let fits = |head: [Option<u8>; 3]| {
+        let pairs = bytes.iter().zip(head);
+        pairs
+            .into_iter()
+            .all(|(byte, wanted)| wanted.is_none_or(|wanted| *byte == wanted))
+    };
+    if !fits(head) && !fits(refusal) {
+        return Look::Nothing;
+    }
+    match rtu::decode_reply(open, bytes) {
+        Decoded::Reply { used, reply } => {
+            let pdu = bytes.get(1..used.saturating_sub(2)).unwrap_or_default();
+            match reply_or_request(open, &reply, pdu) {
+                Some(cut) => Look::Is(used, cut),
+                None => Look::Nothing,
+            }
+        }
+        // Two bytes fit a request too.
+        Decoded::Incomplete => Look::MayBecome(bytes.len() > 2 && announced(&open.pdu).is_some()),
+        Decoded::Foreign { .. } | Decoded::Corrupt(_) => Look::Nothing,
+    }
+}
+
+/// The third byte of a reply that says how long it is.
+fn announced(pdu: &RequestPdu) -> Option<u8> {
+    match pdu {
+        RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => u8::try_from(pdu.reply_len() - 2).ok(),
+        _ => None,
+    }
+}
+
+/// A PDU that answers `open` by its form. `None` for the request once more. A read's reply that would be a request as well is
+/// ambiguous: it may be that the other master asks again, for something else.
+fn reply_or_request(open: &Request, reply: &Reply, pdu: &[u8]) -> Option<Cut> {
+    let request = RequestPdu::decode(pdu).ok();
+    let reads = matches!(reply, Reply::Bits(_) | Reply::Registers(_));
+    if reads && request.as_ref() == Some(&open.pdu) {
+        return None;
+    }
+    Some(Cut::Reply {
+        reply: reply.clone(),
+        ambiguous: reads && request.is_some(),
+    })
+}
+
+fn rtu_request(bytes: &[u8]) -> Look {
+    let (Some(&address), Some(&function)) = (bytes.first(), bytes.get(1)) else {
+        return Look::MayBecome(false);
+    };
+    let known = matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43);
+    if address > 247 || !known {
+        return Look::Nothing;
+    }
+    // Bytes that must agree with a count before them.
+    let counted = match function {
+        15 => (usize::from(word(bytes, 4)).div_ceil(8), 6),
+        16 => (2 * usize::from(word(bytes, 4)), 6),
+        23 => (2 * usize::from(word(bytes, 8)), 10),
+        _ => (0, usize::MAX),
+    };
+    let announced = bytes.get(counted.1).map(|byte| usize::from(*byte));
+    if announced.is_some_and(|bytes| bytes != counted.0 || bytes == 0) {
+        return Look::Nothing;
+    }
+    let whole = rtu::request_len(bytes).and_then(|length| Some((length, bytes.get(..length)?)));
+    let Some((length, frame)) = whole else {
+        return Look::MayBecome(announced.is_some());
+    };
+    match rtu::decode_request(frame) {
+        Some((address, pdu)) => Look::Is(length, Cut::Request { address, pdu: pdu.ok() }),
+        None => Look::Nothing,
+    }
+}
+
+/// Whether bytes that are neither request nor reply are whole frames all the same: of a function that the codec does not know,
+/// or an answer that belongs to nobody.
+pub(super) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
+    match protocol {
+        Protocol::ModbusRtu => {
+            let mut rest = bytes;
+            while !rest.is_empty() {
+                let whole = |length: &usize| {
+                    rest.get(..*length)
+                        .is_some_and(|frame| rtu::open_frame(frame).is_some())
+                };
+                let Some(length) = (4..=rest.len().min(rtu::LONGEST)).find(whole) else {
+                    return false;
+                };
+                rest = rest.get(length..).unwrap_or_default();
+            }
+            true
+        }
+        Protocol::ModbusAscii => bytes
+            .split_inclusive(|byte| *byte == b'\n')
+            .all(|line| ascii::open_frame(line).is_some()),
+        Protocol::N2 => bytes.split_inclusive(|byte| *byte == b'\r').all(|line| {
+            line.strip_suffix(b"\r")
+                .is_some_and(|line| n2::Answer::decode(line).is_ok())
+        }),
+    }
+}
+
+/// Whether so much garbage may be a request that was mangled and got no reply: as much as half of the shortest one, and not as much
+/// as that and the shortest reply.
+pub(super) fn may_be_request(protocol: Protocol, garbage: usize) -> bool {
+    let (request, reply) = match protocol {
+        Protocol::ModbusRtu => (8, 5),
+        Protocol::ModbusAscii => (17, 11),
+        Protocol::N2 => (12, 2),
+    };
+    (request / 2 + 1..request + reply).contains(&garbage)
+}
+
+fn word(bytes: &[u8], at: usize) -> u16 {
+    let byte = |at: usize| bytes.get(at).copied().unwrap_or_default();
+    u16::from_be_bytes([byte(at), byte(at + 1)])
+}
+
+/// Where the frame of a line begins: at its last colon or `>`, or with N2 at its first letter.
+fn begin_of(protocol: Protocol, line: &[u8]) -> usize {
+    match protocol {
+        Protocol::N2 => {
+            let request = line.iter().rposition(|byte| *byte == b'>');
+            request
+                .or_else(|| line.iter().position(u8::is_ascii_graphic))
+                .unwrap_or(0)
+        }
+        Protocol::ModbusAscii | Protocol::ModbusRtu => line.iter().rposition(|byte| *byte == b':').unwrap_or(0),
+    }
+}
+
+/// What a line is, from its beginning to its end.
+fn line_cut(protocol: Protocol, frame: &[u8], open: Option<&Request>) -> Cut {
+    let reply = match open.map(|open| (open, protocol.decode(open, frame))) {
+        Some((open, Decoded::Reply { reply, .. })) => Some((open, reply)),
+        _ => None,
+    };
+    if protocol == Protocol::N2 {
+        return match (Command::decode(frame), reply) {
+            (Some((address, Ok(command))), _) => Cut::Request {
+                address,
+                pdu: n2::pdu_of(&command),
+            },
+            (None, Some((_, reply))) => Cut::Reply {
+                reply,
+                ambiguous: false,
+            },
+            _ => Cut::Garbage,
+        };
+    }
+    let Some((address, pdu)) = ascii::open_frame(frame) else {
+        return Cut::Garbage;
+    };
+    if let Some(cut) = reply.and_then(|(open, reply)| reply_or_request(open, &reply, &pdu)) {
+        return cut;
+    }
+    match RequestPdu::decode(&pdu) {
+        Ok(pdu) if address <= 247 => Cut::Request {
+            address,
+            pdu: Some(pdu),
+        },
+        _ => Cut::Garbage,
+    }
+}

@@ -1,0 +1,21 @@
+//! A line that another master owns: the gateway only listens.
+//!
+//! - [`decoder`]: bytes and their times in, exchanges of the other master out; [`frames`] cuts the bytes. Pure.
+//! - [`core`](self::core): the bus without its thread: what was heard goes into the process image, events and the audit. Pure.
+//! - [`commands`]: what the other master commands, reported when it changes. Pure.
+//! - [`survey`]: who speaks to whom how often, for `drivegate listen`. Pure.
+//! - [`n2_survey`]: what confirms or contradicts the assumptions about N2. Pure.
+//! - [`guess`]: protocol and format of a line from what is heard with a setting. Pure.
+//!
+//! Nothing here can send: the thread ([`crate::bus::BusTask`]) holds a [`crate::line::Receiver`], which has no way to.
+
+pub mod commands;
+pub mod core;
+pub mod decoder;
+pub mod frames;
+pub mod guess;
+pub mod n2_survey;
+pub mod survey;
+
+pub use self::core::ListenCore;
+pub use decoder::{Decoder, Exchange, Heard};

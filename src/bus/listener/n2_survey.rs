@@ -1,0 +1,261 @@
+//! What contradicts or confirms on a real trunk what is assumed of N2 ([`ASSUMPTIONS`](crate::codec::n2::ASSUMPTIONS)). Pure.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::time::{Duration, Instant};
+
+use super::decoder::{Exchange, Heard};
+use crate::codec::n2::command::checksum;
+use crate::codec::n2::{Answer, Command, Object, Region};
+
+/// Different values of one kind that are counted apart.
+const MOST: usize = 16;
+
+/// How often each of some values was seen.
+type Seen = BTreeMap<String, u64>;
+
+/// What was seen on an N2 line.
+#[derive(Debug, Default)]
+pub struct N2Survey {
+    /// Lines of master and drives by whether their checksum is the sum of their characters.
+    sums: [u64; 2],
+    /// Regions of overrides and releases by their digits.
+    widths: Seen,
+    /// Status bytes of binary objects.
+    states: Seen,
+    /// Device types.
+    devices: Seen,
+    /// Times at which a drive wanted to be identified.
+    unidentified: u64,
+    /// Overrides of analog outputs, and releases of them.
+    overrides: u64,
+    releases: u64,
+    /// Polls, by form and by what was answered.
+    polls: Seen,
+    reports: Seen,
+    last_polls: BTreeMap<u8, Instant>,
+    intervals: (u64, Duration),
+    /// Digits of the answers to reads of floats and integers.
+    floats: Seen,
+    integers: Seen,
+    /// Refusals by their form.
+    refusals: Seen,
+    /// Floats that are no number.
+    no_numbers: Seen,
+    /// Objects of number 0, and the others.
+    numbers: [u64; 2],
+    times: u64,
+    /// Other commands.
+    others: u64,
+}
+
+fn count(seen: &mut Seen, what: impl Into<String>) {
+    let what = what.into();
+    if seen.len() < MOST || seen.contains_key(&what) {
+        *seen.entry(what).or_default() += 1;
+    }
+}
+
+impl N2Survey {
+    /// Takes note of what was heard.
+    pub fn add(&mut self, heard: &Heard) {
+        match heard {
+            Heard::Exchange(exchange) => self.exchange(exchange),
+            Heard::Stray { bytes, .. } => self.sum(bytes),
+        }
+    }
+
+    /// Whether the checksum of a line, a request's or an answer's with data, is what is assumed.
+    fn sum(&mut self, line: &[u8]) {
+        // An A may be a digit as well.
+        let request = line.iter().rposition(|byte| *byte == b'>');
+        let begin = request.or_else(|| line.iter().position(|byte| *byte == b'A'));
+        let text = begin.and_then(|begin| line.get(begin + 1..)?.strip_suffix(b"\r"));
+        let Some((body, check)) = text.and_then(|text| text.split_at_checked(text.len().checked_sub(2)?)) else {
+            return;
+        };
+        if body.is_empty() || !body.iter().all(u8::is_ascii_hexdigit) {
+            return;
+        }
+        let fits = check.eq_ignore_ascii_case(format!("{:02X}", checksum(body)).as_bytes());
+        if let Some(sums) = self.sums.get_mut(usize::from(!fits)) {
+            *sums += 1;
+        }
+    }
+
+    fn exchange(&mut self, exchange: &Exchange) {
+        self.sum(&exchange.frame);
+        let answer = exchange.heard.iter().position(u8::is_ascii_graphic);
+        let answer = answer.and_then(|begin| exchange.heard.get(begin..)).unwrap_or_default();
+        self.sum(answer);
+        let line = answer.strip_suffix(b"\r").unwrap_or_default();
+        let decoded = Answer::decode(line).ok();
+        if let Some(Answer::Nak(code)) = &decoded {
+            self.unidentified += u64::from(*code == 0);
+            count(
+                &mut self.refusals,
+                if line.len() == 3 {
+                    "without a checksum"
+                } else {
+                    "with a checksum"
+                },
+            );
+        }
+        let Some((address, Ok(command))) = Command::decode(&exchange.frame) else {
+            return;
+        };
+        match command {
+            Command::Identify => {
+                if let Some(Answer::Data(digits)) = decoded {
+                    count(&mut self.devices, text(&digits));
+                }
+            }
+            Command::Poll { again } => self.poll(address, again, decoded.as_ref(), exchange.began),
+            Command::Read { object, attribute } => {
+                self.number(object);
+                if attribute == object.region.value_attribute() {
+                    self.read(object, decoded.as_ref());
+                }
+            }
+            Command::Override { object, .. } => {
+                self.number(object);
+                self.width(&exchange.frame);
+                self.overrides += u64::from(object.region == Region::Ao);
+            }
+            Command::Release { object } => {
+                self.number(object);
+                self.width(&exchange.frame);
+                self.releases += u64::from(object.region == Region::Ao);
+            }
+            Command::SyncTime => self.times += 1,
+            _ => self.others += 1,
+        }
+    }
+
+    fn number(&mut self, object: Object) {
+        if let Some(numbers) = self.numbers.get_mut(usize::from(object.number != 0)) {
+            *numbers += 1;
+        }
+    }
+
+    /// `>aa72` or `>aa73`, then the region: a 0 in front shows two digits.
+    fn width(&mut self, frame: &[u8]) {
+        let begin = frame.iter().rposition(|byte| *byte == b'>').unwrap_or(0);
+        let two = frame.get(begin + 5) == Some(&b'0');
+        count(&mut self.widths, if two { "2 digits" } else { "1 digit" });
+    }
+
+    fn poll(&mut self, address: u8, again: bool, answer: Option<&Answer>, at: Instant) {
+        count(&mut self.polls, if again { "0/5" } else { "0/4" });
+        if let Some(before) = self.last_polls.insert(address, at) {
+            self.intervals.0 += 1;
+            self.intervals.1 += at.saturating_duration_since(before);
+        }
+        match answer {
+            Some(Answer::Ack) => count(&mut self.reports, "A alone"),
+            Some(Answer::Data(digits)) => count(&mut self.reports, format!("{} digits", digits.len())),
+            _ => {}
+        }
+    }
+
+    fn read(&mut self, object: Object, answer: Option<&Answer>) {
+        let Some(Answer::Data(digits)) = answer else { return };
+        match object.region {
+            Region::Bi | Region::Bo => count(&mut self.states, text(digits)),
+            Region::Adi => count(&mut self.integers, format!("{} digits", digits.len())),
+            Region::Bd => {}
+            Region::Ai | Region::Ao | Region::Adf => {
+                count(&mut self.floats, format!("{} digits", digits.len()));
+                let value = digits
+                    .len()
+                    .checked_sub(8)
+                    .and_then(|from| digits.get(from..))
+                    .map(text);
+                let bits = value.as_ref().and_then(|value| u32::from_str_radix(value, 16).ok());
+                if let Some(value) = value.filter(|_| bits.is_some_and(|bits| !f32::from_bits(bits).is_finite())) {
+                    count(&mut self.no_numbers, value);
+                }
+            }
+        }
+    }
+
+    /// A line for each assumption: what was seen of it.
+    pub fn report(&self) -> String {
+        let mut out = String::new();
+        let mut line = |what: &str, seen: String| {
+            // Writing to a string cannot fail.
+            let _ = writeln!(out, "  {what}\n    {seen}");
+        };
+        let [right, wrong] = self.sums;
+        let of_sums = match (right, wrong) {
+            (0, 0) => "not seen".to_string(),
+            (_, 0) => format!("confirmed by {right} lines"),
+            (0, _) => format!("contradicted by all {wrong} lines"),
+            _ => format!("confirmed by {right} lines; {wrong} others, which may have been damaged on the line"),
+        };
+        line(
+            "checksum: sum of the characters behind the lead character, modulo 256",
+            of_sums,
+        );
+        line("region in override and release: 2 digits", list(&self.widths));
+        line(
+            "status byte of BI and BO: bit 6 holds the state, others may mark it as unreliable",
+            format!(
+                "values seen: {}; compare with the states that the drives show",
+                list(&self.states)
+            ),
+        );
+        line(
+            "a drive replies to nothing before Identify (N00)",
+            format!("{} times N00 was answered", self.unidentified),
+        );
+        line("device type 10", list(&self.devices));
+        line(
+            "an overridden AO is released at once",
+            format!("{} overrides, {} releases", self.overrides, self.releases),
+        );
+        let interval = u32::try_from(self.intervals.0).ok().filter(|n| *n > 0);
+        let interval = interval.map(|n| self.intervals.1 / n);
+        line(
+            "polls for changes: 0/4 first, then 0/5",
+            match interval {
+                Some(interval) => format!("{}; every {:.1} s a drive", list(&self.polls), interval.as_secs_f64()),
+                None => list(&self.polls),
+            },
+        );
+        line("no changes: A alone; a report has data", list(&self.reports));
+        line("a float has 8 digits, or 10 with a byte before it", list(&self.floats));
+        line(
+            "an integer has 4 digits, or 6 with a byte before it",
+            list(&self.integers),
+        );
+        line("a refusal has no checksum", list(&self.refusals));
+        line(
+            "any NaN or infinity means that there is no value",
+            list(&self.no_numbers),
+        );
+        let [zero, others] = self.numbers;
+        line(
+            "object numbers are those of the printed maps, from 1",
+            format!("{others} of 1 and more, {zero} of 0"),
+        );
+        line(
+            "time is not synchronised",
+            format!("{} commands with a time", self.times),
+        );
+        line("other commands are not used", format!("{} heard", self.others));
+        out
+    }
+}
+
+fn text(digits: &[u8]) -> String {
+    String::from_utf8_lossy(digits).to_ascii_uppercase()
+}
+
+fn list(seen: &Seen) -> String {
+    if seen.is_empty() {
+        return "not seen".to_string();
+    }
+    let one = |(what, count): (&String, &u64)| format!("{what} ({count} times)");
+    seen.iter().map(one).collect::<Vec<_>>().join(", ")
+}

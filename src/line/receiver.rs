@@ -1,0 +1,65 @@
+//! A line that is only listened to: there is no way to send on it.
+
+use std::os::fd::BorrowedFd;
+use std::time::Instant;
+
+use super::{Level, Line, LineOptions, Lost, Names, OpenError, Rs485, Spin, Woken};
+use crate::codec::LineFormat;
+
+/// How such a port is set up: the kernel switches no direction, and RTS, which enables the driver of many adapters, is lowered.
+/// Linux raises RTS and DTR itself when a port is opened, for the moment until then.
+const OPTIONS: LineOptions = LineOptions {
+    rs485: Rs485::Off,
+    rts_before_send: std::time::Duration::ZERO,
+    rts_after_send: std::time::Duration::ZERO,
+    rx_during_tx: false,
+    termination: false,
+    rts: Level::Off,
+    dtr: Level::Driver,
+    spin: Spin::Off,
+    receives_only: true,
+};
+
+/// An open line that cannot send.
+#[derive(Debug)]
+pub struct Receiver(Line);
+
+impl Receiver {
+    /// Opens the port exclusively; the texts are warnings.
+    ///
+    /// # Errors
+    /// As [`Line::open`].
+    pub fn open(port: &str, format: &LineFormat) -> Result<(Receiver, Vec<String>), OpenError> {
+        Receiver::open_by(&mut Names::default(), port, format, &|| true)
+    }
+
+    /// As [`Line::open_by`].
+    ///
+    /// # Errors
+    /// As [`Line::open`].
+    pub fn open_by(
+        names: &mut Names,
+        port: &str,
+        format: &LineFormat,
+        go_on: &dyn Fn() -> bool,
+    ) -> Result<(Receiver, Vec<String>), OpenError> {
+        let (line, warnings) = Line::open_by(names, port, format, &OPTIONS, go_on)?;
+        Ok((Receiver(line), warnings))
+    }
+
+    /// Reads what is there, without waiting; 0 is nothing.
+    ///
+    /// # Errors
+    /// When the port is gone.
+    pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
+        self.0.receive(buffer)
+    }
+
+    /// Waits for bytes, for `wake`, or for the time.
+    ///
+    /// # Errors
+    /// When the system refuses to wait.
+    pub fn wait(&self, until: Instant, wake: Option<BorrowedFd<'_>>) -> Result<Woken, Lost> {
+        self.0.wait(until, wake, false)
+    }
+}
