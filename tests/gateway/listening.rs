@@ -10,7 +10,7 @@ use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use serde_json::Value as Json;
 
 use crate::support::process::{Running, api, drivegate, get, until};
-use crate::support::site::{HTTP, Site};
+use crate::support::site::{HTTP, Site, nx_in_ascii};
 use crate::support::tools::{python, root, run_well, tool};
 
 /// Exchanges of each master.
@@ -58,7 +58,7 @@ impl Shared {
         let own = "nx-of-this-line";
         let profile = match protocol {
             Protocol::ModbusAscii => {
-                self.site.write("own.toml", &in_ascii(profile, own));
+                self.site.write("own.toml", &nx_in_ascii(own));
                 own
             }
             _ => profile,
@@ -87,16 +87,6 @@ impl Shared {
         self.line.signal("TERM");
         self.line.until_printed("the listener sent")
     }
-}
-
-/// The Vacon NX profile, said to speak Modbus ASCII.
-fn in_ascii(profile: &str, name: &str) -> String {
-    let text = std::fs::read_to_string(root().join(format!("profiles/{profile}.toml"))).unwrap();
-    let changed = text
-        .replace(&format!("name = \"{profile}\""), &format!("name = \"{name}\""))
-        .replace("protocols = [\"modbus-rtu\"]", "protocols = [\"modbus-ascii\"]");
-    assert!(changed.contains(name) && changed.contains("modbus-ascii"));
-    changed
 }
 
 /// The lines that a master printed, as address or kind, number, values.

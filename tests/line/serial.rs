@@ -6,7 +6,7 @@ use std::path::{Path, PathBuf};
 use serde_json::Value;
 
 use crate::support::process::{self, Running, get, mbpoll_read, read_registers, until, write_registers};
-use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
+use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site, nx_in_ascii};
 use crate::support::tools::{python, root, tool};
 
 /// What `drivegate` printed on stdout and stderr.
@@ -143,23 +143,13 @@ fn a_pymodbus_slave_in_rtu() {
     reads_and_writes_pymodbus("modbus-rtu", "rtu", "8N1");
 }
 
-/// The Vacon NX profile, said to speak Modbus ASCII.
-fn nx_in_ascii() -> String {
-    let text = std::fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
-    let changed = text
-        .replace("name = \"vacon-nx\"", "name = \"nx-ascii\"")
-        .replace("protocols = [\"modbus-rtu\"]", "protocols = [\"modbus-ascii\"]");
-    assert!(changed.contains("nx-ascii") && changed.contains("modbus-ascii"));
-    changed
-}
-
 #[test]
 fn simulated_drives_in_ascii_run_and_meet_faults() {
     let site = site(
         "protocol = \"modbus-ascii\"\nbaud = 38400\nretries = 2\nresponse_timeout = \"1s\"",
         "nx-ascii",
     );
-    site.write("nx-ascii.toml", &nx_in_ascii());
+    site.write("nx-ascii.toml", &nx_in_ascii("nx-ascii"));
     let file = site.config();
     let simulate = |faults: &str| {
         let arguments = ["simulate", "--config", &file, "--turnaround", "15ms", "--fault", faults];

@@ -12,7 +12,7 @@ use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use tempfile::TempDir;
 
 use super::process::{Running, api, free_port, get, until, until_ready};
-use super::tools::{run, run_well, tool};
+use super::tools::{root, run, run_well, tool};
 
 /// The gateway and its bus `line1`; a reply that comes late on a busy machine still comes in time.
 pub(crate) const LINE1: &str = "[gateway]\nname = \"test\"\nprofile_dirs = [\".\"]\n\
@@ -31,6 +31,16 @@ pub(crate) fn drive(name: &str, address: u8, keys: &str) -> String {
 /// One that takes commands.
 pub(crate) fn controlled(name: &str, address: u8, keys: &str) -> String {
     drive(name, address, &format!("access = \"control\"\n{keys}"))
+}
+
+/// The Vacon NX profile under another name, said to speak Modbus ASCII.
+pub(crate) fn nx_in_ascii(name: &str) -> String {
+    let text = std::fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
+    let changed = text
+        .replace("name = \"vacon-nx\"", &format!("name = \"{name}\""))
+        .replace("protocols = [\"modbus-rtu\"]", "protocols = [\"modbus-ascii\"]");
+    assert!(changed.contains(name) && changed.contains("modbus-ascii"));
+    changed
 }
 
 pub(crate) struct Site {

@@ -117,7 +117,11 @@ pub(super) fn check_new(file: &Path) -> Result<(), String> {
 pub(super) fn write_new(file: &Path, text: &str) -> Result<(), String> {
     check_new(file)?;
     let opened = std::fs::File::options().write(true).create_new(true).open(file);
-    let written = opened.and_then(|mut opened| opened.write_all(text.as_bytes()));
+    let written = opened.and_then(|mut opened| {
+        // Half a file would be in the way of the next try.
+        let remove = |_: &std::io::Error| drop(std::fs::remove_file(file));
+        opened.write_all(text.as_bytes()).inspect_err(remove)
+    });
     written.map_err(|why| {
         format!(
             "cannot write {}: {why}; choose another name or directory",
