@@ -21,7 +21,9 @@ use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{RecorderTask, Recordings};
 use crate::north::local::Control;
+use crate::north::parameters::keep_reading;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
+use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 
@@ -63,6 +65,10 @@ pub struct Daemon {
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
+    /// Readings of parameters.
+    vault: Arc<Vault>,
+    /// Reads parameters every so often.
+    reader: Option<tokio::task::JoinHandle<()>>,
     recorder: Option<RecorderTask>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
@@ -90,6 +96,7 @@ impl Daemon {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
+        let vault = Arc::new(Vault::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
@@ -97,6 +104,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            parameters: vault.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
@@ -111,6 +119,8 @@ impl Daemon {
             http: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
+            vault,
+            reader: None,
             recorder: None,
             reporter: report_refusals(shared),
             pulse: Pulse::default(),
@@ -121,6 +131,7 @@ impl Daemon {
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
+        daemon.apply_params(&settings);
         daemon.replace_buses(&settings, prepared).await;
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -177,6 +188,7 @@ impl Daemon {
         self.replace_buses(&settings, prepared).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
+        self.apply_params(&settings);
         self.apply_audit(&settings).await;
         let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
@@ -239,6 +251,7 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            parameters: self.vault.clone(),
         }));
         if let Some(recorder) = &self.recorder {
             recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
@@ -282,6 +295,21 @@ impl Daemon {
             self.recorder = Some(started.map_err(StartError::Recorder)?);
         }
         Ok(())
+    }
+
+    /// Reads parameters every so often, where that is configured.
+    fn apply_params(&mut self, settings: &Settings) {
+        let params = &settings.params;
+        self.vault
+            .configure(Some(Store::new(params.dir.clone())), params.names.clone());
+        if self.reader.is_some() && self.settings.params.every == params.every {
+            return;
+        }
+        if let Some(reader) = self.reader.take() {
+            reader.abort();
+        }
+        let every = params.every;
+        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
     }
 
     /// Prepares the servers that listen on the network: all of them or none.
@@ -367,6 +395,9 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
+        if let Some(reader) = &self.reader {
+            reader.abort();
+        }
         // What is held back, whenever it would be due.
         self.plant
             .load()

@@ -64,11 +64,13 @@ pub enum EventKind {
     ReloadRefused,
     /// The other master of a line commands a drive.
     ForeignCommand,
+    /// Parameters changed that the gateway did not write.
+    ParametersChanged,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 20] = [
+    pub const ALL: [EventKind; 21] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -89,6 +91,7 @@ impl EventKind {
         EventKind::Recording,
         EventKind::ReloadRefused,
         EventKind::ForeignCommand,
+        EventKind::ParametersChanged,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -113,7 +116,8 @@ impl EventKind {
             | EventKind::RefusedCommand
             | EventKind::BusUp
             | EventKind::Recording
-            | EventKind::ForeignCommand => false,
+            | EventKind::ForeignCommand
+            | EventKind::ParametersChanged => false,
         }
     }
 
@@ -140,6 +144,7 @@ impl EventKind {
             EventKind::Recording => "recording",
             EventKind::ReloadRefused => "reload_refused",
             EventKind::ForeignCommand => "foreign_command",
+            EventKind::ParametersChanged => "parameters_changed",
         }
     }
 }
@@ -367,8 +372,8 @@ mod tests {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown | Recording | ReloadRefused => false,
-                ForeignCommand => true,
+                | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                ParametersChanged => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

@@ -18,6 +18,7 @@ mod loading;
 mod local_client;
 mod log;
 mod map;
+mod params;
 mod printable;
 mod profiles;
 mod read;
@@ -107,6 +108,7 @@ commands! {
     Why => why,
     Record => record,
     Recordings => recordings,
+    Params => params,
     Watch => watch,
     Trace => trace,
     Replay => replay,

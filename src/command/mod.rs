@@ -52,11 +52,13 @@ pub enum SourceKind {
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
+    /// What the gateway does every so often. It reads only.
+    Schedule,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 8] = [
+    pub const ALL: [SourceKind; 9] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -65,6 +67,7 @@ impl SourceKind {
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
         SourceKind::OtherMaster,
+        SourceKind::Schedule,
     ];
 
     /// The label of metrics and audit lines.
@@ -78,6 +81,7 @@ impl SourceKind {
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
             SourceKind::OtherMaster => "other_master",
+            SourceKind::Schedule => "schedule",
         }
     }
 }

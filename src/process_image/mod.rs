@@ -159,6 +159,8 @@ pub struct DriveImage {
     heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
     unsupervised: AtomicBool,
+    /// Values of parameters that the gateway wrote since they were read last, by address.
+    written: Mutex<BTreeMap<u16, u16>>,
 }
 
 impl DriveImage {
@@ -179,7 +181,27 @@ impl DriveImage {
             heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
+            written: Mutex::default(),
         }
+    }
+
+    /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
+    pub(crate) fn note_written(&self, items: &[(u16, u16)]) {
+        let parameters = &self.spec.profile.parameters;
+        let is_parameter = |address: u16| parameters.id(address).is_some();
+        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.extend(items.iter().copied().filter(|(address, _)| is_parameter(*address)));
+    }
+
+    /// The value that the gateway wrote to that parameter since the parameters were read last.
+    pub fn written(&self, address: u16) -> Option<u16> {
+        let written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.get(&address).copied()
+    }
+
+    /// The parameters were read.
+    pub fn forget_written(&self) {
+        self.written.lock().unwrap_or_else(PoisonError::into_inner).clear();
     }
 
     /// Process data is not stale before that age: the line cannot renew it faster.

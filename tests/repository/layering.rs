@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 16] = [
+const ROOMS: [&str; 17] = [
     "document",
     "codec",
     "drive",
@@ -17,6 +17,7 @@ const ROOMS: [&str; 16] = [
     "process_image",
     "command",
     "history",
+    "parameters",
     "plant",
     "line",
     "bus",

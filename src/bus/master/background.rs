@@ -7,7 +7,7 @@ use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::Admission;
 use crate::bus::transaction::Ended;
-use crate::codec::{Exception, Reply};
+use crate::codec::{Exception, Reply, Table};
 use crate::command::{BackgroundRequest, Interruption, Outcome, Pace, Urgency, written};
 use crate::drive::PlannedRead;
 use crate::drive::plan::WireTime;
@@ -194,6 +194,10 @@ impl Master {
             }
         }
         if let Some((table, items)) = written(&turn.pdu) {
+            let image = self.bus.image.drives.get(turn.drive);
+            if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
+                image.note_written(&items);
+            }
             let covers = |read: &PlannedRead| items.iter().any(|(address, _)| read.covers(table, *address));
             self.schedule.refresh(turn.drive, covers, now);
         }

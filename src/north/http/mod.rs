@@ -9,6 +9,7 @@ mod hosts;
 mod in_use;
 mod offline;
 mod page;
+mod params;
 mod routes;
 mod streams;
 mod terms;

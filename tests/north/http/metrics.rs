@@ -56,6 +56,7 @@ const FROZEN: [&str; 52] = [
     "drivegate_point_value gauge bus,drive,point,unit",
     "drivegate_supervision_actions_total counter bus,drive",
     "drivegate_write_seconds histogram ",
+    "drivegate_parameters_changed_total counter bus,drive",
     "drivegate_recordings_total counter trigger",
     "drivegate_writes_total counter result,source",
     "process_cpu_seconds_total counter ",
