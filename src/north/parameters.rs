@@ -219,7 +219,7 @@ const LOOK: Duration = Duration::from_secs(10);
 
 /// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.
 pub async fn keep_reading(plant: SharedPlant, every: Duration) {
-    let mut begun: BTreeMap<String, Instant> = BTreeMap::new();
+    let mut begun: BTreeMap<String, SystemTime> = BTreeMap::new();
     loop {
         let plant_now = plant.load_full();
         let vault = plant_now.parameters.clone();
@@ -236,17 +236,18 @@ pub async fn keep_reading(plant: SharedPlant, every: Duration) {
             for drive in of_bus {
                 let name = drive.image.spec.name.clone();
                 let online = drive.image.snapshot().link.is_online();
-                let failed = vault
-                    .status(&name)
-                    .is_some_and(|status| matches!(status.result, Some(Err(_))));
-                let is_due = match begun.get(&name) {
-                    Some(at) if failed => at.elapsed() >= every.min(AGAIN),
-                    Some(at) => at.elapsed() >= every,
-                    None => is_old(latest(vault.store(), name.clone()).await.as_ref(), every),
-                };
+                if !begun.contains_key(&name) {
+                    let last = latest(vault.store(), name.clone()).await;
+                    begun.extend(read_at(last.as_ref()).map(|at| (name.clone(), at)));
+                }
+                let failed = matches!(vault.status(&name).and_then(|status| status.result), Some(Err(_)));
+                let pause = if failed { every.min(AGAIN) } else { every };
+                // A clock that was set back leaves the next reading to the time it has lost.
+                let is_due = |at: &SystemTime| at.elapsed().is_ok_and(|age| age >= pause);
+                let is_due = begun.get(&name).is_none_or(is_due);
                 if is_due && online {
                     let origin = Origin::new(SourceKind::Schedule, "every");
-                    begun.insert(name, Instant::now());
+                    begun.insert(name, SystemTime::now());
                     // It has parameters, and its line is the gateway's.
                     let how = How {
                         afresh: false,
@@ -261,8 +262,7 @@ pub async fn keep_reading(plant: SharedPlant, every: Duration) {
     }
 }
 
-/// Whether a reading is as old as that, or its time is not known.
-fn is_old(file: Option<&ParameterFile>, every: Duration) -> bool {
-    let time = file.and_then(|file| humantime::parse_rfc3339(&file.time).ok());
-    time.is_none_or(|time| time.elapsed().is_ok_and(|age| age >= every))
+/// When a reading was made.
+fn read_at(file: Option<&ParameterFile>) -> Option<SystemTime> {
+    humantime::parse_rfc3339(&file?.time).ok()
 }

@@ -198,6 +198,8 @@ impl ParameterFile {
         let mut file = ParameterFile::default();
         let mut checksum = String::new();
         for (number, line) in lines {
+            // A terminal is to show nothing but text.
+            let line = one_line(line);
             let line = line.trim();
             if line.is_empty() || line.starts_with('#') {
                 continue;

@@ -12,12 +12,6 @@ const LOOK: Duration = Duration::from_millis(250);
 /// Cadence of process data on a bus of its own.
 const RESTFUL: Duration = Duration::from_secs(1);
 
-/// Which way the reading was begun.
-enum Begun {
-    Gateway,
-    Direct(Direct),
-}
-
 impl Target {
     /// Reads all parameters of the drive, afresh, briskly, or neither; the text of the file. `progress` is told how far it is.
     ///
@@ -45,15 +39,15 @@ impl Target {
                 brisk,
             })
         };
-        let (mut outcome, begun) = match gateway::ask(self, &request(true)).await? {
-            Ok(outcome) => (outcome, Begun::Gateway),
+        let (mut outcome, direct) = match gateway::ask(self, &request(true)).await? {
+            Ok(outcome) => (outcome, None),
             Err(not_found) => {
                 log_audit_only();
                 // Nobody looks at its process data: the line is there for the parameters.
                 let mut alone = self.clone();
                 alone.bus.spec.cycle = RESTFUL.max(alone.bus.spec.cycle);
                 let direct = Direct::start(&alone, &not_found).await?;
-                (direct.ask(&request(true)).await, Begun::Direct(direct))
+                (direct.ask(&request(true)).await, Some(direct))
             }
         };
         let text = loop {
@@ -69,9 +63,9 @@ impl Target {
                 other => break Err(other.not_asked_for()),
             }
             tokio::time::sleep(LOOK).await;
-            outcome = match &begun {
-                Begun::Direct(direct) => direct.ask(&request(false)).await,
-                Begun::Gateway => match gateway::ask(self, &request(false)).await {
+            outcome = match &direct {
+                Some(direct) => direct.ask(&request(false)).await,
+                None => match gateway::ask(self, &request(false)).await {
                     Ok(Ok(outcome)) => outcome,
                     Ok(Err(gone)) => {
                         break Err(format!("the gateway is gone: {}; the local socket; try again", gone.0));
@@ -80,7 +74,7 @@ impl Target {
                 },
             };
         };
-        if let Begun::Direct(direct) = begun {
+        if let Some(direct) = direct {
             direct.stop().await;
         }
         text
