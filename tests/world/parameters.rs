@@ -144,7 +144,7 @@ fn what_is_read_is_what_the_drive_has() {
         }
         assert_eq!(differences(&first, &second).len(), changed);
         assert!(
-            line.protocol == Protocol::N2 || changed > 5,
+            line.protocol == Protocol::N2 || changed > 3,
             "{}: {changed}",
             line.family
         );
@@ -179,8 +179,7 @@ fn nothing_is_written_by_reading() {
 fn a_reading_goes_on_after_outages_and_noise_and_is_true() {
     for seed in 0..20 {
         let mut random = Random::new(seed);
-        let [_, _, _, teco, ..] = families();
-        let mut rig = ready(&teco);
+        let mut rig = ready(&line("teco-7300pa", Protocol::ModbusAscii, 19_200, 1));
         rig.set_faults(FaultPlan::new("drop=0.05,corrupt=0.05".parse().unwrap(), seed));
         let file = rig.read_parameters(BTreeSet::new(), |rig| match random.within(0..=12) {
             0 => {
@@ -213,8 +212,7 @@ fn a_reading_goes_on_after_outages_and_noise_and_is_true() {
 
 #[test]
 fn another_application_is_found_out() {
-    let [nx, ..] = families();
-    let mut rig = ready(&nx);
+    let mut rig = ready(&line("vacon-nx", Protocol::ModbusRtu, 38_400, 1));
     // An earlier reading found one that this application has not.
     let known = BTreeSet::from([100, 101, 399]);
     let file = rig.read_parameters(known, |_| ());
