@@ -33,6 +33,9 @@ impl Names {
             if number == 1 && field(0).eq_ignore_ascii_case("id") {
                 continue;
             }
+            if field(0).is_empty() || fields.len() > 4 {
+                return Err(format!("line {number}: expected id, name, unit, scale"));
+            }
             let scale = match field(3) {
                 "" => 0.0,
                 text => text
@@ -41,9 +44,6 @@ impl Names {
                     .filter(|scale: &f64| scale.is_finite() && *scale > 0.0)
                     .ok_or_else(|| format!("line {number}: the scale `{text}` is not a number above 0"))?,
             };
-            if field(0).is_empty() || fields.len() > 4 {
-                return Err(format!("line {number}: expected id, name, unit, scale"));
-            }
             let label = Label {
                 name: field(1).to_string(),
                 unit: field(2).to_string(),
