@@ -1,8 +1,8 @@
 use serde_json::Value as Json;
 
 use super::super::fixture;
-use super::memory::REMEMBERED;
 use super::*;
+use crate::north::command_json::REMEMBERED;
 use crate::codec::Reply as BusReply;
 use crate::command::{Outcome, Receipt, Urgency};
 
