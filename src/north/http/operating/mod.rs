@@ -72,7 +72,7 @@ pub(super) struct Operating {
 struct State {
     sessions: Sessions,
     throttle: Throttle,
-    /// Passwords that were right: their keyed hash, whose they are, and until when.
+    /// Passwords that were right: their keyed hash, whose they are, and until when they need not be hashed.
     verified: HashMap<[u8; 32], (Arc<str>, Instant)>,
     /// Addresses from which a user did something, who and when.
     operators: HashMap<IpAddr, (Arc<str>, Instant)>,
@@ -265,10 +265,13 @@ impl Operating {
             return Err(Denied::NotLoggedIn);
         };
         let mark = self.mark(given);
-        let known = mark.and_then(|mark| self.state().verified.get(&mark).cloned());
-        if let Some((user, _)) = known.filter(|(_, until)| Instant::now() < *until) {
-            return Ok(user);
-        }
+        let known = mark.and_then(|mark| Some((mark, self.state().verified.get(&mark).cloned()?)));
+        let source = match known {
+            Some((_, (user, until))) if Instant::now() < until => return Ok(user),
+            // It was right before: whoever else fails at this address does not hold it up.
+            Some((mark, _)) => Source::Known(self.hasher.hash_one(mark)),
+            None => source,
+        };
         let name = self.hasher.hash_one(&given.user);
         let failures = self.state().throttle.begin(source, name, Instant::now());
         let failures = failures.map_err(Denied::TooMany)?;
@@ -337,7 +340,7 @@ impl Operating {
 
 impl State {
     fn remember(&mut self, mark: [u8; 32], user: &Arc<str>, now: Instant) {
-        self.verified.retain(|_, (_, until)| now < *until);
+        // There are no more of them than users, each of which has one password.
         if self.verified.len() < MOST {
             self.verified.insert(mark, (user.clone(), now + VERIFIED));
         }
