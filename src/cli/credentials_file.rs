@@ -22,7 +22,8 @@ impl CredentialsFile<'_> {
     /// What is wrong with it, for the user.
     pub(super) fn read(&self) -> Result<String, String> {
         let (what, shown) = (self.what, self.path.display());
-        read_to_string(self.path).map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
+        read_to_string(self.path)
+            .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
     }
 
     /// Its text with another line; the file need not exist yet.
@@ -66,7 +67,12 @@ impl CredentialsFile<'_> {
         let new = PathBuf::from(name);
         let mode = metadata(self.path).map_or(self.mode, |metadata| metadata.permissions().mode() & 0o777);
         let mut options = OpenOptions::new();
-        let file = options.write(true).create_new(true).mode(mode).open(&new).map_err(failed)?;
+        let file = options
+            .write(true)
+            .create_new(true)
+            .mode(mode)
+            .open(&new)
+            .map_err(failed)?;
         let written = { &file }
             .write_all(text.as_bytes())
             .and_then(|()| file.sync_all())

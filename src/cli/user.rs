@@ -95,10 +95,12 @@ fn add(path: &Path, name: &str) -> Result<String, String> {
         false => file(path).with_line(&line)?,
         true => {
             let text = file(path).read()?;
-            let replaced = text.lines().map(|old| match old.split_whitespace().next() == Some(name) {
-                true => format!("{line}\n"),
-                false => format!("{old}\n"),
-            });
+            let replaced = text
+                .lines()
+                .map(|old| match old.split_whitespace().next() == Some(name) {
+                    true => format!("{line}\n"),
+                    false => format!("{old}\n"),
+                });
             replaced.collect()
         }
     };

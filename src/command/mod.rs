@@ -13,8 +13,8 @@ mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
-pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
+pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 

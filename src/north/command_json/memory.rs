@@ -124,8 +124,7 @@ impl<R: Clone> Memory<R> {
         now: Instant,
     ) -> Option<Repetition<R>> {
         self.forget(now);
-        let marked =
-            |known: &&Recent<R>| taken.dup && known.packet == taken.packet && known.fingerprint == print.whole;
+        let marked = |known: &&Recent<R>| taken.dup && known.packet == taken.packet && known.fingerprint == print.whole;
         let by_id = print
             .identity
             .and_then(|(_, content)| self.known.get(&content).copied());
@@ -176,7 +175,13 @@ impl<R: Clone> Memory<R> {
     }
 
     /// Remembers a command that is taken at `now`; returns its number.
-    pub(in crate::north) fn remember(&mut self, taken: &Taken<'_>, print: Fingerprint, stops: u64, now: Instant) -> u64 {
+    pub(in crate::north) fn remember(
+        &mut self,
+        taken: &Taken<'_>,
+        print: Fingerprint,
+        stops: u64,
+        now: Instant,
+    ) -> u64 {
         self.taken += 1;
         let number = self.taken;
         if self.recent.len() == RECENT {

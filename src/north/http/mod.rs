@@ -315,9 +315,9 @@ impl ConnectionHandler for HttpConnections {
             Instant::now(),
         );
         limits.into_iter().find_map(|(limit, coverage)| {
-            let permit = self
-                .refusals
-                .acquire(limit, newcomer, remedy, || Some(self.operating.authority_at(address, now)))?;
+            let permit = self.refusals.acquire(limit, newcomer, remedy, || {
+                Some(self.operating.authority_at(address, now))
+            })?;
             permit.place().use_at(now, false);
             Some(HttpPermit { permit, coverage })
         })
@@ -372,7 +372,9 @@ impl HttpConnections {
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
             // Somebody may have logged in, or out, since the connection came.
-            place.rights().set(self.operating.authority_at(peer.ip(), Instant::now()));
+            place
+                .rights()
+                .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
             let reply = router.call(request);

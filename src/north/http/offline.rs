@@ -39,7 +39,12 @@ impl Offline {
     /// # Errors
     /// The system does not provide what a timer needs.
     pub fn new(plant: SharedPlant) -> io::Result<Offline> {
-        let router = routes::router(plant, Default::default(), Arc::new(Operating::new()), CancellationToken::new());
+        let router = routes::router(
+            plant,
+            Default::default(),
+            Arc::new(Operating::new()),
+            CancellationToken::new(),
+        );
         let service = TowerToHyperService::new(router);
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
         let reached = Reached {

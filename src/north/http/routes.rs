@@ -96,7 +96,11 @@ pub(super) fn router(
         ("/assets/page.js", "text/javascript; charset=utf-8", page::SCRIPT),
         ("/assets/icon.svg", "image/svg+xml", page::ICON),
         ("/assets/operate.css", "text/css; charset=utf-8", page::OPERATE_STYLE),
-        ("/assets/operate.js", "text/javascript; charset=utf-8", page::OPERATE_SCRIPT),
+        (
+            "/assets/operate.js",
+            "text/javascript; charset=utf-8",
+            page::OPERATE_SCRIPT,
+        ),
     ];
     let assets = assets.into_iter().fold(Router::new(), |router, (path, kind, text)| {
         router.route(path, get(move || asset(kind, text)))
@@ -191,7 +195,12 @@ async fn refused(
             return None;
         }
         let cookies = app.cookies(reached);
-        if app.operating.operator(&headers, &cookies, reached.peer.ip()).await.is_ok() {
+        if app
+            .operating
+            .operator(&headers, &cookies, reached.peer.ip())
+            .await
+            .is_ok()
+        {
             return None;
         }
         if path == "/" {

@@ -54,7 +54,9 @@ pub enum UserError {
     #[error("there are more than {MOST} users")]
     Many,
     /// A password that is easily guessed, or no text.
-    #[error("a password has at least {MIN_PASSWORD} characters, at most {MAX_PASSWORD} bytes and no control characters")]
+    #[error(
+        "a password has at least {MIN_PASSWORD} characters, at most {MAX_PASSWORD} bytes and no control characters"
+    )]
     Password,
     /// The system does not provide them.
     #[error("the system has no random numbers")]
@@ -91,13 +93,17 @@ impl User {
 
 /// Whether this is the password behind that hash. Takes as long as the hash asks for, whatever the password.
 pub(super) fn is_password(hash: &str, password: &str) -> bool {
-    let Ok(hash) = PasswordHash::new(hash) else { return false };
+    let Ok(hash) = PasswordHash::new(hash) else {
+        return false;
+    };
     Argon2::default().verify_password(password.as_bytes(), &hash).is_ok()
 }
 
 /// Whether that is a hash that may be computed.
 fn is_affordable(hash: &str) -> bool {
-    let Ok(hash) = PasswordHash::new(hash) else { return false };
+    let Ok(hash) = PasswordHash::new(hash) else {
+        return false;
+    };
     let (memory, passes, lanes) = MOST_COST;
     let fits = |p: Params| p.m_cost() <= memory && p.t_cost() <= passes && p.p_cost() <= lanes;
     let complete = hash.salt.is_some() && hash.hash.is_some();
@@ -220,14 +226,18 @@ mod tests {
         for (text, line, error) in [
             ("alice".to_string(), 1, UserError::Form),
             (format!("alice {FOREIGN} x"), 1, UserError::Form),
-            (
-                format!("#\na/b {FOREIGN}"),
-                2,
-                UserError::Name("a/b".to_string()),
-            ),
+            (format!("#\na/b {FOREIGN}"), 2, UserError::Name("a/b".to_string())),
             (format!("alice {}", &FOREIGN[1..]), 1, UserError::Hash),
-            (format!("alice {}", FOREIGN.replace("argon2id", "argon2i")), 1, UserError::Hash),
-            (format!("alice {}", FOREIGN.rsplit_once('$').unwrap().0), 1, UserError::Hash),
+            (
+                format!("alice {}", FOREIGN.replace("argon2id", "argon2i")),
+                1,
+                UserError::Hash,
+            ),
+            (
+                format!("alice {}", FOREIGN.rsplit_once('$').unwrap().0),
+                1,
+                UserError::Hash,
+            ),
             (format!("alice {}", with("m=65537,t=2,p=1")), 1, UserError::Hash),
             (format!("alice {}", with("m=4294967295,t=2,p=1")), 1, UserError::Hash),
             (format!("alice {}", with("m=64,t=17,p=1")), 1, UserError::Hash),

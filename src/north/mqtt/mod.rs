@@ -19,7 +19,7 @@ mod client;
 mod commands;
 mod connection;
 #[cfg(test)]
-mod fixture;
+pub(super) mod fixture;
 mod history;
 mod home_assistant;
 mod journal;

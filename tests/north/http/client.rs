@@ -81,7 +81,9 @@ fn unchunked(mut body: &str) -> String {
 /// Sends a POST with a body on a connection of its own and reads to its end.
 pub(crate) async fn post(address: SocketAddr, path: &str, headers: &str, body: &str) -> Reply {
     let length = body.len();
-    let head = format!("POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}Content-Length: {length}\r\n\r\n");
+    let head = format!(
+        "POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}Content-Length: {length}\r\n\r\n"
+    );
     raw(address, &(head + body)).await
 }
 

@@ -31,7 +31,9 @@ struct Rig {
 }
 
 fn users(names: &[&str]) -> Users {
-    let lines = names.iter().map(|name| User::new(name, PASSWORD).unwrap().to_string() + "\n");
+    let lines = names
+        .iter()
+        .map(|name| User::new(name, PASSWORD).unwrap().to_string() + "\n");
     Users::parse(&lines.collect::<String>()).unwrap()
 }
 
@@ -96,7 +98,11 @@ fn cookie(reply: &Reply, name: &str) -> String {
         let (key, value) = line.split_once(": ")?;
         (key.eq_ignore_ascii_case("set-cookie") && value.starts_with(name)).then(|| value.to_string())
     };
-    reply.head.lines().find_map(set).unwrap_or_else(|| panic!("no {name} in {}", reply.head))
+    reply
+        .head
+        .lines()
+        .find_map(set)
+        .unwrap_or_else(|| panic!("no {name} in {}", reply.head))
 }
 
 fn session_of(login: &Reply) -> String {
@@ -122,7 +128,11 @@ async fn without_users_nothing_of_it_is_there() {
     }
     for path in ["/api/v1/login", "/api/v1/logout", PUMP, HEARTBEAT, "/"] {
         let reply = post(rig.address(), path, BASIC, STOP).await;
-        assert_eq!((reply.status, reply.header("allow")), (405, Some("GET, HEAD")), "{path}");
+        assert_eq!(
+            (reply.status, reply.header("allow")),
+            (405, Some("GET, HEAD")),
+            "{path}"
+        );
         assert_eq!(reply.body, "this interface is read only: use GET or HEAD\n");
     }
     let page = get(rig.address(), "/").await.body;
@@ -134,7 +144,10 @@ async fn without_users_nothing_of_it_is_there() {
 async fn a_user_logs_in_commands_and_logs_out() {
     let rig = Rig::new().await;
     let page = get(rig.address(), "/").await.body;
-    assert!(page.contains("assets/operate.js") && !page.contains("read only"), "{page}");
+    assert!(
+        page.contains("assets/operate.js") && !page.contains("read only"),
+        "{page}"
+    );
     assert_eq!(get(rig.address(), "/assets/operate.js").await.status, 200);
     let nobody = get(rig.address(), "/api/v1/session").await.json();
     assert!(nobody["user"].is_null());
@@ -145,17 +158,28 @@ async fn a_user_logs_in_commands_and_logs_out() {
     let session = request(rig.address(), "GET", "/api/v1/session", &alice).await.json();
     assert_eq!(session["user"], "alice");
     assert!(session["expires_in"].as_u64().unwrap() > 1000);
-    let started = rig.command(&alice, "{\"id\": 7, \"run\": true, \"speed_reference\": 50}").await;
+    let started = rig
+        .command(&alice, "{\"id\": 7, \"run\": true, \"speed_reference\": 50}")
+        .await;
     assert_eq!(started.status, 200, "{}", started.body);
     let result = started.json();
-    assert_eq!((&result["id"], &result["drive"], &result["ok"]), (&7.into(), &"pump-1".into(), &true.into()));
+    assert_eq!(
+        (&result["id"], &result["drive"], &result["ok"]),
+        (&7.into(), &"pump-1".into(), &true.into())
+    );
     assert_eq!(result["result"], "acknowledged", "nothing confirms it on this bus");
     assert_eq!(rig.bus.orders().len(), 1);
     let audit = get(rig.address(), "/api/v1/audit").await.json();
     let record = audit.as_array().unwrap().last().unwrap();
-    assert_eq!((&record["source"], &record["client"]), (&"http".into(), &"alice 127.0.0.1".into()));
+    assert_eq!(
+        (&record["source"], &record["client"]),
+        (&"http".into(), &"alice 127.0.0.1".into())
+    );
     let about = request(rig.address(), "GET", PUMP, &alice).await.json();
-    assert_eq!((&about["lease_ms"], &about["commanded_last"]), (&5000.into(), &true.into()));
+    assert_eq!(
+        (&about["lease_ms"], &about["commanded_last"]),
+        (&5000.into(), &true.into())
+    );
 
     let out = post(rig.address(), "/api/v1/logout", &alice, "").await;
     assert_eq!(out.status, 204);
@@ -163,7 +187,11 @@ async fn a_user_logs_in_commands_and_logs_out() {
     for path in [PUMP, HEARTBEAT] {
         let reply = post(rig.address(), path, &alice, STOP).await;
         assert_eq!(reply.status, 401, "{path}");
-        assert_eq!(reply.header("www-authenticate"), Some("Session realm=\"drivegate\""), "no login by the browser");
+        assert_eq!(
+            reply.header("www-authenticate"),
+            Some("Session realm=\"drivegate\""),
+            "no login by the browser"
+        );
     }
     assert_eq!(rig.bus.orders(), []);
 }
@@ -198,7 +226,10 @@ async fn results_have_their_status() {
         assert_eq!((reply.status, &reply.json()["result"]), (status, &code.into()));
     }
     let not_served = post(rig.address(), "/api/v1/drives", &alice, STOP).await;
-    assert_eq!((not_served.status, not_served.body.as_str()), (405, "this is read only: use GET or HEAD\n"));
+    assert_eq!(
+        (not_served.status, not_served.body.as_str()),
+        (405, "this is read only: use GET or HEAD\n")
+    );
 }
 
 /// curl is a client that has nothing of this one; the body is that of the MQTT set topics.
@@ -207,7 +238,16 @@ async fn a_program_commands_with_its_password() {
     let rig = Rig::new().await;
     let url = format!("http://{}{PUMP}", rig.address());
     let curl = async |user: &str| {
-        let arguments = ["-sS", "--max-time", "120", "-u", user, "-d", "{\"run\": false, \"id\": \"a\"}", &url];
+        let arguments = [
+            "-sS",
+            "--max-time",
+            "120",
+            "-u",
+            user,
+            "-d",
+            "{\"run\": false, \"id\": \"a\"}",
+            &url,
+        ];
         let arguments = arguments.map(str::to_string);
         let ran = tokio::task::spawn_blocking(move || run(&tool("curl"), &arguments.each_ref().map(String::as_str)));
         String::from_utf8(ran.await.unwrap().stdout).unwrap()
@@ -219,7 +259,12 @@ async fn a_program_commands_with_its_password() {
     assert_eq!(rig.bus.orders().len(), 3, "a stop is always executed");
     assert!(curl("alice:wrong horse").await.contains("wrong user or password"));
     assert!(curl("carol:correct horse").await.contains("wrong user or password"));
-    for header in ["", "Authorization: Bearer x\r\n", "Authorization: Basic !\r\n", "Authorization: Basic YQ==\r\n"] {
+    for header in [
+        "",
+        "Authorization: Bearer x\r\n",
+        "Authorization: Basic !\r\n",
+        "Authorization: Basic YQ==\r\n",
+    ] {
         assert_eq!(rig.command(header, STOP).await.status, 401, "{header}");
     }
     assert_eq!(rig.bus.orders(), []);
@@ -237,7 +282,10 @@ async fn pages_of_others_command_nothing() {
         (format!("{alice}Origin: http://localhost.evil.example\r\n"), 403),
         (format!("{alice}Origin: http://localhost:8080\r\n"), 403),
         (format!("{alice}Origin: null\r\n"), 403),
-        (format!("{alice}Origin: http://localhost\r\nOrigin: http://evil.example\r\n"), 403),
+        (
+            format!("{alice}Origin: http://localhost\r\nOrigin: http://evil.example\r\n"),
+            403,
+        ),
         (format!("{alice}Sec-Fetch-Site: cross-site\r\n"), 403),
         (format!("{alice}Sec-Fetch-Site: same-site\r\n"), 403),
         (format!("{cookie}\r\n"), 403),
@@ -255,14 +303,31 @@ async fn pages_of_others_command_nothing() {
     let out = post(rig.address(), "/api/v1/logout", &format!("{cookie}\r\n"), "").await;
     assert_eq!(out.status, 403, "nobody is logged out by a page of others");
     // What a form of another page can send.
-    for kind in ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x"] {
+    for kind in [
+        "text/plain",
+        "application/x-www-form-urlencoded",
+        "multipart/form-data; boundary=x",
+    ] {
         let body = format!("{{\"user\": \"alice\", \"password\": \"{PASSWORD}\"}}");
-        let reply = post(rig.address(), "/api/v1/login", &format!("Content-Type: {kind}\r\n"), &body).await;
+        let reply = post(
+            rig.address(),
+            "/api/v1/login",
+            &format!("Content-Type: {kind}\r\n"),
+            &body,
+        )
+        .await;
         assert_eq!(reply.status, 400, "{kind}");
     }
-    assert_eq!(rig.try_login("alice", PASSWORD, "Origin: http://evil.example\r\n").await.status, 403);
+    assert_eq!(
+        rig.try_login("alice", PASSWORD, "Origin: http://evil.example\r\n")
+            .await
+            .status,
+        403
+    );
     // Its own name, or a preflight for it: the host is checked before everything.
-    let rebound = format!("POST {PUMP} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n{alice}Content-Length: 14\r\n\r\n{STOP}");
+    let rebound = format!(
+        "POST {PUMP} HTTP/1.1\r\nHost: evil.example\r\nConnection: close\r\n{alice}Content-Length: 14\r\n\r\n{STOP}"
+    );
     assert_eq!(raw(rig.address(), &rebound).await.status, 421);
     let preflight = request(rig.address(), "OPTIONS", PUMP, "Origin: http://evil.example\r\n").await;
     assert_eq!(preflight.status, 405);
@@ -284,14 +349,22 @@ async fn requests_in_one_segment_keep_their_order() {
         .collect();
     let mut text = String::new();
     for (place, body) in bodies.iter().enumerate() {
-        let close = if place + 1 == bodies.len() { "Connection: close\r\n" } else { "" };
+        let close = if place + 1 == bodies.len() {
+            "Connection: close\r\n"
+        } else {
+            ""
+        };
         let length = body.len();
-        text += &format!("POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{close}{alice}Content-Length: {length}\r\n\r\n{body}");
+        text +=
+            &format!("POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{close}{alice}Content-Length: {length}\r\n\r\n{body}");
     }
     let mut stream = TcpStream::connect(rig.address()).await.unwrap();
     stream.write_all(text.as_bytes()).await.unwrap();
     let mut replies = String::new();
-    timeout(PATIENCE, stream.read_to_string(&mut replies)).await.unwrap().unwrap();
+    timeout(PATIENCE, stream.read_to_string(&mut replies))
+        .await
+        .unwrap()
+        .unwrap();
     assert_eq!(replies.matches("HTTP/1.1 200 OK").count(), bodies.len(), "{replies}");
     let seen: Vec<String> = rig.bus.orders().iter().map(shown).collect();
     let wanted: Vec<String> = bodies
@@ -327,7 +400,10 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     });
     // Both wait for the one in the queue; a client that gives up changes nothing about it.
     let mut gone = TcpStream::connect(rig.address()).await.unwrap();
-    let text = format!("POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{alice}Content-Length: {}\r\n\r\n{body}", body.len());
+    let text = format!(
+        "POST {PUMP} HTTP/1.1\r\nHost: localhost\r\n{alice}Content-Length: {}\r\n\r\n{body}",
+        body.len()
+    );
     gone.write_all(text.as_bytes()).await.unwrap();
     drop(gone);
     while rig.bus.waiting() == 0 {
@@ -335,7 +411,13 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     }
     rig.bus.pause(false);
     let (first, second) = timeout(PATIENCE, twice).await.unwrap().unwrap();
-    assert_eq!((first.status, second.status), (200, 200), "{} {}", first.body, second.body);
+    assert_eq!(
+        (first.status, second.status),
+        (200, 200),
+        "{} {}",
+        first.body,
+        second.body
+    );
     assert_eq!(first.body, second.body);
     assert_eq!(rig.command(&alice, body).await.body, first.body, "later, too");
     assert_eq!(rig.bus.orders().len(), 1);
@@ -383,7 +465,12 @@ async fn only_who_commanded_last_renews_the_lease() {
     assert_eq!(renew(&alice).await, (409, false));
     let other = post(rig.address(), "/api/v1/drives/fan-2/heartbeat", &alice, "").await;
     assert_eq!(other.status, 409);
-    assert_eq!(post(rig.address(), "/api/v1/drives/x/heartbeat", &alice, "").await.status, 404);
+    assert_eq!(
+        post(rig.address(), "/api/v1/drives/x/heartbeat", &alice, "")
+            .await
+            .status,
+        404
+    );
 }
 
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
@@ -404,11 +491,22 @@ async fn guessing_is_slowed_and_locks_nobody_out() {
         }
         statuses.push(reply.status);
     }
-    assert!(statuses.iter().filter(|status| **status == 401).count() >= 4, "{statuses:?}");
+    assert!(
+        statuses.iter().filter(|status| **status == 401).count() >= 4,
+        "{statuses:?}"
+    );
     assert!(statuses.contains(&429), "{statuses:?}");
     assert_eq!(rig.command(&alice, STOP).await.status, 200, "who is logged in commands");
-    assert_eq!(rig.try_login("alice", PASSWORD, &known).await.status, 200, "a known browser gets in");
-    assert_eq!(rig.try_login("bob", PASSWORD, &known).await.status, 429, "as the user that it is known for");
+    assert_eq!(
+        rig.try_login("alice", PASSWORD, &known).await.status,
+        200,
+        "a known browser gets in"
+    );
+    assert_eq!(
+        rig.try_login("bob", PASSWORD, &known).await.status,
+        429,
+        "as the user that it is known for"
+    );
     assert_eq!(rig.bus.orders().len(), 1);
 }
 
@@ -422,7 +520,9 @@ async fn a_flood_of_logins_holds_up_no_stop() {
             tokio::spawn(async move {
                 let socket = TcpSocket::new_v4().unwrap();
                 socket.bind(SocketAddr::from(([127, 0, 1, (i % 50) as u8], 0))).unwrap();
-                let Ok(mut stream) = socket.connect(address).await else { return };
+                let Ok(mut stream) = socket.connect(address).await else {
+                    return;
+                };
                 let body = format!("{{\"user\": \"alice\", \"password\": \"guess number {i}\"}}");
                 let head = format!(
                     "POST /api/v1/login HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\
@@ -456,9 +556,18 @@ async fn a_stop_gets_in_where_nothing_else_does() {
     let alice = rig.log_in("alice").await;
     let mut streams = Vec::new();
     for _ in 0..4 {
-        streams.push(EventStream::open(rig.address(), "/api/v1/events", "").await.opened().await);
+        streams.push(
+            EventStream::open(rig.address(), "/api/v1/events", "")
+                .await
+                .opened()
+                .await,
+        );
     }
-    assert_eq!(get(rig.address(), "/api/v1/drives").await.status, 503, "the address is full");
+    assert_eq!(
+        get(rig.address(), "/api/v1/drives").await.status,
+        503,
+        "the address is full"
+    );
     assert_eq!(rig.command("", STOP).await.status, 401);
     assert_eq!(rig.command(&alice, STOP).await.status, 200);
     assert_eq!(rig.command(BASIC, STOP).await.status, 200);
@@ -476,11 +585,22 @@ async fn long_and_slow_bodies_hold_nobody_up() {
     let long = format!("{{\"speed_reference\": 1, \"pad\": \"{}\"}}", "x".repeat(70_000));
     assert_eq!(rig.command(&alice, &long).await.status, 413);
     let long = format!("{{\"user\": \"{}\", \"password\": \"x\"}}", "x".repeat(5000));
-    let refused = post(rig.address(), "/api/v1/login", "Content-Type: application/json\r\n", &long).await;
+    let refused = post(
+        rig.address(),
+        "/api/v1/login",
+        "Content-Type: application/json\r\n",
+        &long,
+    )
+    .await;
     assert_eq!(refused.status, 413);
     // Bodies that never end, of commands and of logins, from the same address.
     let mut slow = Vec::new();
-    for (path, headers) in [(PUMP, alice.as_str()), ("/api/v1/login", "Content-Type: application/json\r\n")].repeat(6) {
+    for (path, headers) in [
+        (PUMP, alice.as_str()),
+        ("/api/v1/login", "Content-Type: application/json\r\n"),
+    ]
+    .repeat(6)
+    {
         let mut stream = TcpStream::connect(rig.address()).await.unwrap();
         let head = format!("POST {path} HTTP/1.1\r\nHost: localhost\r\n{headers}Content-Length: 100\r\n\r\n{{");
         // The older ones are displaced by the younger ones.
@@ -490,7 +610,9 @@ async fn long_and_slow_bodies_hold_nobody_up() {
     assert_eq!(rig.command(&alice, STOP).await.status, 200);
     let mut last = slow.pop().unwrap();
     let mut reply = String::new();
-    let _ = timeout(PATIENCE, last.read_to_string(&mut reply)).await.expect("it is ended");
+    let _ = timeout(PATIENCE, last.read_to_string(&mut reply))
+        .await
+        .expect("it is ended");
     assert!(reply.is_empty() || reply.starts_with("HTTP/1.1 408"), "{reply}");
     assert_eq!(rig.bus.orders().len(), 1);
 }
@@ -516,7 +638,11 @@ async fn a_removed_user_is_out_with_the_reload() {
     };
     rig.server.reload(with(Some(left))).await;
     assert_eq!(rig.command(&alice, STOP).await.status, 401);
-    assert_eq!(rig.command(BASIC, STOP).await.status, 401, "nor is its password remembered");
+    assert_eq!(
+        rig.command(BASIC, STOP).await.status,
+        401,
+        "nor is its password remembered"
+    );
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
     // Another password ends the sessions, too; so does switching commands off and on.
     let other = User::new("bob", "battery staple").unwrap().to_string();
@@ -558,16 +684,27 @@ async fn users_read_where_tokens_are_required() {
     .await;
     let page = get(rig.address(), "/").await;
     assert_eq!(page.status, 200);
-    assert!(page.body.contains("Log in") && !page.body.contains("pump-1"), "{}", page.body);
+    assert!(
+        page.body.contains("Log in") && !page.body.contains("pump-1"),
+        "{}",
+        page.body
+    );
     assert_eq!(get(rig.address(), "/api/v1/drives").await.status, 401);
     assert_eq!(get(rig.address(), "/assets/page.js").await.status, 200);
     let alice = rig.log_in("alice").await;
     for (path, status) in [("/api/v1/drives", 200), ("/", 200), ("/metrics", 401)] {
-        assert_eq!(request(rig.address(), "GET", path, &alice).await.status, status, "{path}");
+        assert_eq!(
+            request(rig.address(), "GET", path, &alice).await.status,
+            status,
+            "{path}"
+        );
     }
     assert_eq!(request(rig.address(), "GET", "/api/v1/drives", BASIC).await.status, 200);
     let bearer = format!("Authorization: Bearer {secret}\r\n");
-    assert_eq!(request(rig.address(), "GET", "/api/v1/drives", &bearer).await.status, 403);
+    assert_eq!(
+        request(rig.address(), "GET", "/api/v1/drives", &bearer).await.status,
+        403
+    );
     assert_eq!(rig.command(&bearer, STOP).await.status, 401, "a token commands nothing");
     assert_eq!(rig.command(&alice, STOP).await.status, 200);
 }

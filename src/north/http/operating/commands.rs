@@ -12,8 +12,8 @@ use serde_json::{Value as Json_, json};
 use tokio::sync::{OwnedSemaphorePermit, watch};
 
 use super::super::api::ErrorReply;
-use super::super::routes::{AppState, Reached, not_found};
 use super::super::body;
+use super::super::routes::{AppState, Reached, not_found};
 use super::{Operating, Operator};
 use crate::command::{Answer, Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::ModelPoint;
@@ -54,7 +54,13 @@ struct Waiting {
 }
 
 impl CommandReply {
-    fn new(id: Option<&Id>, drive: &str, answer: &Answer, confirmed: Option<Duration>, time: SystemTime) -> CommandReply {
+    fn new(
+        id: Option<&Id>,
+        drive: &str,
+        answer: &Answer,
+        confirmed: Option<Duration>,
+        time: SystemTime,
+    ) -> CommandReply {
         CommandReply {
             status: status(&answer.outcome),
             body: CommandResult::new(id, drive, answer, confirmed, time).to_json(),
@@ -133,7 +139,11 @@ async fn commanded(
 
 /// Waits for a reply that several may wait for.
 async fn shared(mut reply: SharedReply) -> Result<CommandReply, Response> {
-    let known = reply.wait_for(Option::is_some).await.ok().and_then(|reply| reply.clone());
+    let known = reply
+        .wait_for(Option::is_some)
+        .await
+        .ok()
+        .and_then(|reply| reply.clone());
     // Its task ends without a reply only when the process does.
     known.ok_or_else(|| StatusCode::SERVICE_UNAVAILABLE.into_response())
 }
@@ -281,7 +291,12 @@ fn no_drive(name: &str, plant: &Plant) -> Response {
 fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
     let spec = &drive.image.spec;
     let controlled = spec.access == Access::Control;
-    let writable = spec.profile.points.iter().enumerate().filter(|(_, point)| controlled && point.write);
+    let writable = spec
+        .profile
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, point)| controlled && point.write);
     let points: Vec<Json_> = writable
         .map(|(index, point)| {
             let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);

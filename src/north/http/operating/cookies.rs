@@ -84,8 +84,13 @@ fn key(user: &User) -> hmac::Key {
 
 /// The one value of that name. Several are none: a foreign page may have set one of them.
 fn find(headers: &HeaderMap, name: &str) -> Option<String> {
-    let all = headers.get_all(header::COOKIE).iter().filter_map(|value| value.to_str().ok());
-    let pairs = all.flat_map(|text| text.split(';')).filter_map(|pair| pair.trim().split_once('='));
+    let all = headers
+        .get_all(header::COOKIE)
+        .iter()
+        .filter_map(|value| value.to_str().ok());
+    let pairs = all
+        .flat_map(|text| text.split(';'))
+        .filter_map(|pair| pair.trim().split_once('='));
     let mut values = pairs.filter(|(key, _)| *key == name).map(|(_, value)| value);
     match (values.next(), values.next()) {
         (Some(value), None) => Some(value.to_string()),
@@ -131,8 +136,12 @@ mod tests {
 
     #[test]
     fn a_browser_is_known_for_one_user_and_one_password() {
-        let [alice, bob, other] = [("alice", "correct horse"), ("bob", "correct horse"), ("alice", "battery staple")]
-            .map(|(name, password)| User::new(name, password).unwrap());
+        let [alice, bob, other] = [
+            ("alice", "correct horse"),
+            ("bob", "correct horse"),
+            ("alice", "battery staple"),
+        ]
+        .map(|(name, password)| User::new(name, password).unwrap());
         let header = Cookies::of("hall", false).set_known(&alice, &[7; 16]).unwrap();
         let mark = header.to_str().unwrap().split(['=', ';']).nth(1).unwrap();
         assert_eq!(known_as(mark, &alice), Some("07".repeat(16).as_str()));

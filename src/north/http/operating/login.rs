@@ -55,7 +55,10 @@ impl IntoResponse for Denied {
         match self {
             // No Basic here: a browser would ask for a password and then send it by itself, whatever page makes a request.
             Denied::NotLoggedIn | Denied::SessionEnded | Denied::Wrong => {
-                headers.insert(header::WWW_AUTHENTICATE, HeaderValue::from_static("Session realm=\"drivegate\""));
+                headers.insert(
+                    header::WWW_AUTHENTICATE,
+                    HeaderValue::from_static("Session realm=\"drivegate\""),
+                );
             }
             Denied::TooMany(wait) => {
                 headers.insert(header::RETRY_AFTER, (wait.as_secs() + 1).into());
@@ -81,7 +84,12 @@ pub(in crate::north::http) async fn log_in(
     }
 }
 
-async fn logged_in(app: &AppState, reached: &Reached, parts: &request::Parts, body: Body) -> Result<Response, Response> {
+async fn logged_in(
+    app: &AppState,
+    reached: &Reached,
+    parts: &request::Parts,
+    body: Body,
+) -> Result<Response, Response> {
     let (operating, cookies) = (&app.operating, app.cookies(reached));
     is_own_origin(&parts.headers).map_err(Denied::into_response)?;
     let body = body::read(body, reached, MAX_LOGIN).await?;

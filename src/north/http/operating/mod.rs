@@ -49,7 +49,8 @@ const IN_PROGRESS: usize = 256;
 const CSRF: &str = "x-csrf-token";
 
 /// The hash of a user that there is not. Nobody knows its password; it only takes its time.
-const NOBODY: &str = "$argon2id$v=19$m=12288,t=3,p=1$bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
+const NOBODY: &str =
+    "$argon2id$v=19$m=12288,t=3,p=1$bm9ib2R5bm9ib2R5bm9ibw$0000000000000000000000000000000000000000000";
 
 /// The state of commands over HTTP. It outlives reloads and listeners.
 #[derive(Debug)]
@@ -187,7 +188,12 @@ impl Operating {
     ///
     /// # Errors
     /// Nobody who may command; [`Denied::NotLoggedIn`] if it names nobody.
-    pub(super) async fn operator(&self, headers: &HeaderMap, cookies: &Cookies, address: IpAddr) -> Result<Operator, Denied> {
+    pub(super) async fn operator(
+        &self,
+        headers: &HeaderMap,
+        cookies: &Cookies,
+        address: IpAddr,
+    ) -> Result<Operator, Denied> {
         if headers.contains_key(header::AUTHORIZATION) {
             let credentials = basic(headers).ok_or(Denied::NotLoggedIn)?;
             let user = self.verified(&credentials, address, Source::of(address)).await?;
@@ -252,7 +258,10 @@ impl Operating {
         operators.retain(|_, (_, used)| now.saturating_duration_since(*used) < IDLE);
         if operators.len() >= MOST
             && !operators.contains_key(&operator.address)
-            && let Some(oldest) = operators.iter().min_by_key(|(_, (_, used))| *used).map(|(address, _)| *address)
+            && let Some(oldest) = operators
+                .iter()
+                .min_by_key(|(_, (_, used))| *used)
+                .map(|(address, _)| *address)
         {
             operators.remove(&oldest);
         }
@@ -375,14 +384,18 @@ fn is_own_origin(headers: &HeaderMap) -> Result<(), Denied> {
 /// User and password of HTTP Basic.
 fn basic(headers: &HeaderMap) -> Option<Credentials> {
     let mut given = headers.get_all(header::AUTHORIZATION).iter();
-    let (Some(given), None) = (given.next(), given.next()) else { return None };
+    let (Some(given), None) = (given.next(), given.next()) else {
+        return None;
+    };
     let (scheme, text) = given.to_str().ok()?.split_once(' ')?;
     if !scheme.eq_ignore_ascii_case("basic") {
         return None;
     }
     // A longer one is no password.
     let mut bytes = [0; 512];
-    let bytes = Encoding::B64.decode(text.trim().trim_end_matches('='), &mut bytes).ok()?;
+    let bytes = Encoding::B64
+        .decode(text.trim().trim_end_matches('='), &mut bytes)
+        .ok()?;
     let text = std::str::from_utf8(bytes).ok()?;
     let (user, password) = text.split_once(':')?;
     Some(Credentials {
@@ -393,7 +406,10 @@ fn basic(headers: &HeaderMap) -> Option<Credentials> {
 
 /// Whether a path belongs to commands; without them there is nothing at it.
 pub(super) fn is_operating(path: &str) -> bool {
-    let of_drive = |rest: &str| rest.split_once('/').is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"));
+    let of_drive = |rest: &str| {
+        rest.split_once('/')
+            .is_some_and(|(_, what)| matches!(what, "commands" | "heartbeat"))
+    };
     matches!(path, "/api/v1/login" | "/api/v1/logout" | "/api/v1/session")
         || path.starts_with("/assets/operate.")
         || path.strip_prefix("/api/v1/drives/").is_some_and(of_drive)

@@ -138,7 +138,10 @@ mod tests {
             assert!(sessions.find(&cookie, now).is_some());
             sessions.used(&cookie, now);
         }
-        assert!(sessions.find(&cookie, start + LONGEST).is_none(), "whatever its user does");
+        assert!(
+            sessions.find(&cookie, start + LONGEST).is_none(),
+            "whatever its user does"
+        );
     }
 
     #[test]
@@ -153,8 +156,15 @@ mod tests {
         let (_, bob) = sessions.begin(&"bob".into(), secrets(90), now);
         let (_, ninth) = sessions.begin(&"alice".into(), secrets(91), now);
         let open = |sessions: &Sessions, cookie: &str| sessions.find(cookie, now).is_some();
-        assert!(!open(&sessions, &cookies[1]), "the one that was used the longest time ago");
-        assert!([&cookies[0], &cookies[2], &ninth, &bob].iter().all(|cookie| open(&sessions, cookie)));
+        assert!(
+            !open(&sessions, &cookies[1]),
+            "the one that was used the longest time ago"
+        );
+        assert!(
+            [&cookies[0], &cookies[2], &ninth, &bob]
+                .iter()
+                .all(|cookie| open(&sessions, cookie))
+        );
         sessions.end(&ninth);
         sessions.keep(|user| user == "bob");
         assert!(open(&sessions, &bob) && !open(&sessions, &cookies[0]) && !open(&sessions, &ninth));

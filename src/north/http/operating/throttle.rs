@@ -108,7 +108,10 @@ fn wait(failures: Option<Failures>, free: u32, now: Instant) -> Duration {
 fn count<K: Eq + Hash + Copy>(all: &mut HashMap<K, Failures>, key: K, now: Instant) {
     let count = current(all, &key, now).map_or(0, |failures| failures.count);
     if all.len() >= MOST && !all.contains_key(&key) {
-        let oldest = all.iter().min_by_key(|(_, failures)| failures.last).map(|(key, _)| *key);
+        let oldest = all
+            .iter()
+            .min_by_key(|(_, failures)| failures.last)
+            .map(|(key, _)| *key);
         oldest.map(|oldest| all.remove(&oldest));
     }
     all.insert(
@@ -149,7 +152,11 @@ mod tests {
             let pause = Duration::from_secs(seconds);
             assert_eq!(throttle.begin(address(1), ALICE, now), Err(pause));
             now += pause - Duration::from_millis(1);
-            assert_eq!(throttle.begin(address(1), 2, now), Err(Duration::from_millis(1)), "whoever the user");
+            assert_eq!(
+                throttle.begin(address(1), 2, now),
+                Err(Duration::from_millis(1)),
+                "whoever the user"
+            );
             now += Duration::from_millis(1);
             assert!(throttle.begin(address(1), ALICE, now).is_ok());
         }
@@ -182,7 +189,11 @@ mod tests {
         throttle.succeeded(address(1), ALICE);
         assert_eq!(throttle.begin(address(1), ALICE, now), Ok(0));
         throttle.withdraw(address(1), ALICE);
-        assert_eq!(throttle.begin(address(1), ALICE, now), Ok(0), "there was no time to look at it");
+        assert_eq!(
+            throttle.begin(address(1), ALICE, now),
+            Ok(0),
+            "there was no time to look at it"
+        );
     }
 
     #[test]

@@ -156,10 +156,18 @@ mod tests {
         assert!(queue.push(operator), "a full queue does not keep the operator out");
         assert_eq!(queue.waiting.len(), MOST);
         let next = queue.next().unwrap();
-        assert_eq!((next.failures, next.address), (0, [192, 0, 2, 200].into()), "and it goes first");
+        assert_eq!(
+            (next.failures, next.address),
+            (0, [192, 0, 2, 200].into()),
+            "and it goes first"
+        );
         next.answer.send(true).unwrap();
         assert_eq!(answered.try_recv(), Ok(true));
-        assert_eq!(queue.next().unwrap().address, IpAddr::from([192, 0, 2, 0]), "then the first");
+        assert_eq!(
+            queue.next().unwrap().address,
+            IpAddr::from([192, 0, 2, 0]),
+            "then the first"
+        );
     }
 
     #[test]
@@ -167,7 +175,10 @@ mod tests {
         let mut queue = Queue::default();
         let pushed: Vec<_> = (0..10).map(|_| waiting(1, 0)).collect();
         let (ones, answered): (Vec<_>, Vec<_>) = pushed.into_iter().unzip();
-        assert_eq!(ones.into_iter().filter_map(|one| queue.push(one).then_some(())).count(), MOST_OF_ADDRESS);
+        assert_eq!(
+            ones.into_iter().filter_map(|one| queue.push(one).then_some(())).count(),
+            MOST_OF_ADDRESS
+        );
         let (other, _answered) = waiting(2, 9);
         assert!(queue.push(other));
         drop(answered);
@@ -187,6 +198,9 @@ mod tests {
         while verifier.lock().served {
             tokio::task::yield_now().await;
         }
-        assert_eq!(verifier.verify(user.hash(), "correct horse", address, 0).await, Some(true));
+        assert_eq!(
+            verifier.verify(user.hash(), "correct horse", address, 0).await,
+            Some(true)
+        );
     }
 }

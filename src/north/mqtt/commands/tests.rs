@@ -2,9 +2,9 @@ use serde_json::Value as Json;
 
 use super::super::fixture;
 use super::*;
-use crate::north::command_json::REMEMBERED;
 use crate::codec::Reply as BusReply;
 use crate::command::{Outcome, Receipt, Urgency};
+use crate::north::command_json::REMEMBERED;
 
 struct Bench {
     plant: Plant,
