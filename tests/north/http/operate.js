@@ -139,10 +139,10 @@ async function operate(browser) {
   await browser.until("the question", seen(".operate-confirm"));
   assert.ok(await browser.run(seen(stopButton)));
   await accessible(browser, "while it asks");
-  await browser.press("button[aria-label='Do not start pump-1']");
+  await browser.press("button[aria-label='Cancel: do not start pump-1']");
   assert.ok(await browser.run(result("Reference 50 %")), "nothing was sent");
   await browser.press("button[aria-label='Start pump-1']");
-  await browser.press("button[aria-label='Start pump-1 now']");
+  await browser.press("button[aria-label='Start now: pump-1']");
   await browser.until("the start", result("Start: confirmed"));
   await browser.until("it runs", "document.querySelector('#drives .badge').textContent.includes('running')");
   // The lease of 2 s is renewed while the person is active.

@@ -1,5 +1,6 @@
 //! Logging in and out.
 
+use std::hash::BuildHasher;
 use std::sync::Arc;
 use std::time::Instant;
 
@@ -19,7 +20,6 @@ use super::cookies::{Cookies, known_as};
 use super::sessions::Session;
 use super::throttle::Source;
 use super::{Credentials, Denied, Operating, is_own_origin};
-use std::hash::BuildHasher;
 
 /// Most bytes of a login.
 const MAX_LOGIN: usize = 4096;

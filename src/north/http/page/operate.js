@@ -225,11 +225,11 @@ globalThis.Operate = (() => {
   function build(panel, name) {
     panel.stop = button("operate-stop", "■ STOP", `Stop ${name}`, () => stop(name));
     panel.start = button("operate-button", "Start …", `Start ${name}`, () => confirming(panel, true));
-    panel.really = button("operate-button operate-start", "Start now", `Start ${name} now`, () => {
+    panel.really = button("operate-button operate-start", "Start now", `Start now: ${name}`, () => {
       confirming(panel, false);
       command(name, { run: true }, "Start");
     });
-    panel.cancel = button("operate-button", "Cancel", `Do not start ${name}`, () => confirming(panel, false));
+    panel.cancel = button("operate-button", "Cancel", `Cancel: do not start ${name}`, () => confirming(panel, false));
     panel.question = element("span", "operate-confirm", `Start ${name}? The motor turns. `, panel.really, panel.cancel);
     panel.question.hidden = true;
     panel.reset = button("operate-button", "Reset fault", `Reset the fault of ${name}`, () => command(name, { fault_reset: true }, "Reset"));
