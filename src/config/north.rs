@@ -13,7 +13,15 @@ use crate::north::{ServerIdentity, TlsFile};
 /// An address that a server listens on, and its place.
 pub(super) type Listener = (SocketAddr, Place);
 
-pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> (Option<http::Options>, Option<Listener>) {
+/// `[http]`, as far as it is valid.
+pub(super) struct Http {
+    pub(super) options: Option<http::Options>,
+    pub(super) listener: Option<Listener>,
+    /// Clients may command, by what is written.
+    pub(super) commands: bool,
+}
+
+pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> Http {
     let listen = HTTP.listen.read(reader);
     let hosts = HTTP.hosts.get(reader);
     let tokens = read_tokens(reader, base);
@@ -39,7 +47,11 @@ pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> (Option<http::Optio
         identity,
         max_connections: http::MAX_CONNECTIONS,
     });
-    (options, listen.map(|listen| (listen, HTTP.listen.place(reader))))
+    Http {
+        options,
+        listener: listen.map(|listen| (listen, HTTP.listen.place(reader))),
+        commands,
+    }
 }
 
 pub(super) fn parse_host(text: &str) -> Result<String, Finding> {

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Write};
 use std::path::PathBuf;
 use std::process::{Command, Stdio};
 
-use crate::support::process::{Running, api, drivegate, until};
+use crate::support::process::{Running, api, drivegate, get, until};
 use crate::support::site::{HTTP, LINE1, Site, controlled, drive};
 use crate::support::tools::{root, run, tool};
 
@@ -53,6 +53,10 @@ fn arguments(site: &Site, what: &str) -> [String; 4] {
     ]
 }
 
+fn audit(site: &Site) -> String {
+    get(site.http, "/api/v1/audit").expect("an answer").1
+}
+
 fn state(site: &Site) -> String {
     api(site.http, "/api/v1/drives/pump-1")["state"].to_string()
 }
@@ -65,7 +69,7 @@ fn a_drive_is_operated_from_the_page_by_the_keyboard() {
     let arguments = arguments(&site, "operate");
     let browser = run(&tool("node"), &arguments.each_ref().map(String::as_str));
     assert!(browser.status.success(), "{}", String::from_utf8_lossy(&browser.stderr));
-    let audit = api(site.http, "/api/v1/audit");
+    let audit: serde_json::Value = serde_json::from_str(&audit(&site)).unwrap();
     let of = |record: &serde_json::Value| {
         assert_eq!(
             (&record["source"], &record["drive"]),
@@ -114,7 +118,7 @@ fn a_removed_user_stops_nothing_and_the_lease_does() {
     browser.stdin.take().unwrap().write_all(b"\n").unwrap();
     assert!(browser.wait().unwrap().success());
     until("the lease runs out", || (state(&site) == "\"ready\"").then_some(()));
-    let audit = api(site.http, "/api/v1/audit").to_string();
+    let audit = audit(&site);
     assert!(audit.contains("\"supervision\""), "{audit}");
 }
 
