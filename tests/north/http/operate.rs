@@ -58,7 +58,7 @@ fn audit(site: &Site) -> String {
 }
 
 fn state(site: &Site) -> String {
-    api(site.http, "/api/v1/drives/pump-1")["state"].to_string()
+    api(site.http, "pump-1")["state"].to_string()
 }
 
 #[test]
