@@ -156,3 +156,42 @@ fn commands_need_users_and_a_private_way() {
     gateway.until_printed("drivegate runs");
     assert!(gateway.runs());
 }
+
+/// A reload that starts a bus anew keeps who commanded its drives last, as it keeps their leases.
+#[test]
+fn a_bus_that_starts_anew_knows_who_commanded_last() {
+    let site = site();
+    let _line = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let gateway = site.run_ready();
+    let post = |what: &str, body: &str| {
+        let url = format!("http://localhost:{}/api/v1/drives/pump-1/{what}", site.http);
+        let login = "alice:correct horse";
+        let ran = run(
+            &tool("curl"),
+            &[
+                "-sS",
+                "-o",
+                "/dev/null",
+                "-w",
+                "%{http_code}",
+                "-u",
+                login,
+                "-d",
+                body,
+                &url,
+            ],
+        );
+        String::from_utf8(ran.stdout).unwrap()
+    };
+    assert_eq!(post("heartbeat", ""), "409");
+    assert_eq!(post("commands", "{\"speed_reference\": 20}"), "200");
+    assert_eq!(post("heartbeat", ""), "204");
+    site.change("response_timeout = \"2s\"", "response_timeout = \"1900ms\"");
+    gateway.signal("HUP");
+    gateway.until_printed("configuration reloaded");
+    assert!(
+        gateway.output().matches("starting the bus").count() >= 2,
+        "the bus starts anew"
+    );
+    assert_eq!(post("heartbeat", ""), "204");
+}
