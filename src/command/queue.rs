@@ -87,7 +87,6 @@ impl Pending {
             return;
         }
         if command.urgency == Urgency::Stop {
-            self.note_commander(&command);
             self.push_stop(command, now);
             return;
         }
@@ -138,6 +137,7 @@ impl Pending {
     /// same, and are answered with it; of two that do different things besides the newer one is sent.
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
+        self.note_commander(&stop);
         *self.stops.entry(drive).or_default() += 1;
         self.remove(now, &Outcome::Purged, |c| {
             c.drive == drive && c.urgency == Urgency::Command
