@@ -19,7 +19,7 @@ use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::history::{RecorderTask, Recordings};
+use crate::history::{History, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
@@ -45,7 +45,7 @@ pub enum StartError {
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
     /// The system does not provide a thread for the recorder.
-    #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
+    #[error("cannot start the recorder: {0}; free memory or threads")]
     Recorder(std::io::Error),
 }
 
@@ -63,6 +63,7 @@ pub struct Daemon {
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
+    history: Arc<History>,
     recorder: Option<RecorderTask>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
@@ -90,6 +91,7 @@ impl Daemon {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
+        let history = Arc::new(History::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
@@ -97,6 +99,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
@@ -111,6 +114,7 @@ impl Daemon {
             http: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
+            history,
             recorder: None,
             reporter: report_refusals(shared),
             pulse: Pulse::default(),
@@ -239,6 +243,7 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
             recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
@@ -276,11 +281,10 @@ impl Daemon {
             // A thread of it that panicked has logged that.
             let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
         }
-        if settings.recordings.max_count > 0 {
-            let (recordings, events) = (self.recordings.clone(), self.events.clone());
-            let started = RecorderTask::start(settings.recordings.clone(), recordings, events, &self.writes);
-            self.recorder = Some(started.map_err(StartError::Recorder)?);
-        }
+        let (recordings, history) = (self.recordings.clone(), self.history.clone());
+        let options = settings.recordings.clone();
+        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
+        self.recorder = Some(started.map_err(StartError::Recorder)?);
         Ok(())
     }
 

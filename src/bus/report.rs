@@ -15,7 +15,7 @@ use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
 use crate::plant::explain;
 use crate::process_image::{
-    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, Taped, TapedRead,
+    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Taping,
 };
 
 /// The load of the line is reckoned over this time.
@@ -156,14 +156,11 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
-        self.image.tape.append(|| {
-            let read = TapedRead {
-                at,
-                table: read.table,
-                start: read.start,
-                words: words.into(),
-            };
-            Taped::Read(index, read)
+        self.image.tape.read(index, || TapedRead {
+            at,
+            table: read.table,
+            start: read.start,
+            words: words.into(),
         });
         drive.update(|snapshot: &mut Snapshot| {
             snapshot.store(read.table, read.start, words, at);
@@ -449,7 +446,7 @@ impl Report {
         quiet_since: Instant,
         began: Instant,
     ) -> Option<Tap> {
-        if !self.image.trace.wanted() && !self.image.tape.is_on() {
+        if !self.image.trace.wanted() && !self.image.tape.takes(Taping::Everything) {
             return None;
         }
         let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);
@@ -486,17 +483,11 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return false;
         };
-        self.image.tape.append(|| {
-            let words = words.into();
-            Taped::Read(
-                index,
-                TapedRead {
-                    at,
-                    table,
-                    start,
-                    words,
-                },
-            )
+        self.image.tape.read(index, || TapedRead {
+            at,
+            table,
+            start,
+            words: words.into(),
         });
         let mut fast = false;
         drive.update(|snapshot| fast = snapshot.hear(table, start, words, at));

@@ -1,7 +1,9 @@
-//! The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
+//! The past of the drives. Trends: what their values were over the last day, in memory. The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
 //! time after it; one file a recording.
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
+//! - [`trend`]: least, greatest and last values in steps of time; [`drives`]: those of all drives, as the rest of the gateway
+//!   sees them.
 //! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
 //! - [`capture`]: reads captures of lines, its own and others, for `drivegate replay`.
 //! - [`budget`]: how much memory the rings take at most.
@@ -14,6 +16,7 @@
 pub mod assemble;
 pub mod budget;
 pub mod capture;
+pub mod drives;
 pub mod export;
 pub mod pcapng;
 pub mod recorder;
@@ -23,11 +26,13 @@ mod ring;
 pub mod store;
 mod summary;
 mod task;
+pub mod trend;
 pub mod trigger;
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
+pub use drives::{DriveHistory, History};
 pub use recorder::{Capture, Recorder};
 pub use recording::{Recording, RecordingError};
 pub use store::{Entry, Store};
@@ -52,6 +57,11 @@ pub struct RecorderOptions {
 }
 
 impl RecorderOptions {
+    /// Whether anything is recorded.
+    pub fn is_on(&self) -> bool {
+        self.max_count > 0
+    }
+
     /// Time that a ring must hold: the whole recording, and what passes until it is taken out.
     pub(crate) fn window(&self) -> Duration {
         self.before + self.after + Duration::from_secs(1)

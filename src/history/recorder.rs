@@ -1,4 +1,4 @@
-//! The rings of all buses and the recordings under way. Pure: time is an argument, what the buses taped is taken from their
+//! The rings of all buses, the recordings under way, and what feeds the trends. Pure: time is an argument, what the buses taped is taken from their
 //! images.
 
 use std::collections::BTreeMap;
@@ -6,14 +6,19 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::budget::Budget;
+use super::drives::{DriveHistory, History};
 use super::ring::{Ring, Timed};
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
 use crate::drive::Plan;
-use crate::process_image::{BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead};
+use crate::process_image::{
+    BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
+};
 
 /// Triggers of a recording that are noted beside the first.
 const MOST_TRIGGERS: usize = 32;
+/// Age at which a point that others rest on is not good any more for a trend.
+const RECENT: Duration = Duration::from_secs(60);
 /// Age at which a value is still good here: a recording shows what was read, whenever that was.
 const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 
@@ -138,6 +143,7 @@ pub struct Capture {
 #[derive(Debug)]
 struct DriveRing {
     image: Arc<DriveImage>,
+    history: Arc<DriveHistory>,
     samples: Ring<TapedRead>,
     notes: Ring<Note>,
     /// What was known before the oldest sample, and what is known now.
@@ -170,14 +176,16 @@ struct LineRing {
 #[derive(Debug)]
 pub struct Recorder {
     options: RecorderOptions,
+    history: Arc<History>,
     lines: Vec<LineRing>,
 }
 
 impl Recorder {
-    /// A recorder without buses.
-    pub fn new(options: RecorderOptions) -> Recorder {
+    /// A recorder without buses, which keeps trends in `history`.
+    pub fn new(options: RecorderOptions, history: Arc<History>) -> Recorder {
         Recorder {
             options,
+            history,
             lines: Vec::new(),
         }
     }
@@ -185,6 +193,23 @@ impl Recorder {
     /// Records these buses from now on. Those that are there already keep their rings; what was recorded of the others ends
     /// now.
     pub fn adopt(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
+        let captures = self.leave_all_but(buses, clock);
+        let drives = || buses.iter().flat_map(|bus| &bus.drives);
+        self.history
+            .keep_only(|name| drives().any(|drive| drive.spec.name == name));
+        for bus in buses {
+            if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
+                self.lines.push(LineRing::new(bus, &self.options, &self.history, clock));
+                bus.tape.switch(match self.options.is_on() {
+                    true => Taping::Everything,
+                    false => Taping::Reads,
+                });
+            }
+        }
+        captures
+    }
+
+    fn leave_all_but(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
         let mut captures = Vec::new();
         let (kept, gone): (Vec<_>, Vec<_>) = std::mem::take(&mut self.lines)
             .into_iter()
@@ -192,14 +217,8 @@ impl Recorder {
         self.lines = kept;
         for mut line in gone {
             line.take_in(&self.options, clock);
-            line.bus.tape.switch(false);
+            line.bus.tape.switch(Taping::Off);
             captures.extend(line.ended(&self.options, clock, true));
-        }
-        for bus in buses {
-            if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
-                self.lines.push(LineRing::new(bus, &self.options));
-                bus.tape.switch(true);
-            }
         }
         captures
     }
@@ -243,12 +262,12 @@ impl Recorder {
     /// Ends all recordings now; the tapes stop.
     pub fn end(&mut self, clock: Clock) -> Vec<Capture> {
         let captures = self.tick(clock);
-        captures.into_iter().chain(self.adopt(&[], clock)).collect()
+        captures.into_iter().chain(self.leave_all_but(&[], clock)).collect()
     }
 }
 
 impl LineRing {
-    fn new(bus: &Arc<BusImage>, options: &RecorderOptions) -> LineRing {
+    fn new(bus: &Arc<BusImage>, options: &RecorderOptions, history: &History, clock: Clock) -> LineRing {
         let specs: Vec<DriveSpec> = bus.drives.iter().map(|drive| drive.spec.clone()).collect();
         let budget = Budget::of(&bus.spec, &specs, options);
         let window = options.window();
@@ -256,6 +275,7 @@ impl LineRing {
             let base = Arc::new(empty_snapshot(&image.spec));
             DriveRing {
                 image: image.clone(),
+                history: history.of(&image.spec, clock),
                 samples: Ring::new(*samples, window),
                 notes: Ring::new(budget.notes, window),
                 now: base.clone(),
@@ -281,7 +301,7 @@ impl LineRing {
             match entry {
                 Taped::Read(index, read) => {
                     if let Some(drive) = self.drives.get_mut(index)
-                        && let Some(trigger) = drive.read(read, options.warnings)
+                        && let Some(trigger) = drive.read(read, options, clock)
                     {
                         drive.trigger(trigger, clock);
                     }
@@ -337,14 +357,22 @@ impl LineRing {
 }
 
 impl DriveRing {
-    fn read(&mut self, read: TapedRead, warnings: bool) -> Option<Trigger> {
+    fn read(&mut self, read: TapedRead, options: &RecorderOptions, clock: Clock) -> Option<Trigger> {
         let at = read.at;
         Arc::make_mut(&mut self.now).store(read.table, read.start, &read.words, at);
+        let reading = reading(&self.image.spec, &self.now, at);
+        // What a drive said before it was away is no base for a value: its image knows, unless it is away again.
+        let known = self.image.reading(clock.now, RECENT);
+        let is_known = |point: usize| !known.snapshot.link.is_online() || known.sample(point).good().is_some();
+        self.history.trend().read(&read, &reading, is_known);
+        if !options.is_on() {
+            return None;
+        }
         let base = &mut self.base;
         self.samples.push(read, |gone| {
             Arc::make_mut(base).store(gone.table, gone.start, &gone.words, gone.at);
         });
-        self.watch.look(&reading(&self.image.spec, &self.now, at), at, warnings)
+        self.watch.look(&reading, at, options.warnings)
     }
 
     fn trigger(&mut self, trigger: Trigger, clock: Clock) -> Option<String> {

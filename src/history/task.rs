@@ -1,5 +1,5 @@
-//! The recorder at work: a thread that takes what the buses taped, and one that writes files. A slow disk holds up neither the
-//! buses nor the rings.
+//! The recorder at work: a thread that takes what the buses taped, for recordings and trends, and one that writes files. A slow
+//! disk holds up neither the buses nor the rings.
 
 use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
@@ -14,7 +14,7 @@ use super::assemble::assemble;
 use super::recorder::{Capture, Note, NoteBody, Recorder};
 use super::store::{self, Entry, ReadError, Store};
 use super::trigger::{Trigger, TriggerKind, is_refused_stop};
-use super::{Clock, RecorderOptions, Recording};
+use super::{Clock, History, RecorderOptions, Recording};
 use crate::command::{AuditRecord, WriteStats};
 use crate::event::{Event, EventKind, Events, RecordingMade};
 use crate::process_image::BusImage;
@@ -112,7 +112,7 @@ impl Recordings {
     }
 }
 
-/// The recorder of a gateway, at work.
+/// The recorder of a gateway, at work; without recordings for trends only.
 #[derive(Debug)]
 pub struct RecorderTask {
     recordings: Arc<Recordings>,
@@ -128,26 +128,28 @@ impl RecorderTask {
     pub fn start(
         options: RecorderOptions,
         recordings: Arc<Recordings>,
+        history: Arc<History>,
         events: Events,
         writes: &Arc<WriteStats>,
     ) -> std::io::Result<RecorderTask> {
         let (control, orders) = channel();
         let (captures, waiting) = sync_channel(WAITING);
-        let store = Store::open(&options);
+        // Without recordings the directory is left alone.
+        let store = options.is_on().then(|| Store::open(&options));
         {
             let mut shared = recordings.shared();
-            shared.entries = store.entries().to_vec();
+            shared.entries = store.as_ref().map_or_else(Vec::new, |store| store.entries().to_vec());
             shared.control = Some(control.clone());
-            shared.options = Some(options.clone());
+            shared.options = Some(options.clone()).filter(RecorderOptions::is_on);
         }
-        let writer = Writer {
+        let writer = store.map(|store| Writer {
             store,
             recordings: recordings.clone(),
             events: events.clone(),
             failing: false,
-        };
+        });
         let taker = Taker {
-            recorder: Recorder::new(options),
+            recorder: Recorder::new(options, history),
             events: events.clone(),
             heard: events.subscribe(),
             commands: writes.audit().subscribe(),
@@ -155,12 +157,13 @@ impl RecorderTask {
             left_out: 0,
         };
         let thread = |name: &str| std::thread::Builder::new().name(name.to_string());
-        let writer = thread("recordings").spawn(move || writer.run(&waiting))?;
+        let writer = writer.map(|writer| thread("recordings").spawn(move || writer.run(&waiting)));
+        let writer = writer.transpose()?;
         let taker = thread("recorder").spawn(move || taker.run(&orders))?;
         Ok(RecorderTask {
             recordings,
             control,
-            threads: vec![taker, writer],
+            threads: [taker].into_iter().chain(writer).collect(),
         })
     }
 

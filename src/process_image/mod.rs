@@ -11,7 +11,7 @@ mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
 pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
-pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Verdict};
+pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
 use std::collections::BTreeMap;
@@ -320,7 +320,7 @@ pub struct BusImage {
     pub slow_cycles: Histogram,
     /// The frames on the line, for whoever listens.
     pub trace: Trace,
-    /// What is read and what is on the line, for the recorder.
+    /// What is read and what is on the line, for recorder, trends and counters.
     pub tape: Tape,
     health: Mutex<BusHealth>,
 }

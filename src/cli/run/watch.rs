@@ -136,6 +136,7 @@ mod tests {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            history: Default::default(),
         };
         assert_eq!(status(&plant, None), "0 of 0 buses up, 0 of 0 drives online");
         let refused = (SystemTime::UNIX_EPOCH, summary(&errors).unwrap());

@@ -64,7 +64,7 @@ impl Rig {
             now: Instant::now() + Duration::from_secs(3600),
             wall: SystemTime::UNIX_EPOCH + Duration::from_millis(1_770_000_000_000),
         };
-        let mut recorder = Recorder::new(options);
+        let mut recorder = Recorder::new(options, Arc::default());
         assert!(recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
         Rig { bus, recorder, clock }
     }
@@ -78,29 +78,21 @@ impl Rig {
     pub(super) fn poll(&mut self, drive: usize, status: u16, current: u16, code: u16) {
         let at = self.clock.now;
         let words = [status, 0, 8200, 4100, 1200, current, 0, 0, 0, 655, code];
-        self.bus.tape.append(|| {
-            let (table, start, words) = (Table::Holding, 2100, words.into());
-            Taped::Read(
-                drive,
-                TapedRead {
-                    at,
-                    table,
-                    start,
-                    words,
-                },
-            )
+        self.bus.tape.read(drive, || TapedRead {
+            at,
+            table: Table::Holding,
+            start: 2100,
+            words: words.into(),
         });
     }
 
     pub(super) fn fail(&mut self, drive: usize) {
         let at = self.clock.now;
-        self.bus.tape.append(|| {
-            Taped::Frame(TapedFrame {
-                at,
-                drive: Some(drive),
-                verdict: Verdict::Timeout,
-                bytes: [].into(),
-            })
+        self.bus.tape.frame(|| TapedFrame {
+            at,
+            drive: Some(drive),
+            verdict: Verdict::Timeout,
+            bytes: [].into(),
         });
     }
 
@@ -370,9 +362,9 @@ fn a_reload_keeps_what_stays_and_ends_what_goes() {
     });
     let (bus, clock) = (rig.bus.clone(), rig.clock);
     assert!(rig.recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
-    assert!(bus.tape.is_on());
+    assert!(bus.tape.takes(Taping::Reads));
     let made = rig.recorder.adopt(&[], clock);
-    assert!(!bus.tape.is_on());
+    assert!(!bus.tape.takes(Taping::Reads));
     let [recording] = &made.iter().map(assemble).collect::<Vec<_>>()[..] else {
         panic!()
     };

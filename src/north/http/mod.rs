@@ -9,10 +9,12 @@ mod hosts;
 mod in_use;
 mod offline;
 mod page;
+mod query;
 mod routes;
 mod streams;
 mod terms;
 mod tokens;
+mod trend;
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;

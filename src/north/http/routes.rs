@@ -17,12 +17,12 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams, trend};
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
-use crate::plant::SharedPlant;
+use crate::plant::{Plant, SharedPlant};
 
 /// What all handlers share.
 #[derive(Debug)]
@@ -41,7 +41,7 @@ pub(super) struct AppState {
 
 impl AppState {
     /// A turn to render a large reply.
-    async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
         self.rendering.acquire().await.ok()
     }
 }
@@ -90,6 +90,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/readyz", get(ready))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/audit", get(audit))
         .route("/api/v1/recordings", get(recordings))
@@ -203,10 +204,7 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
             let clock = api::Clock::new(Instant::now(), SystemTime::now());
             Json(api::Drive::new(&drive, clock)).into_response()
         }
-        None => {
-            let known = plant.drives().map(|d| d.image.spec.name.clone());
-            not_found(format!("there is no drive `{name}`"), known.collect())
-        }
+        None => no_drive(&plant, &name),
     }
 }
 
@@ -262,6 +260,12 @@ async fn unknown(uri: Uri) -> Response {
     }
     let text = "there is nothing here; the status page is at /\n";
     (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// The reply where there is no such drive.
+pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
+    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
 }
 
 /// A 404 reply that lists the known names.

@@ -1,0 +1,325 @@
+//! Trends in memory: the least, the greatest and the last value of a point in equal steps of time. Pure: time is an argument.
+//!
+//! Each value goes into every range, so the buckets of a coarse range hold the extremes of what was read, not of what a finer
+//! one kept of it. Times are monotonic; the time of day serves for labels only.
+
+use std::ops::RangeInclusive;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::Clock;
+use crate::codec::Table;
+use crate::drive::{ModelPoint, Profile, Source};
+use crate::process_image::{Reading, TapedRead};
+
+/// A span of time and the steps it is kept in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Range {
+    /// How far back it reaches.
+    pub span: Duration,
+    /// Length of a bucket.
+    pub step: Duration,
+}
+
+impl Range {
+    const fn new(span: u64, step: u64) -> Range {
+        Range {
+            span: Duration::from_secs(span),
+            step: Duration::from_secs(step),
+        }
+    }
+
+    const fn buckets(self) -> usize {
+        (self.span.as_secs() / self.step.as_secs()) as usize
+    }
+}
+
+/// The ranges, finest first.
+pub const RANGES: [Range; 3] = [Range::new(600, 1), Range::new(3600, 5), Range::new(24 * 3600, 120)];
+
+/// Points of which a trend is kept, as far as a profile has them.
+pub const POINTS: [ModelPoint; 9] = [
+    ModelPoint::ActualSpeed,
+    ModelPoint::OutputFrequency,
+    ModelPoint::MotorSpeed,
+    ModelPoint::MotorCurrent,
+    ModelPoint::MotorTorque,
+    ModelPoint::MotorPower,
+    ModelPoint::MotorVoltage,
+    ModelPoint::DcLinkVoltage,
+    ModelPoint::HeatsinkTemperature,
+];
+
+/// Memory of the trend of a point, from its first value on, bytes.
+pub const POINT_BYTES: usize = {
+    let [fine, middle, coarse] = RANGES;
+    (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
+};
+
+/// Memory of the trends of a drive at most, bytes.
+pub fn bytes_of(profile: &Profile) -> usize {
+    points_of(profile).count() * POINT_BYTES
+}
+
+fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
+    let index = |point: ModelPoint| Some((point, profile.model_index(point)?));
+    POINTS.into_iter().filter_map(index)
+}
+
+/// What the values of one step were. `min` is no number while there were none.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Bucket {
+    min: f32,
+    max: f32,
+    last: f32,
+}
+
+impl Bucket {
+    const EMPTY: Bucket = Bucket {
+        min: f32::NAN,
+        max: f32::NAN,
+        last: f32::NAN,
+    };
+
+    fn add(&mut self, value: f32, is_last: bool) {
+        // The other one where one is no number.
+        self.min = self.min.min(value);
+        self.max = self.max.max(value);
+        if is_last || self.last.is_nan() {
+            self.last = value;
+        }
+    }
+}
+
+/// The newest buckets of a range.
+#[derive(Debug, Clone)]
+struct Buckets {
+    buckets: Box<[Bucket]>,
+    /// Number of the newest bucket, counted from the beginning of the trend; bucket `n` is at `n % buckets.len()`.
+    newest: u64,
+}
+
+impl Buckets {
+    fn new(range: Range) -> Buckets {
+        Buckets {
+            buckets: vec![Bucket::EMPTY; range.buckets()].into(),
+            newest: 0,
+        }
+    }
+
+    fn len(&self) -> u64 {
+        self.buckets.len() as u64
+    }
+
+    fn place(&self, number: u64) -> usize {
+        // The remainder is less than a length.
+        usize::try_from(number % self.len().max(1)).unwrap_or_default()
+    }
+
+    fn add(&mut self, number: u64, value: f32) {
+        if number > self.newest {
+            // What was a lap before is not of this time.
+            let first = (self.newest + 1).max((number + 1).saturating_sub(self.len()));
+            for stale in first..=number {
+                let place = self.place(stale);
+                if let Some(bucket) = self.buckets.get_mut(place) {
+                    *bucket = Bucket::EMPTY;
+                }
+            }
+            self.newest = number;
+        }
+        if number + self.len() <= self.newest {
+            return;
+        }
+        let (place, is_last) = (self.place(number), number == self.newest);
+        if let Some(bucket) = self.buckets.get_mut(place) {
+            bucket.add(value, is_last);
+        }
+    }
+
+    fn get(&self, number: u64) -> Option<Bucket> {
+        if number > self.newest || number + self.len() <= self.newest {
+            return None;
+        }
+        self.buckets
+            .get(self.place(number))
+            .copied()
+            .filter(|bucket| !bucket.min.is_nan())
+    }
+}
+
+/// What the values of one step were.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// Its beginning, ms since 1970.
+    pub at: u64,
+    /// The least value.
+    pub min: f32,
+    /// The greatest value.
+    pub max: f32,
+    /// The last value.
+    pub last: f32,
+}
+
+/// A part of a trend.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    /// Name of the point.
+    pub point: &'static str,
+    /// Its unit.
+    pub unit: &'static str,
+    /// Length of a step.
+    pub step: Duration,
+    /// Beginning of the first step.
+    pub from: SystemTime,
+    /// End of the last one.
+    pub to: SystemTime,
+    /// A step each, oldest first; `None` where nothing good was read.
+    pub steps: Vec<Option<Step>>,
+}
+
+/// Registers: a table and the addresses in it.
+type Registers = (Table, RangeInclusive<u16>);
+
+#[derive(Debug)]
+struct PointTrend {
+    point: ModelPoint,
+    /// Index in the profile.
+    index: usize,
+    /// Where its value is read from.
+    registers: Vec<Registers>,
+    /// It rests on points that are read elsewhere, too.
+    derived: bool,
+    /// `None` before the first value.
+    ranges: Option<[Buckets; RANGES.len()]>,
+}
+
+/// The trends of a drive.
+#[derive(Debug)]
+pub struct DriveTrend {
+    /// Time that the numbers of the buckets are counted from.
+    epoch: Instant,
+    points: Vec<PointTrend>,
+}
+
+impl DriveTrend {
+    /// The trends of a drive of that profile, empty.
+    pub fn new(profile: &Profile, clock: Clock) -> DriveTrend {
+        let trend = |(point, index): (ModelPoint, usize)| PointTrend {
+            point,
+            index,
+            registers: registers_of(profile, index),
+            derived: profile.points.get(index).is_some_and(|point| point.raw().is_none()),
+            ranges: None,
+        };
+        DriveTrend {
+            epoch: epoch(clock),
+            points: points_of(profile).map(trend).collect(),
+        }
+    }
+
+    /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `is_known` says whether a
+    /// point that is made of others is good: they may have been read before the drive was away.
+    pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, is_known: impl Fn(usize) -> bool) {
+        for point in &mut self.points {
+            if !point.registers.iter().any(|registers| shows(read, registers)) {
+                continue;
+            }
+            let sample = reading.sample(point.index);
+            // The words of a value may come in several reads: it is as old as the oldest.
+            let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
+                continue;
+            };
+            if !point.derived || is_known(point.index) {
+                let since = read.at.saturating_duration_since(self.epoch);
+                point.add(since, value.as_f64() as f32);
+            }
+        }
+    }
+
+    /// The points, and the memory of each in bytes.
+    pub fn points(&self) -> impl Iterator<Item = (ModelPoint, usize)> {
+        let bytes = |point: &PointTrend| point.ranges.as_ref().map_or(0, |_| POINT_BYTES);
+        self.points.iter().map(move |point| (point.point, bytes(point)))
+    }
+
+    /// The trend of a point between two times, in the finest range that reaches back as far as `from`. What is older than the
+    /// longest range, or not yet, is left out. `None` where no trend of the point is kept.
+    pub fn part(&self, point: ModelPoint, from: Instant, to: Instant, clock: Clock) -> Option<Part> {
+        let trend = self.points.iter().find(|trend| trend.point == point)?;
+        let age = clock.now.saturating_duration_since(from);
+        let last = RANGES.len() - 1;
+        let chosen = RANGES.iter().position(|range| age <= range.span).unwrap_or(last);
+        let range = RANGES.get(chosen)?;
+        let number = |at: Instant| number(at.saturating_duration_since(self.epoch), range.step);
+        let now = number(clock.now);
+        let oldest = (now + 1).saturating_sub(range.buckets() as u64);
+        let (first, end) = (number(from).clamp(oldest, now), number(to).clamp(oldest, now));
+        // Steps that follow each other have times that follow each other, whatever the clock says meanwhile.
+        let at = clock.wall_at(self.epoch) + range.step * u32::try_from(first).unwrap_or(u32::MAX);
+        let from = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let from = (from.as_micros() as u64).div_ceil(1000);
+        let step = range.step.as_millis() as u64;
+        let buckets = trend.ranges.as_ref().and_then(|ranges| ranges.get(chosen));
+        let steps = (first..=end).map(|number| {
+            let Bucket { min, max, last } = buckets?.get(number)?;
+            let at = from + (number - first) * step;
+            Some(Step { at, min, max, last })
+        });
+        let wall = |millis: u64| SystemTime::UNIX_EPOCH + Duration::from_millis(millis);
+        Some(Part {
+            point: point.name(),
+            unit: point.unit(),
+            step: range.step,
+            from: wall(from),
+            to: wall(from + (end + 1).saturating_sub(first) * step),
+            steps: steps.collect(),
+        })
+    }
+}
+
+impl PointTrend {
+    fn add(&mut self, since: Duration, value: f32) {
+        let ranges = self.ranges.get_or_insert_with(|| RANGES.map(Buckets::new));
+        for (buckets, range) in ranges.iter_mut().zip(RANGES) {
+            buckets.add(number(since, range.step), value);
+        }
+    }
+}
+
+/// Number of the bucket that a time since the beginning falls into.
+fn number(since: Duration, step: Duration) -> u64 {
+    since.as_secs() / step.as_secs().max(1)
+}
+
+/// A time from which on the steps of all ranges begin at whole steps of the time of day: a longest step ago at most.
+fn epoch(clock: Clock) -> Instant {
+    let [.., Range { step, .. }] = RANGES;
+    let since = clock.wall.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let into = Duration::from_nanos((since.as_nanos() % step.as_nanos().max(1)) as u64);
+    // Shortly after the machine was started there may be no such instant.
+    clock.now.checked_sub(into).unwrap_or(clock.now)
+}
+
+fn shows(read: &TapedRead, (table, addresses): &Registers) -> bool {
+    let end = usize::from(read.start) + read.words.len();
+    let overlap = *addresses.end() >= read.start && usize::from(*addresses.start()) < end;
+    read.table == *table && overlap
+}
+
+/// Where the value of a point is read from, without the ends of a band.
+fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
+    let Some(point) = profile.points.get(index) else {
+        return Vec::new();
+    };
+    match &point.source {
+        Source::Raw(raw) => {
+            let last = raw.address.saturating_add(raw.form.items().saturating_sub(1));
+            vec![(raw.table, raw.address..=last)]
+        }
+        // A point rests on points before it only: the profile is refused otherwise.
+        Source::Derived(derived) => {
+            let sources = derived.sources().into_iter().filter(|source| *source != index);
+            sources.flat_map(|source| registers_of(profile, source)).collect()
+        }
+    }
+}
