@@ -246,7 +246,8 @@ impl Daemon {
             history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
-            recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
+            let images = kept.iter().map(|(_, task)| task.handle().image.clone());
+            recorder.adopt(images.collect(), settings.stale_after);
         }
         self.buses = kept;
     }

@@ -2,8 +2,8 @@
 //! time after it; one file a recording.
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
-//! - [`trend`]: least, greatest and last values in steps of time; [`drives`]: those of all drives, as the rest of the gateway
-//!   sees them.
+//! - [`trend`]: least, greatest and last values in steps of time; [`counters`]: starts and run time; [`line`]: the last hour of a
+//!   line. [`drives`]: those of all drives and buses, as the rest of the gateway sees them.
 //! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
 //! - [`capture`]: reads captures of lines, its own and others, for `drivegate replay`.
 //! - [`budget`]: how much memory the rings take at most.
@@ -14,10 +14,13 @@
 //!   gateway sees them.
 
 pub mod assemble;
+mod buckets;
 pub mod budget;
 pub mod capture;
+pub mod counters;
 pub mod drives;
 pub mod export;
+pub mod line;
 pub mod pcapng;
 pub mod recorder;
 pub mod recording;

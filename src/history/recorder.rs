@@ -2,11 +2,12 @@
 //! images.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::budget::Budget;
 use super::drives::{DriveHistory, History};
+use super::line::LineHistory;
 use super::ring::{Ring, Timed};
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
@@ -17,8 +18,6 @@ use crate::process_image::{
 
 /// Triggers of a recording that are noted beside the first.
 const MOST_TRIGGERS: usize = 32;
-/// Age at which a point that others rest on is not good any more for a trend.
-const RECENT: Duration = Duration::from_secs(60);
 /// Age at which a value is still good here: a recording shows what was read, whenever that was.
 const ANY_AGE: Duration = Duration::from_secs(10 * 365 * 86_400);
 
@@ -144,6 +143,8 @@ pub struct Capture {
 struct DriveRing {
     image: Arc<DriveImage>,
     history: Arc<DriveHistory>,
+    /// Whether it answered when it was last looked at, and since when.
+    link: Link,
     samples: Ring<TapedRead>,
     notes: Ring<Note>,
     /// What was known before the oldest sample, and what is known now.
@@ -166,6 +167,7 @@ struct Pending {
 #[derive(Debug)]
 struct LineRing {
     bus: Arc<BusImage>,
+    last_hour: Arc<Mutex<LineHistory>>,
     drives: Vec<DriveRing>,
     frames: Ring<TapedFrame>,
     errors: LineErrors,
@@ -177,6 +179,8 @@ struct LineRing {
 pub struct Recorder {
     options: RecorderOptions,
     history: Arc<History>,
+    /// Age from which process data is stale.
+    stale_after: Duration,
     lines: Vec<LineRing>,
 }
 
@@ -186,17 +190,17 @@ impl Recorder {
         Recorder {
             options,
             history,
+            stale_after: Duration::from_secs(1),
             lines: Vec::new(),
         }
     }
 
     /// Records these buses from now on. Those that are there already keep their rings; what was recorded of the others ends
-    /// now.
-    pub fn adopt(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
+    /// now. Process data is stale from `stale_after` on.
+    pub fn adopt(&mut self, buses: &[Arc<BusImage>], stale_after: Duration, clock: Clock) -> Vec<Capture> {
+        self.stale_after = stale_after;
         let captures = self.leave_all_but(buses, clock);
-        let drives = || buses.iter().flat_map(|bus| &bus.drives);
-        self.history
-            .keep_only(|name| drives().any(|drive| drive.spec.name == name));
+        self.history.keep_only(buses);
         for bus in buses {
             if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
                 self.lines.push(LineRing::new(bus, &self.options, &self.history, clock));
@@ -216,7 +220,7 @@ impl Recorder {
             .partition(|line| buses.iter().any(|bus| Arc::ptr_eq(bus, &line.bus)));
         self.lines = kept;
         for mut line in gone {
-            line.take_in(&self.options, clock);
+            line.take_in(&self.options, self.stale_after, clock);
             line.bus.tape.switch(Taping::Off);
             captures.extend(line.ended(&self.options, clock, true));
         }
@@ -253,7 +257,7 @@ impl Recorder {
     pub fn tick(&mut self, clock: Clock) -> Vec<Capture> {
         let mut captures = Vec::new();
         for line in &mut self.lines {
-            line.take_in(&self.options, clock);
+            line.take_in(&self.options, self.stale_after, clock);
             captures.extend(line.ended(&self.options, clock, false));
         }
         captures
@@ -276,6 +280,7 @@ impl LineRing {
             DriveRing {
                 image: image.clone(),
                 history: history.of(&image.spec, clock),
+                link: image.snapshot().link,
                 samples: Ring::new(*samples, window),
                 notes: Ring::new(budget.notes, window),
                 now: base.clone(),
@@ -290,18 +295,22 @@ impl LineRing {
             frames: Ring::new(budget.frames, window),
             errors: LineErrors::default(),
             lost: 0,
+            last_hour: history.of_line(bus, clock),
             bus: bus.clone(),
         }
     }
 
-    fn take_in(&mut self, options: &RecorderOptions, clock: Clock) {
+    fn take_in(&mut self, options: &RecorderOptions, stale_after: Duration, clock: Clock) {
         let (entries, lost) = self.bus.tape.take();
         self.lost += lost;
+        let mut last_hour = self.last_hour.lock().unwrap_or_else(PoisonError::into_inner);
+        last_hour.look(&self.bus, clock.now);
+        drop(last_hour);
         for entry in entries {
             match entry {
                 Taped::Read(index, read) => {
                     if let Some(drive) = self.drives.get_mut(index)
-                        && let Some(trigger) = drive.read(read, options, clock)
+                        && let Some(trigger) = drive.read(read, options, stale_after, clock)
                     {
                         drive.trigger(trigger, clock);
                     }
@@ -319,6 +328,7 @@ impl LineRing {
                 }
             }
         }
+        self.drives.iter_mut().for_each(DriveRing::look_at_link);
     }
 
     fn answers(&self, drive: usize) -> bool {
@@ -357,14 +367,27 @@ impl LineRing {
 }
 
 impl DriveRing {
-    fn read(&mut self, read: TapedRead, options: &RecorderOptions, clock: Clock) -> Option<Trigger> {
+    /// Whatever a drive does while it is away, nobody sees. To be called when all is taken in that was read before.
+    fn look_at_link(&mut self) {
+        let link = self.image.snapshot().link;
+        let before = std::mem::replace(&mut self.link, link);
+        if before.is_online() && before != link {
+            self.history.interrupt();
+        }
+    }
+
+    fn read(
+        &mut self,
+        read: TapedRead,
+        options: &RecorderOptions,
+        stale_after: Duration,
+        clock: Clock,
+    ) -> Option<Trigger> {
         let at = read.at;
         Arc::make_mut(&mut self.now).store(read.table, read.start, &read.words, at);
         let reading = reading(&self.image.spec, &self.now, at);
-        // What a drive said before it was away is no base for a value: its image knows, unless it is away again.
-        let known = self.image.reading(clock.now, RECENT);
-        let is_known = |point: usize| !known.snapshot.link.is_online() || known.sample(point).good().is_some();
-        self.history.trend().read(&read, &reading, is_known);
+        let known = self.image.reading(clock.now, stale_after);
+        self.history.read(&read, &reading, &known);
         if !options.is_on() {
             return None;
         }

@@ -38,7 +38,7 @@ pub enum NotRecorded {
 }
 
 enum Control {
-    Buses(Vec<Arc<BusImage>>),
+    Buses(Vec<Arc<BusImage>>, Duration),
     Record(String, String, oneshot::Sender<Option<String>>),
     Stop,
 }
@@ -167,10 +167,10 @@ impl RecorderTask {
         })
     }
 
-    /// Records these buses from now on.
-    pub fn adopt(&self, buses: Vec<Arc<BusImage>>) {
+    /// Records these buses from now on; process data is stale from `stale_after` on.
+    pub fn adopt(&self, buses: Vec<Arc<BusImage>>, stale_after: Duration) {
         // The thread only ends when this is stopped.
-        let _ = self.control.send(Control::Buses(buses));
+        let _ = self.control.send(Control::Buses(buses, stale_after));
     }
 
     /// Ends what is being recorded, and waits until it is on disk.
@@ -206,7 +206,9 @@ impl Taker {
             self.take_notes(clock);
             let mut captures = self.recorder.tick(clock);
             match order {
-                Ok(Control::Buses(buses)) => captures.extend(self.recorder.adopt(&buses, clock)),
+                Ok(Control::Buses(buses, stale_after)) => {
+                    captures.extend(self.recorder.adopt(&buses, stale_after, clock));
+                }
                 Ok(Control::Record(drive, who, reply)) => {
                     let trigger = Trigger {
                         kind: TriggerKind::Command,

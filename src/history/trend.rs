@@ -7,6 +7,7 @@ use std::ops::RangeInclusive;
 use std::time::{Duration, Instant, SystemTime};
 
 use super::Clock;
+use super::buckets::Buckets;
 use crate::codec::Table;
 use crate::drive::{ModelPoint, Profile, Source};
 use crate::process_image::{Reading, TapedRead};
@@ -65,85 +66,31 @@ fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
     POINTS.into_iter().filter_map(index)
 }
 
-/// What the values of one step were. `min` is no number while there were none.
+/// What the values of one step were; no numbers while there were none.
 #[derive(Debug, Clone, Copy, PartialEq)]
-struct Bucket {
-    min: f32,
-    max: f32,
-    last: f32,
+pub(super) struct Bucket {
+    pub(super) min: f32,
+    pub(super) max: f32,
+    pub(super) last: f32,
+}
+
+impl Default for Bucket {
+    fn default() -> Bucket {
+        let [min, max, last] = [f32::NAN; 3];
+        Bucket { min, max, last }
+    }
 }
 
 impl Bucket {
-    const EMPTY: Bucket = Bucket {
-        min: f32::NAN,
-        max: f32::NAN,
-        last: f32::NAN,
-    };
-
-    fn add(&mut self, value: f32, is_last: bool) {
-        // The other one where one is no number.
+    pub(super) fn add(&mut self, value: f32) {
+        // `min` and `max` take the other one where one is no number.
         self.min = self.min.min(value);
         self.max = self.max.max(value);
-        if is_last || self.last.is_nan() {
-            self.last = value;
-        }
-    }
-}
-
-/// The newest buckets of a range.
-#[derive(Debug, Clone)]
-struct Buckets {
-    buckets: Box<[Bucket]>,
-    /// Number of the newest bucket, counted from the beginning of the trend; bucket `n` is at `n % buckets.len()`.
-    newest: u64,
-}
-
-impl Buckets {
-    fn new(range: Range) -> Buckets {
-        Buckets {
-            buckets: vec![Bucket::EMPTY; range.buckets()].into(),
-            newest: 0,
-        }
+        self.last = value;
     }
 
-    fn len(&self) -> u64 {
-        self.buckets.len() as u64
-    }
-
-    fn place(&self, number: u64) -> usize {
-        // The remainder is less than a length.
-        usize::try_from(number % self.len().max(1)).unwrap_or_default()
-    }
-
-    fn add(&mut self, number: u64, value: f32) {
-        if number > self.newest {
-            // What was a lap before is not of this time.
-            let first = (self.newest + 1).max((number + 1).saturating_sub(self.len()));
-            for stale in first..=number {
-                let place = self.place(stale);
-                if let Some(bucket) = self.buckets.get_mut(place) {
-                    *bucket = Bucket::EMPTY;
-                }
-            }
-            self.newest = number;
-        }
-        if number + self.len() <= self.newest {
-            return;
-        }
-        let (place, is_last) = (self.place(number), number == self.newest);
-        if let Some(bucket) = self.buckets.get_mut(place) {
-            bucket.add(value, is_last);
-        }
-    }
-
-    fn get(&self, number: u64) -> Option<Bucket> {
-        if number > self.newest || number + self.len() <= self.newest {
-            return None;
-        }
-        self.buckets
-            .get(self.place(number))
-            .copied()
-            .filter(|bucket| !bucket.min.is_nan())
+    pub(super) fn is_empty(self) -> bool {
+        self.last.is_nan()
     }
 }
 
@@ -190,7 +137,15 @@ struct PointTrend {
     /// It rests on points that are read elsewhere, too.
     derived: bool,
     /// `None` before the first value.
-    ranges: Option<[Buckets; RANGES.len()]>,
+    kept: Option<Kept>,
+}
+
+/// The values of a point.
+#[derive(Debug)]
+struct Kept {
+    ranges: [Buckets<Bucket>; RANGES.len()],
+    /// The last value and when it was read, as long as the drive was not away since.
+    last: Option<(Duration, f32)>,
 }
 
 /// The trends of a drive.
@@ -209,7 +164,7 @@ impl DriveTrend {
             index,
             registers: registers_of(profile, index),
             derived: profile.points.get(index).is_some_and(|point| point.raw().is_none()),
-            ranges: None,
+            kept: None,
         };
         DriveTrend {
             epoch: epoch(clock),
@@ -217,9 +172,10 @@ impl DriveTrend {
         }
     }
 
-    /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `is_known` says whether a
-    /// point that is made of others is good: they may have been read before the drive was away.
-    pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, is_known: impl Fn(usize) -> bool) {
+    /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `known` is the drive as its
+    /// image has it: it knows whether a point that is made of others is good, since they may have been read before the drive
+    /// was away, and for how long a value is good. A value stands for the steps until the next one, as far as it is good so long.
+    pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
         for point in &mut self.points {
             if !point.registers.iter().any(|registers| shows(read, registers)) {
                 continue;
@@ -229,16 +185,25 @@ impl DriveTrend {
             let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
                 continue;
             };
-            if !point.derived || is_known(point.index) {
+            let is_known = !known.snapshot.link.is_online() || known.sample(point.index).good().is_some();
+            if !point.derived || is_known {
                 let since = read.at.saturating_duration_since(self.epoch);
-                point.add(since, value.as_f64() as f32);
+                let kept = point.kept.get_or_insert_with(Kept::new);
+                kept.add(since, value.as_f64() as f32, known.good_for(point.index));
             }
+        }
+    }
+
+    /// The drive was away: no value from before stands for the time since.
+    pub fn interrupt(&mut self) {
+        for kept in self.points.iter_mut().filter_map(|point| point.kept.as_mut()) {
+            kept.last = None;
         }
     }
 
     /// The points, and the memory of each in bytes.
     pub fn points(&self) -> impl Iterator<Item = (ModelPoint, usize)> {
-        let bytes = |point: &PointTrend| point.ranges.as_ref().map_or(0, |_| POINT_BYTES);
+        let bytes = |point: &PointTrend| point.kept.as_ref().map_or(0, |_| POINT_BYTES);
         self.points.iter().map(move |point| (point.point, bytes(point)))
     }
 
@@ -259,9 +224,10 @@ impl DriveTrend {
         let from = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
         let from = (from.as_micros() as u64).div_ceil(1000);
         let step = range.step.as_millis() as u64;
-        let buckets = trend.ranges.as_ref().and_then(|ranges| ranges.get(chosen));
+        let buckets = trend.kept.as_ref().and_then(|kept| kept.ranges.get(chosen));
         let steps = (first..=end).map(|number| {
-            let Bucket { min, max, last } = buckets?.get(number)?;
+            let bucket = buckets?.get(number).filter(|bucket| !bucket.is_empty());
+            let Bucket { min, max, last } = bucket?;
             let at = from + (number - first) * step;
             Some(Step { at, min, max, last })
         });
@@ -277,22 +243,42 @@ impl DriveTrend {
     }
 }
 
-impl PointTrend {
-    fn add(&mut self, since: Duration, value: f32) {
-        let ranges = self.ranges.get_or_insert_with(|| RANGES.map(Buckets::new));
-        for (buckets, range) in ranges.iter_mut().zip(RANGES) {
-            buckets.add(number(since, range.step), value);
+impl Kept {
+    fn new() -> Kept {
+        Kept {
+            ranges: RANGES.map(|range| Buckets::new(range.buckets())),
+            last: None,
         }
+    }
+
+    /// A value was read `since` the beginning; the one before was good for `good_for`.
+    fn add(&mut self, since: Duration, value: f32, good_for: Duration) {
+        let before = self.last.filter(|(at, _)| since.saturating_sub(*at) <= good_for);
+        for (buckets, range) in self.ranges.iter_mut().zip(RANGES) {
+            let number = number(since, range.step);
+            if let Some((at, before)) = before {
+                let first = self::number(at, range.step).max(number.saturating_sub(range.buckets() as u64)) + 1;
+                for between in first..number {
+                    if let Some(bucket) = buckets.at(between) {
+                        bucket.add(before);
+                    }
+                }
+            }
+            if let Some(bucket) = buckets.at(number) {
+                bucket.add(value);
+            }
+        }
+        self.last = Some((since, value));
     }
 }
 
 /// Number of the bucket that a time since the beginning falls into.
-fn number(since: Duration, step: Duration) -> u64 {
+pub(super) fn number(since: Duration, step: Duration) -> u64 {
     since.as_secs() / step.as_secs().max(1)
 }
 
 /// A time from which on the steps of all ranges begin at whole steps of the time of day: a longest step ago at most.
-fn epoch(clock: Clock) -> Instant {
+pub(super) fn epoch(clock: Clock) -> Instant {
     let [.., Range { step, .. }] = RANGES;
     let since = clock.wall.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
     let into = Duration::from_nanos((since.as_nanos() % step.as_nanos().max(1)) as u64);

@@ -65,7 +65,11 @@ impl Rig {
             wall: SystemTime::UNIX_EPOCH + Duration::from_millis(1_770_000_000_000),
         };
         let mut recorder = Recorder::new(options, Arc::default());
-        assert!(recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
+        assert!(
+            recorder
+                .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
+                .is_empty()
+        );
         Rig { bus, recorder, clock }
     }
 
@@ -361,9 +365,13 @@ fn a_reload_keeps_what_stays_and_ends_what_goes() {
         rig.poll(0, if n == 300 { FAULT } else { RUNS }, 0, 5)
     });
     let (bus, clock) = (rig.bus.clone(), rig.clock);
-    assert!(rig.recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
+    assert!(
+        rig.recorder
+            .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
+            .is_empty()
+    );
     assert!(bus.tape.takes(Taping::Reads));
-    let made = rig.recorder.adopt(&[], clock);
+    let made = rig.recorder.adopt(&[], STALE_AFTER, clock);
     assert!(!bus.tape.takes(Taping::Reads));
     let [recording] = &made.iter().map(assemble).collect::<Vec<_>>()[..] else {
         panic!()

@@ -7,6 +7,7 @@ mod access;
 mod api;
 mod hosts;
 mod in_use;
+mod line;
 mod offline;
 mod page;
 mod query;
@@ -45,6 +46,7 @@ use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
 use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
 use crate::command::Authority;
+use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 
 pub use self::offline::Offline;
@@ -414,6 +416,11 @@ fn set_socket_options(stream: &TcpStream) {
 ///
 /// # Errors
 /// None is known; a value that JSON cannot express would be one.
-pub fn drive_json(drive: &DriveHandle, now: Instant, wall: SystemTime) -> serde_json::Result<serde_json::Value> {
-    serde_json::to_value(api::Drive::new(drive, api::Clock::new(now, wall)))
+pub fn drive_json(
+    drive: &DriveHandle,
+    history: &History,
+    now: Instant,
+    wall: SystemTime,
+) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, history, api::Clock::new(now, wall)))
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use axum::Router;
-use axum::extract::{Path, Request, State};
+use axum::extract::{Path, RawQuery, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
@@ -17,7 +17,7 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams, trend};
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, line, page, query, streams, trend};
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::log_throttle::LogThrottle;
@@ -92,6 +92,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
+        .route("/api/v1/buses/{name}", get(line::bus))
         .route("/api/v1/audit", get(audit))
         .route("/api/v1/recordings", get(recordings))
         .route("/api/v1/recordings/{id}", get(recording))
@@ -193,7 +194,10 @@ async fn drives(State(app): State<Arc<AppState>>) -> Response {
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
-    let all: Vec<_> = all.iter().map(|drive| api::Drive::new(drive, clock)).collect();
+    let all: Vec<_> = all
+        .iter()
+        .map(|drive| api::Drive::new(drive, &plant.history, clock))
+        .collect();
     Json(all).into_response()
 }
 
@@ -202,7 +206,7 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
     match plant.drive(&name) {
         Some(drive) => {
             let clock = api::Clock::new(Instant::now(), SystemTime::now());
-            Json(api::Drive::new(&drive, clock)).into_response()
+            Json(api::Drive::new(&drive, &plant.history, clock)).into_response()
         }
         None => no_drive(&plant, &name),
     }
@@ -214,11 +218,22 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
     Json(all).into_response()
 }
 
-/// The last commands, newest last.
-async fn audit(State(app): State<Arc<AppState>>) -> Response {
+/// The last commands, newest last; with `drive` those to one drive.
+async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let [drive] = match query::parameters(query.as_deref(), &["drive"]) {
+        Ok(wanted) => wanted,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let plant = app.plant.load();
+    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
+        return no_drive(&plant, drive);
+    }
     let _turn = app.turn().await;
-    let records = app.plant.load().writes.audit().recent();
-    Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+    let records = plant.writes.audit().recent();
+    let wanted = records
+        .iter()
+        .filter(|record| drive.as_ref().is_none_or(|drive| record.drive == *drive));
+    Json(wanted.map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
 /// The recordings, oldest first.
