@@ -140,15 +140,10 @@ impl Report {
 
     fn event(&self, kind: EventKind, drive: Option<String>, fault_code: Option<i64>, text: String) {
         self.events.publish(Event {
-            id: 0,
-            time: SystemTime::now(),
-            kind,
             bus: self.image.spec.name.clone(),
             drive,
             fault_code,
-            count: None,
-            text,
-            recording: None,
+            ..Event::new(kind, SystemTime::now(), text)
         });
     }
 

@@ -67,6 +67,15 @@ impl Recordings {
         self.shared().entries.clone()
     }
 
+    /// Time before and after the trigger that a recording has; nothing while the recorder is off.
+    pub fn span(&self) -> (Duration, Duration) {
+        let shared = self.shared();
+        shared
+            .options
+            .as_ref()
+            .map_or_else(Default::default, |options| (options.before, options.after))
+    }
+
     /// Recordings made since the gateway started, by what made them.
     pub fn made(&self) -> BTreeMap<TriggerKind, u64> {
         self.shared().made.clone()
@@ -343,7 +352,7 @@ impl Writer {
                     let text = format!("recording {}: {}", entry.id, entry.summary);
                     let made = RecordingMade {
                         id: entry.id.clone(),
-                        trigger: entry.trigger.name(),
+                        trigger: entry.trigger.name().into(),
                         summary: entry.summary.clone(),
                     };
                     publish(&self.events, bus, Some(drive), text, Some(made));
@@ -366,14 +375,9 @@ impl Writer {
 
 fn publish(events: &Events, bus: String, drive: Option<String>, text: String, recording: Option<RecordingMade>) {
     events.publish(Event {
-        id: 0,
-        time: std::time::SystemTime::now(),
-        kind: EventKind::Recording,
         bus,
         drive,
-        fault_code: None,
-        count: None,
-        text,
         recording,
+        ..Event::new(EventKind::Recording, std::time::SystemTime::now(), text)
     });
 }

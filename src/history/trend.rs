@@ -309,3 +309,6 @@ fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
         }
     }
 }
+
+#[cfg(test)]
+mod tests;

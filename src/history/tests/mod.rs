@@ -1,6 +1,7 @@
 //! The recorder as a whole, in virtual time: what a bus tapes by hand becomes recordings.
 
 mod files;
+mod trends;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -10,12 +11,15 @@ use super::recorder::{Note, NoteBody};
 use super::recording::Recording;
 use super::*;
 use crate::codec::{LineFormat, Protocol, Table};
+use crate::drive::ModelPoint;
 use crate::drive::profile::Profiles;
 use crate::process_image::{
-    BusImage, BusSpec, DriveImage, DriveSpec, Link, PointTrigger, Taped, TapedFrame, TapedRead, TriggerLimit, Verdict,
+    BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit,
+    Verdict,
 };
 
 const POLL: Duration = Duration::from_millis(10);
+const STALE_AFTER: Duration = Duration::from_secs(1);
 /// Bits of the status word: ready, running, fault, warning.
 const RUNS: u16 = 0x0003;
 const FAULT: u16 = 0x0008;
@@ -36,6 +40,7 @@ pub(super) fn options() -> RecorderOptions {
 pub(super) struct Rig {
     pub(super) bus: Arc<BusImage>,
     pub(super) recorder: Recorder,
+    pub(super) history: Arc<History>,
     pub(super) clock: Clock,
 }
 
@@ -64,13 +69,23 @@ impl Rig {
             now: Instant::now() + Duration::from_secs(3600),
             wall: SystemTime::UNIX_EPOCH + Duration::from_millis(1_770_000_000_000),
         };
-        let mut recorder = Recorder::new(options, Arc::default());
+        let history = Arc::<History>::default();
+        let mut recorder = Recorder::new(options, history.clone());
         assert!(
             recorder
                 .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
                 .is_empty()
         );
-        Rig { bus, recorder, clock }
+        Rig {
+            bus,
+            recorder,
+            history,
+            clock,
+        }
+    }
+
+    pub(super) fn history(&self) -> Arc<DriveHistory> {
+        self.history.drive("pump-1").unwrap()
     }
 
     pub(super) fn pass(&mut self, time: Duration) {

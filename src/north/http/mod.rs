@@ -5,6 +5,7 @@
 
 mod access;
 mod api;
+mod event_log;
 mod hosts;
 mod in_use;
 mod line;

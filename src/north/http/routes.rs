@@ -17,7 +17,7 @@ use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
 use super::access::Access;
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, line, page, query, streams, trend};
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, streams, trend};
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits};
 use crate::north::log_throttle::LogThrottle;
@@ -97,6 +97,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/recordings", get(recordings))
         .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
+        .route("/api/v1/events/log", get(event_log::log))
         .route("/api/v1/trace", get(streams::trace))
         .fallback(unknown)
         .with_state(app)

@@ -42,6 +42,8 @@ const FROZEN: [&str; 52] = [
     "drivegate_drive_running gauge bus,drive",
     "drivegate_drive_sample_age_seconds gauge bus,drive",
     "drivegate_drive_speed_reference_percent gauge bus,drive",
+    "drivegate_drive_running_seconds_total counter bus,drive",
+    "drivegate_drive_starts_total counter bus,drive",
     "drivegate_drive_state gauge bus,drive,state",
     "drivegate_drive_transactions_total counter bus,drive,outcome",
     "drivegate_drive_turnaround_seconds gauge bus,drive",
