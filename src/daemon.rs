@@ -19,7 +19,7 @@ use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::history::{History, RecorderTask, Recordings};
+use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
@@ -30,7 +30,7 @@ const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
-/// Time limit for the audit file to be written.
+/// Time limit for the audit file, and for events and counters, to be written.
 const STOP_AUDIT: Duration = Duration::from_secs(1);
 /// Interval at which refusals are reported whose count is due.
 const REFUSALS_REPORTED: Duration = Duration::from_millis(250);
@@ -65,6 +65,8 @@ pub struct Daemon {
     recordings: Arc<Recordings>,
     history: Arc<History>,
     recorder: Option<RecorderTask>,
+    /// Keeps events and counters on disk.
+    keeper: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     pulse: Pulse,
@@ -116,10 +118,13 @@ impl Daemon {
             recordings,
             history,
             recorder: None,
+            keeper: None,
             reporter: report_refusals(shared),
             pulse: Pulse::default(),
             control,
         };
+        // Before anything happens: it knows what happened earlier.
+        daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
@@ -182,6 +187,7 @@ impl Daemon {
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
+        self.apply_keeper(&settings).await;
         let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
         Ok(changes)
@@ -289,6 +295,30 @@ impl Daemon {
         Ok(())
     }
 
+    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
+    async fn apply_keeper(&mut self, settings: &Settings) {
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
+        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
+            return;
+        }
+        let first = self.keeper.is_none();
+        self.stop_keeper().await;
+        match Keeper::start(&settings.state_dir, first, self.history.clone(), &self.events) {
+            Ok(keeper) => self.keeper = Some(keeper),
+            Err(error) => {
+                tracing::error!(
+                    "cannot start the thread that keeps events and counters: {error}; free memory or threads"
+                );
+            }
+        }
+    }
+
+    async fn stop_keeper(&mut self) {
+        if let Some(keeper) = self.keeper.take() {
+            within(STOP_AUDIT, "the history of events", keeper.stop()).await;
+        }
+    }
+
     /// Prepares the servers that listen on the network: all of them or none.
     async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let (plant, stats) = (&self.plant, &self.stats);
@@ -378,6 +408,7 @@ impl Daemon {
             .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
+        self.stop_keeper().await;
         let audit = self.writes.audit();
         if let Some(file) = audit.file() {
             within(STOP_AUDIT, "the audit file", file.stop()).await;

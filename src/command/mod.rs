@@ -14,7 +14,7 @@ mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
 pub(crate) use audit::SENT;
-pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
+pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 

@@ -23,6 +23,16 @@ pub struct Totals {
 }
 
 impl Totals {
+    /// These, counted after `before`.
+    #[must_use]
+    pub fn after(self, before: Totals) -> Totals {
+        Totals {
+            starts: self.starts.saturating_add(before.starts),
+            running_seconds: self.running_seconds + before.running_seconds,
+            energy_kwh: self.energy_kwh.or(before.energy_kwh),
+        }
+    }
+
     /// Whether they can have been counted.
     pub fn is_sane(&self) -> bool {
         let fine = |figure: f64| figure.is_finite() && figure >= 0.0;
@@ -42,6 +52,11 @@ impl Counters {
     /// Counts on from there.
     pub fn from(totals: Totals) -> Counters {
         Counters { totals, ran: None }
+    }
+
+    /// Adds what was counted before.
+    pub fn add(&mut self, before: Totals) {
+        self.totals = self.totals.after(before);
     }
 
     /// What was counted.

@@ -69,9 +69,18 @@ impl History {
         all
     }
 
-    /// Counts on from what was counted before. To be called before any bus is started.
+    /// Adds what was counted before, in earlier runs.
     pub fn count_on(&self, totals: BTreeMap<String, Totals>) {
-        lock(&self.known).absent = totals;
+        let known = &mut *lock(&self.known);
+        for (name, before) in totals {
+            match known.drives.get(&name) {
+                Some(drive) => lock(&drive.counters).add(before),
+                None => {
+                    let absent = known.absent.entry(name).or_default();
+                    *absent = absent.after(before);
+                }
+            }
+        }
     }
 
     /// The past of a drive, which it keeps over a reload: its counters for ever, its trends as long as bus, address and

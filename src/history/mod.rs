@@ -10,7 +10,8 @@
 //! - [`assemble`]: the raw words of a ring as points, and what they show in one sentence (`summary`).
 //! - [`recording`]: the form of a file, its parts and its faults; [`export`] and [`pcapng`] turn one into other forms.
 //! - [`store`]: the directory of the recordings; [`retention`] decides which of them go.
-//! - `task`: the two threads: one takes what the buses taped, the other writes files. [`Recordings`] is how the rest of the
+//! - `keeper`: the thread that writes events and counters, so that they survive a restart.
+//! - `task`: the two threads of the recorder: one takes what the buses taped, the other writes files. [`Recordings`] is how the rest of the
 //!   gateway sees them.
 
 pub mod assemble;
@@ -20,6 +21,7 @@ pub mod capture;
 pub mod counters;
 pub mod drives;
 pub mod export;
+mod keeper;
 pub mod line;
 pub mod pcapng;
 pub mod recorder;
@@ -36,6 +38,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
 pub use drives::{DriveHistory, History};
+pub use keeper::Keeper;
 pub use recorder::{Capture, Recorder};
 pub use recording::{Recording, RecordingError};
 pub use store::{Entry, Store};

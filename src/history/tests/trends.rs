@@ -49,7 +49,7 @@ fn trends_have_the_extremes_of_every_poll_with_and_without_recordings() {
             "{whole:?}"
         );
         let frequency = rig.part(ModelPoint::OutputFrequency, 10);
-        assert_eq!(frequency.steps[3].map(|step| step.last), Some(82.0));
+        assert_eq!(frequency.steps[3].map(|step| step.last), Some(41.0));
         assert_eq!(
             rig.part(ModelPoint::HeatsinkTemperature, 10)
                 .steps

@@ -203,9 +203,9 @@ fn labels_are_whole_steps_and_what_is_asked_for_is_what_comes() {
     let part = |from, to| rig.trend.part(ModelPoint::MotorCurrent, from, to, rig.clock).unwrap();
     for (from, to, step, steps) in [
         (60, 0, 1, 61),
-        (600, 590, 1, 11),
+        (590, 580, 1, 11),
         (601, 0, 5, 121),
-        (3600, 3590, 5, 3),
+        (3590, 3580, 5, 3),
         (7100, 7000, 120, 2),
     ] {
         let part = part(ago(from), ago(to));

@@ -71,6 +71,7 @@ pub(super) fn time(name: &'static str, value: &str, now: SystemTime) -> Result<S
     };
     let age = || now.checked_sub(parse_duration(value).ok()?);
     let at = seconds().or_else(|| humantime::parse_rfc3339(value).ok()).or_else(age);
+    let at = at.map(|at| at.max(SystemTime::UNIX_EPOCH));
     at.ok_or_else(|| QueryError::Value {
         name,
         value: value.to_string(),
@@ -106,7 +107,8 @@ mod tests {
         assert_eq!(of("1800000000"), Ok(now));
         assert_eq!(of("1799999999.5"), Ok(now - Duration::from_millis(500)));
         assert_eq!(of("2027-01-15T08:00:00Z"), Ok(now));
-        for wrong in ["yesterday", "-1", "NaN", "1e300", "10 parsecs", "9999999999999h"] {
+        assert_eq!(of("9999999999999h"), Ok(SystemTime::UNIX_EPOCH));
+        for wrong in ["yesterday", "-1", "NaN", "1e300", "10 parsecs", "99999999999999999999h"] {
             let error = of(wrong).unwrap_err().to_string();
             assert!(error.contains(wrong) && error.contains("10min"), "{error}");
         }

@@ -13,7 +13,7 @@ use serde::{Serialize, Serializer};
 use super::query::{self, QueryError};
 use super::routes::{AppState, no_drive, not_found};
 use crate::drive::ModelPoint;
-use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Step};
+use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Step};
 use crate::history::{Clock, DriveHistory};
 
 /// Shown without `from`.
@@ -38,6 +38,9 @@ impl Wanted {
         let to_text = to.clone().unwrap_or_default();
         let to = time("to", to, now)?.min(now);
         let from = time("from", from, to.checked_sub(SHOWN).unwrap_or(to))?;
+        // There is nothing older.
+        let [.., Range { span, .. }] = RANGES;
+        let from = now.checked_sub(span).map_or(from, |oldest| from.max(oldest));
         if from > to {
             return Err(QueryError::Value {
                 name: "to",
@@ -151,7 +154,7 @@ impl<'d> Kept<'d> {
     fn new(drive: &'d str, history: Option<&DriveHistory>, known: &[ModelPoint]) -> Kept<'d> {
         let bytes: Vec<_> = history.map_or_else(Vec::new, |history| history.trend().points().collect());
         let of = |point: ModelPoint| bytes.iter().find(|(known, _)| *known == point).map_or(0, |(_, b)| *b);
-        let range = |range: crate::history::trend::Range| KeptRange {
+        let range = |range: Range| KeptRange {
             span_s: range.span.as_secs(),
             step_s: range.step.as_secs(),
         };
