@@ -206,7 +206,7 @@ fn labels_are_whole_steps_and_what_is_asked_for_is_what_comes() {
         (590, 580, 1, 11),
         (601, 0, 5, 121),
         (3590, 3580, 5, 3),
-        (7100, 7000, 120, 2),
+        (7100, 6900, 120, 2),
     ] {
         let part = part(ago(from), ago(to));
         let since = part.from.duration_since(SystemTime::UNIX_EPOCH).unwrap();
