@@ -292,7 +292,10 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
 
 /// Memory of trends and the last hour of a line, bytes: all of it, and of the drive with most points.
 fn trend_bytes(bus: &BusSettings) -> (usize, usize) {
-    let drives = bus.drives.iter().map(|drive| trend::bytes_of(&drive.profile) + line::BYTES.1);
+    let drives = bus
+        .drives
+        .iter()
+        .map(|drive| trend::bytes_of(&drive.profile) + line::BYTES.1);
     let most = drives.clone().max().unwrap_or(0);
     (drives.sum::<usize>() + line::BYTES.0, most)
 }
@@ -311,12 +314,13 @@ fn memory(bus: &BusSettings, recorder: &RecorderOptions) -> String {
         return trends;
     }
     let drive = budget.samples.iter().max().map_or(0, |samples| samples + budget.notes);
-    trends + &format!(
-        "  recorder    {} kB of memory at most: {} kB a drive, {} kB for the line\n",
-        kilobytes(budget.total()),
-        kilobytes(drive),
-        kilobytes(budget.frames)
-    )
+    trends
+        + &format!(
+            "  recorder    {} kB of memory at most: {} kB a drive, {} kB for the line\n",
+            kilobytes(budget.total()),
+            kilobytes(drive),
+            kilobytes(budget.frames)
+        )
 }
 
 /// Duration of the stops at shutdown; empty where there are none.

@@ -5,6 +5,8 @@
 pub(super) struct Buckets<T> {
     slots: Box<[T]>,
     newest: u64,
+    /// Where the newest is: a division less for every value.
+    place: usize,
 }
 
 impl<T: Copy + Default> Buckets<T> {
@@ -13,6 +15,7 @@ impl<T: Copy + Default> Buckets<T> {
         Buckets {
             slots: vec![T::default(); steps].into(),
             newest: 0,
+            place: 0,
         }
     }
 
@@ -31,6 +34,9 @@ impl<T: Copy + Default> Buckets<T> {
 
     /// A step to be changed; a newer one than all before takes the place of the oldest. `None` where it is too old to be kept.
     pub(super) fn at(&mut self, number: u64) -> Option<&mut T> {
+        if number == self.newest {
+            return self.slots.get_mut(self.place);
+        }
         if number > self.newest {
             // What was a lap before is not of this time.
             let first = (self.newest + 1).max((number + 1).saturating_sub(self.len()));
@@ -40,7 +46,7 @@ impl<T: Copy + Default> Buckets<T> {
                     *slot = T::default();
                 }
             }
-            self.newest = number;
+            (self.newest, self.place) = (number, self.place(number));
         }
         let place = self.place(number);
         let holds = self.holds(number);

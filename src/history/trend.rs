@@ -256,8 +256,9 @@ impl Kept {
         let before = self.last.filter(|(at, _)| since.saturating_sub(*at) <= good_for);
         for (buckets, range) in self.ranges.iter_mut().zip(RANGES) {
             let number = number(since, range.step);
-            if let Some((at, before)) = before {
-                let first = self::number(at, range.step).max(number.saturating_sub(range.buckets() as u64)) + 1;
+            let between = before.map(|(at, before)| (self::number(at, range.step), before));
+            if let Some((at, before)) = between.filter(|(at, _)| at + 1 < number) {
+                let first = at.max(number.saturating_sub(range.buckets() as u64)) + 1;
                 for between in first..number {
                     if let Some(bucket) = buckets.at(between) {
                         bucket.add(before);

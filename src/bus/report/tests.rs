@@ -136,7 +136,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
         };
         let event = events.recent().into_iter().rfind(|event| event.kind == wanted).unwrap();
         assert_eq!(event.by.as_deref(), expected, "{}", event.text);
-        let named = expected.map_or_else(|| "", |who| who);
+        let named = expected.unwrap_or_default();
         assert!(event.text.contains(named), "{}", event.text);
         assert_eq!(
             event.text.contains("by no order"),

@@ -37,7 +37,7 @@ impl Run {
         let done = self.writer.work(true);
         let told = done
             .as_ref()
-            .map(|()| ())
+            .copied()
             .map_err(|error| io::Error::new(error.kind(), error.to_string()));
         self.writer.report(done, false);
         told
