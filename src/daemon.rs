@@ -19,7 +19,7 @@ use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::history::{RecorderTask, Recordings};
+use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
 use crate::plant::{BusHandle, Plant, SharedPlant};
@@ -30,7 +30,7 @@ const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
-/// Time limit for the audit file to be written.
+/// Time limit for the audit file, and for events and counters, to be written.
 const STOP_AUDIT: Duration = Duration::from_secs(1);
 /// Interval at which refusals are reported whose count is due.
 const REFUSALS_REPORTED: Duration = Duration::from_millis(250);
@@ -45,7 +45,7 @@ pub enum StartError {
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
     /// The system does not provide a thread for the recorder.
-    #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
+    #[error("cannot start the recorder: {0}; free memory or threads")]
     Recorder(std::io::Error),
 }
 
@@ -63,7 +63,10 @@ pub struct Daemon {
     http: ServerSlot<http::Http>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
+    history: Arc<History>,
     recorder: Option<RecorderTask>,
+    /// Keeps events and counters on disk.
+    keeper: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     pulse: Pulse,
@@ -90,6 +93,7 @@ impl Daemon {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
+        let history = Arc::new(History::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
@@ -97,6 +101,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
@@ -111,11 +116,15 @@ impl Daemon {
             http: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
+            history,
             recorder: None,
+            keeper: None,
             reporter: report_refusals(shared),
             pulse: Pulse::default(),
             control,
         };
+        // Before anything happens: it knows what happened earlier.
+        daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
@@ -178,6 +187,7 @@ impl Daemon {
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
         self.apply_audit(&settings).await;
+        self.apply_keeper(&settings).await;
         let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
         Ok(changes)
@@ -245,9 +255,11 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
-            recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
+            let images = kept.iter().map(|(_, task)| task.handle().image.clone());
+            recorder.adopt(images.collect(), settings.stale_after);
         }
         self.buses = kept;
     }
@@ -282,12 +294,35 @@ impl Daemon {
             // A thread of it that panicked has logged that.
             let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
         }
-        if settings.recordings.max_count > 0 {
-            let (recordings, events) = (self.recordings.clone(), self.events.clone());
-            let started = RecorderTask::start(settings.recordings.clone(), recordings, events, &self.writes);
-            self.recorder = Some(started.map_err(StartError::Recorder)?);
-        }
+        let (recordings, history) = (self.recordings.clone(), self.history.clone());
+        let options = settings.recordings.clone();
+        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
+        self.recorder = Some(started.map_err(StartError::Recorder)?);
         Ok(())
+    }
+
+    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
+    async fn apply_keeper(&mut self, settings: &Settings) {
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
+        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
+            return;
+        }
+        let first = self.keeper.is_none();
+        self.stop_keeper().await;
+        match Keeper::start(&settings.state_dir, first, self.history.clone(), &self.events) {
+            Ok(keeper) => self.keeper = Some(keeper),
+            Err(error) => {
+                tracing::error!(
+                    "cannot start the thread that keeps events and counters: {error}; free memory or threads"
+                );
+            }
+        }
+    }
+
+    async fn stop_keeper(&mut self) {
+        if let Some(keeper) = self.keeper.take() {
+            within(STOP_AUDIT, "the history of events", keeper.stop()).await;
+        }
     }
 
     /// Prepares the servers that listen on the network: all of them or none.
@@ -379,6 +414,7 @@ impl Daemon {
             .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
+        self.stop_keeper().await;
         let audit = self.writes.audit();
         if let Some(file) = audit.file() {
             within(STOP_AUDIT, "the audit file", file.stop()).await;

@@ -17,7 +17,7 @@ use crate::command::{
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Events, RefusedCommand};
-use crate::history::Recordings;
+use crate::history::{History, Recordings};
 use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::placed::Placed;
@@ -50,6 +50,8 @@ pub struct Plant {
     pub writes: Arc<WriteStats>,
     /// What the recorder has kept.
     pub recordings: Arc<Recordings>,
+    /// The past of the drives.
+    pub history: Arc<History>,
 }
 
 /// One drive and the way to it.

@@ -156,6 +156,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        history: Default::default(),
     };
     let poll = move || {
         for (drive, value) in drives.iter().cycle().zip((0..=u16::MAX).cycle()) {

@@ -15,6 +15,7 @@ use crate::codec::{Exception, Reply, Request};
 use crate::command::{Outcome, Urgency, WriteStats};
 use crate::event::Events;
 use crate::plant::BusHandle;
+use crate::process_image::Taping;
 
 /// What is to be done with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -246,7 +247,7 @@ impl BusCore {
     fn report_all(&mut self, news: &[News], now: Instant) {
         for one in news {
             if let Some(drive) = self.report.apply(one, now)
-                && self.bus.image.tape.is_on()
+                && self.bus.image.tape.takes(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
             }

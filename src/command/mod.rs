@@ -13,7 +13,7 @@ mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
-pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
+pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};

@@ -182,7 +182,8 @@ keys! {
         /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps: [recordings](recordings.md), and the [audit file](commands.md#the-audit-file).
+        /// Directory of what the gateway keeps: [recordings](recordings.md), [events, run hours and starts](history.md), and the
+        /// [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.

@@ -57,6 +57,8 @@ pub struct Settings {
     pub socket: SocketPath,
     /// Directory of what the gateway keeps.
     pub state_dir: PathBuf,
+    /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
+    pub keeps_history: bool,
     /// What the recorder keeps.
     pub recordings: RecorderOptions,
     /// Directories of the user's profiles.
@@ -250,6 +252,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         gateway: name?,
         socket,
         state_dir,
+        keeps_history: true,
         recordings: recordings?,
         profile_dirs,
         profiles,

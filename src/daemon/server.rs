@@ -364,6 +364,7 @@ mod tests {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            history: Default::default(),
         };
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }

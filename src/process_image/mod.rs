@@ -11,7 +11,7 @@ mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
 pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
-pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Verdict};
+pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
 use std::collections::BTreeMap;
@@ -23,6 +23,7 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
+use self::health::TURNAROUNDS;
 use crate::codec::{LineFormat, Protocol};
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
 
@@ -155,6 +156,8 @@ pub struct DriveImage {
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
+    /// Turnarounds measured.
+    turnarounds: Histogram,
     /// The last heartbeat that the bus has not taken note of.
     heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
@@ -176,6 +179,7 @@ impl DriveImage {
             listeners: ArcSwap::default(),
             outcomes,
             turnaround: AtomicU64::new(0),
+            turnarounds: Histogram::of(&TURNAROUNDS),
             heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
@@ -253,6 +257,7 @@ impl DriveImage {
 
     /// Notes a time from the end of a request to the beginning of its answer; single late wake-ups are smoothed out.
     pub fn set_turnaround(&self, time: Duration) {
+        self.turnarounds.observe(time);
         let last = self.turnaround.load(Ordering::Relaxed);
         let time = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1);
         let smooth = if last == 0 { time } else { last - last / 8 + time / 8 };
@@ -265,6 +270,11 @@ impl DriveImage {
             0 => None,
             nanos => Some(Duration::from_nanos(nanos)),
         }
+    }
+
+    /// Turnarounds so far.
+    pub fn turnarounds(&self) -> HistogramSnapshot {
+        self.turnarounds.snapshot()
     }
 
     /// A commanding client sent its heartbeat: the lease runs anew.
@@ -320,7 +330,7 @@ pub struct BusImage {
     pub slow_cycles: Histogram,
     /// The frames on the line, for whoever listens.
     pub trace: Trace,
-    /// What is read and what is on the line, for the recorder.
+    /// What is read and what is on the line, for recorder, trends and counters.
     pub tape: Tape,
     health: Mutex<BusHealth>,
 }

@@ -9,8 +9,9 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 16] = [
+const ROOMS: [&str; 17] = [
     "document",
+    "files",
     "codec",
     "drive",
     "event",

@@ -246,5 +246,6 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         events: events.clone(),
         writes: writes.clone(),
         recordings: Default::default(),
+        history: Default::default(),
     }
 }

@@ -6,7 +6,8 @@ use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
 use crate::drive::why::Cause;
-use crate::drive::{self, Quality, State};
+use crate::drive::{self, ModelPoint, Quality, State};
+use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 
@@ -66,11 +67,16 @@ pub(super) struct Drive<'d> {
     why: Vec<Cause>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
+    /// `null` where the drive does not say whether it runs.
+    starts: Option<u64>,
+    running_seconds: Option<f64>,
+    /// `null` where the drive does not count it.
+    energy_kwh: Option<f64>,
     points: Points<'d>,
 }
 
 impl<'d> Drive<'d> {
-    pub(super) fn new(drive: &'d DriveHandle, clock: Clock) -> Drive<'d> {
+    pub(super) fn new(drive: &'d DriveHandle, history: &History, clock: Clock) -> Drive<'d> {
         let image = &drive.image;
         let spec = &image.spec;
         let reading = drive.reading(clock.now);
@@ -79,6 +85,8 @@ impl<'d> Drive<'d> {
             Link::Online(since) | Link::Offline(since) => Some(Time(since)),
         };
         let why = drive.why(&reading);
+        let totals = history.totals(&spec.name);
+        let tells_running = spec.profile.model_index(ModelPoint::Running).is_some();
         Drive {
             name: &spec.name,
             bus: &spec.bus,
@@ -99,6 +107,9 @@ impl<'d> Drive<'d> {
             why: why.causes,
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
+            starts: tells_running.then_some(totals.starts),
+            running_seconds: tells_running.then(|| rounded(totals.running_seconds, 1000.0)),
+            energy_kwh: totals.energy_kwh,
             points: Points { reading, clock },
         }
     }
@@ -268,10 +279,10 @@ fn millis(time: Duration) -> u64 {
 }
 
 /// Milliseconds, rounded to the microsecond.
-fn fine_millis(time: Duration) -> f64 {
+pub(super) fn fine_millis(time: Duration) -> f64 {
     rounded(time.as_secs_f64() * 1000.0, 1000.0)
 }
 
-fn rounded(value: f64, parts: f64) -> f64 {
+pub(super) fn rounded(value: f64, parts: f64) -> f64 {
     (value * parts).round() / parts
 }

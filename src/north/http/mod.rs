@@ -6,15 +6,19 @@
 mod access;
 mod api;
 mod body;
+mod event_log;
 mod hosts;
 mod in_use;
+mod line;
 mod offline;
 mod operating;
 mod page;
+mod query;
 mod routes;
 mod streams;
 mod terms;
 mod tokens;
+mod trend;
 mod users;
 
 use std::net::{IpAddr, SocketAddr};
@@ -46,6 +50,7 @@ use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
 use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
+use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 
 pub use self::offline::Offline;
@@ -435,6 +440,11 @@ fn set_socket_options(stream: &TcpStream) {
 ///
 /// # Errors
 /// None is known; a value that JSON cannot express would be one.
-pub fn drive_json(drive: &DriveHandle, now: Instant, wall: SystemTime) -> serde_json::Result<serde_json::Value> {
-    serde_json::to_value(api::Drive::new(drive, api::Clock::new(now, wall)))
+pub fn drive_json(
+    drive: &DriveHandle,
+    history: &History,
+    now: Instant,
+    wall: SystemTime,
+) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, history, api::Clock::new(now, wall)))
 }

@@ -6,7 +6,7 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use axum::Router;
-use axum::extract::{Extension, Path, Request, State};
+use axum::extract::{Extension, Path, RawQuery, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
@@ -18,12 +18,12 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
 use super::operating::{self, Cookies, Operating};
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, streams, trend};
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
-use crate::plant::SharedPlant;
+use crate::plant::{Plant, SharedPlant};
 
 /// What all handlers share.
 #[derive(Debug)]
@@ -43,7 +43,7 @@ pub(super) struct AppState {
 
 impl AppState {
     /// A turn to render a large reply.
-    async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
         self.rendering.acquire().await.ok()
     }
 
@@ -113,11 +113,14 @@ pub(super) fn router(
         .route("/readyz", get(ready))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
+        .route("/api/v1/buses/{name}", get(line::bus))
         .route("/api/v1/audit", get(audit))
         .route("/api/v1/recordings", get(recordings))
         .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
+        .route("/api/v1/events/log", get(event_log::log))
         .route("/api/v1/trace", get(streams::trace))
         .route("/api/v1/login", post(operating::log_in))
         .route("/api/v1/logout", post(operating::log_out))
@@ -266,7 +269,10 @@ async fn drives(State(app): State<Arc<AppState>>) -> Response {
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
-    let all: Vec<_> = all.iter().map(|drive| api::Drive::new(drive, clock)).collect();
+    let all: Vec<_> = all
+        .iter()
+        .map(|drive| api::Drive::new(drive, &plant.history, clock))
+        .collect();
     Json(all).into_response()
 }
 
@@ -275,12 +281,9 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
     match plant.drive(&name) {
         Some(drive) => {
             let clock = api::Clock::new(Instant::now(), SystemTime::now());
-            Json(api::Drive::new(&drive, clock)).into_response()
+            Json(api::Drive::new(&drive, &plant.history, clock)).into_response()
         }
-        None => {
-            let known = plant.drives().map(|d| d.image.spec.name.clone());
-            not_found(format!("there is no drive `{name}`"), known.collect())
-        }
+        None => no_drive(&plant, &name),
     }
 }
 
@@ -290,11 +293,22 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
     Json(all).into_response()
 }
 
-/// The last commands, newest last.
-async fn audit(State(app): State<Arc<AppState>>) -> Response {
+/// The last commands, newest last; with `drive` those to one drive.
+async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let [drive] = match query::parameters(query.as_deref(), &["drive"]) {
+        Ok(wanted) => wanted,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let plant = app.plant.load();
+    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
+        return no_drive(&plant, drive);
+    }
     let _turn = app.turn().await;
-    let records = app.plant.load().writes.audit().recent();
-    Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+    let records = plant.writes.audit().recent();
+    let wanted = records
+        .iter()
+        .filter(|record| drive.as_ref().is_none_or(|drive| record.drive == *drive));
+    Json(wanted.map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
 /// The recordings, oldest first.
@@ -336,6 +350,12 @@ async fn unknown(uri: Uri) -> Response {
     }
     let text = "there is nothing here; the status page is at /\n";
     (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// The reply where there is no such drive.
+pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
+    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
 }
 
 /// A 404 reply that lists the known names.

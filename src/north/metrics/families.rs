@@ -70,6 +70,7 @@ impl Family {
 pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
     let mut all = Vec::new();
     drives(plant, now, &mut all);
+    runs(plant, &mut all);
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
     recordings(plant, &mut all);
@@ -162,6 +163,29 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     all.extend([up, state, blocked, fault_info, age]);
     all.append(&mut model);
     all.extend([point, transactions, turnaround, supervision, unsupervised]);
+}
+
+/// What was counted of the drives that say whether they run.
+fn runs(plant: &Plant, all: &mut Vec<Family>) {
+    let counter = |name, help| Family::new(Kind::Counter, name, help);
+    let mut starts = counter(
+        "drivegate_drive_starts_total",
+        "Starts of the motor that were seen; kept over restarts of the gateway.",
+    );
+    let mut running = counter(
+        "drivegate_drive_running_seconds_total",
+        "Time that the motor was seen running; kept over restarts of the gateway.",
+    );
+    for drive in plant.drives() {
+        let spec = &drive.image.spec;
+        if spec.profile.model_index(ModelPoint::Running).is_some() {
+            let totals = plant.history.totals(&spec.name);
+            let labels = labels_of(&drive.image);
+            starts.add(labels.clone(), SeriesValue::Count(totals.starts));
+            running.add(labels, SeriesValue::Total(totals.running_seconds));
+        }
+    }
+    all.extend([starts, running]);
 }
 
 /// The good points of a drive; `model` has the families of [`MODEL`], in its order.

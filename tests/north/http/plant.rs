@@ -153,15 +153,10 @@ pub(crate) fn plant(buses: Vec<BusHandle>) -> Plant {
 
 pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
     Event {
-        id: 0,
-        time: SystemTime::now(),
-        kind,
         bus: "line1".to_string(),
         drive: Some(drive.to_string()),
         fault_code: (kind == EventKind::Fault).then_some(7),
-        count: None,
-        text: text.to_string(),
-        recording: None,
+        ..Event::new(kind, SystemTime::now(), text.to_string())
     }
 }
 
