@@ -24,6 +24,7 @@ use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
 use crate::codec::{LineFormat, Protocol};
+use crate::diagnosis::Diagnosis;
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
 
 /// Whether a drive may be commanded.
@@ -322,6 +323,8 @@ pub struct BusImage {
     pub trace: Trace,
     /// What is read and what is on the line, for the recorder.
     pub tape: Tape,
+    /// What is wrong with the line. Only the bus itself may store one.
+    pub diagnosis: ArcSwap<Diagnosis>,
     health: Mutex<BusHealth>,
 }
 
@@ -336,6 +339,7 @@ impl BusImage {
             slow_cycles: Histogram::new(),
             trace: Trace::default(),
             tape: Tape::default(),
+            diagnosis: ArcSwap::default(),
             health: Mutex::new(BusHealth::default()),
         }
     }

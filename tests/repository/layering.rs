@@ -9,11 +9,12 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 16] = [
+const ROOMS: [&str; 17] = [
     "document",
     "codec",
     "drive",
     "event",
+    "diagnosis",
     "process_image",
     "command",
     "history",
