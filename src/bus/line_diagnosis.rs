@@ -77,6 +77,7 @@ impl LineDiagnosis {
             gap: self.gap,
             began: exchanged.began,
             at,
+            heard_at: exchanged.heard_at,
             turnaround,
         });
     }
@@ -102,6 +103,7 @@ impl LineDiagnosis {
             gap: exchange.began.saturating_duration_since(exchange.quiet_since),
             began: exchange.began,
             at: exchange.at,
+            heard_at: exchange.at,
             turnaround: answered.map(|replied| replied.saturating_duration_since(exchange.sent)),
         });
     }

@@ -67,6 +67,8 @@ pub struct Exchange<'e> {
     pub began: Instant,
     /// When the exchange was over.
     pub at: Instant,
+    /// When the last bytes came; no matter where none did.
+    pub heard_at: Instant,
     /// Time until the reply began.
     pub turnaround: Option<Duration>,
 }
@@ -394,7 +396,7 @@ impl Figures {
             self.paced.add(self.millisecond(exchange.began), 1);
         }
         let limit = self.line.response_timeout / 2;
-        let middle = self.middle(exchange);
+        let (middle, length) = self.middle(exchange);
         let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
         drive.add(Sign::Answered);
         if let Shape::Led(zero) = shape {
@@ -412,12 +414,12 @@ impl Figures {
                 *slowest = tenths.max(*slowest);
             }
         }
-        drive.mains.look(middle, false);
+        drive.mains.look(middle, length, false);
     }
 
     fn damaged(&mut self, exchange: &Exchange<'_>, shape: Shape) {
         self.is_there(exchange.drive, exchange.at);
-        let middle = self.middle(exchange);
+        let damage = self.damage_at(exchange);
         let runs = usize::from(self.runs);
         let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
         match shape {
@@ -434,7 +436,9 @@ impl Figures {
                 if shape == Shape::Overlong {
                     drive.add(Sign::Overlong);
                 }
-                drive.mains.look(middle, true);
+                if let Some(at) = damage {
+                    drive.mains.look(at, Duration::ZERO, true);
+                }
                 self.running.add(runs, 1.0, 1.0);
             }
         }
@@ -456,9 +460,20 @@ impl Figures {
         }
     }
 
-    fn middle(&self, exchange: &Exchange<'_>) -> Instant {
-        let half = self.line.format.chars(exchange.seen.len()) / 2;
-        exchange.at.checked_sub(half).unwrap_or(exchange.at)
+    /// The middle of a reply on the wire, and for how long it could have been hit where the place of damage is known.
+    fn middle(&self, exchange: &Exchange<'_>) -> (Instant, Duration) {
+        let length = self.line.format.chars(exchange.seen.len());
+        let middle = exchange.heard_at.checked_sub(length / 2).unwrap_or(exchange.at);
+        (middle, if self.line.protocol.is_text() { length } else { Duration::ZERO })
+    }
+
+    /// When a reply was damaged: in a text protocol a character may show it, else the middle is taken.
+    fn damage_at(&self, exchange: &Exchange<'_>) -> Option<Instant> {
+        if !self.line.protocol.is_text() {
+            return Some(self.middle(exchange).0);
+        }
+        let misfit = signature::misfit(self.line.protocol, exchange.seen)?;
+        exchange.heard_at.checked_sub(self.line.format.chars(exchange.seen.len() - misfit))
     }
 
     fn millisecond(&self, at: Instant) -> usize {
@@ -550,7 +565,7 @@ impl Figures {
 }
 
 impl InPhase {
-    fn look(&mut self, at: Instant, damaged: bool) {
+    fn look(&mut self, at: Instant, length: Duration, damaged: bool) {
         if let Some(last) = self.last {
             let since = at.saturating_duration_since(last);
             if since > IN_PHASE {
@@ -558,7 +573,10 @@ impl InPhase {
             } else {
                 for (sums, hertz) in self.sums.iter_mut().zip(MAINS) {
                     let [bad, bad_cosines, good, good_cosines] = sums;
-                    let cosine = (TAU * (hertz * since.as_secs_f32()).fract()).cos();
+                    // The mean over the whole length.
+                    let half = TAU / 2.0 * hertz * length.as_secs_f32();
+                    let mean = if half > 0.0 { half.sin() / half } else { 1.0 };
+                    let cosine = mean * (TAU * (hertz * since.as_secs_f32()).fract()).cos();
                     let (count, sum) = if damaged { (bad, bad_cosines) } else { (good, good_cosines) };
                     *count += 1.0;
                     *sum += cosine;

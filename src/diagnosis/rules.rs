@@ -10,7 +10,7 @@ const KNOWN: u32 = 15;
 /// What is seen in fewer steps of 5 s is a passing disturbance.
 const LASTING: usize = 3;
 /// What is seen less often in a minute is chance.
-const FEW: u32 = 6;
+const FEW: u32 = 5;
 /// The same of what would be told of the whole line.
 const FEW_OF_LINE: u32 = 10;
 /// Share of exchanges below which a drive is good.
@@ -37,7 +37,7 @@ impl Known {
     }
 
     fn is_bad(&self) -> bool {
-        self.lasting && self.failed >= FEW && self.share() >= 0.03
+        self.lasting && self.failed >= FEW && self.share() >= 0.02
     }
 }
 
@@ -53,6 +53,15 @@ fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32) {
 fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
     let expected = f64::from(asked) * rate;
     f64::from(failed) > expected + SIGNIFICANT * expected.max(1.0).sqrt()
+}
+
+/// Whether the first `count` of these, the worst first, are all bad, and much worse than the others.
+fn stand_out(known: &[Known], count: usize) -> bool {
+    let Some((bad, good)) = known.split_at_checked(count) else { return false };
+    let (failed, asked) = sums(good);
+    let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
+    let stands_out = |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
+    good.len() >= 2 && asked >= 60 && bad.iter().all(stands_out)
 }
 
 /// The rules, over the figures of one line.
@@ -73,7 +82,8 @@ pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
         let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
         let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
         let asked = others + silent + damaged;
-        (asked >= KNOWN).then(|| Known {
+        // A bad drive is asked less and less often.
+        (asked >= KNOWN || silent + damaged >= FEW).then(|| Known {
             place,
             asked,
             failed: silent + damaged,
@@ -188,7 +198,7 @@ impl Rules<'_> {
             let shows = [Sign::Second, Sign::Overlong];
             let lasts = self.figures.drives.get(known.place).is_some_and(|drive| drive.steps(&shows) >= LASTING);
             let of_others = seconds - second - overlong;
-            let enough = second >= FEW || (second + overlong >= FEW && overlong * 2 >= known.damaged);
+            let enough = second >= FEW || (second + overlong >= FEW - 1 && overlong * 5 >= known.damaged * 3);
             // A line that repeats everything is no second drive.
             if !lasts || !enough || of_others * 5 > second + overlong || self.known.len() < 2.min(self.figures.drives.len()) {
                 continue;
@@ -251,22 +261,21 @@ impl Rules<'_> {
             return;
         }
         self.answers_late();
-        if !self.comparable || self.known.len() < 3 {
-            return;
-        }
         let mut known: Vec<Known> = self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect();
-        known.sort_by_key(|one| self.figures.drives.get(one.place).map(|drive| drive.address));
-        let (bad, good): (Vec<Known>, Vec<Known>) = known.iter().partition(|one| one.is_bad());
-        let (failed, asked) = sums(&good);
-        let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
-        let stands_out = |one: &Known| one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
-        if bad.is_empty() || good.len() < 2 || asked < 60 || !bad.iter().all(stands_out) {
+        if !self.comparable || known.len() < 3 {
             return;
         }
-        let is_tail = known.iter().rev().take(bad.len()).all(Known::is_bad);
+        known.sort_by(|a, b| b.share().total_cmp(&a.share()));
+        let Some(count) = (1..known.len() - 1).rev().find(|count| stand_out(&known, *count)) else { return };
+        let (bad, good) = known.split_at(count);
+        let (failed, asked) = sums(good);
+        let mut bad = bad.to_vec();
+        let address = |one: &Known| self.figures.drives.get(one.place).map(|drive| drive.address);
+        bad.sort_by_key(address);
+        let is_tail = good.iter().map(address).max() < bad.first().map(address);
         if bad.len() > 1 && is_tail {
             self.from_address(&bad, (failed, asked));
-        } else if bad.len() * 2 < known.len() && bad.len() <= 3 {
+        } else if bad.len() * 2 < self.known.len() && bad.len() <= 3 {
             bad.iter().for_each(|one| self.one_drive(one, (failed, asked)));
         }
     }

@@ -73,14 +73,28 @@ fn shape(protocol: Protocol, request: &Request, frame: &[u8], heard: &[u8], answ
     if heard.len() > 1 && heard.len() < frame.len() && frame.starts_with(heard) {
         return Shape::CutEcho;
     }
-    let expected = protocol.reply_chars(&request.pdu);
-    if heard.len() > expected {
+    if is_overlong(protocol, request, heard.len()) {
         Shape::Overlong
     } else if heard.len() < protocol.least_reply_chars(&request.pdu) && protocol.begins_reply(request, heard) {
         Shape::EndLost
     } else {
         Shape::Garbled
     }
+}
+
+/// Whether a reply to the request cannot have so many characters; N2 has numbers of two lengths.
+fn is_overlong(protocol: Protocol, request: &Request, count: usize) -> bool {
+    let (least, most) = (protocol.least_reply_chars(&request.pdu), protocol.reply_chars(&request.pdu));
+    count > most || (protocol == Protocol::N2 && most < least + 4 && count > least && count < most)
+}
+
+/// The place of a character that no frame of a text protocol has inside, the first if there are several.
+pub fn misfit(protocol: Protocol, seen: &[u8]) -> Option<usize> {
+    if !protocol.is_text() {
+        return None;
+    }
+    let inside = seen.get(1..seen.len().saturating_sub(2))?;
+    inside.iter().position(|byte| !byte.is_ascii_hexdigit()).map(|place| place + 1)
 }
 
 /// Whether a reply may begin so.

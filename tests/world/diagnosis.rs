@@ -175,3 +175,91 @@ fn each_cause_is_told_within_a_minute() {
     }
     assert!(wrong.is_empty(), "{} of all: {}", wrong.len(), wrong.join("\n"));
 }
+
+/// A line without a fault, and what befalls it that is none of the line's.
+struct Sound {
+    name: String,
+    line: Line,
+    parts: fn(&mut Parts),
+    each: fn(&mut Rig, u64),
+}
+
+fn sound_lines() -> Vec<Sound> {
+    let sound = |name: &str, line: &Line, each: fn(&mut Rig, u64)| Sound {
+        name: format!("{} {} {name}", line.family, line.protocol.name()),
+        line: line.clone(),
+        parts: |_| {},
+        each,
+    };
+    let nothing: fn(&mut Rig, u64) = |_, _| {};
+    let mut all = Vec::new();
+    for usual in lines() {
+        all.push(sound("as it is", &usual, nothing));
+        let one_off = Line { dead: vec![2], ..usual.clone() };
+        all.push(sound("one off", &one_off, nothing));
+        let two_off = Line { dead: vec![usual.drives - 1, usual.drives], ..usual.clone() };
+        all.push(sound("the last two off", &two_off, nothing));
+        all.push(sound("one restarts", &usual, |rig, second| {
+            if second % 150 == 30 || second % 150 == 37 {
+                rig.with_drive(3, |drive, now| if second % 150 == 30 { drive.power_off() } else { drive.power_on(now) });
+            }
+        }));
+        all.push(sound("commands", &usual, |rig, second| {
+            let address = 1 + (second % 4) as u8;
+            let order = rig.points(address, &[("run", f64::from(u8::from(second % 7 < 4))), ("speed_reference", (second % 90) as f64)]);
+            drop(rig.place(address, order));
+        }));
+        all.push(sound("rare errors", &Line { faults: "corrupt=0.0004,drop=0.0004".to_string(), ..usual.clone() }, nothing));
+        let slow = Line { turnaround: Duration::from_millis(70), ..usual.clone() };
+        all.push(sound("slow replies", &slow, nothing));
+        all.push(sound("the port goes once", &usual, |rig, second| match second {
+            100 => rig.bus.set_open(false, rig.now),
+            104 => rig.bus.set_open(true, rig.now),
+            _ => {}
+        }));
+        for cycle in [16, 20, 40, 50, 80, 400, 1000] {
+            let paced = Line { cycle: Duration::from_millis(cycle), drives: 3, ..usual.clone() };
+            all.push(sound(&format!("every {cycle} ms"), &paced, nothing));
+        }
+        all.push(Sound {
+            parts: |parts| parts.delivery = Delivery::Chunks(14),
+            ..sound("in chunks", &usual, nothing)
+        });
+    }
+    for (family, protocol, baud, drives) in [
+        ("vacon-nx", Protocol::ModbusRtu, 115_200, 32),
+        ("vacon-nx", Protocol::ModbusRtu, 9600, 1),
+        ("eaton-svx", Protocol::ModbusRtu, 19_200, 10),
+        ("eaton-hvx", Protocol::ModbusRtu, 19_200, 4),
+        ("vacon-cx", Protocol::ModbusRtu, 9600, 4),
+        ("teco-7300pa", Protocol::ModbusRtu, 19_200, 4),
+        ("eaton-hvx-n2", Protocol::N2, 9600, 10),
+        ("teco-7300pa-n2", Protocol::N2, 9600, 16),
+    ] {
+        all.push(sound("as it is", &line(family, protocol, baud, drives), nothing));
+    }
+    all
+}
+
+#[test]
+fn nothing_is_told_of_a_sound_line() {
+    let minutes = number("DIAGNOSIS_MINUTES").unwrap_or(10);
+    let only = std::env::var("DIAGNOSIS_ONLY").ok();
+    let mut wrong = Vec::new();
+    for sound in sound_lines().iter().filter(|sound| only.as_ref().is_none_or(|only| sound.name.contains(only))) {
+        let mut parts = Parts::of(0, &sound.line, 5);
+        (sound.parts)(&mut parts);
+        let mut rig = Rig::new(&sound.line, parts);
+        for second in 0..minutes * 60 {
+            (sound.each)(&mut rig, second);
+            rig.run(SECOND);
+            if !told(&rig).is_empty() {
+                let diagnosis = rig.bus.handle.image.diagnosis.load();
+                wrong.push(format!("{} after {second} s: {:?}\n    {:?}", sound.name, diagnosis.verdicts, diagnosis.drives));
+                println!("{}", wrong.last().unwrap());
+                break;
+            }
+        }
+    }
+    assert!(wrong.is_empty(), "{}", wrong.join("\n"));
+}
