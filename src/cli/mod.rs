@@ -11,6 +11,7 @@ mod backup;
 mod check;
 mod client;
 mod demo;
+mod diagnose;
 mod drive_access;
 mod health;
 mod listen;
@@ -105,6 +106,7 @@ commands! {
     Read => read,
     Write => write,
     Why => why,
+    Diagnose => diagnose,
     Record => record,
     Recordings => recordings,
     Watch => watch,

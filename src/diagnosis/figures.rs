@@ -17,6 +17,8 @@ pub const BYTES_PER_DRIVE: usize = 512;
 const ABSENCE: u16 = 12;
 /// A reply within this time behind a request that got none may be a late one.
 const LATE: Duration = Duration::from_secs(5);
+/// The rest of a damaged reply may be on the line for so long.
+const LEFT_OVER: Duration = Duration::from_millis(50);
 /// Bytes between two exchanges that are kept until it is known whether they are a frame.
 const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
@@ -228,6 +230,40 @@ impl Contrast {
     }
 }
 
+/// A contrast by whether a drive runs. What was counted shortly before a change belongs to neither: the state is read some time after it
+/// changes.
+#[derive(Debug, Clone, Copy, Default)]
+struct Running {
+    runs: bool,
+    /// Asked and failed in this slot and in the one before.
+    slots: [(f32, f32); 2],
+    slot_ends: Option<Instant>,
+    contrast: Contrast,
+}
+
+/// Longest time that a change of state may stay unknown.
+const UNKNOWN: Duration = Duration::from_secs(2);
+
+impl Running {
+    fn change(&mut self, runs: bool) {
+        if runs != self.runs {
+            (self.runs, self.slots, self.slot_ends) = (runs, Default::default(), None);
+        }
+    }
+
+    fn add(&mut self, asked: f32, failed: f32, at: Instant) {
+        let ends = *self.slot_ends.get_or_insert(at + UNKNOWN);
+        let [now, before] = &mut self.slots;
+        if at >= ends {
+            self.contrast.add(usize::from(self.runs), before.0, before.1);
+            (*before, *now) = (*now, (0.0, 0.0));
+            self.slot_ends = Some(at + UNKNOWN);
+        }
+        now.0 += asked;
+        now.1 += failed;
+    }
+}
+
 /// What was counted on a line.
 #[derive(Debug, Clone)]
 pub struct Figures {
@@ -238,15 +274,15 @@ pub struct Figures {
     /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
     arrivals: Window<LATENCY>,
     paced: Window<LATENCY>,
-    /// While all drives stand, while one runs.
-    pub running: Contrast,
+    running: Running,
     /// Close behind a reply, after a pause.
     pub pause: Contrast,
     /// Sound replies of an address that was not asked, by step.
     wrong: Window<1>,
-    runs: bool,
     idle: Vec<u8>,
     last: Option<(usize, End)>,
+    /// When the exchange before was over.
+    last_at: Instant,
     epoch: Instant,
     step_ends: Instant,
     opened: Option<Instant>,
@@ -271,12 +307,12 @@ impl Figures {
             drives: addresses.into_iter().map(drive).collect(),
             arrivals: Window::new(),
             paced: Window::new(),
-            running: Contrast::default(),
+            running: Running::default(),
             pause: Contrast::default(),
             wrong: Window::new(),
-            runs: false,
             idle: Vec::new(),
             last: None,
+            last_at: now,
             epoch: now,
             step_ends: now + STEP,
             opened: None,
@@ -321,7 +357,12 @@ impl Figures {
 
     /// Whether any drive runs from now on.
     pub fn set_running(&mut self, runs: bool) {
-        self.runs = runs;
+        self.running.change(runs);
+    }
+
+    /// While all drives stand, while one runs.
+    pub fn while_running(&self) -> &Contrast {
+        &self.running.contrast
     }
 
     /// In the last minute, of all drives.
@@ -348,7 +389,15 @@ impl Figures {
                 drive.add(Sign::Echoed);
             }
         }
+        let excused = self.is_excused(exchange);
+        let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
         match exchange.end {
+            End::Damaged | End::Silent if excused => {
+                drive.add(Sign::Tried);
+                if exchange.end == End::Silent {
+                    drive.silent_at = Some(exchange.at);
+                }
+            }
             End::Answered => self.answered(exchange, seen.shape),
             End::Damaged => self.damaged(exchange, seen.shape),
             End::Silent => {
@@ -361,7 +410,7 @@ impl Figures {
             }
             End::Doubtful => {}
         }
-        if let (Some(condition), End::Answered | End::Damaged) = (condition, exchange.end) {
+        if let (Some(condition), End::Answered | End::Damaged, false) = (condition, exchange.end, excused) {
             self.pause.add(condition, 1.0, 0.0);
         }
         if exchange.foreign && !matches!(seen.shape, Shape::Led(_)) {
@@ -373,9 +422,18 @@ impl Figures {
             }
         }
         self.last = Some((exchange.drive, exchange.end));
+        self.last_at = exchange.at;
         if answered {
             self.stray(exchange.behind);
         }
+    }
+
+    /// Whether a failure may come of what was left on the line by an exchange with another drive that failed just before.
+    fn is_excused(&self, exchange: &Exchange<'_>) -> bool {
+        let just_before = exchange.began.saturating_duration_since(self.last_at) < LEFT_OVER;
+        exchange.end != End::Answered
+            && just_before
+            && self.last.is_some_and(|(drive, end)| drive != exchange.drive && end == End::Damaged)
     }
 
     fn condition(&self, gap: Duration) -> Option<usize> {
@@ -390,9 +448,10 @@ impl Figures {
     fn answered(&mut self, exchange: &Exchange<'_>, shape: Shape) {
         self.is_there(exchange.drive, exchange.at);
         self.answered_since_opened = true;
-        self.running.add(usize::from(self.runs), 1.0, 0.0);
+        self.running.add(1.0, 0.0, exchange.at);
         self.arrivals.add(self.millisecond(exchange.at), 1);
-        if exchange.gap >= self.line.silence + Duration::from_millis(4) {
+        let follows = self.last.is_some_and(|(_, end)| end == End::Answered);
+        if follows && exchange.gap >= self.line.silence + Duration::from_millis(4) {
             self.paced.add(self.millisecond(exchange.began), 1);
         }
         let limit = self.line.response_timeout / 2;
@@ -420,7 +479,6 @@ impl Figures {
     fn damaged(&mut self, exchange: &Exchange<'_>, shape: Shape) {
         self.is_there(exchange.drive, exchange.at);
         let damage = self.damage_at(exchange);
-        let runs = usize::from(self.runs);
         let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
         match shape {
             Shape::CutEcho => drive.add(Sign::CutEcho),
@@ -439,14 +497,13 @@ impl Figures {
                 if let Some(at) = damage {
                     drive.mains.look(at, Duration::ZERO, true);
                 }
-                self.running.add(runs, 1.0, 1.0);
+                self.running.add(1.0, 1.0, exchange.at);
             }
         }
     }
 
     /// The drive is heard of: what it left unanswered before counts, unless it was absent.
     fn is_there(&mut self, drive: usize, at: Instant) {
-        let runs = usize::from(self.runs);
         let Some(drive) = self.drives.get_mut(drive) else { return };
         let (run, paused) = (std::mem::take(&mut drive.run), std::mem::take(&mut drive.run_paused));
         if run == 0 || run > ABSENCE {
@@ -454,7 +511,7 @@ impl Figures {
         }
         drive.window.add(Sign::Silent as usize, run);
         drive.silent_at = drive.silent_at.filter(|silent| at.saturating_duration_since(*silent) <= LATE);
-        self.running.add(runs, f32::from(run), f32::from(run));
+        self.running.add(f32::from(run), f32::from(run), at);
         for (condition, count) in paused.into_iter().enumerate() {
             self.pause.add(condition, f32::from(count), f32::from(count));
         }
@@ -507,7 +564,11 @@ impl Figures {
         let asked = self.last.map(|(drive, _)| drive);
         let drive = match address {
             Some(address) => self.drives.iter().position(|drive| drive.address == address),
-            None => asked,
+            // A frame of N2 names nobody: it is late if anybody was silent lately.
+            None => {
+                let silent = self.drives.iter().enumerate().filter(|(_, drive)| drive.was_silent(at));
+                silent.max_by_key(|(_, drive)| drive.silent_at).map(|(place, _)| place).or(asked)
+            }
         };
         let is_second = drive.is_some() && self.last == drive.map(|drive| (drive, End::Answered));
         match drive.and_then(|drive| self.drives.get_mut(drive)) {
@@ -535,7 +596,7 @@ impl Figures {
             self.arrivals.roll();
             self.paced.roll();
             self.wrong.roll();
-            self.running.fade();
+            self.running.contrast.fade();
             self.pause.fade();
         }
         self.step_ends = now + STEP;

@@ -37,7 +37,7 @@ impl Known {
     }
 
     fn is_bad(&self) -> bool {
-        self.lasting && self.failed >= FEW && self.share() >= 0.02
+        self.failed >= FEW && self.share() >= 0.02
     }
 }
 
@@ -71,6 +71,8 @@ pub struct Rules<'f> {
     names: &'f [String],
     now: Instant,
     known: Vec<Known>,
+    /// So many failures of others come of drives that speak when others are asked.
+    disturbed: u32,
     /// Most drives are known, those aside that are absent.
     comparable: bool,
     found: Vec<Finding>,
@@ -98,6 +100,7 @@ pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let absent = figures.drives.iter().filter(is_absent).count();
     let mut rules = Rules {
         comparable: (known.len() + absent) * 5 >= figures.drives.len() * 4,
+        disturbed: 0,
         figures,
         names,
         now,
@@ -209,6 +212,7 @@ impl Rules<'_> {
                 "{second} times in the last minute a second sound reply came behind that of {name}, and {overlong} replies were \
                  longer than asked for; {of_others} times with all other drives"
             );
+            self.disturbed += second + overlong;
             self.add(Cause::AddressTwice, Some(known.place), certainty, evidence);
         }
     }
@@ -226,7 +230,7 @@ impl Rules<'_> {
     }
 
     fn while_running(&mut self) {
-        let running = self.figures.running;
+        let running = *self.figures.while_running();
         let (failed, _) = self.exchanges();
         if !Self::contrast(&running) || failed < FEW || self.steps(&[Sign::Silent, Sign::Damaged]) < 2 {
             return;
@@ -262,19 +266,23 @@ impl Rules<'_> {
         }
         self.answers_late();
         let mut known: Vec<Known> = self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect();
-        if !self.comparable || known.len() < 3 {
+        if !self.comparable || known.len() < 3 || sums(&known).0 <= self.disturbed {
             return;
         }
         known.sort_by(|a, b| b.share().total_cmp(&a.share()));
         let Some(count) = (1..known.len() - 1).rev().find(|count| stand_out(&known, *count)) else { return };
         let (bad, good) = known.split_at(count);
+        // Whether it is one drive or several shows when all of them were bad for some time.
+        if !bad.iter().all(|one| one.lasting) {
+            return;
+        }
         let (failed, asked) = sums(good);
         let mut bad = bad.to_vec();
         let address = |one: &Known| self.figures.drives.get(one.place).map(|drive| drive.address);
         bad.sort_by_key(address);
         let is_tail = good.iter().map(address).max() < bad.first().map(address);
         if bad.len() > 1 && is_tail {
-            self.from_address(&bad, (failed, asked));
+            self.bad_tail(&bad, (failed, asked));
         } else if bad.len() * 2 < self.known.len() && bad.len() <= 3 {
             bad.iter().for_each(|one| self.one_drive(one, (failed, asked)));
         }
@@ -301,7 +309,7 @@ impl Rules<'_> {
         self.add(Cause::OneDrive, Some(bad.place), certainty, evidence);
     }
 
-    fn from_address(&mut self, bad: &[Known], (failed, asked): (u32, u32)) {
+    fn bad_tail(&mut self, bad: &[Known], (failed, asked): (u32, u32)) {
         let (of_bad, asked_bad) = sums(bad);
         let Some(first) = bad.first() else { return };
         let address = self.figures.drives.get(first.place).map_or(0, |drive| drive.address);
@@ -329,6 +337,7 @@ impl Rules<'_> {
                 self.name(place),
                 late - own
             );
+            self.disturbed += own;
             self.add(Cause::OneDrive, Some(place), Certainty::Likely, evidence);
         }
     }
@@ -453,7 +462,8 @@ impl Rules<'_> {
         if of_line.iter().any(|cause| self.has(*cause)) {
             return Vec::new();
         }
-        self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect()
+        let rest: Vec<Known> = self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect();
+        if sums(&rest).0 <= self.disturbed { Vec::new() } else { rest }
     }
 
     /// Whether errors are lasting, frequent, and of more than one drive: of half of those that should show some.

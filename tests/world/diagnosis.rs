@@ -35,7 +35,7 @@ struct Case {
     faults: fn(u8, u64) -> FaultPlan,
     parts: fn(&mut Parts),
     told: fn(u8) -> Vec<(Cause, u8)>,
-    /// A drive runs every other five seconds.
+    /// A drive runs every other ten seconds.
     runs: bool,
 }
 
@@ -80,7 +80,7 @@ fn cases() -> Vec<Case> {
         case("noise", |_, seed| plan("corrupt=0.05,deaf=0.02", seed), |_| vec![(Cause::Noise, 0)]),
         case(
             "one drive and echo",
-            |_, seed| plan("corrupt=0.2,drop=0.2", seed).only(&[3]).and(plan("echo=1", seed + 1)),
+            |_, seed| plan("corrupt=0.12,drop=0.12", seed).only(&[3]).and(plan("echo=1", seed + 1)),
             |_| vec![(Cause::OneDrive, 3), (Cause::Echo, 0)],
         ),
         case(
@@ -90,7 +90,7 @@ fn cases() -> Vec<Case> {
         ),
         case(
             "one drive and noise",
-            |_, seed| plan("corrupt=0.3,drop=0.2", seed).only(&[3]).and(plan("corrupt=0.03", seed + 1)),
+            |_, seed| plan("corrupt=0.15,drop=0.15", seed).only(&[3]).and(plan("corrupt=0.03", seed + 1)),
             |_| vec![(Cause::OneDrive, 3), (Cause::Noise, 0)],
         ),
         Case {
@@ -111,12 +111,12 @@ fn told(rig: &Rig) -> Told {
     diagnosis.verdicts.iter().map(|one| (one.verdict, one.drive.as_ref().map_or(0, address))).collect()
 }
 
-/// Lets time pass; a drive is started and stopped every five seconds, where that is wanted.
+/// Lets time pass; a drive is started and stopped every ten seconds, where that is wanted.
 fn pass(rig: &mut Rig, time: Duration, runs: bool, mut each: impl FnMut(&Rig, Duration)) {
     let mut gone = Duration::ZERO;
     while gone < time {
-        if runs && gone.as_secs() % 5 == 0 {
-            let on = f64::from(u8::from(gone.as_secs() % 10 == 5));
+        if runs && gone.as_secs() % 10 == 0 {
+            let on = f64::from(u8::from(gone.as_secs() % 20 == 10));
             let order = rig.points(1, &[("run", on)]);
             drop(rig.place(1, order));
         }
