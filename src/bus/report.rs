@@ -414,6 +414,7 @@ impl Report {
     fn look_at_state(&mut self, index: usize, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         let reading = drive.reading(now, RECENT);
+        let age = reading.model(ModelPoint::Running).at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
         for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
             let Some(Value::Bool(value)) = reading.model(point).good() else {
                 continue;
@@ -429,7 +430,7 @@ impl Report {
         }
         let running = |watched: &[Option<bool>; WATCHED.len()]| watched.first() == Some(&Some(true));
         let runs = self.watched.iter().any(running);
-        self.diagnosis.figures().set_running(runs);
+        self.diagnosis.figures().set_running(runs, age);
     }
 
     pub(super) fn fast_round(&self, cycle: Option<Duration>) {

@@ -24,6 +24,8 @@ const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
+/// A state that is older is not that of the drives at all.
+const LONGEST_AGE: Duration = Duration::from_secs(10);
 /// Part of the counters without steps that is left after each step: half in two minutes.
 const FADE: f32 = 0.97;
 /// The latency timer of usual USB adapters, ms.
@@ -231,18 +233,20 @@ impl Contrast {
 }
 
 /// A contrast by whether a drive runs. What was counted shortly before a change belongs to neither: the state is read some time after it
-/// changes.
+/// changes, and on a slow line some seconds.
 #[derive(Debug, Clone, Copy, Default)]
 struct Running {
     runs: bool,
     /// Asked and failed in this slot and in the one before.
     slots: [(f32, f32); 2],
     slot_ends: Option<Instant>,
+    /// Age of the state before it was read anew, at most lately.
+    age: Duration,
     contrast: Contrast,
 }
 
-/// Longest time that a change of state may stay unknown.
-const UNKNOWN: Duration = Duration::from_secs(2);
+/// So long, at least, a change of state may stay unknown.
+const UNKNOWN: Duration = Duration::from_secs(1);
 
 impl Running {
     fn change(&mut self, runs: bool) {
@@ -252,12 +256,13 @@ impl Running {
     }
 
     fn add(&mut self, asked: f32, failed: f32, at: Instant) {
-        let ends = *self.slot_ends.get_or_insert(at + UNKNOWN);
+        let unknown = self.age.max(UNKNOWN);
+        let ends = *self.slot_ends.get_or_insert(at + unknown);
         let [now, before] = &mut self.slots;
         if at >= ends {
             self.contrast.add(usize::from(self.runs), before.0, before.1);
             (*before, *now) = (*now, (0.0, 0.0));
-            self.slot_ends = Some(at + UNKNOWN);
+            self.slot_ends = Some(at + unknown);
         }
         now.0 += asked;
         now.1 += failed;
@@ -355,9 +360,15 @@ impl Figures {
         self.answered_since_opened
     }
 
-    /// Whether any drive runs from now on.
-    pub fn set_running(&mut self, runs: bool) {
+    /// Whether any drive runs from now on, as read at some time in the last `age`.
+    pub fn set_running(&mut self, runs: bool, age: Duration) {
+        self.running.age = self.running.age.max(age).min(LONGEST_AGE);
         self.running.change(runs);
+    }
+
+    /// Whether any drive runs.
+    pub fn runs(&self) -> bool {
+        self.running.runs
     }
 
     /// While all drives stand, while one runs.
@@ -597,6 +608,7 @@ impl Figures {
             self.paced.roll();
             self.wrong.roll();
             self.running.contrast.fade();
+            self.running.age = self.running.age.mul_f32(FADE);
             self.pause.fade();
         }
         self.step_ends = now + STEP;

@@ -261,7 +261,7 @@ impl Rules<'_> {
 
     /// One drive, or all from one address on.
     fn single_drives(&mut self) {
-        if self.has(Cause::WhileRunning) || self.has(Cause::Mains) {
+        if self.has(Cause::WhileRunning) || self.has(Cause::Mains) || self.may_be_of_running() {
             return;
         }
         self.answers_late();
@@ -456,8 +456,20 @@ impl Rules<'_> {
         }
     }
 
+    /// Whether errors began about when a drive started, so that it is not known yet whether they are those of running drives.
+    fn may_be_of_running(&self) -> bool {
+        let Contrast { asked, failed } = *self.figures.while_running();
+        let (now, of) = self.exchanges();
+        let [usual, _] = failed;
+        let [standing, running] = asked;
+        self.figures.runs() && standing >= 100.0 && running < 100.0 && f64::from(usual / standing) < 0.5 * share(now, of)
+    }
+
     /// Known drives whose errors no verdict explains.
     fn unexplained(&self) -> Vec<Known> {
+        if self.may_be_of_running() {
+            return Vec::new();
+        }
         let of_line = [Cause::WhileRunning, Cause::Mains, Cause::SilenceTooShort, Cause::FromAddress];
         if of_line.iter().any(|cause| self.has(*cause)) {
             return Vec::new();

@@ -17,6 +17,9 @@ const SECOND: Duration = Duration::from_secs(1);
 /// Within this time each cause must be told.
 const TOLD: Duration = Duration::from_secs(60);
 
+/// When the drive is started whose line is to be disturbed by it.
+const RUNS_FROM: Duration = Duration::from_secs(20);
+
 /// What is told: causes, and the addresses of drives they are about (0: none).
 type Told = BTreeSet<(Cause, u8)>;
 
@@ -35,7 +38,7 @@ struct Case {
     faults: fn(u8, u64) -> FaultPlan,
     parts: fn(&mut Parts),
     told: fn(u8) -> Vec<(Cause, u8)>,
-    /// A drive runs every other ten seconds.
+    /// A drive runs from [`RUNS_FROM`] on.
     runs: bool,
 }
 
@@ -111,13 +114,12 @@ fn told(rig: &Rig) -> Told {
     diagnosis.verdicts.iter().map(|one| (one.verdict, one.drive.as_ref().map_or(0, address))).collect()
 }
 
-/// Lets time pass; a drive is started and stopped every ten seconds, where that is wanted.
+/// Lets time pass; a drive is started in between, where that is wanted.
 fn pass(rig: &mut Rig, time: Duration, runs: bool, mut each: impl FnMut(&Rig, Duration)) {
     let mut gone = Duration::ZERO;
     while gone < time {
-        if runs && gone.as_secs() % 10 == 0 {
-            let on = f64::from(u8::from(gone.as_secs() % 20 == 10));
-            let order = rig.points(1, &[("run", on)]);
+        if runs && gone == RUNS_FROM {
+            let order = rig.points(1, &[("run", 1.0)]);
             drop(rig.place(1, order));
         }
         rig.run(SECOND);
