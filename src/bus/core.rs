@@ -194,7 +194,9 @@ impl BusCore {
             tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
         }
         let quiet_since = self.line.quiet_since();
-        self.report.diagnosis.sending(now.saturating_duration_since(quiet_since));
+        self.report
+            .diagnosis
+            .sending(now.saturating_duration_since(quiet_since));
         self.tap = self.report.tap(Some(turn.drive), &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();

@@ -87,7 +87,9 @@ impl LineDiagnosis {
         let (Some(request), Some(ended)) = (&exchange.request, &exchange.ended) else {
             return;
         };
-        let answered = exchange.replied.filter(|_| matches!(ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_))));
+        let answered = exchange
+            .replied
+            .filter(|_| matches!(ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_))));
         self.figures.exchange(&Exchange {
             drive,
             request,
@@ -119,10 +121,7 @@ impl LineDiagnosis {
         let tell = |change: &Change| match change {
             Change::Came(finding) => (finding.drive, told(finding)),
             Change::Firmer(finding) => (finding.drive, format!("now {}", told(finding))),
-            Change::Went(finding) => (
-                finding.drive,
-                format!("no longer: {}", finding.cause.meaning()),
-            ),
+            Change::Went(finding) => (finding.drive, format!("no longer: {}", finding.cause.meaning())),
         };
         changes.iter().map(tell).collect()
     }
@@ -135,7 +134,11 @@ impl LineDiagnosis {
         };
         self.since.retain(|one| shown.iter().any(|finding| is(finding, one)));
         let verdicts = shown.iter().map(|finding| {
-            let known = self.since.iter().find(|one| is(finding, one)).map(|(_, _, since)| *since);
+            let known = self
+                .since
+                .iter()
+                .find(|one| is(finding, one))
+                .map(|(_, _, since)| *since);
             let since = known.unwrap_or(now);
             if known.is_none() {
                 self.since.push((finding.cause, finding.drive, since));
@@ -151,17 +154,22 @@ impl LineDiagnosis {
             }
         });
         let verdicts = verdicts.collect();
-        let counted = self.figures.drives.iter().zip(&self.names).map(|(drive, name)| Counted {
-            drive: name.clone(),
-            answered: drive.sum(Sign::Answered),
-            silent: drive.sum(Sign::Tried),
-            damaged: drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho),
-            stray_before: drive.sum(Sign::Led),
-            start_lost: drive.sum(Sign::StartLost),
-            late: drive.sum(Sign::Late),
-            second: drive.sum(Sign::Second),
-            slowest_ms: drive.slowest_ms(),
-        });
+        let counted = self
+            .figures
+            .drives
+            .iter()
+            .zip(&self.names)
+            .map(|(drive, name)| Counted {
+                drive: name.clone(),
+                answered: drive.sum(Sign::Answered),
+                silent: drive.sum(Sign::Tried),
+                damaged: drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho),
+                stray_before: drive.sum(Sign::Led),
+                start_lost: drive.sum(Sign::StartLost),
+                late: drive.sum(Sign::Late),
+                second: drive.sum(Sign::Second),
+                slowest_ms: drive.slowest_ms(),
+            });
         let drives = counted.collect();
         self.image.diagnosis.store(Arc::new(Diagnosis {
             at: Some(now),
@@ -181,6 +189,16 @@ fn end(ended: &Ended) -> End {
 }
 
 fn told(finding: &Finding) -> String {
-    let Finding { cause, certainty, evidence, .. } = finding;
-    format!("{} ({}): {evidence}; {}", cause.meaning(), certainty.name(), cause.remedy())
+    let Finding {
+        cause,
+        certainty,
+        evidence,
+        ..
+    } = finding;
+    format!(
+        "{} ({}): {evidence}; {}",
+        cause.meaning(),
+        certainty.name(),
+        cause.remedy()
+    )
 }

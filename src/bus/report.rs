@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use super::BusOptions;
 use super::confirm::Unconfirmed;
 use super::line_diagnosis::LineDiagnosis;
 use super::line_state::Exchanged;
 use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
-use super::BusOptions;
 use super::transaction::Ended;
 use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
@@ -414,7 +414,10 @@ impl Report {
     fn look_at_state(&mut self, index: usize, now: Instant) {
         let Some(drive) = self.drive(index) else { return };
         let reading = drive.reading(now, RECENT);
-        let age = reading.model(ModelPoint::Running).at.map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+        let age = reading
+            .model(ModelPoint::Running)
+            .at
+            .map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
         for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
             let Some(Value::Bool(value)) = reading.model(point).good() else {
                 continue;
@@ -555,7 +558,9 @@ impl Report {
     /// Asks the diagnosis every 5 s, and reckons the load once a second.
     pub(super) fn tick(&mut self, now: Instant) {
         for (drive, text) in self.diagnosis.tick(now) {
-            let drive = drive.and_then(|drive| self.drive(drive)).map(|drive| drive.spec.name.clone());
+            let drive = drive
+                .and_then(|drive| self.drive(drive))
+                .map(|drive| drive.spec.name.clone());
             let about = drive.as_ref().map_or(String::new(), |drive| format!(", drive {drive}"));
             let text = format!("line of bus {}{about}: {text}", self.image.spec.name);
             self.event(EventKind::Diagnosis, drive, None, text);

@@ -56,7 +56,11 @@ async fn diagnose(args: &Args) -> Result<String, String> {
         Some(name) => vec![name.clone()],
         None => {
             let buses = get("/api/v1/buses").await?;
-            let names = buses.as_array().into_iter().flatten().filter_map(|bus| bus.get("name")?.as_str());
+            let names = buses
+                .as_array()
+                .into_iter()
+                .flatten()
+                .filter_map(|bus| bus.get("name")?.as_str());
             names.map(str::to_string).collect()
         }
     };
@@ -73,7 +77,10 @@ async fn diagnose(args: &Args) -> Result<String, String> {
             .map_err(|error| format!("the reply is no diagnosis ({error}); the gateway; use the same version"))?;
         Ok(text(&diagnosis))
     };
-    all.into_iter().map(text).collect::<Result<Vec<String>, String>>().map(|texts| texts.join("\n"))
+    all.into_iter()
+        .map(text)
+        .collect::<Result<Vec<String>, String>>()
+        .map(|texts| texts.join("\n"))
 }
 
 fn text(diagnosis: &Diagnosis) -> String {
@@ -84,7 +91,10 @@ fn text(diagnosis: &Diagnosis) -> String {
         _ => "\n",
     };
     for verdict in &diagnosis.verdicts {
-        let about = verdict.drive.as_deref().map_or(String::new(), |drive| format!(" {}", printable::line(drive)));
+        let about = verdict
+            .drive
+            .as_deref()
+            .map_or(String::new(), |drive| format!(" {}", printable::line(drive)));
         let (evidence, remedy) = (printable::line(&verdict.evidence), printable::line(&verdict.remedy));
         // Writing to a String cannot fail.
         let _ = write!(
@@ -128,11 +138,20 @@ mod tests {
             bus: "line1".to_string(),
             time: None,
             verdicts: Vec::new(),
-            drives: vec![Counted { drive: "pump-1".to_string(), ..Counted::default() }],
+            drives: vec![Counted {
+                drive: "pump-1".to_string(),
+                ..Counted::default()
+            }],
         };
-        assert_eq!(text(&diagnosis), "line1: not looked at yet; ask again in some seconds\n");
+        assert_eq!(
+            text(&diagnosis),
+            "line1: not looked at yet; ask again in some seconds\n"
+        );
         diagnosis.time = Some("2026-03-02T06:11:09.480Z".to_string());
-        assert_eq!(text(&diagnosis), "line1: nothing wrong was recognised in the last minute\n");
+        assert_eq!(
+            text(&diagnosis),
+            "line1: nothing wrong was recognised in the last minute\n"
+        );
         diagnosis.verdicts.push(Verdict {
             verdict: Cause::OneDrive,
             drive: Some("pump-1".to_string()),

@@ -136,7 +136,10 @@ struct Window<const N: usize> {
 
 impl<const N: usize> Window<N> {
     fn new() -> Window<N> {
-        Window { steps: [[0; N]; STEPS], now: 0 }
+        Window {
+            steps: [[0; N]; STEPS],
+            now: 0,
+        }
     }
 
     fn add(&mut self, place: usize, count: u16) {
@@ -153,7 +156,9 @@ impl<const N: usize> Window<N> {
     }
 
     fn each(&self, place: usize) -> impl Iterator<Item = u16> {
-        self.steps.iter().map(move |step| step.get(place).copied().unwrap_or_default())
+        self.steps
+            .iter()
+            .map(move |step| step.get(place).copied().unwrap_or_default())
     }
 
     fn sum(&self, place: usize) -> u32 {
@@ -196,7 +201,11 @@ impl Drive {
 
     /// Steps of the last minute in which one of these was counted.
     pub fn steps(&self, signs: &[Sign]) -> usize {
-        let has = |step: &&[u16; SIGNS]| signs.iter().any(|sign| step.get(*sign as usize).is_some_and(|count| *count > 0));
+        let has = |step: &&[u16; SIGNS]| {
+            signs
+                .iter()
+                .any(|sign| step.get(*sign as usize).is_some_and(|count| *count > 0))
+        };
         self.window.steps.iter().filter(has).count()
     }
 
@@ -206,7 +215,8 @@ impl Drive {
     }
 
     fn was_silent(&self, at: Instant) -> bool {
-        self.silent_at.is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
+        self.silent_at
+            .is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
     }
 }
 
@@ -228,7 +238,10 @@ impl Contrast {
     }
 
     fn fade(&mut self) {
-        self.asked.iter_mut().chain(&mut self.failed).for_each(|count| *count *= FADE);
+        self.asked
+            .iter_mut()
+            .chain(&mut self.failed)
+            .for_each(|count| *count *= FADE);
     }
 }
 
@@ -393,7 +406,9 @@ impl Figures {
         let answered = exchange.end == End::Answered;
         let seen = signature::of(protocol, exchange.request, exchange.frame, exchange.seen, answered);
         let condition = self.condition(exchange.gap);
-        let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
         if let Some(echoed) = seen.echoed {
             drive.add(Sign::EchoShown);
             if echoed {
@@ -401,7 +416,9 @@ impl Figures {
             }
         }
         let excused = self.is_excused(exchange);
-        let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
         match exchange.end {
             End::Damaged | End::Silent if excused => {
                 drive.add(Sign::Tried);
@@ -444,7 +461,9 @@ impl Figures {
         let just_before = exchange.began.saturating_duration_since(self.last_at) < LEFT_OVER;
         exchange.end != End::Answered
             && just_before
-            && self.last.is_some_and(|(drive, end)| drive != exchange.drive && end == End::Damaged)
+            && self
+                .last
+                .is_some_and(|(drive, end)| drive != exchange.drive && end == End::Damaged)
     }
 
     fn condition(&self, gap: Duration) -> Option<usize> {
@@ -467,7 +486,9 @@ impl Figures {
         }
         let limit = self.line.response_timeout / 2;
         let (middle, length) = self.middle(exchange);
-        let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
         drive.add(Sign::Answered);
         if let Shape::Led(zero) = shape {
             drive.add(Sign::Led);
@@ -490,7 +511,9 @@ impl Figures {
     fn damaged(&mut self, exchange: &Exchange<'_>, shape: Shape) {
         self.is_there(exchange.drive, exchange.at);
         let damage = self.damage_at(exchange);
-        let Some(drive) = self.drives.get_mut(exchange.drive) else { return };
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
         match shape {
             Shape::CutEcho => drive.add(Sign::CutEcho),
             Shape::StartLost => drive.add(Sign::StartLost),
@@ -515,13 +538,17 @@ impl Figures {
 
     /// The drive is heard of: what it left unanswered before counts, unless it was absent.
     fn is_there(&mut self, drive: usize, at: Instant) {
-        let Some(drive) = self.drives.get_mut(drive) else { return };
+        let Some(drive) = self.drives.get_mut(drive) else {
+            return;
+        };
         let (run, paused) = (std::mem::take(&mut drive.run), std::mem::take(&mut drive.run_paused));
         if run == 0 || run > ABSENCE {
             return;
         }
         drive.window.add(Sign::Silent as usize, run);
-        drive.silent_at = drive.silent_at.filter(|silent| at.saturating_duration_since(*silent) <= LATE);
+        drive.silent_at = drive
+            .silent_at
+            .filter(|silent| at.saturating_duration_since(*silent) <= LATE);
         self.running.add(f32::from(run), f32::from(run), at);
         for (condition, count) in paused.into_iter().enumerate() {
             self.pause.add(condition, f32::from(count), f32::from(count));
@@ -532,7 +559,14 @@ impl Figures {
     fn middle(&self, exchange: &Exchange<'_>) -> (Instant, Duration) {
         let length = self.line.format.chars(exchange.seen.len());
         let middle = exchange.heard_at.checked_sub(length / 2).unwrap_or(exchange.at);
-        (middle, if self.line.protocol.is_text() { length } else { Duration::ZERO })
+        (
+            middle,
+            if self.line.protocol.is_text() {
+                length
+            } else {
+                Duration::ZERO
+            },
+        )
     }
 
     /// When a reply was damaged: in a text protocol a character may show it, else the middle is taken.
@@ -541,7 +575,9 @@ impl Figures {
             return Some(self.middle(exchange).0);
         }
         let misfit = signature::misfit(self.line.protocol, exchange.seen)?;
-        exchange.heard_at.checked_sub(self.line.format.chars(exchange.seen.len() - misfit))
+        exchange
+            .heard_at
+            .checked_sub(self.line.format.chars(exchange.seen.len() - misfit))
     }
 
     fn millisecond(&self, at: Instant) -> usize {
@@ -571,14 +607,19 @@ impl Figures {
 
     /// A sound answer that was not believed, if it is one: a late one, a second one, or one of nobody who was asked.
     fn answer_of_another(&mut self, bytes: &[u8], at: Instant) -> bool {
-        let Some(address) = signature::answer(self.line.protocol, bytes) else { return false };
+        let Some(address) = signature::answer(self.line.protocol, bytes) else {
+            return false;
+        };
         let asked = self.last.map(|(drive, _)| drive);
         let drive = match address {
             Some(address) => self.drives.iter().position(|drive| drive.address == address),
             // A frame of N2 names nobody: it is late if anybody was silent lately.
             None => {
                 let silent = self.drives.iter().enumerate().filter(|(_, drive)| drive.was_silent(at));
-                silent.max_by_key(|(_, drive)| drive.silent_at).map(|(place, _)| place).or(asked)
+                silent
+                    .max_by_key(|(_, drive)| drive.silent_at)
+                    .map(|(place, _)| place)
+                    .or(asked)
             }
         };
         let is_second = drive.is_some() && self.last == drive.map(|drive| (drive, End::Answered));
@@ -625,7 +666,8 @@ impl Figures {
         let of = |place: usize| {
             let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));
             let (mut count, mut closer) = (0.0, 0.0);
-            for &[bad, bad_cosines, good, good_cosines] in sums.filter(|[bad, _, good, _]| *bad >= 1.0 && *good >= 1.0) {
+            for &[bad, bad_cosines, good, good_cosines] in sums.filter(|[bad, _, good, _]| *bad >= 1.0 && *good >= 1.0)
+            {
                 // As certain as the smaller of the two.
                 let weight = bad.min(good);
                 count += weight;
@@ -650,7 +692,11 @@ impl InPhase {
                     let half = TAU / 2.0 * hertz * length.as_secs_f32();
                     let mean = if half > 0.0 { half.sin() / half } else { 1.0 };
                     let cosine = mean * (TAU * (hertz * since.as_secs_f32()).fract()).cos();
-                    let (count, sum) = if damaged { (bad, bad_cosines) } else { (good, good_cosines) };
+                    let (count, sum) = if damaged {
+                        (bad, bad_cosines)
+                    } else {
+                        (good, good_cosines)
+                    };
                     *count += 1.0;
                     *sum += cosine;
                 }

@@ -38,7 +38,7 @@ pub struct Hold {
 /// Steps in a row for which a rule must hold. Causes that only say that nothing else was recognised wait until it would have been.
 fn patience(cause: Cause) -> u32 {
     match cause {
-        Cause::Noise | Cause::RequestEndLost => 6,
+        Cause::Noise | Cause::RequestEndLost => 5,
         Cause::OneDrive | Cause::FromAddress => 3,
         Cause::PortResets => 1,
         _ => 2,
@@ -78,13 +78,22 @@ impl Hold {
                 if shown {
                     changes.push(Change::Came(finding.clone()));
                 }
-                self.held.push(Held { finding, holds: 1, missing: 0, shown });
+                self.held.push(Held {
+                    finding,
+                    holds: 1,
+                    missing: 0,
+                    shown,
+                });
             }
             return;
         };
         let before = held.finding.certainty;
         // Less certain in one step than in another: it was seen.
-        let certainty = if held.shown { before.max(finding.certainty) } else { finding.certainty };
+        let certainty = if held.shown {
+            before.max(finding.certainty)
+        } else {
+            finding.certainty
+        };
         held.finding = Finding { certainty, ..finding };
         (held.holds, held.missing) = (held.holds + 1, 0);
         if !held.shown && held.holds >= patience(held.finding.cause) {
@@ -97,8 +106,19 @@ impl Hold {
 
     /// What is shown, the surest first.
     pub fn shown(&self) -> impl Iterator<Item = &Finding> {
-        let mut shown: Vec<&Finding> = self.held.iter().filter(|held| held.shown).map(|held| &held.finding).collect();
-        shown.sort_by_key(|finding| (std::cmp::Reverse::<Certainty>(finding.certainty), finding.cause, finding.drive));
+        let mut shown: Vec<&Finding> = self
+            .held
+            .iter()
+            .filter(|held| held.shown)
+            .map(|held| &held.finding)
+            .collect();
+        shown.sort_by_key(|finding| {
+            (
+                std::cmp::Reverse::<Certainty>(finding.certainty),
+                finding.cause,
+                finding.drive,
+            )
+        });
         shown.into_iter()
     }
 }
@@ -108,7 +128,12 @@ mod tests {
     use super::*;
 
     fn finding(cause: Cause, certainty: Certainty) -> Finding {
-        Finding { cause, drive: None, certainty, evidence: String::new() }
+        Finding {
+            cause,
+            drive: None,
+            certainty,
+            evidence: String::new(),
+        }
     }
 
     #[test]
@@ -123,13 +148,19 @@ mod tests {
         }
         assert_eq!(hold.take(fits()), []);
         assert_eq!(hold.take(fits()), [Change::Came(finding(Cause::Bias, Certainty::Fits))]);
-        assert_eq!(hold.take(likely()), [Change::Firmer(finding(Cause::Bias, Certainty::Likely))]);
+        assert_eq!(
+            hold.take(likely()),
+            [Change::Firmer(finding(Cause::Bias, Certainty::Likely))]
+        );
         assert_eq!(hold.take(fits()), [], "it does not become less certain");
         for step in 1..GOES_AFTER {
             assert_eq!(hold.take(Vec::new()), [], "{step}");
             assert_eq!(hold.shown().count(), 1);
         }
-        assert_eq!(hold.take(Vec::new()), [Change::Went(finding(Cause::Bias, Certainty::Likely))]);
+        assert_eq!(
+            hold.take(Vec::new()),
+            [Change::Went(finding(Cause::Bias, Certainty::Likely))]
+        );
         assert_eq!(hold.shown().count(), 0);
     }
 
@@ -137,6 +168,6 @@ mod tests {
     fn what_only_fits_because_nothing_else_does_waits() {
         let mut hold = Hold::default();
         let steps = (1..).find(|_| !hold.take(vec![finding(Cause::Noise, Certainty::Likely)]).is_empty());
-        assert_eq!(steps, Some(6));
+        assert_eq!(steps, Some(5));
     }
 }

@@ -185,3 +185,6 @@ pub struct Counted {
 
 /// How often the rules are asked.
 pub const STEP: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests;

@@ -46,7 +46,9 @@ fn share(part: u32, of: u32) -> f64 {
 }
 
 fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32) {
-    drives.into_iter().fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
+    drives
+        .into_iter()
+        .fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
 }
 
 /// Whether `failed` of `asked` are more than chance allows where `rate` is usual.
@@ -57,10 +59,13 @@ fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
 
 /// Whether the first `count` of these, the worst first, are all bad, and much worse than the others.
 fn stand_out(known: &[Known], count: usize) -> bool {
-    let Some((bad, good)) = known.split_at_checked(count) else { return false };
+    let Some((bad, good)) = known.split_at_checked(count) else {
+        return false;
+    };
     let (failed, asked) = sums(good);
     let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
-    let stands_out = |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
+    let stands_out =
+        |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
     good.len() >= 2 && asked >= 60 && bad.iter().all(stands_out)
 }
 
@@ -132,7 +137,12 @@ impl Rules<'_> {
     }
 
     fn add(&mut self, cause: Cause, drive: Option<usize>, certainty: Certainty, evidence: String) {
-        self.found.push(Finding { cause, drive, certainty, evidence });
+        self.found.push(Finding {
+            cause,
+            drive,
+            certainty,
+            evidence,
+        });
     }
 
     fn has(&self, cause: Cause) -> bool {
@@ -160,7 +170,12 @@ impl Rules<'_> {
     }
 
     fn steps(&self, signs: &[Sign]) -> usize {
-        self.figures.drives.iter().map(|drive| drive.steps(signs)).max().unwrap_or(0)
+        self.figures
+            .drives
+            .iter()
+            .map(|drive| drive.steps(signs))
+            .max()
+            .unwrap_or(0)
     }
 
     /// Exchanges of the known drives, and how many of them failed.
@@ -175,9 +190,15 @@ impl Rules<'_> {
             return false;
         }
         let drives = figures.drives.len();
-        let (tried, damaged) = (figures.sum(Sign::Tried), figures.sum(Sign::Damaged) + figures.sum(Sign::Overlong));
+        let (tried, damaged) = (
+            figures.sum(Sign::Tried),
+            figures.sum(Sign::Damaged) + figures.sum(Sign::Overlong),
+        );
         let explained = figures.sum(Sign::StartLost) + figures.sum(Sign::CutEcho) + figures.sum(Sign::Led);
-        let each = figures.drives.iter().all(|drive| drive.sum(Sign::Tried) + drive.sum(Sign::Damaged) >= 2);
+        let each = figures
+            .drives
+            .iter()
+            .all(|drive| drive.sum(Sign::Tried) + drive.sum(Sign::Damaged) >= 2);
         // A single drive that has answered is off; its event says so.
         let is_one = drives < 2 && figures.answered_since_opened();
         if !each || is_one || tried + damaged < 6 || explained > (tried + damaged) / 4 {
@@ -185,11 +206,22 @@ impl Rules<'_> {
         }
         let heard = match (damaged, figures.sum(Sign::Echoed)) {
             (0, 0) => "not one byte came back".to_string(),
-            (0, echoes) => format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter sends"),
-            (_, _) => format!("{damaged} replies came that are no valid frames: baud, format or protocol are likely to differ"),
+            (0, echoes) => {
+                format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter sends")
+            }
+            (_, _) => format!(
+                "{damaged} replies came that are no valid frames: baud, format or protocol are likely to differ"
+            ),
         };
-        let certainty = if figures.answered_since_opened() || drives < 3 { Certainty::Fits } else { Certainty::Likely };
-        let evidence = format!("{} requests to {drives} drives in the last minute were not answered; {heard}", tried + damaged);
+        let certainty = if figures.answered_since_opened() || drives < 3 {
+            Certainty::Fits
+        } else {
+            Certainty::Likely
+        };
+        let evidence = format!(
+            "{} requests to {drives} drives in the last minute were not answered; {heard}",
+            tried + damaged
+        );
         self.add(Cause::AllSilent, None, certainty, evidence);
         true
     }
@@ -197,16 +229,31 @@ impl Rules<'_> {
     fn address_twice(&mut self) {
         let seconds = self.figures.sum(Sign::Second) + self.figures.sum(Sign::Overlong);
         for known in self.known.clone() {
-            let (second, overlong) = (self.sum(known.place, Sign::Second), self.sum(known.place, Sign::Overlong));
+            let (second, overlong) = (
+                self.sum(known.place, Sign::Second),
+                self.sum(known.place, Sign::Overlong),
+            );
             let shows = [Sign::Second, Sign::Overlong];
-            let lasts = self.figures.drives.get(known.place).is_some_and(|drive| drive.steps(&shows) >= LASTING);
+            let lasts = self
+                .figures
+                .drives
+                .get(known.place)
+                .is_some_and(|drive| drive.steps(&shows) >= LASTING);
             let of_others = seconds - second - overlong;
             let enough = second >= FEW || (second + overlong >= FEW - 1 && overlong * 5 >= known.damaged * 3);
             // A line that repeats everything is no second drive.
-            if !lasts || !enough || of_others * 5 > second + overlong || self.known.len() < 2.min(self.figures.drives.len()) {
+            if !lasts
+                || !enough
+                || of_others * 5 > second + overlong
+                || self.known.len() < 2.min(self.figures.drives.len())
+            {
                 continue;
             }
-            let certainty = if second >= FEW { Certainty::Likely } else { Certainty::Fits };
+            let certainty = if second >= FEW {
+                Certainty::Likely
+            } else {
+                Certainty::Fits
+            };
             let name = self.name(known.place);
             let evidence = format!(
                 "{second} times in the last minute a second sound reply came behind that of {name}, and {overlong} replies were \
@@ -240,13 +287,20 @@ impl Rules<'_> {
         let evidence = format!(
             "{runs} of {of_runs} exchanges failed lately while a drive ran, {standing} of {of_standing} while all stood"
         );
-        let certainty = if runs >= 30.0 && of_standing >= 300.0 { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if runs >= 30.0 && of_standing >= 300.0 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::WhileRunning, None, certainty, evidence);
     }
 
     fn mains(&mut self) {
         let phases = self.figures.in_phase();
-        let best = MAINS.into_iter().zip(phases).max_by(|(_, a), (_, b)| a.1.total_cmp(&b.1));
+        let best = MAINS
+            .into_iter()
+            .zip(phases)
+            .max_by(|(_, a), (_, b)| a.1.total_cmp(&b.1));
         let Some((hertz, (count, closer))) = best else { return };
         // The difference of two means of cosines, each of which deviates by the root of one half over their number.
         if count < 40.0 || closer < 0.25 || closer < SIGNIFICANT as f32 / count.sqrt() {
@@ -255,7 +309,11 @@ impl Rules<'_> {
         let evidence = format!(
             "{count:.0} damaged replies lately came at the same place of the {hertz:.0} Hz period, which the sound ones avoid"
         );
-        let certainty = if closer > 0.5 { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if closer > 0.5 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::Mains, None, certainty, evidence);
     }
 
@@ -265,12 +323,19 @@ impl Rules<'_> {
             return;
         }
         self.answers_late();
-        let mut known: Vec<Known> = self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect();
+        let mut known: Vec<Known> = self
+            .known
+            .iter()
+            .filter(|one| !self.is_told(one.place))
+            .copied()
+            .collect();
         if !self.comparable || known.len() < 3 || sums(&known).0 <= self.disturbed {
             return;
         }
         known.sort_by(|a, b| b.share().total_cmp(&a.share()));
-        let Some(count) = (1..known.len() - 1).rev().find(|count| stand_out(&known, *count)) else { return };
+        let Some(count) = (1..known.len() - 1).rev().find(|count| stand_out(&known, *count)) else {
+            return;
+        };
         let (bad, good) = known.split_at(count);
         // Whether it is one drive or several shows when all of them were bad for some time.
         if !bad.iter().all(|one| one.lasting) {
@@ -305,7 +370,11 @@ impl Rules<'_> {
             bad.silent,
             bad.damaged
         );
-        let certainty = if bad.failed >= 15 && share(failed, asked) < GOOD { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if bad.failed >= 15 && share(failed, asked) < GOOD {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::OneDrive, Some(bad.place), certainty, evidence);
     }
 
@@ -318,7 +387,11 @@ impl Rules<'_> {
              address {address}",
             self.names_of(bad.iter().map(|one| one.place)),
         );
-        let certainty = if bad.len() > 2 && share(failed, asked) < GOOD { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if bad.len() > 2 && share(failed, asked) < GOOD {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::FromAddress, None, certainty, evidence);
     }
 
@@ -327,7 +400,11 @@ impl Rules<'_> {
         let late = self.figures.sum(Sign::Late);
         for place in 0..self.figures.drives.len() {
             let own = self.sum(place, Sign::Late);
-            let lasts = self.figures.drives.get(place).is_some_and(|drive| drive.steps(&[Sign::Late]) >= LASTING);
+            let lasts = self
+                .figures
+                .drives
+                .get(place)
+                .is_some_and(|drive| drive.steps(&[Sign::Late]) >= LASTING);
             if own < FEW || !lasts || self.is_told(place) || own * 2 <= late {
                 continue;
             }
@@ -347,7 +424,10 @@ impl Rules<'_> {
             let of = |counts: [f32; 2]| counts.get(place).copied().unwrap_or_default();
             (of(self.figures.pause.failed), of(self.figures.pause.asked))
         });
-        let turned = Contrast { asked: [paused.1, close.1], failed: [paused.0, close.0] };
+        let turned = Contrast {
+            asked: [paused.1, close.1],
+            failed: [paused.0, close.0],
+        };
         let silent = self.figures.sum(Sign::Silent);
         let mut few = turned;
         // Pauses are rare on a busy line, mostly those behind a request without a reply.
@@ -369,13 +449,23 @@ impl Rules<'_> {
             paused.0,
             paused.1
         );
-        self.found.retain(|found| !matches!(found.cause, Cause::OneDrive | Cause::FromAddress));
+        self.found
+            .retain(|found| !matches!(found.cause, Cause::OneDrive | Cause::FromAddress));
         self.add(Cause::SilenceTooShort, None, Certainty::Likely, evidence);
     }
 
     fn bias(&mut self) {
-        let (led, zero, idle) = (self.figures.sum(Sign::Led), self.figures.sum(Sign::LedZero), self.figures.sum(Sign::Idle));
-        let with = self.figures.drives.iter().filter(|drive| drive.sum(Sign::Led) + drive.sum(Sign::Idle) > 0).count();
+        let (led, zero, idle) = (
+            self.figures.sum(Sign::Led),
+            self.figures.sum(Sign::LedZero),
+            self.figures.sum(Sign::Idle),
+        );
+        let with = self
+            .figures
+            .drives
+            .iter()
+            .filter(|drive| drive.sum(Sign::Led) + drive.sum(Sign::Idle) > 0)
+            .count();
         let answered = self.figures.sum(Sign::Answered) + led;
         let lasts = self.steps(&[Sign::Led, Sign::Idle]) >= LASTING;
         if !lasts || led + idle < FEW_OF_LINE || share(led + idle, answered) < 0.01 || with < 2.min(self.known.len()) {
@@ -385,7 +475,11 @@ impl Rules<'_> {
             "{led} of {answered} replies in the last minute had stray bytes before them ({zero} times only zeros), and {idle} times \
              stray bytes came while nobody was to speak"
         );
-        let certainty = if zero * 2 > led || (led > 0 && idle > 0) { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if zero * 2 > led || (led > 0 && idle > 0) {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::Bias, None, certainty, evidence);
     }
 
@@ -395,19 +489,29 @@ impl Rules<'_> {
         if lost < FEW || self.steps(&[Sign::StartLost]) < LASTING || share(lost, damaged) < 0.4 {
             return;
         }
-        let with = self.figures.drives.iter().enumerate().filter(|(_, drive)| drive.sum(Sign::StartLost) > 0);
+        let with = self
+            .figures
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, drive)| drive.sum(Sign::StartLost) > 0);
         let evidence = format!(
             "{lost} of {damaged} damaged replies in the last minute are sound once their first bytes are put back ({})",
             self.names_of(with.map(|(place, _)| place))
         );
-        let certainty = if lost >= 20 && share(lost, damaged) > 0.8 { Certainty::Certain } else { Certainty::Likely };
+        let certainty = if lost >= 20 && share(lost, damaged) > 0.8 {
+            Certainty::Certain
+        } else {
+            Certainty::Likely
+        };
         self.add(Cause::ReplyStartLost, None, certainty, evidence);
     }
 
     fn request_end_lost(&mut self) {
         let cut = self.figures.sum(Sign::CutEcho);
         if cut >= FEW && self.steps(&[Sign::CutEcho]) >= LASTING {
-            let evidence = format!("{cut} requests in the last minute came back as an echo without their end, and got no reply");
+            let evidence =
+                format!("{cut} requests in the last minute came back as an echo without their end, and got no reply");
             self.add(Cause::RequestEndLost, None, Certainty::Certain, evidence);
             return;
         }
@@ -462,7 +566,10 @@ impl Rules<'_> {
         let (now, of) = self.exchanges();
         let [usual, _] = failed;
         let [standing, running] = asked;
-        self.figures.runs() && standing >= 100.0 && running < 100.0 && f64::from(usual / standing) < 0.5 * share(now, of)
+        self.figures.runs()
+            && standing >= 100.0
+            && running < 100.0
+            && f64::from(usual / standing) < 0.5 * share(now, of)
     }
 
     /// Known drives whose errors no verdict explains.
@@ -470,12 +577,26 @@ impl Rules<'_> {
         if self.may_be_of_running() {
             return Vec::new();
         }
-        let of_line = [Cause::WhileRunning, Cause::Mains, Cause::SilenceTooShort, Cause::FromAddress];
+        let of_line = [
+            Cause::WhileRunning,
+            Cause::Mains,
+            Cause::SilenceTooShort,
+            Cause::FromAddress,
+        ];
         if of_line.iter().any(|cause| self.has(*cause)) {
             return Vec::new();
         }
-        let rest: Vec<Known> = self.known.iter().filter(|one| !self.is_told(one.place)).copied().collect();
-        if sums(&rest).0 <= self.disturbed { Vec::new() } else { rest }
+        let rest: Vec<Known> = self
+            .known
+            .iter()
+            .filter(|one| !self.is_told(one.place))
+            .copied()
+            .collect();
+        if sums(&rest).0 <= self.disturbed {
+            Vec::new()
+        } else {
+            rest
+        }
     }
 
     /// Whether errors are lasting, frequent, and of more than one drive: of half of those that should show some.
@@ -494,7 +615,12 @@ impl Rules<'_> {
 
     /// Steps, at most, in which any drive had errors.
     fn steps_of_line(&self) -> usize {
-        let steps: usize = self.figures.drives.iter().map(|drive| drive.steps(&[Sign::Silent, Sign::Damaged])).sum();
+        let steps: usize = self
+            .figures
+            .drives
+            .iter()
+            .map(|drive| drive.steps(&[Sign::Silent, Sign::Damaged]))
+            .sum();
         (steps / 2).min(STEPS)
     }
 
@@ -511,7 +637,11 @@ impl Rules<'_> {
             "{damaged} of {asked} replies in the last minute were damaged and {silent} requests got none, without a pattern ({})",
             self.names_of(with)
         );
-        let certainty = if rest.len() > 2 { Certainty::Likely } else { Certainty::Fits };
+        let certainty = if rest.len() > 2 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
         self.add(Cause::Noise, None, certainty, evidence);
     }
 }

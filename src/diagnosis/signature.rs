@@ -41,7 +41,11 @@ pub struct Signature {
 pub fn of(protocol: Protocol, request: &Request, frame: &[u8], seen: &[u8], answered: bool) -> Signature {
     let is_read = matches!(request.pdu, RequestPdu::Read { .. }) || protocol == Protocol::N2;
     let echoed = is_read && !frame.is_empty() && seen.starts_with(frame);
-    let heard = if echoed { seen.get(frame.len()..).unwrap_or_default() } else { seen };
+    let heard = if echoed {
+        seen.get(frame.len()..).unwrap_or_default()
+    } else {
+        seen
+    };
     Signature {
         echoed: (is_read && !seen.is_empty()).then_some(echoed),
         shape: shape(protocol, request, frame, heard, answered),
@@ -53,13 +57,17 @@ fn shape(protocol: Protocol, request: &Request, frame: &[u8], heard: &[u8], answ
         Decoded::Reply { reply, .. } => answered || !matches!(reply, Reply::Exception(_)),
         _ => false,
     };
-    let Some(&first) = heard.first() else { return Shape::Nothing };
+    let Some(&first) = heard.first() else {
+        return Shape::Nothing;
+    };
     if answered && begins(protocol, request.address, first) {
         return Shape::Sound;
     }
     let stray = (1..=MOST_STRAY).find(|count| {
         let rest = heard.get(*count..).unwrap_or_default();
-        rest.first().is_some_and(|&first| begins(protocol, request.address, first)) && is_reply(rest)
+        rest.first()
+            .is_some_and(|&first| begins(protocol, request.address, first))
+            && is_reply(rest)
     });
     if let Some(stray) = stray {
         return Shape::Led(heard.iter().take(stray).all(|byte| *byte == 0));
@@ -84,7 +92,10 @@ fn shape(protocol: Protocol, request: &Request, frame: &[u8], heard: &[u8], answ
 
 /// Whether a reply to the request cannot have so many characters; N2 has numbers of two lengths.
 fn is_overlong(protocol: Protocol, request: &Request, count: usize) -> bool {
-    let (least, most) = (protocol.least_reply_chars(&request.pdu), protocol.reply_chars(&request.pdu));
+    let (least, most) = (
+        protocol.least_reply_chars(&request.pdu),
+        protocol.reply_chars(&request.pdu),
+    );
     count > most || (protocol == Protocol::N2 && most < least + 4 && count > least && count < most)
 }
 
@@ -94,7 +105,10 @@ pub fn misfit(protocol: Protocol, seen: &[u8]) -> Option<usize> {
         return None;
     }
     let inside = seen.get(1..seen.len().saturating_sub(2))?;
-    inside.iter().position(|byte| !byte.is_ascii_hexdigit()).map(|place| place + 1)
+    inside
+        .iter()
+        .position(|byte| !byte.is_ascii_hexdigit())
+        .map(|place| place + 1)
 }
 
 /// Whether a reply may begin so.
@@ -147,7 +161,14 @@ mod tests {
     use crate::codec::{Table, ascii, rtu};
 
     fn request() -> Request {
-        Request::new(5, RequestPdu::Read { table: Table::Holding, start: 2100, count: 2 })
+        Request::new(
+            5,
+            RequestPdu::Read {
+                table: Table::Holding,
+                start: 2100,
+                count: 2,
+            },
+        )
     }
 
     fn modbus(protocol: Protocol) -> (Vec<u8>, Vec<u8>) {
@@ -183,7 +204,13 @@ mod tests {
             assert_eq!(shape(&reply[..reply.len() - 1], false), Shape::EndLost);
             assert_eq!(shape(&frame[..frame.len() - 1], false), Shape::CutEcho);
             assert_eq!(shape(&[mangled(4), reply.clone()].concat(), false), Shape::Overlong);
-            let echoed = of(protocol, &request(), &frame, &[frame.clone(), reply.clone()].concat(), true);
+            let echoed = of(
+                protocol,
+                &request(),
+                &frame,
+                &[frame.clone(), reply.clone()].concat(),
+                true,
+            );
             assert_eq!((echoed.echoed, echoed.shape), (Some(true), Shape::Sound));
             assert_eq!(answer(protocol, &reply), Some(Some(5)));
             assert_eq!(answer(protocol, &reply[1..]), None);

@@ -38,7 +38,9 @@ impl Cause {
                 "check the cable and terminals before the first of these drives, if addresses follow the cable, and the \
                  termination at both ends of the line"
             }
-            Cause::AddressTwice => "switch this drive off: if its address still answers, give the other drive another one",
+            Cause::AddressTwice => {
+                "switch this drive off: if its address still answers, give the other drive another one"
+            }
             Cause::WhileRunning => {
                 "use shielded twisted pair, earth the shield as the drives' manual says, and keep it away from motor cables (30 cm \
                  or more); earth the motor cables at both ends"
@@ -63,9 +65,7 @@ impl Cause {
                 "harmless, but it costs bytes and hides collisions: two-wire wiring of a four-wire adapter, switch its echo \
                  suppression on"
             }
-            Cause::LatencyTimer => {
-                "set the latency timer of the USB adapter to 1 ms: docs/performance.md, adapters"
-            }
+            Cause::LatencyTimer => "set the latency timer of the USB adapter to 1 ms: docs/performance.md, adapters",
             Cause::SilenceTooShort => "set a longer silence of the bus, such as silence = \"10ms\"",
             Cause::PortResets => {
                 "check the USB cable, plug and hub, and the supply of the adapter; an isolated adapter survives what drives \

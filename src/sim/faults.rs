@@ -394,7 +394,10 @@ fn twin(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<Vec<u8>>
     }
     let mut both = reply;
     both.resize(behind + later.len(), 0xFF);
-    both.iter_mut().skip(behind).zip(&later).for_each(|(byte, other)| *byte &= other);
+    both.iter_mut()
+        .skip(behind)
+        .zip(&later)
+        .for_each(|(byte, other)| *byte &= other);
     vec![both]
 }
 

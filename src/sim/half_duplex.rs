@@ -316,7 +316,9 @@ impl HalfDuplex {
 
     fn finish(&mut self, frame: &Incoming) {
         let heard_at = frame.end + self.silence();
-        self.pause_before = self.reply_end.map_or(Duration::MAX, |end| frame.start.saturating_sub(end));
+        self.pause_before = self
+            .reply_end
+            .map_or(Duration::MAX, |end| frame.start.saturating_sub(end));
         self.last_end = Some(frame.end);
         let met_fault = self.provoked_end.is_some_and(|end| frame.start < end + self.silence());
         self.statistics.provoked_overlaps += u64::from(met_fault && self.rules.wire != Wire::Instant);

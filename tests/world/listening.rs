@@ -613,6 +613,10 @@ fn what_is_wrong_with_a_line_shows_to_a_listener() {
         assert_eq!(verdicts(line(), plan("")), [], "{family}");
         let bad = plan("corrupt=0.15,drop=0.15").only(&[2]);
         assert_eq!(verdicts(line(), bad), [Cause::OneDrive], "{family}");
-        assert_eq!(verdicts(line(), plan("reply-start=0.2")), [Cause::ReplyStartLost], "{family}");
+        assert_eq!(
+            verdicts(line(), plan("reply-start=0.2")),
+            [Cause::ReplyStartLost],
+            "{family}"
+        );
     }
 }

@@ -160,7 +160,10 @@ mod tests {
                 late,
                 "4 replies came that are sound once their first bytes are put back: the beginning of replies is lost; ",
             ),
-            (early, "30 of 30 requests came back as the adapter's own echo without their end"),
+            (
+                early,
+                "30 of 30 requests came back as the adapter's own echo without their end",
+            ),
             (silent, "after 30 requests not one byte was heard; /dev/x; "),
             (echo, "30 of 30 requests came back as the adapter's own echo"),
             (
