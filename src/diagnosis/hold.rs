@@ -11,7 +11,7 @@ const MOST: usize = 24;
 #[derive(Debug, Clone, PartialEq)]
 struct Held {
     finding: Finding,
-    /// Steps in a row in which the rule held.
+    /// Steps in which the rule held, less those in which it did not.
     holds: u32,
     /// Steps since it held last.
     missing: u32,
@@ -35,7 +35,7 @@ pub struct Hold {
     held: Vec<Held>,
 }
 
-/// Steps in a row for which a rule must hold. Causes that only say that nothing else was recognised wait until it would have been.
+/// Steps for which a rule must hold, beside those in which it did not. Causes that only say that nothing else was recognised wait until it would have been.
 fn patience(cause: Cause) -> u32 {
     match cause {
         Cause::Noise | Cause::RequestEndLost => 5,
@@ -57,11 +57,11 @@ impl Hold {
         }
         for held in &mut self.held {
             if held.missing > 0 {
-                held.holds = 0;
+                held.holds = held.holds.saturating_sub(1);
             }
         }
         self.held.retain(|held| {
-            let goes = held.missing >= GOES_AFTER || (!held.shown && held.missing > 0);
+            let goes = held.missing >= GOES_AFTER || (!held.shown && held.holds == 0);
             if goes && held.shown {
                 changes.push(Change::Went(held.finding.clone()));
             }

@@ -17,6 +17,8 @@ const FEW_OF_LINE: u32 = 10;
 const GOOD: f64 = 0.003;
 /// So many standard deviations are no chance.
 const SIGNIFICANT: f64 = 5.0;
+/// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
+const ENOUGH: f64 = 6.0;
 /// A drive is bad whose errors are so many times as frequent as those of the others.
 const TIMES: f64 = 5.0;
 
@@ -78,8 +80,8 @@ pub struct Rules<'f> {
     known: Vec<Known>,
     /// So many failures of others come of drives that speak when others are asked.
     disturbed: u32,
-    /// Most drives are known, those aside that are absent.
-    comparable: bool,
+    /// Drives that are neither known nor absent.
+    waiting: usize,
     found: Vec<Finding>,
 }
 
@@ -104,7 +106,7 @@ pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
     let is_absent = |drive: &&super::Drive| drive.steps(&heard) == 0 && drive.sum(Sign::Tried) > 1;
     let absent = figures.drives.iter().filter(is_absent).count();
     let mut rules = Rules {
-        comparable: (known.len() + absent) * 5 >= figures.drives.len() * 4,
+        waiting: figures.drives.len().saturating_sub(known.len() + absent),
         disturbed: 0,
         figures,
         names,
@@ -329,7 +331,7 @@ impl Rules<'_> {
             .filter(|one| !self.is_told(one.place))
             .copied()
             .collect();
-        if !self.comparable || known.len() < 3 || sums(&known).0 <= self.disturbed {
+        if self.waiting * 10 > self.figures.drives.len() || known.len() < 3 || sums(&known).0 <= self.disturbed {
             return;
         }
         known.sort_by(|a, b| b.share().total_cmp(&a.share()));
@@ -337,8 +339,12 @@ impl Rules<'_> {
             return;
         };
         let (bad, good) = known.split_at(count);
-        // Whether it is one drive or several shows when all of them were bad for some time.
-        if !bad.iter().all(|one| one.lasting) {
+        // Whether it is one drive or several shows when all of them were bad for some time, and all others were asked so often that
+        // they would have failed by now, too.
+        let least = bad.iter().map(Known::share).fold(1.0, f64::min);
+        let is_good =
+            |one: &Known| f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least);
+        if !bad.iter().all(|one| one.lasting) || !good.iter().all(is_good) {
             return;
         }
         let (failed, asked) = sums(good);
@@ -610,7 +616,8 @@ impl Rules<'_> {
         );
         let lasts = rest.iter().any(|one| one.lasting) || self.steps_of_line() >= LASTING;
         let several = rest.iter().filter(|one| one.failed > 0).count() >= 2.min(rest.len());
-        self.comparable && lasts && several && failed >= FEW_OF_LINE && rate >= 0.005 && with * 2 >= some
+        let comparable = self.waiting * 5 <= self.figures.drives.len();
+        comparable && lasts && several && failed >= FEW_OF_LINE && rate >= 0.005 && with * 2 >= some
     }
 
     /// Steps, at most, in which any drive had errors.

@@ -209,7 +209,9 @@ fn run_case(case: &Case, line: &Line, seed: u64) -> Result<Duration, String> {
     let mut rig = Rig::new(line, parts);
     let wanted: Told = (case.told)(line.drives).into_iter().collect();
     let (mut came, mut wrong) = (None, None);
-    pass(&mut rig, TOLD, case.runs, |rig, gone| {
+    // The cause is there from the beginning, or with the first drive that runs.
+    let time = if case.runs { RUNS_FROM + TOLD } else { TOLD };
+    pass(&mut rig, time, case.runs, |rig, gone| {
         let told = told(rig);
         if let Some(other) = told.difference(&wanted).next() {
             wrong.get_or_insert((gone, *other));
