@@ -174,6 +174,7 @@ impl LineDiagnosis {
         self.image.diagnosis.store(Arc::new(Diagnosis {
             at: Some(now),
             verdicts,
+            wrong_address: self.figures.wrong_address(),
             drives,
         }));
     }

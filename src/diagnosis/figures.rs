@@ -1,16 +1,14 @@
 //! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and an exchange that goes well
 //! costs a few additions.
 
-use std::f32::consts::TAU;
 use std::time::{Duration, Instant};
 
 use super::STEP;
+use super::counters::{Contrast, FADE, InPhase, LATENCY, LONGEST_AGE, MAINS, Running, STEPS, Window, lock};
 use super::signature::{self, Shape};
 use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
 
-/// Steps that are remembered: a minute.
-pub const STEPS: usize = 12;
 /// Memory of a drive, at most; a line has about 1.5 KiB beside.
 pub const BYTES_PER_DRIVE: usize = 512;
 /// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
@@ -24,16 +22,6 @@ const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
-/// A state that is older is not that of the drives at all.
-const LONGEST_AGE: Duration = Duration::from_secs(10);
-/// Part of the counters without steps that is left after each step: half in two minutes.
-const FADE: f32 = 0.97;
-/// The latency timer of usual USB adapters, ms.
-pub const LATENCY: usize = 16;
-/// Frequencies of the mains, Hz.
-pub const MAINS: [f32; 2] = [50.0, 60.0];
-/// The phase of the mains is not kept for longer: it differs by some hundredths of a Hz.
-const IN_PHASE: Duration = Duration::from_secs(3);
 
 /// How an exchange ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -127,53 +115,6 @@ pub enum Sign {
 
 const SIGNS: usize = Sign::Echoed as usize + 1;
 
-/// Counters in steps.
-#[derive(Debug, Clone)]
-struct Window<const N: usize> {
-    steps: [[u16; N]; STEPS],
-    now: usize,
-}
-
-impl<const N: usize> Window<N> {
-    fn new() -> Window<N> {
-        Window {
-            steps: [[0; N]; STEPS],
-            now: 0,
-        }
-    }
-
-    fn add(&mut self, place: usize, count: u16) {
-        if let Some(counter) = self.steps.get_mut(self.now).and_then(|step| step.get_mut(place)) {
-            *counter = counter.saturating_add(count);
-        }
-    }
-
-    fn roll(&mut self) {
-        self.now = (self.now + 1) % STEPS;
-        if let Some(step) = self.steps.get_mut(self.now) {
-            *step = [0; N];
-        }
-    }
-
-    fn each(&self, place: usize) -> impl Iterator<Item = u16> {
-        self.steps
-            .iter()
-            .map(move |step| step.get(place).copied().unwrap_or_default())
-    }
-
-    fn sum(&self, place: usize) -> u32 {
-        self.each(place).map(u32::from).sum()
-    }
-}
-
-/// Damage and sound replies of a drive by their place in the mains period, seen from its last damage.
-#[derive(Debug, Clone, Copy, Default)]
-struct InPhase {
-    last: Option<Instant>,
-    /// For each frequency: number and sum of cosines of damaged replies, of sound ones.
-    sums: [[f32; 4]; MAINS.len()],
-}
-
 /// What is counted of one drive.
 #[derive(Debug, Clone)]
 pub struct Drive {
@@ -217,68 +158,6 @@ impl Drive {
     fn was_silent(&self, at: Instant) -> bool {
         self.silent_at
             .is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
-    }
-}
-
-/// What was asked and failed under two conditions.
-#[derive(Debug, Clone, Copy, Default, PartialEq)]
-pub struct Contrast {
-    /// Exchanges under each condition.
-    pub asked: [f32; 2],
-    /// Those of them that failed.
-    pub failed: [f32; 2],
-}
-
-impl Contrast {
-    fn add(&mut self, condition: usize, asked: f32, failed: f32) {
-        if let (Some(a), Some(f)) = (self.asked.get_mut(condition), self.failed.get_mut(condition)) {
-            *a += asked;
-            *f += failed;
-        }
-    }
-
-    fn fade(&mut self) {
-        self.asked
-            .iter_mut()
-            .chain(&mut self.failed)
-            .for_each(|count| *count *= FADE);
-    }
-}
-
-/// A contrast by whether a drive runs. What was counted shortly before a change belongs to neither: the state is read some time after it
-/// changes, and on a slow line some seconds.
-#[derive(Debug, Clone, Copy, Default)]
-struct Running {
-    runs: bool,
-    /// Asked and failed in this slot and in the one before.
-    slots: [(f32, f32); 2],
-    slot_ends: Option<Instant>,
-    /// Age of the state before it was read anew, at most lately.
-    age: Duration,
-    contrast: Contrast,
-}
-
-/// So long, at least, a change of state may stay unknown.
-const UNKNOWN: Duration = Duration::from_secs(1);
-
-impl Running {
-    fn change(&mut self, runs: bool) {
-        if runs != self.runs {
-            (self.runs, self.slots, self.slot_ends) = (runs, Default::default(), None);
-        }
-    }
-
-    fn add(&mut self, asked: f32, failed: f32, at: Instant) {
-        let unknown = self.age.max(UNKNOWN);
-        let ends = *self.slot_ends.get_or_insert(at + unknown);
-        let [now, before] = &mut self.slots;
-        if at >= ends {
-            self.contrast.add(usize::from(self.runs), before.0, before.1);
-            (*before, *now) = (*now, (0.0, 0.0));
-            self.slot_ends = Some(at + unknown);
-        }
-        now.0 += asked;
-        now.1 += failed;
     }
 }
 
@@ -501,9 +380,7 @@ impl Figures {
                 drive.add(Sign::Slow);
             }
             let tenths = u16::try_from(turnaround.as_micros() / 100).unwrap_or(u16::MAX);
-            if let Some([slowest]) = drive.slowest.steps.get_mut(drive.slowest.now) {
-                *slowest = tenths.max(*slowest);
-            }
+            drive.slowest.most(0, tenths);
         }
         drive.mains.look(middle, length, false);
     }
@@ -679,52 +556,6 @@ impl Figures {
     }
 }
 
-impl InPhase {
-    fn look(&mut self, at: Instant, length: Duration, damaged: bool) {
-        if let Some(last) = self.last {
-            let since = at.saturating_duration_since(last);
-            if since > IN_PHASE {
-                self.last = None;
-            } else {
-                for (sums, hertz) in self.sums.iter_mut().zip(MAINS) {
-                    let [bad, bad_cosines, good, good_cosines] = sums;
-                    // The mean over the whole length.
-                    let half = TAU / 2.0 * hertz * length.as_secs_f32();
-                    let mean = if half > 0.0 { half.sin() / half } else { 1.0 };
-                    let cosine = mean * (TAU * (hertz * since.as_secs_f32()).fract()).cos();
-                    let (count, sum) = if damaged {
-                        (bad, bad_cosines)
-                    } else {
-                        (good, good_cosines)
-                    };
-                    *count += 1.0;
-                    *sum += cosine;
-                }
-            }
-        }
-        if damaged {
-            self.last = Some(at);
-        }
-    }
-}
-
-/// Length of the mean vector of the milliseconds on a circle, each step for itself as clocks drift apart.
-fn lock(window: &Window<LATENCY>) -> (f64, u32) {
-    let (mut length, mut all) = (0.0, 0);
-    for step in &window.steps {
-        let (mut x, mut y, mut count) = (0.0, 0.0, 0);
-        for (place, number) in step.iter().enumerate() {
-            let angle = std::f64::consts::TAU * place as f64 / LATENCY as f64;
-            x += f64::from(*number) * angle.cos();
-            y += f64::from(*number) * angle.sin();
-            count += u32::from(*number);
-        }
-        length += x.hypot(y);
-        all += count;
-    }
-    (if all > 0 { length / f64::from(all) } else { 0.0 }, all)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -733,18 +564,5 @@ mod tests {
     fn a_drive_takes_as_much_memory_as_is_stated() {
         assert!(size_of::<Drive>() <= BYTES_PER_DRIVE, "{}", size_of::<Drive>());
         assert!(size_of::<Figures>() + MOST_IDLE <= 1536, "{}", size_of::<Figures>());
-    }
-
-    #[test]
-    fn what_is_older_than_a_minute_is_forgotten() {
-        let mut window = Window::<1>::new();
-        window.add(0, u16::MAX);
-        window.add(0, 1);
-        for _ in 0..STEPS - 1 {
-            window.roll();
-            assert_eq!(window.sum(0), u32::from(u16::MAX));
-        }
-        window.roll();
-        assert_eq!(window.sum(0), 0);
     }
 }

@@ -2,13 +2,17 @@
 //! arguments.
 //!
 //! - [`signature`]: what the bytes of one exchange show: the echo, a stray byte before the reply, a reply without its beginning.
+//! - [`counters`]: the kinds of counters.
 //! - [`figures`]: what was counted in the last minute, for each drive and for the line. Bounded: see [`figures::BYTES_PER_DRIVE`].
+//! - `known`: what is known of each drive, and which stand out.
 //! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
 //! - [`hold`]: a verdict comes and goes only by lasting evidence.
 //! - [`words`]: how causes are told, and what to do.
 
+pub mod counters;
 pub mod figures;
 pub mod hold;
+mod known;
 pub mod rules;
 pub mod signature;
 pub mod words;
@@ -156,6 +160,8 @@ pub struct Diagnosis {
     pub at: Option<SystemTime>,
     /// What holds, most telling first.
     pub verdicts: Vec<Verdict>,
+    /// Sound replies of addresses that were not asked, in the last minute.
+    pub wrong_address: u32,
     /// What was counted in the last minute, a line for each drive in the order of the file.
     pub drives: Vec<Counted>,
 }

@@ -2,74 +2,15 @@
 
 use std::time::{Duration, Instant};
 
-use super::figures::{Contrast, Figures, MAINS, STEPS, Sign};
+use super::counters::{Contrast, MAINS, STEPS};
+use super::figures::{Figures, Sign};
+use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::{Cause, Certainty, Finding};
 
-/// Exchanges in the last minute from which on a drive is known.
-const KNOWN: u32 = 15;
-/// What is seen in fewer steps of 5 s is a passing disturbance.
-const LASTING: usize = 3;
-/// What is seen less often in a minute is chance.
-const FEW: u32 = 5;
 /// The same of what would be told of the whole line.
 const FEW_OF_LINE: u32 = 10;
 /// Share of exchanges below which a drive is good.
 const GOOD: f64 = 0.003;
-/// So many standard deviations are no chance.
-const SIGNIFICANT: f64 = 5.0;
-/// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
-const ENOUGH: f64 = 6.0;
-/// A drive is bad whose errors are so many times as frequent as those of the others.
-const TIMES: f64 = 5.0;
-
-/// What is known of one drive.
-#[derive(Debug, Clone, Copy)]
-struct Known {
-    place: usize,
-    asked: u32,
-    failed: u32,
-    silent: u32,
-    damaged: u32,
-    lasting: bool,
-}
-
-impl Known {
-    fn share(&self) -> f64 {
-        share(self.failed, self.asked)
-    }
-
-    fn is_bad(&self) -> bool {
-        self.failed >= FEW && self.share() >= 0.02
-    }
-}
-
-fn share(part: u32, of: u32) -> f64 {
-    f64::from(part) / f64::from(of.max(1))
-}
-
-fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32) {
-    drives
-        .into_iter()
-        .fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
-}
-
-/// Whether `failed` of `asked` are more than chance allows where `rate` is usual.
-fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
-    let expected = f64::from(asked) * rate;
-    f64::from(failed) > expected + SIGNIFICANT * expected.max(1.0).sqrt()
-}
-
-/// Whether the first `count` of these, the worst first, are all bad, and much worse than the others.
-fn stand_out(known: &[Known], count: usize) -> bool {
-    let Some((bad, good)) = known.split_at_checked(count) else {
-        return false;
-    };
-    let (failed, asked) = sums(good);
-    let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
-    let stands_out =
-        |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
-    good.len() >= 2 && asked >= 60 && bad.iter().all(stands_out)
-}
 
 /// The rules, over the figures of one line.
 #[derive(Debug)]
@@ -87,21 +28,12 @@ pub struct Rules<'f> {
 
 /// What holds at `now`, most telling first; `names` are those of the drives.
 pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
-    let known = |(place, drive): (usize, &super::Drive)| {
-        let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
-        let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
-        let asked = others + silent + damaged;
-        // A bad drive is asked less and less often.
-        (asked >= KNOWN || silent + damaged >= FEW).then(|| Known {
-            place,
-            asked,
-            failed: silent + damaged,
-            silent,
-            damaged,
-            lasting: drive.steps(&[Sign::Silent, Sign::Damaged]) >= LASTING,
-        })
-    };
-    let known: Vec<Known> = figures.drives.iter().enumerate().filter_map(known).collect();
+    let known: Vec<Known> = figures
+        .drives
+        .iter()
+        .enumerate()
+        .filter_map(|(place, drive)| Known::of(place, drive))
+        .collect();
     let heard = [Sign::Answered, Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Led];
     let is_absent = |drive: &&super::Drive| drive.steps(&heard) == 0 && drive.sum(Sign::Tried) > 1;
     let absent = figures.drives.iter().filter(is_absent).count();

@@ -271,6 +271,8 @@ pub(super) struct Diagnosis<'d> {
     /// `null` before the first five seconds are over.
     time: Option<Time>,
     verdicts: &'d [Verdict],
+    /// Sound replies of addresses that were not asked, in the last minute.
+    wrong_address: u32,
     /// Counted in the last minute.
     drives: &'d [Counted],
 }
@@ -281,6 +283,7 @@ impl<'d> Diagnosis<'d> {
             bus,
             time: diagnosis.at.map(Time),
             verdicts: &diagnosis.verdicts,
+            wrong_address: diagnosis.wrong_address,
             drives: &diagnosis.drives,
         }
     }

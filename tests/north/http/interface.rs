@@ -299,7 +299,7 @@ async fn what_is_wrong_with_a_line() {
     let before = of("line1").await.json();
     assert_eq!(
         before,
-        json!({"bus": "line1", "time": null, "verdicts": [], "drives": []})
+        json!({"bus": "line1", "time": null, "verdicts": [], "wrong_address": 0, "drives": []})
     );
     plant::diagnose(&server.plant().buses[0]);
     let told = of("line1").await.json();

@@ -290,6 +290,7 @@ pub(crate) fn diagnose(bus: &BusHandle) {
     bus.image.diagnosis.store(Arc::new(Diagnosis {
         at: Some(SystemTime::UNIX_EPOCH),
         verdicts: vec![verdict],
+        wrong_address: 0,
         drives: bus.image.drives.iter().map(counted).collect(),
     }));
 }
