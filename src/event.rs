@@ -67,11 +67,13 @@ pub enum EventKind {
     ReloadRefused,
     /// The other master of a line commands a drive.
     ForeignCommand,
+    /// A verdict about a line came, became firmer, or went.
+    Diagnosis,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 20] = [
+    pub const ALL: [EventKind; 21] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -92,6 +94,7 @@ impl EventKind {
         EventKind::Recording,
         EventKind::ReloadRefused,
         EventKind::ForeignCommand,
+        EventKind::Diagnosis,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -105,6 +108,7 @@ impl EventKind {
             | EventKind::Unsupervised
             | EventKind::NotConfirmed
             | EventKind::BusDown
+            | EventKind::Diagnosis
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -143,6 +147,7 @@ impl EventKind {
             EventKind::Recording => "recording",
             EventKind::ReloadRefused => "reload_refused",
             EventKind::ForeignCommand => "foreign_command",
+            EventKind::Diagnosis => "diagnosis",
         }
     }
 }
@@ -429,8 +434,8 @@ mod tests {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown | Recording | ReloadRefused => false,
-                ForeignCommand => true,
+                | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                Diagnosis => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

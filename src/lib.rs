@@ -24,6 +24,7 @@
 //! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); points made of others
 //!   ([`drive::derive`]); which requests read them ([`drive::plan`]); how a family is known ([`drive::identify`]). Pure.
 //! - [`event`]: what happened, published once.
+//! - [`diagnosis`]: what is wrong with a line, from what is seen on it: counters and rules. Pure.
 //! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`history`]: trends and counters; the trip recorder: what was read and sent before and after a fault, kept on disk.
@@ -55,6 +56,7 @@ pub mod codec;
 pub mod command;
 pub mod config;
 pub mod daemon;
+pub mod diagnosis;
 pub mod document;
 pub mod drive;
 pub mod event;

@@ -72,7 +72,7 @@ impl BusCore {
         BusCore {
             line: LineState::new(spec.protocol, spec.format, silence, now),
             master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
-            report: Report::new(bus.image.clone(), events, writes, now),
+            report: Report::new(bus.image.clone(), options, events, writes, now),
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
@@ -97,7 +97,7 @@ impl BusCore {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
         self.master.lost(now);
-        self.report.bus_down(why);
+        self.report.bus_down(why, now);
     }
 
     /// The bus ends: everybody who waits is answered. What the bus that comes after has to know; the reply to an exchange
@@ -195,6 +195,9 @@ impl BusCore {
             tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
         }
         let quiet_since = self.line.quiet_since();
+        self.report
+            .diagnosis
+            .sending(now.saturating_duration_since(quiet_since));
         self.tap = self.report.tap(Some(turn.drive), &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
@@ -208,6 +211,7 @@ impl BusCore {
         if !self.line.is_underway() {
             if !bytes.is_empty() {
                 self.report.noise(bytes, self.line.quiet_since(), now);
+                self.report.diagnosis.figures().stray(bytes);
                 self.line.heard(bytes, now);
             }
             return;

@@ -6,7 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
 use self::changes::{WATCHED, Watched};
+use super::BusOptions;
 use super::confirm::Unconfirmed;
+use super::line_diagnosis::LineDiagnosis;
 use super::line_state::Exchanged;
 use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
@@ -40,14 +42,24 @@ pub(super) struct Report {
     watched: Vec<[Watched; WATCHED.len()]>,
     /// Drives whose own response to a silent master was looked at since they came online.
     looked_at: Vec<bool>,
+    /// What is wrong with the line.
+    pub(super) diagnosis: LineDiagnosis,
     up: bool,
     reason: String,
 }
 
 impl Report {
-    pub(super) fn new(image: Arc<BusImage>, events: Events, writes: Arc<WriteStats>, now: Instant) -> Report {
+    pub(super) fn new(
+        image: Arc<BusImage>,
+        options: &BusOptions,
+        events: Events,
+        writes: Arc<WriteStats>,
+        now: Instant,
+    ) -> Report {
         let faults = vec![None; image.drives.len()];
+        let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
         Report {
+            diagnosis: LineDiagnosis::new(image.clone(), silence, options.response_timeout, now),
             image,
             events,
             writes,
@@ -200,6 +212,7 @@ impl Report {
     }
 
     pub(super) fn bus_up(&mut self, now: Instant) {
+        self.diagnosis.figures().port_opened(now);
         self.up = true;
         self.reason.clear();
         self.window = now;
@@ -218,7 +231,8 @@ impl Report {
 
     /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
     /// for each reason, not at every try.
-    pub(super) fn bus_down(&mut self, why: &str) {
+    pub(super) fn bus_down(&mut self, why: &str, now: Instant) {
+        self.diagnosis.figures().port_lost(now);
         let news = self.up || self.reason != why;
         let drives = self.image.drives.iter().enumerate();
         let gone: Vec<usize> = drives
@@ -472,19 +486,31 @@ impl Report {
             return;
         };
         drive.count(counted(&exchanged.ended));
+        let mut turnaround = None;
         if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
             // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
             let by_first = first.saturating_duration_since(exchanged.sent);
             let by_last = now.saturating_duration_since(exchanged.sent);
             let by_last = by_last.saturating_sub(exchanged.reply_time);
             if !matches!(reply, Reply::Exception(_)) {
-                drive.set_turnaround(by_first.min(by_last));
+                let measured = by_first.min(by_last);
+                drive.set_turnaround(measured);
+                turnaround = Some(measured);
             }
         }
+        self.diagnosis.exchanged(index, exchanged, turnaround, now);
     }
 
-    /// Reckons the load once a second.
+    /// Asks the diagnosis every 5 s, and reckons the load once a second.
     pub(super) fn tick(&mut self, now: Instant) {
+        for (drive, text) in self.diagnosis.tick(now) {
+            let drive = drive
+                .and_then(|drive| self.drive(drive))
+                .map(|drive| drive.spec.name.clone());
+            let about = drive.as_ref().map_or(String::new(), |drive| format!(", drive {drive}"));
+            let text = format!("line of bus {}{about}: {text}", self.image.spec.name);
+            self.event(EventKind::Diagnosis, drive, None, text);
+        }
         let window = now.saturating_duration_since(self.window);
         if window < LOAD_WINDOW {
             return;

@@ -143,6 +143,11 @@ impl Transaction {
         self.deadline
     }
 
+    /// The frame of the request.
+    pub fn frame(&self) -> &[u8] {
+        &self.frame
+    }
+
     /// The request.
     pub fn request(&self) -> &Request {
         &self.request

@@ -12,6 +12,7 @@ mod check;
 mod client;
 mod credentials_file;
 mod demo;
+mod diagnose;
 mod drive_access;
 mod health;
 mod listen;
@@ -107,6 +108,7 @@ commands! {
     Read => read,
     Write => write,
     Why => why,
+    Diagnose => diagnose,
     Record => record,
     Recordings => recordings,
     Watch => watch,

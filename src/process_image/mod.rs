@@ -25,6 +25,7 @@ use tokio::sync::Notify;
 
 use self::health::TURNAROUNDS;
 use crate::codec::{LineFormat, Protocol};
+use crate::diagnosis::Diagnosis;
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
 
 /// Whether a drive may be commanded.
@@ -332,6 +333,8 @@ pub struct BusImage {
     pub trace: Trace,
     /// What is read and what is on the line, for recorder, trends and counters.
     pub tape: Tape,
+    /// What is wrong with the line. Only the bus itself may store one.
+    pub diagnosis: ArcSwap<Diagnosis>,
     health: Mutex<BusHealth>,
 }
 
@@ -346,6 +349,7 @@ impl BusImage {
             slow_cycles: Histogram::new(),
             trace: Trace::default(),
             tape: Tape::default(),
+            diagnosis: ArcSwap::default(),
             health: Mutex::new(BusHealth::default()),
         }
     }

@@ -15,6 +15,7 @@ const ROOMS: [&str; 17] = [
     "codec",
     "drive",
     "event",
+    "diagnosis",
     "process_image",
     "command",
     "history",

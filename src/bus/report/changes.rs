@@ -86,6 +86,11 @@ impl Watched {
         })
     }
 
+    /// Whether it was set when it was read last.
+    fn is_set(&self) -> bool {
+        self.seen.is_some_and(|(value, _)| value)
+    }
+
     fn may_report(&mut self, now: Instant) -> bool {
         let (spent, since) = self.spent.unwrap_or((0, now));
         let passed = now.saturating_duration_since(since);
@@ -137,6 +142,12 @@ impl Report {
                 ..Event::new(kind, SystemTime::now(), text)
             });
         }
+        let age = reading
+            .model(ModelPoint::Running)
+            .at
+            .map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+        let runs = self.watched.iter().any(|[running, ..]| running.is_set());
+        self.diagnosis.figures().set_running(runs, age);
     }
 
     /// Who ordered a motor to start or to stop that has done so: the last order to the drive, if it was that and nothing else

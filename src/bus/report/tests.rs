@@ -22,12 +22,22 @@ fn image(drives: u8) -> Arc<BusImage> {
     Arc::new(BusImage::new(bus, (1..=drives).map(drive).collect()))
 }
 
+fn options() -> BusOptions {
+    BusOptions {
+        response_timeout: Duration::from_millis(100),
+        retries: 1,
+        silence: Default::default(),
+        line: Default::default(),
+        mode: Default::default(),
+    }
+}
+
 /// A reader that saw the bus down found values of its drives good (a motor that runs on a bus that is down).
 #[test]
 fn whoever_sees_the_bus_down_sees_every_drive_offline() {
     let image = image(200);
     let now = Instant::now();
-    let mut report = Report::new(image.clone(), Events::default(), Default::default(), now);
+    let mut report = Report::new(image.clone(), &options(), Events::default(), Default::default(), now);
     for _ in 0..20 {
         report.bus_up(now);
         for index in 0..image.drives.len() {
@@ -41,7 +51,7 @@ fn whoever_sees_the_bus_down_sees_every_drive_offline() {
             let offline = |drive: &&Arc<DriveImage>| matches!(drive.snapshot().link, Link::Offline(_));
             looking.drives.iter().filter(offline).count()
         });
-        report.bus_down("unplugged");
+        report.bus_down("unplugged", now);
         assert_eq!(reader.join().unwrap(), image.drives.len());
     }
 }
@@ -51,11 +61,11 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
     let image = image(2);
     let now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image, events.clone(), Default::default(), now);
+    let mut report = Report::new(image, &options(), events.clone(), Default::default(), now);
     report.bus_up(now);
     report.apply(&News::Online(0), now);
-    report.bus_down("unplugged");
-    report.bus_down("unplugged");
+    report.bus_down("unplugged", now);
+    report.bus_down("unplugged", now);
     let kinds: Vec<EventKind> = events.recent().iter().map(|event| event.kind).collect();
     let expected = [
         EventKind::BusUp,
@@ -75,7 +85,7 @@ fn an_event_tells_who_started_and_stopped_a_motor() {
     let image = image(1);
     let (events, writes) = (Events::default(), Arc::<WriteStats>::default());
     let mut now = Instant::now();
-    let mut report = Report::new(image.clone(), events.clone(), writes.clone(), now);
+    let mut report = Report::new(image.clone(), &options(), events.clone(), writes.clone(), now);
     let status = image.drives[0]
         .plan
         .reads

@@ -5,6 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::diagnosis::{self, Counted, Verdict};
 use crate::drive::why::Cause;
 use crate::drive::{self, ModelPoint, Quality, State};
 use crate::history::History;
@@ -270,6 +271,31 @@ impl<'b> Bus<'b> {
             opened: health.opened,
             unknown_drives: health.unknown,
             queue_depth: handle.queue.lock().len(),
+        }
+    }
+}
+
+/// What is wrong with the line of a bus.
+#[derive(Debug, Serialize)]
+pub(super) struct Diagnosis<'d> {
+    bus: &'d str,
+    /// `null` before the first five seconds are over.
+    time: Option<Time>,
+    verdicts: &'d [Verdict],
+    /// Sound replies of addresses that were not asked, in the last minute.
+    wrong_address: u32,
+    /// Counted in the last minute.
+    drives: &'d [Counted],
+}
+
+impl<'d> Diagnosis<'d> {
+    pub(super) fn new(bus: &'d str, diagnosis: &'d diagnosis::Diagnosis) -> Diagnosis<'d> {
+        Diagnosis {
+            bus,
+            time: diagnosis.at.map(Time),
+            verdicts: &diagnosis.verdicts,
+            wrong_address: diagnosis.wrong_address,
+            drives: &diagnosis.drives,
         }
     }
 }

@@ -116,6 +116,7 @@ pub(super) fn router(
         .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/buses/{name}", get(line::bus))
+        .route("/api/v1/buses/{name}/diagnosis", get(diagnosis))
         .route("/api/v1/audit", get(audit))
         .route("/api/v1/recordings", get(recordings))
         .route("/api/v1/recordings/{id}", get(recording))
@@ -291,6 +292,18 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
     let plant = app.plant.load();
     let all: Vec<_> = plant.buses.iter().map(api::Bus::new).collect();
     Json(all).into_response()
+}
+
+/// What is wrong with the line of a bus.
+async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
+    match plant.buses.iter().find(|bus| bus.image.spec.name == name) {
+        Some(bus) => Json(api::Diagnosis::new(&name, &bus.image.diagnosis.load())).into_response(),
+        None => {
+            let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+            not_found(format!("there is no bus `{name}`"), known.collect())
+        }
+    }
 }
 
 /// The last commands, newest last; with `drive` those to one drive.

@@ -258,8 +258,18 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         "drivegate_bus_queue_depth",
         "Commands and forwarded reads that wait for the bus.",
     );
+    let mut diagnosis = Family::new(
+        Kind::Gauge,
+        "drivegate_line_diagnosis",
+        "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
+    );
     for (labels, handle, _) in looks {
         let image = &handle.image;
+        for verdict in &image.diagnosis.load().verdicts {
+            let mut labels = with(&labels, "drive", verdict.drive.as_deref().unwrap_or_default());
+            labels.push(("verdict", verdict.verdict.name().to_string()));
+            diagnosis.add(labels, SeriesValue::Value(1.0));
+        }
         for (class, times) in [
             (PollClass::Fast, &image.fast_cycles),
             (PollClass::Slow, &image.slow_cycles),
@@ -272,7 +282,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         transactions.add(labels.clone(), SeriesValue::Histogram(image.transactions.snapshot()));
         queue.add(labels, SeriesValue::Value(handle.queue.lock().len() as f64));
     }
-    all.extend([cycles, transactions, queue]);
+    all.extend([cycles, transactions, queue, diagnosis]);
 }
 
 fn writes(plant: &Plant, all: &mut Vec<Family>) {

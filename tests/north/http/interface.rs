@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 use super::client::{get, raw, request};
 use super::plant::{self, HOLDING, STALE_AFTER, Server};
 
-const PLACES: [&str; 14] = [
+const PLACES: [&str; 15] = [
     "/",
     "/assets/style.css",
     "/assets/page.js",
@@ -29,6 +29,7 @@ const PLACES: [&str; 14] = [
     "/api/v1/drives",
     "/api/v1/drives/pump-1",
     "/api/v1/buses",
+    "/api/v1/buses/line1/diagnosis",
     "/api/v1/audit",
     "/api/v1/recordings",
     "/api/v1/events",
@@ -289,6 +290,37 @@ async fn buses() {
     assert_eq!(
         (&list[1]["state"], &list[1]["reason"]),
         (&json!("down"), &json!("the adapter is gone"))
+    );
+}
+
+#[tokio::test]
+async fn what_is_wrong_with_a_line() {
+    let server = Server::of(plant::mixed()).await;
+    let of = async |bus: &str| get(server.address, &format!("/api/v1/buses/{bus}/diagnosis")).await;
+    let before = of("line1").await.json();
+    assert_eq!(
+        before,
+        json!({"bus": "line1", "time": null, "verdicts": [], "wrong_address": 0, "drives": []})
+    );
+    plant::diagnose(&server.plant().buses[0]);
+    let told = of("line1").await.json();
+    assert_eq!(told["time"], json!("1970-01-01T00:00:00.000Z"));
+    let verdict = &told["verdicts"][0];
+    for (field, value) in [
+        ("verdict", "one_drive"),
+        ("drive", "pump-1"),
+        ("certainty", "likely"),
+        ("evidence", "7 of 90 exchanges failed"),
+        ("since", "2026-03-02T06:11:09.480Z"),
+    ] {
+        assert_eq!(verdict[field], json!(value));
+    }
+    assert_eq!(told["drives"].as_array().unwrap().len(), 3);
+    let unknown = of("line9").await;
+    assert_eq!(unknown.status, 404);
+    assert_eq!(
+        unknown.json(),
+        json!({"error": "there is no bus `line9`", "known": ["line1", "line2"]})
     );
 }
 

