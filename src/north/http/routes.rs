@@ -76,15 +76,7 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
     });
     Router::new()
         .route("/", get(status_page))
-        .route(
-            "/assets/style.css",
-            get(|| asset("text/css; charset=utf-8", page::STYLE)),
-        )
-        .route(
-            "/assets/page.js",
-            get(|| asset("text/javascript; charset=utf-8", page::SCRIPT)),
-        )
-        .route("/assets/icon.svg", get(|| asset("image/svg+xml", page::ICON)))
+        .route("/assets/{name}", get(asset))
         .route("/metrics", get(exposition))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(ready))
@@ -153,8 +145,11 @@ async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
     (policy, Html(page::render(&app.plant.load(), Instant::now())))
 }
 
-async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, content_type)], body)
+async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
+    match page::ASSETS.iter().find(|asset| asset.name == name) {
+        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
+        None => unknown(uri).await,
+    }
 }
 
 async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
@@ -190,14 +185,16 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn drives(State(app): State<Arc<AppState>>) -> Response {
+/// All drives; with `points=` only these points of each.
+async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let shown = query::names(query.as_deref(), "points");
     let _turn = app.turn().await;
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
     let all: Vec<_> = all
         .iter()
-        .map(|drive| api::Drive::new(drive, &plant.history, clock))
+        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
         .collect();
     Json(all).into_response()
 }
