@@ -527,8 +527,8 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only; open to everybody who can connect unless there is
-        /// a `tokens_file`.
+        /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everybody who can connect
+        /// unless there is a `tokens_file`.
         listen: SocketAddr = Parsed {
             parse: values::socket, words: &[], pattern: "", range: "an address with a port",
         }, default "127.0.0.1:9488";
@@ -539,6 +539,11 @@ keys! {
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.
         tokens_file: PathBuf = PATH, or "none";
+        /// Whether [users](operating.md) may command drives with `access = "control"`, from the status page and by
+        /// programs. Needs `users_file`, and `certificate` or a `listen` on the loopback.
+        commands: bool = Flag, default false;
+        /// File of the users who may command, made by `drivegate user add`.
+        users_file: PathBuf = PATH, or "none";
         /// PEM file with the server's certificate chain, for [https](http.md#tls); needs `key`.
         certificate: PathBuf = PATH, or "none";
         /// PEM file of the certificate's private key.

@@ -236,12 +236,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
-    let (http, http_listener) = ROOT
-        .http
-        .table(reader)
-        .map(|table| north::read_http(&table, base))
-        .unzip();
-    let http_listener = http_listener.flatten();
+    let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
     let audit = ROOT
         .audit
         .table(reader)
@@ -251,13 +246,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
-    judge(
-        reader,
-        &buses,
-        modbus_tcp.as_ref(),
-        mqtt.as_ref(),
-        http_listener.as_ref(),
-    );
+    judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
 
     Some(Settings {
         gateway: name?,
@@ -275,7 +264,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
-        http: flipped(http)?,
+        http: flipped(http.map(|http| http.options))?,
         audit,
         log: log?,
     })
@@ -287,18 +276,20 @@ fn judge(
     buses: &[bus::Found],
     modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
     mqtt: Option<&Option<mqtt_client::Options>>,
-    http: Option<&north::Listener>,
+    http: Option<&north::Http>,
 ) {
     unique::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
     }
-    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http);
+    let http_listener = http.and_then(|http| http.listener.as_ref());
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);
-    let commanded =
-        modbus_tcp.is_some_and(|m| m.commands) || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
+    let commanded = modbus_tcp.is_some_and(|m| m.commands)
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
+        || http.is_some_and(|http| http.commands);
     if !commanded {
         warn_of_idle_control(reader, buses);
     }
@@ -490,7 +481,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
         reader.document().warning(
             place,
             format!("drive `{name}` accepts commands but no client may send any"),
-            "set `write` of [modbus_tcp] or `commands = true` of [mqtt]",
+            "set `write` of [modbus_tcp], or `commands = true` of [mqtt] or [http]",
         );
     }
 }

@@ -31,11 +31,15 @@ macro_rules! assets {
 /// All of them.
 pub(in crate::north::http) const ASSETS: &[Asset] = assets! {
     "image/svg+xml": "icon.svg";
-    "text/css; charset=utf-8": "style.css", "views.css";
+    "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
     "text/javascript; charset=utf-8":
-        "common.js", "drive.js", "events.js", "gateway.js", "lines.js", "overview.js", "page.js", "plot.js",
+        "common.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js", "page.js", "plot.js",
         "recording.js", "strips.js", "trend.js";
 };
+
+/// What the document has in its head for the operating part; its script comes before the page's.
+const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
+    <script src=\"assets/operate.js\" defer></script>";
 
 /// Only this server's own files, no inline code, no forms.
 pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
@@ -49,15 +53,30 @@ const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::MotorTorque, "Torque"),
 ];
 
-/// The document with the state of the plant at `now`.
-pub(in crate::north::http) fn render(plant: &Plant, now: Instant) -> String {
+/// The document with the state of the plant at `now`; `operating` says whether it has the part that commands.
+pub(in crate::north::http) fn render(plant: &Plant, operating: bool, now: Instant) -> String {
     let mut tables = String::new();
     // Writing to a string cannot fail.
     let _ = buses(&mut tables, plant).and_then(|()| drives(&mut tables, plant, now));
+    document(plant, operating, &tables)
+}
+
+/// The document without any value, for somebody who has to log in first.
+pub(in crate::north::http) fn render_login(plant: &Plant) -> String {
+    document(plant, true, "<p>Log in to see the drives; that needs scripts.</p>")
+}
+
+fn document(plant: &Plant, operating: bool, tables: &str) -> String {
+    let (head, mode) = match operating {
+        true => (OPERATE_HEAD, "commands after login"),
+        false => ("", "read only"),
+    };
     DOCUMENT
+        .replace("{{operate}}", head)
+        .replace("{{mode}}", mode)
         .replace("{{version}}", env!("CARGO_PKG_VERSION"))
         .replace("{{gateway}}", &Escaped(&plant.gateway).to_string())
-        .replace("{{tables}}", &tables)
+        .replace("{{tables}}", tables)
 }
 
 fn buses(out: &mut String, plant: &Plant) -> fmt::Result {
