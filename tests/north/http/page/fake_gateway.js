@@ -51,7 +51,7 @@ class FakeGateway {
   }
 
   file(response, name, type) {
-    const text = fs.readFileSync(path.join(FILES, name), "utf8").replace(/\{\{gateway\}\}/g, "test").replace("{{version}}", "1").replace("{{tables}}", "");
+    const text = fs.readFileSync(path.join(FILES, name), "utf8").replace(/\{\{gateway\}\}/g, "test").replace(/\{\{\w+\}\}/g, "");
     response.writeHead(200, { "content-type": `${type}; charset=utf-8`, "content-security-policy": POLICY });
     response.end(text);
   }
