@@ -279,7 +279,7 @@ export class PlotGroup {
 
   /// Shows another time; the cursor moves in steps of that many ms.
   setRange(from, to, step) {
-    this.range = { from, to };
+    Object.assign(this, { range: { from, to }, step });
     if (this.cursor !== null && this.cursor < from) this.cursor = null;
     Object.assign(this.slider, { min: from, max: to, step });
     this.render();
@@ -294,7 +294,8 @@ export class PlotGroup {
   point(t) {
     const { from, to } = this.range;
     const within = Math.min(to, Math.max(from, t));
-    this.cursor = this.rests && within >= to ? null : within;
+    // The slider ends at its last whole step.
+    this.cursor = this.rests && within > to - this.step ? null : within;
     this.moved();
   }
 
