@@ -1,5 +1,6 @@
 //! The JSON objects of drives and buses. Fields are added, never renamed or removed.
 
+use std::collections::HashSet;
 use std::time::{Duration, Instant, SystemTime};
 
 use serde::ser::SerializeMap;
@@ -111,8 +112,18 @@ impl<'d> Drive<'d> {
             starts: tells_running.then_some(totals.starts),
             running_seconds: tells_running.then(|| rounded(totals.running_seconds, 1000.0)),
             energy_kwh: totals.energy_kwh,
-            points: Points { reading, clock },
+            points: Points {
+                reading,
+                clock,
+                shown: None,
+            },
         }
+    }
+
+    /// Only these of its points.
+    pub(super) fn only(mut self, shown: Option<&'d HashSet<String>>) -> Drive<'d> {
+        self.points.shown = shown;
+        self
     }
 }
 
@@ -141,14 +152,16 @@ impl Outcomes {
 struct Points<'d> {
     reading: Reading<'d>,
     clock: Clock,
+    shown: Option<&'d HashSet<String>>,
 }
 
 impl Serialize for Points<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let profile = &self.reading.spec.profile;
         let names = public_points(profile);
-        let mut map = serializer.serialize_map(Some(names.len()))?;
-        for (index, name) in names {
+        let mut map = serializer.serialize_map(None)?;
+        let wanted = |name: &str| self.shown.is_none_or(|shown| shown.contains(name));
+        for (index, name) in names.into_iter().filter(|(_, name)| wanted(name)) {
             let Some(point) = profile.points.get(index) else {
                 continue;
             };

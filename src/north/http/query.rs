@@ -1,5 +1,6 @@
 //! Parameters of a request: `?name=value&…`. Pure.
 
+use std::collections::HashSet;
 use std::time::{Duration, SystemTime};
 
 use percent_encoding::percent_decode_str;
@@ -59,6 +60,18 @@ pub(super) fn parameters<const N: usize>(
     Ok(values)
 }
 
+/// The names in a list such as `points=ready,running`; `None` without that parameter. Others are nothing to it.
+pub(super) fn names(query: Option<&str>, parameter: &str) -> Option<HashSet<String>> {
+    let pairs = query.unwrap_or_default().split('&');
+    let value = pairs
+        .filter_map(|pair| pair.split_once('='))
+        .find(|(name, _)| *name == parameter);
+    let (_, value) = value?;
+    let value = percent_decode_str(value).decode_utf8_lossy();
+    let names = value.split(',').filter(|name| !name.is_empty());
+    Some(names.map(str::to_string).collect())
+}
+
 /// A time: RFC 3339 in UTC, seconds since 1970, or an age such as `10min`.
 ///
 /// # Errors
@@ -97,6 +110,18 @@ mod tests {
         let unknown = of("line=1").unwrap_err();
         assert_eq!(unknown.reply().known, ["bus", "from"]);
         assert_eq!(unknown.to_string(), "unknown parameter `line`");
+    }
+
+    #[test]
+    fn lists_of_names() {
+        let of = |query: &str| names(Some(query), "points");
+        assert_eq!(names(None, "points"), None);
+        assert_eq!(of("point=a"), None);
+        assert_eq!(of("points="), Some(HashSet::new()));
+        assert_eq!(
+            of("_=1&points=a,b%2Cc"),
+            Some(["a", "b", "c"].map(str::to_string).into())
+        );
     }
 
     #[test]

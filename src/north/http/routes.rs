@@ -91,23 +91,9 @@ pub(super) fn router(
         files: Semaphore::new(1),
         operating,
     });
-    let assets = [
-        ("/assets/style.css", "text/css; charset=utf-8", page::STYLE),
-        ("/assets/page.js", "text/javascript; charset=utf-8", page::SCRIPT),
-        ("/assets/icon.svg", "image/svg+xml", page::ICON),
-        ("/assets/operate.css", "text/css; charset=utf-8", page::OPERATE_STYLE),
-        (
-            "/assets/operate.js",
-            "text/javascript; charset=utf-8",
-            page::OPERATE_SCRIPT,
-        ),
-    ];
-    let assets = assets.into_iter().fold(Router::new(), |router, (path, kind, text)| {
-        router.route(path, get(move || asset(kind, text)))
-    });
     Router::new()
         .route("/", get(status_page))
-        .merge(assets)
+        .route("/assets/{name}", get(asset))
         .route("/metrics", get(exposition))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(ready))
@@ -228,8 +214,11 @@ fn document(html: String) -> Response {
     (policy, Html(html)).into_response()
 }
 
-async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, content_type)], body)
+async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
+    match page::ASSETS.iter().find(|asset| asset.name == name) {
+        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
+        None => unknown(uri).await,
+    }
 }
 
 async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
@@ -265,14 +254,16 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn drives(State(app): State<Arc<AppState>>) -> Response {
+/// All drives; with `points=` only these points of each.
+async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let shown = query::names(query.as_deref(), "points");
     let _turn = app.turn().await;
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
     let all: Vec<_> = all
         .iter()
-        .map(|drive| api::Drive::new(drive, &plant.history, clock))
+        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
         .collect();
     Json(all).into_response()
 }

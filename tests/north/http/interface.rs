@@ -368,6 +368,7 @@ async fn the_page_without_scripts_has_tables() {
     for (place, kind) in [
         ("/assets/style.css", "text/css"),
         ("/assets/page.js", "text/javascript"),
+        ("/assets/overview.js", "text/javascript"),
         ("/assets/icon.svg", "image/svg+xml"),
     ] {
         let reply = get(server.address, place).await;

@@ -144,17 +144,17 @@ async function operate(browser) {
   await browser.press("button[aria-label='Start pump-1']");
   await browser.press("button[aria-label='Start now: pump-1']");
   await browser.until("the start", result("Start: confirmed"));
-  await browser.until("it runs", "document.querySelector('#drives .badge').textContent.includes('running')");
+  await browser.until("it runs", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   // The lease of 2 s is renewed while the person is active.
   for (let turn = 0; turn < 12; turn += 1) {
     await browser.key("Tab");
     await new Promise((done) => setTimeout(done, 500));
   }
-  assert.ok(await browser.run("document.querySelector('#drives .badge').textContent.includes('running')"), "its lease was renewed");
+  assert.ok(await browser.run("document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')"), "its lease was renewed");
   await browser.until("who supervises", "document.querySelector('.operate-lease').textContent.includes('Supervised by this page')");
   await browser.press(stopButton);
   await browser.until("the stop", result("Stop: "));
-  await browser.until("it stands", "!document.querySelector('#drives .badge').textContent.includes('running')");
+  await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
   await browser.press("#login .login-known button");
   await browser.until("the logout", seen("#login input[name=user]"));
   assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press after the logout");
