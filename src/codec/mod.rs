@@ -6,6 +6,7 @@
 pub mod ascii;
 pub(crate) mod checksum;
 pub mod describe;
+pub(crate) mod frames;
 pub mod modbus;
 pub mod n2;
 pub mod rtu;
