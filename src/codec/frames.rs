@@ -104,9 +104,9 @@ impl Frames {
         Some(last + self.format.silence_chars() + held_back)
     }
 
-    /// Whether bytes wait for more.
-    pub(crate) fn has_bytes(&self) -> bool {
-        !self.bytes.is_empty()
+    /// The bytes that are not cut yet.
+    pub(crate) fn rest(&self) -> &[u8] {
+        &self.bytes
     }
 
     /// The next piece, if one can be cut by `now`; `open` is the request whose reply may come.
@@ -248,8 +248,7 @@ fn rtu_request(bytes: &[u8]) -> Look {
     let (Some(&address), Some(&function)) = (bytes.first(), bytes.get(1)) else {
         return Look::MayBecome(false);
     };
-    let known = matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43);
-    if address > 247 || !known {
+    if address > 247 || !rtu::is_known(function) {
         return Look::Nothing;
     }
     // Bytes that must agree with a count before them.

@@ -123,6 +123,15 @@ impl Protocol {
         }
     }
 
+    /// A frame of that PDU, appended to `out`; nothing in N2, whose frames hold none.
+    pub fn encode_frame(self, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
+        match self {
+            Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
+            Protocol::ModbusAscii => ascii::encode_frame(address, pdu, out),
+            Protocol::N2 => {}
+        }
+    }
+
     /// What `bytes` are as an answer to `request`.
     pub fn decode(self, request: &Request, bytes: &[u8]) -> Decoded {
         match self {

@@ -115,6 +115,11 @@ fn device_identification_len(bytes: &[u8]) -> Option<usize> {
     Some(at + 2)
 }
 
+/// Whether requests of that function are decoded here, so that their length is known.
+pub fn is_known(function: u8) -> bool {
+    matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43)
+}
+
 /// Splits what a slave or a listener received into the first frame of a master and the rest.
 ///
 /// Returns `None` while the frame is not whole; the length comes from the function code.

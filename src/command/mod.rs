@@ -50,11 +50,13 @@ pub enum SourceKind {
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
+    /// A tool at a slot of the bus.
+    Slot,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 8] = [
+    pub const ALL: [SourceKind; 9] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -63,6 +65,7 @@ impl SourceKind {
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
         SourceKind::OtherMaster,
+        SourceKind::Slot,
     ];
 
     /// The label of metrics and audit lines.
@@ -76,6 +79,7 @@ impl SourceKind {
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
             SourceKind::OtherMaster => "other_master",
+            SourceKind::Slot => "slot",
         }
     }
 }
