@@ -9,12 +9,14 @@
 
 mod admit;
 mod audit;
+mod background;
 mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
 pub(crate) use audit::SENT;
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
+pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, Pace};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 

@@ -26,6 +26,7 @@ impl Master {
         match &turn.purpose {
             Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, &mut news),
             Purpose::Poll(poll) => self.polled(poll, end.ended, end.took, now, &mut news),
+            Purpose::Background => self.background_over(turn, end, now, &mut news),
             Purpose::Command { slot, rank, step } => {
                 let step = Step {
                     purpose: *step,
@@ -122,7 +123,7 @@ impl Master {
     }
 
     /// The drive has started anew: nothing that is known of it holds.
-    fn restarted(&mut self, drive: usize, now: Instant, news: &mut Vec<News>) {
+    pub(super) fn restarted(&mut self, drive: usize, now: Instant, news: &mut Vec<News>) {
         if let Some(state) = self.drives.get_mut(drive) {
             state.restarted();
         }
