@@ -244,7 +244,14 @@ impl Transaction {
 
     /// The frame of the reply, as the drive sent it.
     pub fn take_reply_frame(&mut self) -> Vec<u8> {
-        std::mem::take(&mut self.reply_frame)
+        let mut frame = std::mem::take(&mut self.reply_frame);
+        let before = match self.protocol {
+            // Blanks and glitches of a line that changes direction.
+            Protocol::N2 => frame.iter().position(u8::is_ascii_graphic).unwrap_or(0),
+            protocol => protocol.noise(&frame),
+        };
+        frame.drain(..before.min(frame.len()));
+        frame
     }
 
     /// The reply that stands whole behind garbage.

@@ -16,7 +16,9 @@ mod ticket;
 pub use admit::{Admitted, admit, sets_twice, written};
 pub(crate) use audit::SENT;
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
-pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, Pace};
+pub use background::{
+    BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
+};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 

@@ -5,7 +5,7 @@ use rustix::pty::{OpenptFlags, grantpt, openpt, ptsname, unlockpt};
 use rustix::termios::{OptionalActions, QueueSelector, ioctl_tiocnxcl, tcflush, tcgetattr, tcsetattr};
 use std::fs;
 use std::io;
-use std::os::fd::{AsFd, AsRawFd, BorrowedFd, OwnedFd, RawFd};
+use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
 use std::os::unix::fs::{fchown, symlink};
 use std::path::{Path, PathBuf};
 
@@ -99,12 +99,6 @@ impl Pty {
 impl AsFd for Pty {
     fn as_fd(&self) -> BorrowedFd<'_> {
         self.master.as_fd()
-    }
-}
-
-impl AsRawFd for Pty {
-    fn as_raw_fd(&self) -> RawFd {
-        self.master.as_raw_fd()
     }
 }
 

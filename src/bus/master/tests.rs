@@ -415,6 +415,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
             began: rig.now,
             took: COST,
             mangled: false,
+            frame: Vec::new(),
         };
         rig.now += COST;
         rig.master.done(&turn, end, rig.now);

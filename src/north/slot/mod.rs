@@ -49,6 +49,17 @@ pub enum SlotAccess {
     Raw,
 }
 
+impl SlotAccess {
+    /// In words.
+    pub fn meaning(self) -> &'static str {
+        match self {
+            SlotAccess::Read => "tools read only",
+            SlotAccess::Write => "tools may write what Modbus TCP clients may",
+            SlotAccess::Raw => "tools may write, broadcast and send what cannot be checked",
+        }
+    }
+}
+
 /// One slot of a bus.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Slot {

@@ -1,13 +1,15 @@
 //! The pseudo-terminal of a slot: a serial port that an old program opens.
 
+use std::fs::File;
 use std::future::poll_fn;
 use std::io;
+use std::os::fd::AsFd;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
 
-use tokio::io::Interest;
-use tokio::io::unix::AsyncFd;
+use tokio::io::AsyncReadExt;
+use tokio::net::unix::pipe;
 use tokio::time::Instant;
 use tokio_util::sync::CancellationToken;
 
@@ -31,10 +33,12 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
                 tracing::info!(%bus, path = %path.display(), "tool slot: open");
                 told.clear();
                 let tool = Tool::new(terms.clone(), &path.display().to_string(), "pty");
-                let served = Port::new(pty, Arc::new(tool)).serve();
-                match cancel.run_until_cancelled(served).await {
-                    None => return,
-                    Some(error) => error,
+                match Port::new(pty, Arc::new(tool)) {
+                    Ok(port) => match cancel.run_until_cancelled(port.serve()).await {
+                        None => return,
+                        Some(error) => error,
+                    },
+                    Err(error) => error,
                 }
             }
             Err(error) => error,
@@ -50,26 +54,30 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
     }
 }
 
-fn open(path: &Path) -> io::Result<AsyncFd<Pty>> {
+fn open(path: &Path) -> io::Result<Pty> {
     let pty = Pty::open(Some(path))?;
     pty.share()?;
-    AsyncFd::with_interest(pty, Interest::READABLE)
+    Ok(pty)
 }
 
 struct Port {
-    pty: AsyncFd<Pty>,
+    pty: Pty,
+    /// The same end of the pseudo-terminal. To the runtime it is a pipe: something that can be read now and then.
+    reader: pipe::Receiver,
     dialogue: Dialogue,
     /// When bytes came or went last; `None` once the port rests.
     used: Option<Instant>,
 }
 
 impl Port {
-    fn new(pty: AsyncFd<Pty>, tool: Arc<Tool>) -> Port {
-        Port {
+    fn new(pty: Pty, tool: Arc<Tool>) -> io::Result<Port> {
+        let same = File::from(pty.as_fd().try_clone_to_owned()?);
+        Ok(Port {
+            reader: pipe::Receiver::from_file_unchecked(same)?,
             pty,
             dialogue: Dialogue::new(tool),
             used: None,
-        }
+        })
     }
 
     /// Serves until the system reports an error.
@@ -85,12 +93,12 @@ impl Port {
         let wake_at = self.dialogue.wake_at().map(Instant::from_std);
         let rests_at = self.used.map(|at| at + RESTS).filter(|_| !self.dialogue.is_waiting());
         let timer = [wake_at, rests_at].into_iter().flatten().min();
-        let (pty, dialogue) = (&self.pty, &mut self.dialogue);
+        let dialogue = &mut self.dialogue;
         let mut buffer = [0; 1024];
         let asked = tokio::select! {
             biased;
             () = poll_fn(|cx| dialogue.poll(cx, std::time::Instant::now())) => false,
-            count = read(pty, &mut buffer) => {
+            count = self.reader.read(&mut buffer) => {
                 let bytes = count.map(|count| buffer.get(..count).unwrap_or_default())?;
                 self.used = Some(Instant::now());
                 self.dialogue.received(bytes, std::time::Instant::now())
@@ -98,14 +106,14 @@ impl Port {
             () = sleep_until(timer) => {
                 if rests_at.is_some_and(|at| at <= Instant::now()) {
                     self.used = None;
-                    self.pty.get_ref().settle();
+                    self.pty.settle();
                 }
                 self.dialogue.on_time(std::time::Instant::now())
             }
         };
         if asked {
             // What was answered to an earlier request and not read is no answer to this one.
-            self.pty.get_ref().discard_unread();
+            self.pty.discard_unread();
         }
         self.write();
         Ok(())
@@ -118,15 +126,11 @@ impl Port {
             return;
         }
         self.used = Some(Instant::now());
-        let written = self.pty.get_ref().write(&answer).unwrap_or(0);
+        let written = self.pty.write(&answer).unwrap_or(0);
         if written < answer.len() {
-            self.pty.get_ref().discard_unread();
+            self.pty.discard_unread();
         }
     }
-}
-
-async fn read(pty: &AsyncFd<Pty>, buffer: &mut [u8]) -> io::Result<usize> {
-    pty.async_io(Interest::READABLE, |pty| pty.read(buffer)).await
 }
 
 async fn sleep_until(at: Option<Instant>) {
