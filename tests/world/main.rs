@@ -32,6 +32,7 @@ mod recorder;
 mod rig;
 mod scenario;
 mod situations;
+mod slot;
 mod world;
 
 use std::ops::Range;

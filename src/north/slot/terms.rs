@@ -132,7 +132,11 @@ impl Tool {
         let drives = self.asked(&plant, request);
         pace.is_stop = self.writes() && drives.iter().any(|drive| stops(drive, pdu, now));
         pace.stops = drives.iter().map(DriveHandle::stops).sum();
-        if self.writes() && !pace.is_stop {
+        // What is refused anyway, is at once.
+        let admitted = drives.iter().all(|drive| {
+            command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok()
+        });
+        if self.writes() && !pace.is_stop && admitted {
             pace.not_before = self.terms.paces.not_before(&self.terms.slot.bus).unwrap_or(now).max(now);
         }
         pace
