@@ -278,7 +278,7 @@ pub struct SlotStats(Mutex<BTreeMap<String, [u64; SlotOutcome::ALL.len()]>>);
 
 impl SlotStats {
     /// Counts a request of a tool.
-    pub(crate) fn count(&self, bus: &str, outcome: SlotOutcome) {
+    pub fn count(&self, bus: &str, outcome: SlotOutcome) {
         let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
         if !all.contains_key(bus) {
             all.insert(bus.to_string(), Default::default());

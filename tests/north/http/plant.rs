@@ -13,7 +13,7 @@ use drivegate::drive::model::Kind;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthStats;
+use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::north::http::{self, Http, Options};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, Link, Outcome, PollCycle};
@@ -199,6 +199,7 @@ pub(crate) fn count_a_write(plant: &Plant) {
 /// Figures of all north sides.
 pub(crate) fn stats() -> Arc<NorthStats> {
     let stats = NorthStats::default();
+    stats.slots.count("line1", SlotOutcome::Answered);
     stats.modbus_tcp.connected();
     stats.modbus_tcp.answered(3, 0);
     stats.modbus_tcp.answered(6, 1);
