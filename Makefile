@@ -20,10 +20,12 @@ build: ## Build the optimised binary, target/release/drivegate
 	commit="$$(git rev-parse --short=12 HEAD 2>/dev/null || true)"; \
 	DRIVEGATE_COMMIT="$${commit:-unknown}" cargo build --release --locked
 
+# Most tests wait for other programs and for real time, so three times as many as there are cores run at once.
+TEST_THREADS ?= $(shell expr 3 \* "$$(getconf _NPROCESSORS_ONLN)")
 # Documentation tests first, so that the output ends with the count of a suite that tests the product.
 test: tools lint deny advisories check ## Run every check and every test; installs missing test tools first
 	cargo test --locked --doc
-	cargo test --locked --tests --no-fail-fast
+	RUST_TEST_THREADS=$(TEST_THREADS) cargo test --locked --tests --no-fail-fast
 
 tools: ## Install what the tests need (apt, PyPI, cargo); quick when nothing is missing
 	@tests/tools/install.sh

@@ -5,8 +5,10 @@
 //! whole, and get [`SLOW_SHARE`] of the line at least. Requests of the class `once` cost nothing in the long run.
 
 mod cadence;
+mod faster;
 
 pub use cadence::carried;
+pub use faster::faster_points;
 
 use std::fmt;
 use std::time::Duration;
@@ -21,6 +23,10 @@ use crate::process_image::{BusSpec, DriveSpec};
 
 /// Baud rates that are proposed when no profile of the bus lists any.
 const USUAL_BAUDS: [u32; 9] = [1200, 2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
+
+/// Share of the line that is used at most where there is a choice: the rest is for commands, retries and drives slower
+/// than their profile says.
+const MOST_LOAD: f64 = 0.8;
 
 /// Part of a cadence by which it may be missed before it is reported.
 const TOLERANCE: f64 = 0.001;
@@ -117,6 +123,13 @@ pub fn predict(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Predic
     };
     prediction.shortage = line.shortage(&prediction, &total);
     prediction
+}
+
+impl Prediction {
+    /// Whether the line keeps all cadences with a fifth of its time to spare.
+    fn is_comfortable(&self) -> bool {
+        self.shortage.is_none() && self.demand <= MOST_LOAD
+    }
 }
 
 /// Wire time of one round of each class, s.

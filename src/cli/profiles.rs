@@ -238,6 +238,9 @@ fn remarks(profile: &Profile, point: &Point) -> String {
     if let Some(target) = point.write_to {
         parts.push(format!("commands go to {}", name_of(profile, target)));
     }
+    if point.fast_if_carried {
+        parts.push("fast where the line carries it".to_string());
+    }
     if point.on_change {
         parts.push("written on change only".to_string());
     }

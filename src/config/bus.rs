@@ -6,6 +6,7 @@ use std::time::Duration;
 use super::drive::{self, Surroundings};
 use super::keys::BUS;
 use super::{BusSettings, line, slot, values};
+use crate::bus::predict::faster_points;
 use crate::bus::{BusOptions, Mode};
 use crate::codec::wire::Silence;
 use crate::codec::{LineFormat, Protocol, n2};
@@ -83,6 +84,9 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
                 cycle,
                 slow_cycle,
             };
+            let asks = options.mode == Mode::Master;
+            let faster = asks.then(|| faster_points(&spec, options.silence, &drives)).flatten();
+            let drives = faster.unwrap_or(drives);
             Some(BusSettings { spec, options, drives })
         }
         _ => None,

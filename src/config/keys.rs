@@ -244,7 +244,8 @@ keys! {
         /// Target poll cycle of process data (poll class fast). If the line cannot carry it, cycles follow one another
         /// without a pause; `check` warns about this.
         cycle: Duration = TIMES, default "10ms";
-        /// Target poll cycle of class slow: temperatures and other slowly changing values.
+        /// Target poll cycle of class slow: temperatures and other slowly changing values. A motor
+        /// speed that is slow in its profile is read every `cycle` where the line has time for it (`fast_if_carried`).
         slow_cycle: Duration = TIMES, default "1s";
         /// Time a drive may take to begin its reply; the time on the wire is added. N2: `"250ms"`. Above `"1s"` causes a
         /// warning: each try to reach an absent drive takes the line for that time.

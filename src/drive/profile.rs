@@ -170,6 +170,8 @@ pub struct Point {
     pub source: Source,
     /// How often it is read.
     pub class: PollClass,
+    /// A slow point that is read in the fast class on lines that carry it.
+    pub fast_if_carried: bool,
     /// Whether it can be commanded.
     pub write: bool,
     /// The point that receives the commands, in the same unit, if the drive reports the value elsewhere.
@@ -253,6 +255,18 @@ impl Profile {
     /// The point of the common model.
     pub fn model_point(&self, point: ModelPoint) -> Option<&Point> {
         self.model_index(point).and_then(|i| self.points.get(i))
+    }
+
+    /// The profile with the points that are fast where the line carries it; `None` if it has none.
+    pub(crate) fn with_faster_points(&self) -> Option<Profile> {
+        if !self.points.iter().any(|point| point.fast_if_carried) {
+            return None;
+        }
+        let mut faster = self.clone();
+        for point in faster.points.iter_mut().filter(|point| point.fast_if_carried) {
+            point.class = PollClass::Fast;
+        }
+        Some(faster)
     }
 
     /// Index of the point of that name.

@@ -303,6 +303,8 @@ impl SlotStats {
 /// Counters of the MQTT client.
 #[derive(Debug, Default)]
 pub struct MqttStats {
+    /// Whether a broker is configured: a client runs.
+    pub configured: AtomicBool,
     /// Whether the client is connected to the broker.
     pub connected: AtomicBool,
     /// Messages that the broker acknowledged.

@@ -1,5 +1,7 @@
 //! The gateway listens on a line on which programs that were written elsewhere poll simulated drives.
 
+use std::collections::BTreeMap;
+use std::path::Path;
 use std::time::Duration;
 
 use drivegate::codec::{LineFormat, Protocol};
@@ -8,13 +10,17 @@ use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::half_duplex::LineRules;
 use drivegate::sim::wire::{SimulatedBus, SimulatedBusOptions};
 use serde_json::Value as Json;
+use tokio_modbus::client::{Reader as _, Writer as _};
+use tokio_modbus::slave::{Slave, SlaveContext as _};
 
 use crate::support::process::{Running, api, drivegate, get, until};
 use crate::support::site::{HTTP, Site, nx_in_ascii};
 use crate::support::tools::{python, root, run_well, tool};
 
-/// Exchanges of each master.
-const EXCHANGES: &str = "1000";
+/// Exchanges of each master; more with the variable `DRIVEGATE_EXCHANGES`.
+fn exchanges(usual: &str) -> String {
+    std::env::var("DRIVEGATE_EXCHANGES").unwrap_or_else(|_| usual.to_string())
+}
 
 /// Drives, another master's port and the gateway's, all one line.
 struct Shared {
@@ -90,7 +96,7 @@ impl Shared {
 }
 
 /// The lines that a master printed, as address or kind, number, values.
-fn printed(text: &str) -> Vec<(String, u16, Vec<f64>)> {
+fn printed(text: &str) -> Vec<Block> {
     let line = |line: &str| {
         let mut words = line.split_whitespace();
         let (kind, number) = (words.next()?.to_string(), words.next()?.parse().ok()?);
@@ -99,12 +105,58 @@ fn printed(text: &str) -> Vec<(String, u16, Vec<f64>)> {
     text.lines().filter_map(line).collect()
 }
 
-fn polled_by_pymodbus(framer: &str, protocol: Protocol) {
+/// A block of registers as a master read it last: address of the drive, first register, words.
+type Block = (String, u16, Vec<f64>);
+
+fn pymodbus(framer: &str, port: &str) -> Vec<Block> {
+    let script = root().join("tests/peers/polling_master.py");
+    let arguments = [script.to_str().unwrap(), port, framer, "115200", &exchanges("600")];
+    printed(&run_well(&python(), &arguments))
+}
+
+fn libmodbus(site: &Site, port: &str) -> Vec<Block> {
+    let program = site.path("polling_master");
+    let source = root().join("tests/peers/polling_master.c");
+    run_well(
+        &tool("gcc"),
+        &["-O1", "-o", &program, source.to_str().unwrap(), "-lmodbus"],
+    );
+    printed(&run_well(Path::new(&program), &[port, "115200", &exchanges("600")]))
+}
+
+/// What the two programs above do, by tokio-modbus.
+#[tokio::main(flavor = "current_thread")]
+async fn tokio_modbus(port: &str) -> Vec<Block> {
+    let stream = tokio_serial::SerialStream::open(&tokio_serial::new(port, 115_200)).unwrap();
+    let mut client = tokio_modbus::client::rtu::attach(stream);
+    client.set_slave(Slave(1));
+    client
+        .write_multiple_registers(2000, &[1, 0, 4000])
+        .await
+        .unwrap()
+        .unwrap();
+    let mut read = BTreeMap::new();
+    let mut left: u32 = exchanges("600").parse().unwrap();
+    while left > 1 {
+        for address in [1, 2] {
+            client.set_slave(Slave(address));
+            for (first, count) in [(2100, 11), (2000, 3), (7, 2)] {
+                let words = client.read_holding_registers(first, count).await.unwrap().unwrap();
+                read.insert((address.to_string(), first), words);
+                left = left.saturating_sub(1);
+            }
+        }
+    }
+    let blocks = read.into_iter();
+    let blocks = blocks.map(|((address, first), words)| (address, first, words.into_iter().map(f64::from).collect()));
+    blocks.collect()
+}
+
+/// What a program reads and commands on the line is what the gateway shows.
+fn polled(protocol: Protocol, master: impl FnOnce(&Site, &str) -> Vec<Block>) {
     let shared = Shared::start(protocol, 115_200, "vacon-nx", 2);
     let gateway = shared.gateway(protocol, 115_200, "vacon-nx", 2);
-    let script = root().join("tests/peers/polling_master.py");
-    let arguments = [script.to_str().unwrap(), &shared.master(), framer, "115200", EXCHANGES];
-    let said = printed(&run_well(&python(), &arguments));
+    let said = master(&shared.site, &shared.master());
     assert_eq!(said.len(), 6, "{said:?}");
     let port = shared.site.modbus.to_string();
     for (address, first, words) in &said {
@@ -182,12 +234,22 @@ fn polled_by_pymodbus(framer: &str, protocol: Protocol) {
 
 #[test]
 fn what_pymodbus_reads_by_rtu_is_shown() {
-    polled_by_pymodbus("rtu", Protocol::ModbusRtu);
+    polled(Protocol::ModbusRtu, |_, port| pymodbus("rtu", port));
 }
 
 #[test]
 fn what_pymodbus_reads_by_ascii_is_shown() {
-    polled_by_pymodbus("ascii", Protocol::ModbusAscii);
+    polled(Protocol::ModbusAscii, |_, port| pymodbus("ascii", port));
+}
+
+#[test]
+fn what_libmodbus_reads_is_shown() {
+    polled(Protocol::ModbusRtu, libmodbus);
+}
+
+#[test]
+fn what_tokio_modbus_reads_is_shown() {
+    polled(Protocol::ModbusRtu, |_, port| tokio_modbus(port));
 }
 
 #[test]
@@ -197,7 +259,7 @@ fn what_another_master_of_n2_reads_is_shown() {
     let script = root().join("tests/peers/n2_master.py");
     let said = printed(&run_well(
         &python(),
-        &[script.to_str().unwrap(), &shared.master(), "200"],
+        &[script.to_str().unwrap(), &shared.master(), &exchanges("200")],
     ));
     assert_eq!(said.len(), 8, "{said:?}");
     let drive = shared.drive("d1");

@@ -3,6 +3,7 @@
 use std::collections::BTreeSet;
 use std::fs;
 use std::net::TcpStream;
+use std::process::Command;
 
 use crate::support::process::{Running, until};
 use crate::support::site::Site;
@@ -11,7 +12,13 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// The metrics of the public contract; dashboards and alerts of users hang on these names.
-const METRICS: [&str; 40] = [
+const METRICS: [&str; 46] = [
+    "drivegate_drive_blocked",
+    "drivegate_drive_fault_info",
+    "drivegate_drive_unsupervised",
+    "drivegate_mqtt_configured",
+    "drivegate_recordings_total",
+    "drivegate_supervision_actions_total",
     "drivegate_drive_up",
     "drivegate_drive_state",
     "drivegate_drive_sample_age_seconds",
@@ -73,7 +80,7 @@ const SHOWN: [&str; 15] = [
     "drivegate_mqtt_connected",
 ];
 
-const DASHBOARD: &str = "deploy/compose/grafana/dashboards/drivegate.json";
+const DASHBOARDS: [&str; 4] = ["fleet", "gateway", "line", "drive"];
 const ALERTS: &str = "deploy/compose/prometheus/alerts.yml";
 
 fn read(path: &str) -> String {
@@ -150,6 +157,10 @@ fn prometheus_takes_its_configuration_and_the_alerts_do_what_they_say() {
     );
     run_well(&promtool, &["check", "rules", ALERTS]);
     run_well(
+        &tool("amtool"),
+        &["check-config", "deploy/compose/alertmanager/alertmanager.yml"],
+    );
+    run_well(
         &promtool,
         &["test", "rules", "deploy/compose/prometheus/alerts_test.yml"],
     );
@@ -163,32 +174,43 @@ fn metrics_in(text: &str) -> BTreeSet<String> {
         .collect()
 }
 
+fn dashboard_path(name: &str) -> String {
+    format!("deploy/compose/grafana/dashboards/{name}.json")
+}
+
+fn dashboards() -> Vec<Value> {
+    let read = |name| serde_json::from_str(&read(&dashboard_path(name))).unwrap();
+    DASHBOARDS.into_iter().map(read).collect()
+}
+
+/// The queries of panels and annotations.
 fn expressions(dashboard: &Value) -> Vec<String> {
     let panels = dashboard["panels"].as_array().unwrap();
     let targets = panels.iter().filter_map(|panel| panel["targets"].as_array()).flatten();
     targets
+        .chain(dashboard["annotations"]["list"].as_array().unwrap())
         .map(|target| target["expr"].as_str().unwrap().to_string())
         .collect()
 }
 
 #[test]
-fn dashboard_and_alerts_use_metrics_that_exist() {
+fn dashboards_and_alerts_use_metrics_that_exist() {
     let known: BTreeSet<String> = METRICS.iter().map(ToString::to_string).collect();
-    let dashboard: Value = serde_json::from_str(&read(DASHBOARD)).unwrap();
-    let mut queries = expressions(&dashboard);
-    for variable in dashboard["templating"]["list"].as_array().unwrap() {
-        queries.push(variable["query"].to_string());
+    let mut queries = Vec::new();
+    for dashboard in dashboards() {
+        queries.extend(expressions(&dashboard));
+        for variable in dashboard["templating"]["list"].as_array().unwrap() {
+            queries.push(variable["query"].to_string());
+        }
     }
     let shown = metrics_in(&queries.join("\n"));
     let unknown: Vec<_> = shown.difference(&known).collect();
-    assert!(unknown.is_empty(), "{DASHBOARD}: {unknown:?}");
+    assert!(unknown.is_empty(), "dashboards: {unknown:?}");
     let missing: Vec<_> = SHOWN.iter().filter(|metric| !shown.contains(**metric)).collect();
-    assert!(missing.is_empty(), "{DASHBOARD} does not show {missing:?}");
+    assert!(missing.is_empty(), "the dashboards do not show {missing:?}");
 
     // Label values such as a file name may begin like a metric; expressions are what counts.
-    let alerts = yaml(ALERTS);
-    let rules = alerts["groups"][0]["rules"].as_array().unwrap();
-    let expressions: Vec<&str> = rules.iter().map(|rule| rule["expr"].as_str().unwrap()).collect();
+    let expressions: Vec<String> = alert_rules().iter().map(|rule| rule["expr"].to_string()).collect();
     let unknown: Vec<_> = metrics_in(&expressions.join("\n"))
         .into_iter()
         .filter(|m| !known.contains(m))
@@ -196,26 +218,86 @@ fn dashboard_and_alerts_use_metrics_that_exist() {
     assert!(unknown.is_empty(), "{ALERTS}: {unknown:?}");
 }
 
+fn alert_rules() -> Vec<Value> {
+    yaml(ALERTS)["groups"][0]["rules"].as_array().unwrap().clone()
+}
+
 #[test]
-fn the_expressions_of_the_dashboard_are_sound() {
-    let dashboard: Value = serde_json::from_str(&read(DASHBOARD)).unwrap();
-    let panels = dashboard["panels"].as_array().unwrap();
-    let ids: BTreeSet<i64> = panels.iter().map(|panel| panel["id"].as_i64().unwrap()).collect();
-    assert_eq!(ids.len(), panels.len(), "two panels have the same id");
-    let expressions = expressions(&dashboard);
-    assert!(expressions.len() > 20, "only {} expressions", expressions.len());
-    let rules: Vec<Value> = expressions
-        .iter()
-        .enumerate()
-        .map(|(i, expression)| {
+fn every_alert_is_documented() {
+    let page = read("docs/http.md");
+    for rule in alert_rules() {
+        let name = rule["alert"].as_str().unwrap();
+        assert!(page.contains(&format!("| `{name}` |")), "{name}");
+    }
+}
+
+#[test]
+fn the_dashboards_are_those_of_their_script() {
+    run_well(&python(), &["deploy/compose/grafana/make_dashboards.py", "--check"]);
+}
+
+/// The types of Grafana itself: keys that it would ignore and values that it does not know fail here.
+#[test]
+fn grafana_knows_all_of_the_dashboards() {
+    let check = |files: &[String]| {
+        Command::new(tool("node"))
+            .arg("tests/tools/node/check_dashboards.js")
+            .args(files)
+            .current_dir(root())
+            .env("NODE_PATH", root().join(".tools/node/node_modules"))
+            .output()
+            .unwrap()
+    };
+    let checked = check(&DASHBOARDS.map(dashboard_path));
+    assert!(checked.status.success(), "{}", String::from_utf8_lossy(&checked.stderr));
+    // The check itself sees a value that Grafana does not know.
+    let dir = TempDir::new().unwrap();
+    let wrong = dir.path().join("wrong.json");
+    let text = read(&dashboard_path("drive"));
+    fs::write(
+        &wrong,
+        text.replacen("\"drawStyle\": \"line\"", "\"drawStyle\": \"curve\"", 1),
+    )
+    .unwrap();
+    let checked = check(&[wrong.display().to_string()]);
+    let said = String::from_utf8_lossy(&checked.stderr);
+    assert!(!checked.status.success() && said.contains("drawStyle"), "{said}");
+}
+
+#[test]
+fn links_between_dashboards_lead_somewhere() {
+    let dashboards = dashboards();
+    let uids: BTreeSet<&str> = dashboards.iter().map(|one| one["uid"].as_str().unwrap()).collect();
+    assert_eq!(uids.len(), DASHBOARDS.len());
+    for dashboard in &dashboards {
+        let text = dashboard.to_string();
+        let linked = text.match_indices("\"/d/").map(|(at, found)| {
+            let rest = &text[at + found.len()..];
+            rest.split(['?', '"']).next().unwrap()
+        });
+        let linked: BTreeSet<&str> = linked.collect();
+        assert!(linked.is_subset(&uids), "{linked:?}");
+        assert!(linked.len() >= 3, "{}: links to {linked:?} only", dashboard["uid"]);
+    }
+}
+
+#[test]
+fn the_expressions_of_the_dashboards_are_sound() {
+    let mut rules = Vec::new();
+    for dashboard in dashboards() {
+        let panels = dashboard["panels"].as_array().unwrap();
+        let ids: BTreeSet<i64> = panels.iter().map(|panel| panel["id"].as_i64().unwrap()).collect();
+        assert_eq!(ids.len(), panels.len(), "two panels have the same id");
+        for expression in expressions(&dashboard) {
             let plain = expression.replace("$__rate_interval", "1m");
-            serde_json::json!({ "record": format!("expression:{i}"), "expr": plain })
-        })
-        .collect();
+            rules.push(serde_json::json!({ "record": format!("expression:{}", rules.len()), "expr": plain }));
+        }
+    }
+    assert!(rules.len() > 50, "only {} expressions", rules.len());
     let dir = TempDir::new().unwrap();
     let file = dir.path().join("rules.yml");
     // JSON is YAML.
-    let text = serde_json::json!({ "groups": [{ "name": "dashboard", "rules": rules }] }).to_string();
+    let text = serde_json::json!({ "groups": [{ "name": "dashboards", "rules": rules }] }).to_string();
     fs::write(&file, text).unwrap();
     run_well(&tool("promtool"), &["check", "rules", &file.display().to_string()]);
 }
@@ -262,7 +344,7 @@ fn what_compose_mounts_and_publishes_is_there() {
 }
 
 #[test]
-fn grafana_finds_its_datasource_and_dashboard() {
+fn grafana_finds_its_datasource_and_dashboards() {
     let datasource = yaml("deploy/compose/grafana/provisioning/datasources/prometheus.yaml");
     assert_eq!(datasource["datasources"][0]["url"], "http://prometheus:9090");
     let provider = yaml("deploy/compose/grafana/provisioning/dashboards/drivegate.yaml");
@@ -273,6 +355,8 @@ fn grafana_finds_its_datasource_and_dashboard() {
     let compose = yaml("deploy/compose.yaml");
     let mounts = compose["services"]["grafana"]["volumes"].to_string();
     assert!(mounts.contains(&format!("./compose/grafana/dashboards:{path}:ro")));
+    let home = compose["services"]["grafana"]["environment"]["GF_DASHBOARDS_DEFAULT_HOME_DASHBOARD_PATH"].as_str();
+    assert_eq!(home, Some(format!("{path}/gateway.json").as_str()));
 }
 
 #[test]

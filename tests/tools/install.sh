@@ -14,6 +14,7 @@ needed=(
     "mosquitto mosquitto"
     "mosquitto_pub mosquitto-clients"
     "promtool prometheus"
+    "amtool prometheus-alertmanager"
     "mbpoll mbpoll"
     "socat socat"
     "tshark tshark"
@@ -46,7 +47,7 @@ install_packages() {
         local package
         for package in "${packages[@]}"; do
             case $package in
-                mosquitto | prometheus) as_root systemctl disable --now --quiet "$package" ;;
+                mosquitto | prometheus | prometheus-alertmanager) as_root systemctl disable --now --quiet "$package" ;;
             esac
         done
     fi

@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use super::faster::with_faster_points;
 use super::predict;
 use crate::codec::wire::Silence;
 use crate::process_image::{BusSpec, DriveSpec};
@@ -14,12 +15,12 @@ const STEPS: [u64; 17] = [
 const SLOW_STEPS: [u64; 7] = [1000, 2000, 5000, 10_000, 20_000, 30_000, 60_000];
 /// A slow cadence is at most so many times the fast one, or the shortest.
 const MOST_RATIO: u32 = 10;
-/// Share of the line that is used at most: the rest is for commands, retries and drives slower than their profile says.
-const MOST_LOAD: f64 = 0.8;
-
-/// `cycle` and `slow_cycle` for that bus: the shortest cadences that leave a fifth of the line free. `None` if the line does
+/// `cycle` and `slow_cycle` for that bus: the shortest cadences that leave a fifth of the line free, with the
+/// points that are [read in the fast class where that is possible](super::faster_points). `None` if the line does
 /// not carry the longest ones, or there is nothing to read.
 pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option<(Duration, Duration)> {
+    let faster = with_faster_points(drives);
+    let drives = faster.as_deref().unwrap_or(drives);
     let all = STEPS.iter().flat_map(|cycle| {
         let cycle = Duration::from_millis(*cycle);
         let slow = SLOW_STEPS.into_iter().map(Duration::from_millis);
@@ -33,7 +34,7 @@ pub fn carried(spec: &BusSpec, silence: Silence, drives: &[DriveSpec]) -> Option
             ..spec.clone()
         };
         let prediction = predict(&spec, silence, drives);
-        prediction.shortage.is_none() && prediction.demand <= MOST_LOAD && !prediction.requests.is_empty()
+        prediction.is_comfortable() && !prediction.requests.is_empty()
     })
 }
 
@@ -64,10 +65,7 @@ mod tests {
             ..spec
         };
         let prediction = predict(&found, Silence::Spec, &drives);
-        assert!(
-            prediction.shortage.is_none() && prediction.load <= MOST_LOAD,
-            "{prediction:?}"
-        );
+        assert!(prediction.is_comfortable(), "{prediction:?}");
         Some((cycle.as_millis(), slow_cycle.as_millis()))
     }
 

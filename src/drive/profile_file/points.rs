@@ -60,6 +60,7 @@ pub(super) fn read_point(
         model,
         unit,
         class,
+        fast_if_carried: reader.or("fast_if_carried", false) && class == PollClass::Slow,
         write: reader.or("write", false),
         write_to: reader
             .optional::<String>("write_to")

@@ -341,6 +341,12 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     let mqtt = &stats.mqtt;
     all.push(Family::of(
         Kind::Gauge,
+        "drivegate_mqtt_configured",
+        "Whether an MQTT broker is configured: 1, else 0.",
+        flag(mqtt.configured.load(Ordering::Relaxed)),
+    ));
+    all.push(Family::of(
+        Kind::Gauge,
         "drivegate_mqtt_connected",
         "Whether the gateway is connected to its MQTT broker: 1, else 0 (also without one configured).",
         flag(mqtt.connected.load(Ordering::Relaxed)),

@@ -61,6 +61,7 @@ pub(super) async fn run(
     events: Receiver<Arc<Event>>,
     cancel: CancellationToken,
 ) {
+    stats.mqtt.configured.store(true, Ordering::Relaxed);
     let mut client = Client::new(options, plant, stats, events);
     loop {
         let look_at = tokio::time::Instant::from_std(client.look_at);
@@ -547,6 +548,7 @@ impl Client {
             tracing::warn!("the orderly disconnect from the broker timed out; the broker publishes the last will");
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
+        self.stats.mqtt.configured.store(false, Ordering::Relaxed);
         for update in self.publisher.recorded() {
             self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
         }

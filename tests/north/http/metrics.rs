@@ -12,7 +12,7 @@ use crate::support::tools::{feed, tool};
 
 /// Every metric with its type and labels. Dashboards and alerts rest on these: a new metric is added here, none is
 /// renamed, retyped or removed.
-const FROZEN: [&str; 52] = [
+const FROZEN: [&str; 54] = [
     "drivegate_build_info gauge commit,gateway,version",
     "drivegate_bus_cycle_seconds histogram bus,class",
     "drivegate_bus_load_ratio gauge bus",
@@ -45,12 +45,14 @@ const FROZEN: [&str; 52] = [
     "drivegate_drive_state gauge bus,drive,state",
     "drivegate_drive_transactions_total counter bus,drive,outcome",
     "drivegate_drive_turnaround_seconds gauge bus,drive",
+    "drivegate_drive_unsupervised gauge bus,drive",
     "drivegate_drive_up gauge bus,drive",
     "drivegate_drive_warning gauge bus,drive",
     "drivegate_modbus_tcp_connections gauge ",
     "drivegate_modbus_tcp_requests_total counter function,outcome",
     "drivegate_slot_requests_total counter bus,outcome",
     "drivegate_mqtt_buffered_messages gauge ",
+    "drivegate_mqtt_configured gauge ",
     "drivegate_mqtt_lost_total counter kind",
     "drivegate_mqtt_connected gauge ",
     "drivegate_mqtt_published_total counter ",
@@ -142,7 +144,7 @@ fn value(text: &str, name: &str, labels: &str) -> Option<f64> {
 
 /// A plant with a drive that has every point there is, and one that was never asked.
 pub(super) async fn everything() -> Server {
-    let image = plant::drive("line1", "all", 1, &plant::everything());
+    let image = plant::supervised("line1", "all", 1, &plant::everything());
     plant::answer(&image, Instant::now(), |address| if address == 41 { 50 } else { 1 });
     let untried = plant::drive("line1", "untried", 2, &plant::everything());
     let bus = plant::bus("line1", vec![image, untried]);
@@ -410,13 +412,18 @@ pub(super) struct Prometheus {
 
 impl Prometheus {
     pub(super) fn scraping(targets: &[SocketAddr]) -> Prometheus {
+        Prometheus::with(targets, "")
+    }
+
+    /// With more settings than the targets.
+    pub(super) fn with(targets: &[SocketAddr], more: &str) -> Prometheus {
         let directory = tempfile::tempdir().unwrap();
         let port = free_port();
         let place = |name: &str| directory.path().join(name).display().to_string();
         let targets: Vec<String> = targets.iter().map(|target| format!("\"{target}\"")).collect();
         let targets = targets.join(", ");
         let settings = format!(
-            "global: {{ scrape_interval: 1s }}\nscrape_configs:\n- job_name: drivegate\n  static_configs: [{{ targets: [{targets}] }}]\n"
+            "global: {{ scrape_interval: 1s, evaluation_interval: 1s }}\nscrape_configs:\n- job_name: drivegate\n  static_configs: [{{ targets: [{targets}] }}]\n{more}"
         );
         fs::write(place("prometheus.yml"), settings).unwrap();
         let arguments = [

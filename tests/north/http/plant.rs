@@ -16,7 +16,7 @@ use drivegate::event::{Event, EventKind};
 use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::north::http::{self, Http, Options};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
-use drivegate::process_image::{DriveImage, Link, Outcome, PollCycle};
+use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
 use tokio_util::sync::CancellationToken;
 
 use crate::north::plant;
@@ -89,6 +89,18 @@ pub(crate) fn nx_faulted(address: u16) -> u16 {
 
 pub(crate) fn drive(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
     plant::image(plant::spec(bus, name, address, profile))
+}
+
+/// A drive with a lease.
+pub(crate) fn supervised(bus: &str, name: &str, address: u8, profile: &Arc<Profile>) -> Arc<DriveImage> {
+    plant::image(DriveSpec {
+        supervision: Some(Supervision {
+            timeout: STALE_AFTER,
+            action: LeaseAction::Hold,
+            adopt: false,
+        }),
+        ..plant::spec(bus, name, address, profile)
+    })
 }
 
 pub(crate) fn bus(name: &str, drives: Vec<Arc<DriveImage>>) -> BusHandle {
@@ -203,6 +215,7 @@ pub(crate) fn stats() -> Arc<NorthStats> {
     stats.modbus_tcp.connected();
     stats.modbus_tcp.answered(3, 0);
     stats.modbus_tcp.answered(6, 1);
+    stats.mqtt.configured.store(true, Ordering::Relaxed);
     stats.mqtt.connected.store(true, Ordering::Relaxed);
     stats.mqtt.published.store(17, Ordering::Relaxed);
     stats.mqtt.buffered.store(2, Ordering::Relaxed);
