@@ -173,7 +173,9 @@ impl CommandRun {
 
     /// Whether a tool gave it: its share of the line is that of background exchanges.
     pub fn is_of_tool(&self) -> bool {
-        self.tickets.iter().all(|ticket| ticket.origin().kind == SourceKind::Slot)
+        self.tickets
+            .iter()
+            .all(|ticket| ticket.origin().kind == SourceKind::Slot)
     }
 
     /// Whether only supervision wants it.

@@ -246,7 +246,11 @@ impl Master {
         };
         let leases = self.drives.iter_mut().map(close).collect();
         self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-        let late = self.drives.iter().map(|drive| &drive.late).chain(self.strangers.values());
+        let late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
         let late = late.filter_map(LateReplies::until);
         let window = match self.sessions.is_empty() {
             true => FORGOTTEN_AFTER,
@@ -309,7 +313,11 @@ impl Master {
         if turn.purpose == Purpose::Background {
             self.background_sent();
         }
-        let mut late = self.drives.iter().map(|drive| &drive.late).chain(self.strangers.values());
+        let mut late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
         self.late_before = self.n2_late.may_come(now) || late.any(|late| late.may_come(now));
         let last = self.last_answered.as_ref();
         let n2 = !self.sessions.is_empty();

@@ -188,7 +188,9 @@ impl Transaction {
                     self.whole_at = Some(now + WHOLE_AFTER);
                     return self.on_time(now);
                 }
-                Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => return self.replied(0, used, reply),
+                Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => {
+                    return self.replied(0, used, reply);
+                }
                 Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
@@ -294,7 +296,11 @@ impl Transaction {
         if let Some(at) = self.whole_at.map(|at| at.min(until))
             && let Decoded::Reply { used, reply } = self.protocol.decode(&self.request, &self.received)
         {
-            return if now < at { Step::Wait(at) } else { self.replied(0, used, reply) };
+            return if now < at {
+                Step::Wait(at)
+            } else {
+                self.replied(0, used, reply)
+            };
         }
         if now < until {
             return Step::Wait(until);

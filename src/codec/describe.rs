@@ -78,7 +78,11 @@ pub fn request(request: &RequestPdu) -> String {
             format!("device identification: code {code} from object {object}")
         }
         RequestPdu::N2(_) => n2_words::command(request).unwrap_or_default(),
-        RequestPdu::Other(pdu) => format!("function {}, {} of data", request.function(), counted(pdu.len().saturating_sub(1), "byte")),
+        RequestPdu::Other(pdu) => format!(
+            "function {}, {} of data",
+            request.function(),
+            counted(pdu.len().saturating_sub(1), "byte")
+        ),
     }
 }
 

@@ -75,7 +75,9 @@ pub struct PassedOn {
 impl BackgroundRequest {
     /// Whether the tool for which it is passed on has gone, or asked for something else.
     pub fn is_unwanted(&self) -> bool {
-        self.passed_on.as_ref().is_some_and(|passed_on| passed_on.frame.is_closed())
+        self.passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.frame.is_closed())
     }
 
     /// As [`BackgroundRequest::answer`], with the frame of the reply.

@@ -54,7 +54,10 @@ fn read_one(reader: &Reader<'_>, base: &Path, around: &Surroundings<'_>) -> Foun
         .into_iter()
         .filter_map(|(address, key)| Some((address?, key.place(reader))))
         .collect();
-    if ![SLOT.listen.name, SLOT.rfc2217.name, SLOT.pty.name].iter().any(|key| reader.has(key)) {
+    if ![SLOT.listen.name, SLOT.rfc2217.name, SLOT.pty.name]
+        .iter()
+        .any(|key| reader.has(key))
+    {
         reader.problem(
             SLOT.listen.name,
             "the slot has neither `listen` nor `rfc2217` nor `pty`, so no tool can reach it",

@@ -78,17 +78,21 @@ fn check_ports(document: &Document, buses: &[Found]) {
 fn check_ptys(document: &Document, buses: &[Found]) {
     let mut seen: Vec<(&Path, String)> = Vec::new();
     for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
-        seen.push((Path::new(port), format!("the port of {}{}", place.key, line(place))));
+        seen.push((Path::new(port), format!("{}{}", place.key, line(place))));
     }
-    for (path, place) in buses.iter().flat_map(|bus| &bus.slots).filter_map(|slot| slot.pty.as_ref()) {
+    for (path, place) in buses
+        .iter()
+        .flat_map(|bus| &bus.slots)
+        .filter_map(|slot| slot.pty.as_ref())
+    {
         if let Some((_, owner)) = seen.iter().find(|(other, _)| other == path) {
             document.problem(
                 place,
-                format!("{} is already {owner}", path.display()),
+                format!("the path {} already belongs to {owner}", path.display()),
                 "give each slot a path of its own",
             );
         }
-        seen.push((path, format!("that of {}{}", place.key, line(place))));
+        seen.push((path, format!("{}{}", place.key, line(place))));
     }
 }
 

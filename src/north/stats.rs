@@ -294,7 +294,9 @@ impl SlotStats {
         let of_bus = |(bus, counts): (&String, &[u64; SlotOutcome::ALL.len()])| {
             let named = SlotOutcome::ALL.into_iter().zip(*counts);
             let bus = bus.clone();
-            named.filter(|(_, count)| *count > 0).map(move |(outcome, count)| (bus.clone(), outcome, count))
+            named
+                .filter(|(_, count)| *count > 0)
+                .map(move |(outcome, count)| (bus.clone(), outcome, count))
         };
         all.iter().flat_map(of_bus).collect()
     }

@@ -62,7 +62,11 @@ impl BusHandle {
             Target::Drive(index) => {
                 let drive = drives.get(index);
                 let address = drive.map_or(0, |drive| drive.spec.address);
-                (index, address, drive.map_or_else(String::new, |drive| drive.spec.name.clone()))
+                (
+                    index,
+                    address,
+                    drive.map_or_else(String::new, |drive| drive.spec.name.clone()),
+                )
             }
             Target::Address(address) => (NO_DRIVE, address, format!("address {address} of {}", spec.name)),
         };

@@ -12,7 +12,8 @@ import serial
 from pymodbus import FramerType
 from pymodbus.client import ModbusSerialClient, ModbusTcpClient
 
-FIRST, LAST = 100, 119
+# Parameters of a Vacon NX; status and monitoring of a TECO that stands.
+FIRST, LAST = (32, 51) if sys.argv[1] == "ascii" else (100, 119)
 
 
 def client(way, target):

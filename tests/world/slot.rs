@@ -120,7 +120,9 @@ impl ToolRig {
         let gives_up = self.question.as_ref().map(|question| question.at + question.patience);
         let asks_at = (self.question.is_none() && asks).then_some(self.next);
         let due = [gives_up, asks_at, self.slot.wake_at()].into_iter().flatten().min();
-        let until = due.unwrap_or(self.rig.now + Duration::from_millis(100)).max(self.rig.now);
+        let until = due
+            .unwrap_or(self.rig.now + Duration::from_millis(100))
+            .max(self.rig.now);
         let seen = self.rig.step(until).unwrap_or_default();
         for one in &seen {
             if let Seen::Acted(asked) = one {
@@ -130,7 +132,11 @@ impl ToolRig {
         let now = self.rig.now;
         let answer = self.pass(&[]);
         self.hear(&answer);
-        if self.question.as_ref().is_some_and(|question| now >= question.at + question.patience) {
+        if self
+            .question
+            .as_ref()
+            .is_some_and(|question| now >= question.at + question.patience)
+        {
             self.question = None;
             self.figures.given_up += 1;
             self.next = now;
@@ -153,7 +159,14 @@ impl ToolRig {
     }
 
     fn acted(&mut self, asked: &Asked) {
-        let address = self.rig.bus.handle.image.drives.get(asked.drive).map(|drive| drive.spec.address);
+        let address = self
+            .rig
+            .bus
+            .handle
+            .image
+            .drives
+            .get(asked.drive)
+            .map(|drive| drive.spec.address);
         let Some(question) = &mut self.question else { return };
         let same = address.is_none_or(|address| address == question.address) && asked.pdu == question.pdu;
         if same && !asked.is_poll && asked.at >= question.at {
@@ -202,11 +215,17 @@ impl ToolRig {
             return;
         }
         let frame = std::mem::take(&mut self.heard);
-        let question = self.question.take().unwrap_or_else(|| panic!("an answer to nothing: {frame:02X?}"));
+        let question = self
+            .question
+            .take()
+            .unwrap_or_else(|| panic!("an answer to nothing: {frame:02X?}"));
         let now = self.rig.now;
         assert!(now < question.at + ANSWER_WITHIN, "late: {:?}", now - question.at);
         if question.said.is_empty() {
-            assert!(self.refuses(&question, &frame), "{question:?} was answered {frame:02X?} without the drive");
+            assert!(
+                self.refuses(&question, &frame),
+                "{question:?} was answered {frame:02X?} without the drive"
+            );
             self.figures.refused += 1;
         } else {
             // A write may have been answered with the same bytes after several exchanges.
@@ -219,15 +238,17 @@ impl ToolRig {
     fn refuses(&self, question: &Question, frame: &[u8]) -> bool {
         match self.line.protocol {
             Protocol::N2 => frame.starts_with(b"N"),
-            protocol => protocol.open_frame(frame).is_some_and(|(address, pdu)| {
-                address == question.address && pdu[0] == question.pdu.function() | 0x80
-            }),
+            protocol => protocol
+                .open_frame(frame)
+                .is_some_and(|(address, pdu)| address == question.address && pdu[0] == question.pdu.function() | 0x80),
         }
     }
 
     fn count(&self, outcome: SlotOutcome) -> u64 {
         let all = self.stats.slots.requests();
-        all.iter().find(|(_, of, _)| *of == outcome).map_or(0, |(_, _, count)| *count)
+        all.iter()
+            .find(|(_, of, _)| *of == outcome)
+            .map_or(0, |(_, _, count)| *count)
     }
 
     /// Fast rounds of process data so far.
@@ -247,10 +268,26 @@ fn reads(dice: &mut Random, line: &Line) -> (u8, RequestPdu) {
     if line.protocol == Protocol::N2 {
         let number = dice.within(1..=8) as u16;
         let pdu = match dice.within(0..=3) {
-            0 => RequestPdu::Read { table: Table::Input, start: 2 * (number - 1), count: 2 },
-            1 => RequestPdu::Read { table: Table::DiscreteInput, start: number - 1, count: 1 },
-            2 => RequestPdu::Read { table: Table::Coil, start: number - 1, count: 1 },
-            _ => RequestPdu::Read { table: Table::Holding, start: 2 * (number - 1), count: 2 },
+            0 => RequestPdu::Read {
+                table: Table::Input,
+                start: 2 * (number - 1),
+                count: 2,
+            },
+            1 => RequestPdu::Read {
+                table: Table::DiscreteInput,
+                start: number - 1,
+                count: 1,
+            },
+            2 => RequestPdu::Read {
+                table: Table::Coil,
+                start: number - 1,
+                count: 1,
+            },
+            _ => RequestPdu::Read {
+                table: Table::Holding,
+                start: 2 * (number - 1),
+                count: 2,
+            },
         };
         return (address, pdu);
     }
@@ -318,7 +355,10 @@ fn every_answer_is_the_drives_own_and_belongs_to_its_request() {
             figures.answered as f64 / (tool.rig.now - from).as_secs_f64(),
             100.0 * with_tool / alone
         );
-        assert!(with_tool >= 0.8 * alone, "{name}: {with_tool:.2} of {alone:.2} rounds/s");
+        assert!(
+            with_tool >= 0.8 * alone,
+            "{name}: {with_tool:.2} of {alone:.2} rounds/s"
+        );
         assert_eq!(figures.refused, 0, "{name}: nothing is refused that reads");
         assert!(figures.answered * 100 >= figures.asked * 99, "{name}: {figures:?}");
     }
@@ -333,7 +373,11 @@ fn no_answer_is_handed_to_another_request_whatever_the_tool_and_the_line_do() {
         tool.impatient = 0.4;
         tool.ask(requests());
         println!("seed {seed}: {:?}", tool.figures);
-        assert!(tool.figures.answered > tool.figures.asked / 4 && tool.figures.given_up > 0, "{:?}", tool.figures);
+        assert!(
+            tool.figures.answered > tool.figures.asked / 4 && tool.figures.given_up > 0,
+            "{:?}",
+            tool.figures
+        );
     }
 }
 
@@ -351,12 +395,19 @@ fn writes_are_those_of_a_client_and_process_data_keeps_its_rate() {
         tool.next = from;
         tool.ask(requests());
         let share = (tool.rounds() - before) as f64 / (tool.rig.now - from).as_secs_f64() / alone;
-        println!("seed {seed}: {:?}, process data at {:.1} %", tool.figures, 100.0 * share);
+        println!(
+            "seed {seed}: {:?}, process data at {:.1} %",
+            tool.figures,
+            100.0 * share
+        );
         assert!(share >= 0.8, "{share}");
         assert!(tool.figures.refused > 0 && tool.count(SlotOutcome::Refused) > 0);
         for address in 1..=tool.line.drives {
             let reference = tool.rig.word(address, 2002);
-            assert!(reference <= 8000, "a reference beyond the limits reached the drive: {reference}");
+            assert!(
+                reference <= 8000,
+                "a reference beyond the limits reached the drive: {reference}"
+            );
         }
     }
 }
@@ -383,7 +434,11 @@ fn a_stop_waits_for_the_exchange_on_the_line_at_most() {
             }) else {
                 continue;
             };
-            let is_stop = asked.pdu == RequestPdu::WriteRegister { address: 2000, value: 0 };
+            let is_stop = asked.pdu
+                == RequestPdu::WriteRegister {
+                    address: 2000,
+                    value: 0,
+                };
             if is_stop {
                 break;
             }
@@ -402,12 +457,16 @@ fn a_tool_that_says_nothing_changes_no_frame() {
     let sent = |with_tool: bool| {
         let line = line("vacon-nx", Protocol::ModbusRtu, 38_400, 3);
         let mut rig = Rig::recorded(&line, Parts::of(0, &line, 3));
-        let slot = with_tool.then(|| Offline::new(slot(&line, SlotAccess::Raw), rig.shared_plant(), Arc::default(), "tool"));
+        let slot =
+            with_tool.then(|| Offline::new(slot(&line, SlotAccess::Raw), rig.shared_plant(), Arc::default(), "tool"));
         rig.run(Duration::from_secs(10));
         drop(slot);
         let frames = rig.requests();
         let first = frames[0].start;
-        frames.into_iter().map(|frame| (frame.start - first, frame.bytes)).collect::<Vec<_>>()
+        frames
+            .into_iter()
+            .map(|frame| (frame.start - first, frame.bytes))
+            .collect::<Vec<_>>()
     };
     assert!(sent(false) == sent(true));
 }
@@ -420,10 +479,16 @@ fn what_a_tool_reads_fills_the_image() {
     let mut tool = ToolRig::new(slow, SlotAccess::Read, 1);
     tool.rig.run(Duration::from_secs(5));
     tool.rig.at_the_drive(1, 101, 4_200);
-    assert_ne!(tool.rig.value(1, "maximum_frequency").map(|value| value.as_f64()), Some(42.0));
+    assert_ne!(
+        tool.rig.value(1, "maximum_frequency").map(|value| value.as_f64()),
+        Some(42.0)
+    );
     tool.asks = |_, _| (1, holding(100, 4));
     tool.ask(1);
-    assert_eq!(tool.rig.value(1, "maximum_frequency").map(|value| value.as_f64()), Some(42.0));
+    assert_eq!(
+        tool.rig.value(1, "maximum_frequency").map(|value| value.as_f64()),
+        Some(42.0)
+    );
 }
 
 #[test]
@@ -437,7 +502,10 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
     };
     // A reference takes the share of writes; the start behind it is held.
     let now = tool.rig.now;
-    let reference = RequestPdu::WriteRegister { address: 2002, value: 5000 };
+    let reference = RequestPdu::WriteRegister {
+        address: 2002,
+        value: 5000,
+    };
     tool.pass(&frame(&reference));
     tool.pass(&frame(&set(1)));
     assert!(tool.slot.is_waiting() && tool.slot.wake_at().is_some_and(|at| at > now));
@@ -449,7 +517,13 @@ fn a_stop_of_a_tool_goes_as_a_stop_and_takes_a_held_start_away() {
         tool.pass(&[]);
     }
     assert_eq!(tool.rig.word(1, 2000), 0, "the start was asked for before the stop");
-    assert_eq!(tool.rig.sample(1, ModelPoint::Running).good().map(|value| value.as_bool()), Some(false));
+    assert_eq!(
+        tool.rig
+            .sample(1, ModelPoint::Running)
+            .good()
+            .map(|value| value.as_bool()),
+        Some(false)
+    );
     // Its own stop is not held, whatever it wrote before.
     tool.pass(&frame(&set(1)));
     tool.rig.run(Duration::from_millis(200));
@@ -510,7 +584,10 @@ fn an_address_without_a_configured_drive_is_read_and_confused_with_nobody() {
     tool.ask(20);
     assert_eq!(tool.figures.answered, 20);
     for address in [1, 2] {
-        assert_ne!(tool.rig.value(address, "maximum_frequency").map(|value| value.as_f64()), Some(42.0));
+        assert_ne!(
+            tool.rig.value(address, "maximum_frequency").map(|value| value.as_f64()),
+            Some(42.0)
+        );
         assert_eq!(tool.rig.word(address, 101), 5_000);
     }
     // Nobody at all: silence, and the drives keep their cadence.

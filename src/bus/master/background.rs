@@ -10,8 +10,8 @@ use crate::bus::transaction::Ended;
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu};
 use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Urgency, written};
-use crate::drive::{PlannedRead, PollClass};
 use crate::drive::plan::WireTime;
+use crate::drive::{PlannedRead, PollClass};
 
 /// Time of an exchange whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
@@ -65,7 +65,9 @@ impl Master {
         if !queue.is_empty() {
             queue.remove(now, &Outcome::Expired, |r| r.expires <= now);
             queue.remove(now, &Outcome::Replaced, BackgroundRequest::is_unwanted);
-            queue.remove(now, &Outcome::Offline, |r| r.drive != NO_DRIVE && !schedule.is_online(r.drive));
+            queue.remove(now, &Outcome::Offline, |r| {
+                r.drive != NO_DRIVE && !schedule.is_online(r.drive)
+            });
         }
     }
 
@@ -173,7 +175,12 @@ impl Master {
             true => Outcome::Acknowledged(Reply::Written),
             false => self.background_outcome(turn, end, now),
         };
-        if begun.request.passed_on.as_ref().is_some_and(|passed_on| passed_on.may_write) {
+        if begun
+            .request
+            .passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.may_write)
+        {
             self.unchecked_write(&begun.request, &outcome, now);
         } else if turn.pdu.is_write() {
             self.note_background_write(turn, &outcome, now);
@@ -227,7 +234,10 @@ impl Master {
 
     /// The address that a turn asks where no drive is configured at it.
     pub fn stranger(&self, turn: &Turn) -> Option<u8> {
-        let begun = self.background.as_ref().filter(|_| turn.purpose == Purpose::Background)?;
+        let begun = self
+            .background
+            .as_ref()
+            .filter(|_| turn.purpose == Purpose::Background)?;
         let passed_on = begun.request.passed_on.as_ref()?;
         (turn.drive == NO_DRIVE).then_some(passed_on.address)
     }

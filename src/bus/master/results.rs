@@ -247,7 +247,11 @@ impl Master {
         news: &mut Vec<News>,
     ) {
         self.schedule.command_done(rank, end.took);
-        let of_tool = self.drives.get_mut(index).and_then(|drive| drive.run(slot)).is_some_and(|run| run.is_of_tool());
+        let of_tool = self
+            .drives
+            .get_mut(index)
+            .and_then(|drive| drive.run(slot))
+            .is_some_and(|run| run.is_of_tool());
         if of_tool && slot != Urgency::Stop {
             self.schedule.background_owes(Pace::Brisk, end.took);
         }

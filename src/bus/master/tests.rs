@@ -164,6 +164,7 @@ impl Rig {
                         began,
                         took,
                         mangled,
+                        frame: Vec::new(),
                     },
                     self.now,
                 ));
@@ -537,6 +538,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
             began: rig.now,
             took: COST,
             mangled,
+            frame: Vec::new(),
         };
         let garbled = end(Ended::Corrupt("checksum"));
         let mut turn = read(&mut rig);

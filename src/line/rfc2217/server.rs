@@ -169,10 +169,18 @@ mod tests {
             (&[5, 7], &[105, 8]),
             (&[0], &[&[100][..], NAME].concat()),
         ] {
-            assert_eq!(server.take(&sub(question), &mut Vec::new()), sub(answer), "{question:?}");
+            assert_eq!(
+                server.take(&sub(question), &mut Vec::new()),
+                sub(answer),
+                "{question:?}"
+            );
         }
         let asked = [&[IAC, SB, COM_PORT, 11, IAC, IAC][..], &[IAC, SE]].concat();
-        let doubled = [&[IAC, SB, COM_PORT, 111, IAC, IAC, IAC, SE][..], &sub(&[107, MODEM_STATE])].concat();
+        let doubled = [
+            &[IAC, SB, COM_PORT, 111, IAC, IAC, IAC, SE][..],
+            &sub(&[107, MODEM_STATE]),
+        ]
+        .concat();
         assert_eq!(server.take(&asked, &mut Vec::new()), doubled);
     }
 

@@ -83,7 +83,10 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
         let wake_at = self.dialogue.wake_at().map(Instant::from_std);
         // So that the place is seen to be free to yield once the tool rests.
         let rests_at = Some(self.last_request + IN_USE).filter(|at| *at > Instant::now());
-        let timer = [wake_at, idle_at.map(|(_, at)| at), rests_at].into_iter().flatten().min();
+        let timer = [wake_at, idle_at.map(|(_, at)| at), rests_at]
+            .into_iter()
+            .flatten()
+            .min();
         let dialogue = &mut self.dialogue;
         tokio::select! {
             biased;

@@ -129,7 +129,11 @@ impl Dialogue {
         let deadline = now + ANSWER_WITHIN;
         let pace = self.tool.pace(&request, now);
         let haste = impatient.then_some(self.asked).flatten().map(|at| at + IMPATIENT);
-        let until = if pace.is_stop { now } else { pace.not_before.max(haste.unwrap_or(now)) };
+        let until = if pace.is_stop {
+            now
+        } else {
+            pace.not_before.max(haste.unwrap_or(now))
+        };
         let held = Held {
             stops: pace.stops,
             request,
@@ -196,7 +200,11 @@ impl Dialogue {
         if pending.request.is_broadcast(protocol) {
             // A broadcast that was sent is answered by nobody.
             let sent = outcome.is_ok();
-            return self.tool.count(if sent { SlotOutcome::Answered } else { SlotOutcome::NoAnswer });
+            return self.tool.count(if sent {
+                SlotOutcome::Answered
+            } else {
+                SlotOutcome::NoAnswer
+            });
         }
         let answer = match (outcome, frame) {
             (Outcome::Acknowledged(_) | Outcome::Exception(_), Some(frame)) => Some(frame),

@@ -180,7 +180,10 @@ mod tests {
         framing.add(&unknown, now);
         let said = all(&mut framing, now);
         assert_eq!(said[0], asks(3, 32, 4));
-        assert!(matches!(&said[1], Said::Request(request) if request.function == 0x41), "{said:?}");
+        assert!(
+            matches!(&said[1], Said::Request(request) if request.function == 0x41),
+            "{said:?}"
+        );
 
         let mut framing = self::framing(Protocol::N2);
         framing.add(b">0111020388\r\n", now);
@@ -190,10 +193,17 @@ mod tests {
             count: 2,
         };
         let said = all(&mut framing, now);
-        assert!(matches!(&said[..], [Said::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input), "{said:?}");
+        assert!(
+            matches!(&said[..], [Said::Request(ToolRequest { address: 1, meaning: Meaning::Read(pdu), .. })] if *pdu == input),
+            "{said:?}"
+        );
         assert!(!framing.has_begun(), "a line feed begins no request");
         framing.add(b">0111020389\r", now);
-        assert_eq!(all(&mut framing, now), [Said::Broken], "nobody answers a wrong checksum");
+        assert_eq!(
+            all(&mut framing, now),
+            [Said::Broken],
+            "nobody answers a wrong checksum"
+        );
     }
 
     #[test]

@@ -26,7 +26,10 @@ pub(super) struct Served {
 impl Served {
     fn allows(&self, client: IpAddr) -> Option<Authority> {
         let allow = &self.terms.slot.allow;
-        allow.iter().any(|network| network.contains(&client)).then_some(Authority::ReadOnly)
+        allow
+            .iter()
+            .any(|network| network.contains(&client))
+            .then_some(Authority::ReadOnly)
     }
 }
 
@@ -59,9 +62,8 @@ impl SlotListener {
     /// Serves otherwise from now on. Connections stay where nothing changes for them and their address is still allowed.
     pub(super) fn update(&self, served: Served) {
         let before = self.served.load_full();
-        let alike = before.is_some_and(|before| {
-            before.telnet == served.telnet && before.terms.slot.serves_like(&served.terms.slot)
-        });
+        let alike = before
+            .is_some_and(|before| before.telnet == served.telnet && before.terms.slot.serves_like(&served.terms.slot));
         self.served.store(Some(Arc::new(served.clone())));
         self.limit
             .review(self.number, |place| served.allows(place.address()).filter(|_| alike));

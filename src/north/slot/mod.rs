@@ -114,7 +114,8 @@ pub struct Options {
 impl Options {
     /// Files that the slots can have open at one time.
     pub(crate) fn files(&self) -> usize {
-        let files = |slot: &Slot| slot.addresses().count() * (1 + limits().files()) + 2 * usize::from(slot.pty.is_some());
+        let files =
+            |slot: &Slot| slot.addresses().count() * (1 + limits().files()) + 2 * usize::from(slot.pty.is_some());
         self.slots.iter().map(files).sum()
     }
 

@@ -100,7 +100,9 @@ fn meaning(pdu: Vec<u8>) -> Meaning {
         Ok(MaskWrite { .. } | ReadWrite { .. }) => Meaning::Faulty(Refused::Exception(Exception::FUNCTION)),
         Ok(pdu) => Meaning::Unchecked(pdu),
         // Of function 43 only the device identification is known.
-        Err(code) if known && !matches!(pdu.as_slice(), [43, mei, ..] if *mei != 14) => Meaning::Faulty(Refused::Exception(code)),
+        Err(code) if known && !matches!(pdu.as_slice(), [43, mei, ..] if *mei != 14) => {
+            Meaning::Faulty(Refused::Exception(code))
+        }
         Err(_) => Meaning::Unchecked(RequestPdu::Other(pdu)),
     }
 }

@@ -133,11 +133,16 @@ impl Tool {
         pace.is_stop = self.writes() && drives.iter().any(|drive| stops(drive, pdu, now));
         pace.stops = drives.iter().map(DriveHandle::stops).sum();
         // What is refused anyway, is at once.
-        let admitted = drives.iter().all(|drive| {
-            command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok()
-        });
+        let admitted = drives
+            .iter()
+            .all(|drive| command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write).is_ok());
         if self.writes() && !pace.is_stop && admitted {
-            pace.not_before = self.terms.paces.not_before(&self.terms.slot.bus).unwrap_or(now).max(now);
+            pace.not_before = self
+                .terms
+                .paces
+                .not_before(&self.terms.slot.bus)
+                .unwrap_or(now)
+                .max(now);
         }
         pace
     }
@@ -145,15 +150,22 @@ impl Tool {
     /// The configured drives that a request asks: one, none, or all.
     fn asked(&self, plant: &Plant, request: &ToolRequest) -> Vec<DriveHandle> {
         let broadcast = request.is_broadcast(self.protocol());
-        let on_bus = plant.drives().filter(|drive| drive.image.spec.bus == self.terms.slot.bus);
-        on_bus.filter(|drive| broadcast || drive.image.spec.address == request.address).collect()
+        let on_bus = plant
+            .drives()
+            .filter(|drive| drive.image.spec.bus == self.terms.slot.bus);
+        on_bus
+            .filter(|drive| broadcast || drive.image.spec.address == request.address)
+            .collect()
     }
 
     /// What becomes of a request whose drive had been given so many `stops` when the tool asked. What is given to the bus is in
     /// its queue when this returns, and is not sent after `deadline`.
     pub(super) fn decide(&self, request: &ToolRequest, stops: u64, deadline: Instant, now: Instant) -> Decision {
         let plant = self.terms.plant.load();
-        let bus = plant.buses.iter().find(|bus| bus.image.spec.name == self.terms.slot.bus);
+        let bus = plant
+            .buses
+            .iter()
+            .find(|bus| bus.image.spec.name == self.terms.slot.bus);
         let Some(bus) = bus else { return Decision::Silent };
         let drives = self.asked(&plant, request);
         let broadcast = request.is_broadcast(self.protocol());
@@ -189,13 +201,26 @@ impl Tool {
             // A stop came in while it was held.
             let what = describe::request_on(self.protocol(), pdu);
             let plant = self.terms.plant.load();
-            turn_away(&plant.writes, &drive.image.spec.name, &what, Outcome::Purged, self.origin.clone(), now);
+            turn_away(
+                &plant.writes,
+                &drive.image.spec.name,
+                &what,
+                Outcome::Purged,
+                self.origin.clone(),
+                now,
+            );
             return Decision::Silent;
         }
         let cost = cost(drive, pdu);
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
         let order = Order::Write(pdu.clone());
-        Decision::Wait(Work::Command(drive.place(order, self.origin.clone(), Authority::Write, EXPIRY, now)))
+        Decision::Wait(Work::Command(drive.place(
+            order,
+            self.origin.clone(),
+            Authority::Write,
+            EXPIRY,
+            now,
+        )))
     }
 
     /// What only `access = "raw"` admits: broadcasts, functions that are not decoded, writes to addresses of no configured drive.
@@ -213,7 +238,10 @@ impl Tool {
         for drive in drives {
             let spec = &drive.image.spec;
             if spec.access != Access::Control {
-                let text = format!("drive `{}` is only monitored; set access = \"control\" for it", spec.name);
+                let text = format!(
+                    "drive `{}` is only monitored; set access = \"control\" for it",
+                    spec.name
+                );
                 return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
             }
             // Limits hold for each of them.
@@ -225,7 +253,13 @@ impl Tool {
         }
         for drive in drives.iter().filter(|drive| stops(drive, pdu, now)) {
             // Its answer is nobody's: the broadcast has none.
-            drop(drive.place(Order::Write(pdu.clone()), self.origin.clone(), Authority::Write, EXPIRY, now));
+            drop(drive.place(
+                Order::Write(pdu.clone()),
+                self.origin.clone(),
+                Authority::Write,
+                EXPIRY,
+                now,
+            ));
         }
         let first = drives.first().filter(|_| !request.is_broadcast(self.protocol()));
         Decision::Wait(self.exchange(case, target(request, first), pdu, true))
