@@ -175,7 +175,7 @@ impl CommandRun {
     pub fn is_of_tool(&self) -> bool {
         self.tickets
             .iter()
-            .all(|ticket| ticket.origin().kind == SourceKind::Slot)
+            .any(|ticket| ticket.origin().kind == SourceKind::Slot)
     }
 
     /// Whether only supervision wants it.
