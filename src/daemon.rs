@@ -211,6 +211,7 @@ impl Daemon {
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         self.watch(&kept);
+        let queues: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             leases.extend(drives.zip(left.leases));
@@ -226,6 +227,11 @@ impl Daemon {
                     Lease::default()
                 }
             };
+            // So does a login that commanded one of them last.
+            for (index, drive) in bus.drives.iter().enumerate() {
+                let commander = queues.iter().find_map(|before| commander_of(before, drive));
+                task.handle().queue.lock().set_commander(index, commander);
+            }
             task.begin(Handover {
                 leases: bus.drives.iter().map(lease).collect(),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
@@ -441,6 +447,13 @@ impl Daemon {
             );
         }
     }
+}
+
+/// The login that commanded that drive last, as its bus before the reload knows.
+fn commander_of(before: &BusHandle, drive: &DriveSpec) -> Option<Arc<str>> {
+    let same = |image: &Arc<DriveImage>| (&image.spec.name, image.spec.address) == (&drive.name, drive.address);
+    let index = before.image.drives.iter().position(same)?;
+    before.queue.lock().commander(index).cloned()
 }
 
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.

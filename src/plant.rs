@@ -216,6 +216,11 @@ impl DriveHandle {
         self.bus.queue.lock().stops(self.index)
     }
 
+    /// The login that commanded the drive last, unless another client did since.
+    pub fn commander(&self) -> Option<Arc<str>> {
+        self.bus.queue.lock().commander(self.index).cloned()
+    }
+
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
         explain(reading, &self.bus.image, &self.writes)

@@ -10,6 +10,7 @@ mod audit;
 mod backup;
 mod check;
 mod client;
+mod credentials_file;
 mod demo;
 mod drive_access;
 mod health;
@@ -34,6 +35,7 @@ mod simulate;
 mod token;
 mod trace;
 mod trial;
+mod user;
 mod watch;
 mod why;
 mod write;
@@ -115,6 +117,7 @@ commands! {
     Map => map,
     Audit => audit,
     Token => token,
+    User => user,
     Backup => backup,
     Restore => restore,
     Schema => schema,

@@ -86,11 +86,13 @@ fn bare_or_null<S: Serializer>(value: &Option<Value>, serializer: S) -> Result<S
     crate::process_image::value_or_null(*value).serialize(serializer)
 }
 
-fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+/// Serializes a time as milliseconds with three decimals.
+pub(crate) fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64((time.as_secs_f64() * 1e6).round() / 1e3)
 }
 
-fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+/// The same, `null` without a time.
+pub(crate) fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
     match time {
         Some(time) => milliseconds(time, serializer),
         None => serializer.serialize_none(),

@@ -559,8 +559,8 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only; open to everybody who can connect unless there is
-        /// a `tokens_file`.
+        /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everybody who can connect
+        /// unless there is a `tokens_file`.
         listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
         /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
         /// this machine and its own addresses: that of a reverse proxy, a container, a name in DNS. Requests for any
@@ -569,6 +569,11 @@ keys! {
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.
         tokens_file: PathBuf = PATH, or "none";
+        /// Whether [users](operating.md) may command drives with `access = "control"`, from the status page and by
+        /// programs. Needs `users_file`, and `certificate` or a `listen` on the loopback.
+        commands: bool = Flag, default false;
+        /// File of the users who may command, made by `drivegate user add`.
+        users_file: PathBuf = PATH, or "none";
         /// PEM file with the server's certificate chain, for [https](http.md#tls); needs `key`.
         certificate: PathBuf = PATH, or "none";
         /// PEM file of the certificate's private key.

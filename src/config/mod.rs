@@ -237,12 +237,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
-    let (http, http_listener) = ROOT
-        .http
-        .table(reader)
-        .map(|table| north::read_http(&table, base))
-        .unzip();
-    let http_listener = http_listener.flatten();
+    let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
     let audit = ROOT
         .audit
         .table(reader)
@@ -252,13 +247,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
-    judge(
-        reader,
-        &buses,
-        modbus_tcp.as_ref(),
-        mqtt.as_ref(),
-        http_listener.as_ref(),
-    );
+    judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
 
     let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
     let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
@@ -278,7 +267,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
-        http: flipped(http)?,
+        http: flipped(http.map(|http| http.options))?,
         audit,
         log: log?,
     })
@@ -290,21 +279,23 @@ fn judge(
     buses: &[bus::Found],
     modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
     mqtt: Option<&Option<mqtt_client::Options>>,
-    http: Option<&north::Listener>,
+    http: Option<&north::Http>,
 ) {
     unique::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
     }
+    let http_listener = http.and_then(|http| http.listener.as_ref());
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
     let slots = || buses.iter().flat_map(|bus| &bus.slots);
-    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http);
     let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);
-    let commanded =
-        modbus_tcp.is_some_and(|m| m.commands) || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
-    let commanded = commanded || slots().any(|slot| slot.writes);
+    let commanded = modbus_tcp.is_some_and(|m| m.commands)
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
+        || http.is_some_and(|http| http.commands)
+        || slots().any(|slot| slot.writes);
     if !commanded {
         warn_of_idle_control(reader, buses);
     }
@@ -496,7 +487,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
         reader.document().warning(
             place,
             format!("drive `{name}` accepts commands but no client may send any"),
-            "set `write` of [modbus_tcp] or `commands = true` of [mqtt]",
+            "set `write` of [modbus_tcp], or `commands = true` of [mqtt] or [http]",
         );
     }
 }

@@ -2,6 +2,7 @@
 //! name the bus.
 
 mod certificate;
+mod command_json;
 mod connection_limit;
 pub mod http;
 mod identity;

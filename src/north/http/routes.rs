@@ -6,20 +6,21 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use axum::Router;
-use axum::extract::{Path, Request, State};
+use axum::extract::{Extension, Path, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use axum::{Json, response};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::access::Access;
+use super::access::{Access, AccessError};
+use super::operating::{self, Cookies, Operating};
 use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
 use crate::history::export;
-use crate::north::connection_limit::{ConnectionLimit, Limits};
+use crate::north::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
 use crate::plant::SharedPlant;
@@ -37,12 +38,18 @@ pub(super) struct AppState {
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
     files: Semaphore,
+    pub(super) operating: Arc<Operating>,
 }
 
 impl AppState {
     /// A turn to render a large reply.
     async fn turn(&self) -> Option<SemaphorePermit<'_>> {
         self.rendering.acquire().await.ok()
+    }
+
+    /// The cookies of this gateway, on a connection that came like that.
+    pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
+        Cookies::of(&self.plant.load().gateway, reached.tls)
     }
 }
 
@@ -62,10 +69,19 @@ pub(super) struct Reached {
     pub(super) access: Arc<Access>,
     /// Limits the log of refused requests.
     pub(super) refusals: Arc<LogThrottle>,
+    /// The connection has TLS.
+    pub(super) tls: bool,
+    /// The place of the connection; `None` without a socket.
+    pub(super) place: Option<Arc<Place>>,
 }
 
 /// All routes.
-pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Router {
+pub(super) fn router(
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    operating: Arc<Operating>,
+    cancel: CancellationToken,
+) -> Router {
     let app = Arc::new(AppState {
         plant,
         stats,
@@ -73,18 +89,25 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
         rendering: Semaphore::new(1),
         files: Semaphore::new(1),
+        operating,
+    });
+    let assets = [
+        ("/assets/style.css", "text/css; charset=utf-8", page::STYLE),
+        ("/assets/page.js", "text/javascript; charset=utf-8", page::SCRIPT),
+        ("/assets/icon.svg", "image/svg+xml", page::ICON),
+        ("/assets/operate.css", "text/css; charset=utf-8", page::OPERATE_STYLE),
+        (
+            "/assets/operate.js",
+            "text/javascript; charset=utf-8",
+            page::OPERATE_SCRIPT,
+        ),
+    ];
+    let assets = assets.into_iter().fold(Router::new(), |router, (path, kind, text)| {
+        router.route(path, get(move || asset(kind, text)))
     });
     Router::new()
         .route("/", get(status_page))
-        .route(
-            "/assets/style.css",
-            get(|| asset("text/css; charset=utf-8", page::STYLE)),
-        )
-        .route(
-            "/assets/page.js",
-            get(|| asset("text/javascript; charset=utf-8", page::SCRIPT)),
-        )
-        .route("/assets/icon.svg", get(|| asset("image/svg+xml", page::ICON)))
+        .merge(assets)
         .route("/metrics", get(exposition))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(ready))
@@ -96,27 +119,55 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
         .route("/api/v1/trace", get(streams::trace))
+        .route("/api/v1/login", post(operating::log_in))
+        .route("/api/v1/logout", post(operating::log_out))
+        .route("/api/v1/session", get(operating::session))
+        .route(
+            "/api/v1/drives/{name}/commands",
+            get(operating::commands_of).post(operating::command),
+        )
+        .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
         .fallback(unknown)
-        .with_state(app)
-        .layer(middleware::from_fn(guard))
+        .with_state(app.clone())
+        .layer(middleware::from_fn_with_state(app, guard))
 }
 
-/// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
-/// sets the common headers of all replies.
-async fn guard(request: Request, next: Next) -> Response {
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something, commands
+/// apart; sets the common headers of all replies.
+async fn guard(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    request: Request,
+    next: Next,
+) -> Response {
     let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
-    let is_health = ["/healthz", "/readyz"].contains(&request.uri().path());
-    let mut response = if let Some(refusal) = refused(&request) {
+    let (method, path) = (request.method(), request.uri().path());
+    let is_on = app.operating.is_on();
+    // A command of somebody who may give it is served on the last connection too.
+    let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
+    let access = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = match access {
+        Ok(()) => None,
+        Err(error) => refused(&app, &reached, error, request.uri().clone(), request.headers().clone()).await,
+    };
+    let mut response = if let Some(refusal) = refusal {
         refusal
-    } else if coverage == Some(Coverage::Health) && !is_health {
+    } else if coverage == Some(Coverage::Health) && !is_urgent {
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
-    } else if matches!(*request.method(), Method::GET | Method::HEAD) {
+    } else if is_on && operating::may_change(method, path) {
         next.run(request).await
-    } else {
-        let text = "this interface is read only: use GET or HEAD\n";
+    } else if !matches!(*method, Method::GET | Method::HEAD) {
+        let text = match is_on {
+            true => "this is read only: use GET or HEAD\n",
+            false => "this interface is read only: use GET or HEAD\n",
+        };
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
         (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+    } else if !is_on && operating::is_operating(path) {
+        unknown(request.uri().clone()).await
+    } else {
+        next.run(request).await
     };
     const SET: [(HeaderName, &str); 3] = [
         (header::CACHE_CONTROL, "no-store"),
@@ -129,14 +180,33 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-/// The reply to a request that is not answered, because of its host or its token.
-fn refused(request: &Request) -> Option<Response> {
-    let Some(reached) = request.extensions().get::<Reached>() else {
-        // The server adds it to every request.
-        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
-    };
-    let admitted = reached.access.check(request.uri(), request.headers(), reached.address);
-    let refusal = admitted.err()?;
+/// The reply to a request that is not answered because of its host or its token; `None` if it is answered all the same.
+async fn refused(
+    app: &AppState,
+    reached: &Reached,
+    refusal: AccessError,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Option<Response> {
+    let path = uri.path();
+    if refusal.is_for_want_of_a_token() && app.operating.is_on() && path != "/metrics" {
+        // Users read as bearers of tokens do, and have to get as far as the login.
+        if operating::is_operating(path) || path.starts_with("/assets/") {
+            return None;
+        }
+        let cookies = app.cookies(reached);
+        if app
+            .operating
+            .operator(&headers, &cookies, reached.peer.ip())
+            .await
+            .is_ok()
+        {
+            return None;
+        }
+        if path == "/" {
+            return Some(document(page::render_login(&app.plant.load())));
+        }
+    }
     if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
         let peer = reached.peer;
         tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
@@ -146,8 +216,12 @@ fn refused(request: &Request) -> Option<Response> {
 
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
     let _turn = app.turn().await;
+    document(page::render(&app.plant.load(), app.operating.is_on(), Instant::now()))
+}
+
+fn document(html: String) -> Response {
     let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
-    (policy, Html(page::render(&app.plant.load(), Instant::now())))
+    (policy, Html(html)).into_response()
 }
 
 async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {

@@ -19,6 +19,16 @@ pub(in crate::north::http) const STYLE: &str = include_str!("style.css");
 /// Script.
 pub(in crate::north::http) const SCRIPT: &str = include_str!("page.js");
 
+/// Style sheet of the operating part.
+pub(in crate::north::http) const OPERATE_STYLE: &str = include_str!("operate.css");
+
+/// Script of the operating part.
+pub(in crate::north::http) const OPERATE_SCRIPT: &str = include_str!("operate.js");
+
+/// What the document has in its head for the operating part; its script comes before the page's.
+const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
+    <script src=\"assets/operate.js\" defer></script>";
+
 /// Icon.
 pub(in crate::north::http) const ICON: &str = include_str!("icon.svg");
 
@@ -34,15 +44,30 @@ const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::MotorTorque, "Torque"),
 ];
 
-/// The document with the state of the plant at `now`.
-pub(in crate::north::http) fn render(plant: &Plant, now: Instant) -> String {
+/// The document with the state of the plant at `now`; `operating` says whether it has the part that commands.
+pub(in crate::north::http) fn render(plant: &Plant, operating: bool, now: Instant) -> String {
     let mut tables = String::new();
     // Writing to a string cannot fail.
     let _ = buses(&mut tables, plant).and_then(|()| drives(&mut tables, plant, now));
+    document(plant, operating, &tables)
+}
+
+/// The document without any value, for somebody who has to log in first.
+pub(in crate::north::http) fn render_login(plant: &Plant) -> String {
+    document(plant, true, "<p>Log in to see the drives; that needs scripts.</p>")
+}
+
+fn document(plant: &Plant, operating: bool, tables: &str) -> String {
+    let (head, mode) = match operating {
+        true => (OPERATE_HEAD, "commands after login"),
+        false => ("", "read only"),
+    };
     DOCUMENT
+        .replace("{{operate}}", head)
+        .replace("{{mode}}", mode)
         .replace("{{version}}", env!("CARGO_PKG_VERSION"))
         .replace("{{gateway}}", &Escaped(&plant.gateway).to_string())
-        .replace("{{tables}}", &tables)
+        .replace("{{tables}}", tables)
 }
 
 fn buses(out: &mut String, plant: &Plant) -> fmt::Result {
@@ -141,7 +166,7 @@ mod tests {
 
     #[test]
     fn nothing_comes_from_elsewhere_and_no_code_is_inline() {
-        for text in [DOCUMENT, STYLE, SCRIPT] {
+        for text in [DOCUMENT, STYLE, SCRIPT, OPERATE_STYLE, OPERATE_SCRIPT] {
             for foreign in ["http://", "https://", "@import", "eval("] {
                 let own = text.replace("http://www.w3.org/2000/svg", "");
                 assert!(!own.contains(foreign), "{foreign}");
@@ -150,6 +175,8 @@ mod tests {
         for inline in ["<style", " style=", " onclick=", "<script>", "javascript:"] {
             assert!(!DOCUMENT.contains(inline), "{inline}");
         }
-        assert!(!SCRIPT.contains("innerHTML"), "texts of drives must not become markup");
+        for script in [SCRIPT, OPERATE_SCRIPT] {
+            assert!(!script.contains("innerHTML"), "texts of drives must not become markup");
+        }
     }
 }

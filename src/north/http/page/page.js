@@ -116,6 +116,7 @@ function driveRow(name) {
   row.detail = make("tr", "detail", detail);
   row.detail.hidden = true;
   row.body = make("tbody", "", tr, row.detail);
+  operateRow(row, name, tr);
   row.open.addEventListener("click", () => {
     row.detail.hidden = !row.detail.hidden;
     row.open.setAttribute("aria-expanded", String(!row.detail.hidden));
@@ -125,8 +126,20 @@ function driveRow(name) {
   return row;
 }
 
+// The controls of a drive, where the gateway serves them.
+function operateRow(row, name, before) {
+  if (typeof Operate === "undefined") return;
+  const place = make("div");
+  place.dataset.operate = name;
+  const cell = make("td", "", place);
+  cell.colSpan = COLUMNS.length + 3;
+  before.after(make("tr", "operate-row", cell));
+  Operate.mount(place, name);
+}
+
 function showDrive(row, drive) {
   row.drive = drive;
+  if (typeof Operate !== "undefined") Operate.update(drive);
   const state = drive.state || "unknown";
   const [colour, word] = STATES[state] || ["", state];
   className(row.body, state);
