@@ -21,7 +21,7 @@ use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
-use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 
@@ -61,6 +61,7 @@ pub struct Daemon {
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
+    slots: ServerSlot<slot::Server>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
     history: Arc<History>,
@@ -74,7 +75,12 @@ pub struct Daemon {
     control: Option<Control>,
 }
 
-type PreparedServers = (Prepared<modbus_tcp::Server>, Prepared<http::Http>);
+/// The servers that listen on the network, prepared.
+struct PreparedServers {
+    modbus_tcp: Prepared<modbus_tcp::Server>,
+    slots: Prepared<slot::Server>,
+    http: Prepared<http::Http>,
+}
 
 impl Daemon {
     /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
@@ -114,6 +120,7 @@ impl Daemon {
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
+            slots: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
             history,
@@ -151,6 +158,11 @@ impl Daemon {
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
         let server = self.modbus_tcp.server();
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
+    }
+
+    /// The addresses of the tool slots.
+    pub fn slot_addresses(&self) -> Vec<std::net::SocketAddr> {
+        self.slots.server().map(slot::Server::addresses).unwrap_or_default()
     }
 
     /// Path of the local socket, if it is open.
@@ -330,23 +342,37 @@ impl Daemon {
         let (plant, stats) = (&self.plant, &self.stats);
         let options = settings.modbus_tcp.as_ref();
         let modbus_tcp = self.modbus_tcp.prepare(options, plant, stats).await?;
-        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
-            Ok(http) => Ok((modbus_tcp, http)),
+        let slots = match self.slots.prepare(settings.slots.as_ref(), plant, stats).await {
+            Ok(slots) => slots,
             Err(error) => {
+                self.modbus_tcp.abort(modbus_tcp).await;
+                return Err(error);
+            }
+        };
+        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
+            Ok(http) => Ok(PreparedServers {
+                modbus_tcp,
+                slots,
+                http,
+            }),
+            Err(error) => {
+                self.slots.abort(slots).await;
                 self.modbus_tcp.abort(modbus_tcp).await;
                 Err(error)
             }
         }
     }
 
-    async fn abort_servers(&mut self, (modbus_tcp, http): PreparedServers) {
-        self.modbus_tcp.abort(modbus_tcp).await;
-        self.http.abort(http).await;
+    async fn abort_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.abort(prepared.modbus_tcp).await;
+        self.slots.abort(prepared.slots).await;
+        self.http.abort(prepared.http).await;
     }
 
-    async fn commit_servers(&mut self, (modbus_tcp, http): PreparedServers) {
-        self.modbus_tcp.commit(modbus_tcp).await;
-        self.http.commit(http).await;
+    async fn commit_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.commit(prepared.modbus_tcp).await;
+        self.slots.commit(prepared.slots).await;
+        self.http.commit(prepared.http).await;
     }
 
     async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
@@ -391,10 +417,11 @@ impl Daemon {
         }
     }
 
-    /// Shuts down in order: no new commands of local and Modbus TCP clients, the configured stop commands, the buses,
+    /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,
     /// the last MQTT messages.
     pub async fn stop(mut self) {
         self.local.stop().await;
+        self.slots.stop().await;
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);

@@ -1,5 +1,6 @@
 //! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
 
+mod exchange;
 mod placed;
 mod why;
 
@@ -20,6 +21,7 @@ use crate::event::{Events, RefusedCommand};
 use crate::history::{History, Recordings};
 use crate::process_image::{BusImage, DriveImage, Reading};
 
+pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::Placed;
 pub(crate) use self::why::explain;
 

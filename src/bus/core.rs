@@ -144,18 +144,33 @@ impl BusCore {
             Ok(turn) => turn,
             Err(until) => return Some(until),
         };
-        let image = self.bus.image.drives.get(turn.drive)?;
-        let request = Request {
-            address: image.spec.address,
-            pdu: turn.pdu().clone(),
-            n2: image.spec.profile.n2,
+        let request = match self.master.stranger(&turn) {
+            Some(address) => Request::new(address, turn.pdu().clone()),
+            None => {
+                let image = self.bus.image.drives.get(turn.drive)?;
+                Request {
+                    address: image.spec.address,
+                    pdu: turn.pdu().clone(),
+                    n2: image.spec.profile.n2,
+                }
+            }
         };
         let mut frame = Vec::with_capacity(32);
         self.bus.image.spec.protocol.encode(&request, &mut frame);
         if frame.is_empty() {
             // The protocol has no such request, so that the drive has no such address.
             let refused = Ended::Reply(Reply::Exception(Exception::ADDRESS));
-            self.done(&turn, refused, now, now, Duration::ZERO, false);
+            self.done(
+                &turn,
+                TurnEnd {
+                    ended: refused,
+                    began: now,
+                    took: Duration::ZERO,
+                    mangled: false,
+                    frame: Vec::new(),
+                },
+                now,
+            );
             return None;
         }
         self.chosen = Some(Chosen {
@@ -198,7 +213,8 @@ impl BusCore {
         self.report
             .diagnosis
             .sending(now.saturating_duration_since(quiet_since));
-        self.tap = self.report.tap(Some(turn.drive), &request, &frame, quiet_since, now);
+        let drive = Some(turn.drive).filter(|drive| *drive < self.bus.image.drives.len());
+        self.tap = self.report.tap(drive, &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
         self.line.send(request, frame.clone(), sending, late, now);
@@ -233,17 +249,19 @@ impl BusCore {
         }
         self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
+        let frame = exchanged.transaction.take_reply_frame();
         let Exchanged { ended, began, took, .. } = exchanged;
-        self.done(&turn, ended, began, now, took, mangled);
-    }
-
-    fn done(&mut self, turn: &Turn, ended: Ended, began: Instant, now: Instant, took: Duration, mangled: bool) {
         let end = TurnEnd {
             ended,
             began,
             took,
             mangled,
+            frame,
         };
+        self.done(&turn, end, now);
+    }
+
+    fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant) {
         let news = self.master.done(turn, end, now);
         self.report_all(&news, now);
     }

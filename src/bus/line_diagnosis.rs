@@ -6,7 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::line_state::Exchanged;
 use super::listener::Exchange as Overheard;
 use super::transaction::{Ended, MAY_BE_LATE};
-use crate::codec::Reply;
+use crate::codec::{Reply, RequestPdu};
 use crate::diagnosis::figures::Sign;
 use crate::diagnosis::hold::{Change, Hold};
 use crate::diagnosis::{Cause, Counted, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules};
@@ -62,6 +62,10 @@ impl LineDiagnosis {
     /// An exchange of the gateway is over.
     pub(super) fn exchanged(&mut self, drive: usize, exchanged: &Exchanged, turnaround: Option<Duration>, at: Instant) {
         let transaction = &exchanged.transaction;
+        // A drive may well ignore what a tool asks of it that no codec knows.
+        if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
+            return;
+        }
         self.figures.exchange(&Exchange {
             drive,
             request: transaction.request(),

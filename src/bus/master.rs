@@ -1,22 +1,25 @@
 //! The master of a line: what goes on the line next, and what came of it. Pure: time is an argument.
 //!
-//! [`Master::next`] chooses among stops, other commands, forwarded reads and polls; [`Master::done`] takes what became of
+//! [`Master::next`] chooses among stops, other commands, forwarded reads, polls and background exchanges; [`Master::done`] takes what became of
 //! an exchange and says what that changes. All that is known of one drive is in its `DriveState`. Choosing is in
-//! `choose`, results are in `results`, the end of the gateway is in `shutdown`.
+//! `choose`, results are in `results`, background exchanges in `background`, the end of the gateway is in `shutdown`.
 
+mod background;
 mod choose;
 mod results;
 mod shutdown;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use self::background::Begun;
 use self::choose::Turns;
 use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
-use super::late_replies::{FORGOTTEN_AFTER, look_alike};
+use super::late_replies::{FORGOTTEN_AFTER, LateReplies, look_alike};
 use super::line_state::Sending;
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
@@ -66,6 +69,8 @@ pub enum Purpose {
         /// What the step is for.
         step: StepPurpose,
     },
+    /// The background request that has its turn.
+    Background,
     /// What N2 needs said before a read of the plan, or before a step of the begun command in that slot.
     Session(Session, Before),
 }
@@ -85,17 +90,17 @@ impl Turn {
         &self.pdu
     }
 
-    /// The rank of the command that it is for; none of a poll.
+    /// The rank of the command that it is for; none of a poll or a background exchange.
     pub fn rank(&self) -> Option<Urgency> {
         match &self.purpose {
-            Purpose::Poll(_) | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Poll(_) | Purpose::Background | Purpose::Session(_, Before::Poll(_)) => None,
             Purpose::Command { rank, .. } | Purpose::Session(_, Before::Command(_, rank)) => Some(*rank),
         }
     }
 
     fn slot(&self) -> Option<Urgency> {
         match &self.purpose {
-            Purpose::Poll(_) | Purpose::Session(_, Before::Poll(_)) => None,
+            Purpose::Poll(_) | Purpose::Background | Purpose::Session(_, Before::Poll(_)) => None,
             Purpose::Command { slot, .. } | Purpose::Session(_, Before::Command(slot, _)) => Some(*slot),
         }
     }
@@ -112,6 +117,8 @@ pub struct TurnEnd {
     pub took: Duration,
     /// What could not be believed was the drive's own reply, mangled.
     pub mangled: bool,
+    /// The frame of the reply, as the drive sent it.
+    pub frame: Vec<u8>,
 }
 
 /// What a bus that ends leaves to the one that comes after it on the same line.
@@ -129,6 +136,8 @@ pub struct Master {
     bus: BusHandle,
     retries: u32,
     response_timeout: Duration,
+    /// Kept before each request.
+    silence: Duration,
     schedule: Schedule,
     drives: Vec<DriveState>,
     /// What N2 says to drives beside reading them.
@@ -137,6 +146,10 @@ pub struct Master {
     /// Whose reply came last on the line, sound or mangled: it may come once more.
     last_answered: Option<(usize, RequestPdu)>,
     turns: Turns,
+    /// The background request that has its turn, or is on the line.
+    background: Option<Begun>,
+    /// Replies that may still come from addresses at which no drive is configured.
+    strangers: BTreeMap<u8, LateReplies>,
     shutdown: Option<Shutdown>,
     /// The line was spoken on before it was opened: by this bus, or by the one before it.
     successor: bool,
@@ -186,6 +199,7 @@ impl Master {
         Master {
             retries: options.retries,
             response_timeout: options.response_timeout,
+            silence,
             schedule,
             probes: vec![0; drives.len()],
             drives,
@@ -193,6 +207,8 @@ impl Master {
             n2_late: N2LateReplies::default(),
             last_answered: None,
             turns: Turns::default(),
+            background: None,
+            strangers: BTreeMap::new(),
             shutdown: None,
             successor: before.quiet_until.is_some(),
             writes,
@@ -215,6 +231,7 @@ impl Master {
         for drive in &mut self.drives {
             drive.close(&Outcome::BusDown, Interruption::BusDown, now);
         }
+        self.abandon_background(Outcome::BusDown, Interruption::BusDown, now);
     }
 
     /// The bus ends: everybody whose command was begun is answered. What the bus that comes after has to know. An exchange
@@ -228,7 +245,13 @@ impl Master {
             drive.supervision.lease()
         };
         let leases = self.drives.iter_mut().map(close).collect();
-        let late = self.drives.iter().filter_map(|drive| drive.late.until());
+        self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
+        let late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
+        let late = late.filter_map(LateReplies::until);
         let window = match self.sessions.is_empty() {
             true => FORGOTTEN_AFTER,
             false => N2_LATE * self.response_timeout,
@@ -287,7 +310,15 @@ impl Master {
             };
             drive.sent(*slot, &step, now);
         }
-        self.late_before = self.n2_late.may_come(now) || self.drives.iter().any(|drive| drive.late.may_come(now));
+        if turn.purpose == Purpose::Background {
+            self.background_sent();
+        }
+        let mut late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
+        self.late_before = self.n2_late.may_come(now) || late.any(|late| late.may_come(now));
         let last = self.last_answered.as_ref();
         let n2 = !self.sessions.is_empty();
         Sending {
@@ -303,6 +334,9 @@ impl Master {
     }
 
     fn timeout_of(&self, turn: &Turn) -> Duration {
+        if let Some(timeout) = self.passed_on_timeout(turn) {
+            return timeout;
+        }
         let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
         let patient = probes <= self.retries || probes.is_multiple_of(PATIENT_PROBES);
         if self.schedule.is_online(turn.drive) || patient || turn.slot().is_some() {

@@ -1,10 +1,12 @@
 //! What comes next on the line: cadence, fairness and back-off. Pure: time is an argument.
 //!
-//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls.
-//! Four rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
+//! Order: stop, other commands, forwarded reads, due fast polls, due slow polls, background exchanges.
+//! Five rules soften it: after eight commands in a row a due poll goes first; commands, and what they cause, have no more
 //! of a line that is busy with polls than process data; slow polls that had less than their share of the time
-//! ([`slow_share`]) go before fast ones; a drive that does not answer is asked so seldom that it costs at most 2 %.
+//! ([`slow_share`]) go before fast ones; background exchanges have the time that is left over and else a small share
+//! ([`crate::command::Pace`]); a drive that does not answer is asked so seldom that it costs at most 2 %.
 
+mod background;
 mod choice;
 mod drives;
 mod outcome;
@@ -13,6 +15,8 @@ mod share;
 use std::collections::VecDeque;
 use std::time::{Duration, Instant};
 
+pub use self::background::Admission;
+use self::background::BackgroundShare;
 use self::drives::{DriveSchedule, Item, Presence};
 use self::share::CommandShare;
 use crate::codec::Exception;
@@ -137,12 +141,15 @@ pub struct Schedule {
     earned_until: Instant,
     /// Time on the line that commands, and what they asked for, took since then.
     commanded: Duration,
+    /// Time on the line that slow polls took since then.
+    slow_took: Duration,
     /// No more credit than that: more would be a burst of slow polls, and would delay fast ones where idle time serves
     /// the slow ones sooner or later. Less than one request and the time until its turn would not be their share.
     most_credit: Duration,
     /// A probe found nobody since the last fast poll.
     probed: bool,
     share: CommandShare,
+    background: BackgroundShare,
 }
 
 impl Schedule {
@@ -188,9 +195,11 @@ impl Schedule {
             turn: Turn::Due,
             earned_until: now,
             commanded: Duration::ZERO,
+            slow_took: Duration::ZERO,
             most_credit: longest.mul_f64(MOST_CREDIT),
             probed: false,
             share: CommandShare::default(),
+            background: BackgroundShare::default(),
         }
     }
 
@@ -276,6 +285,9 @@ impl Schedule {
                 // There was room for it, so the others will find room too.
                 Turn::Due => Duration::ZERO,
             };
+            if turn != Turn::Asked {
+                self.slow_took += took;
+            }
             self.note_slow(now);
         }
         self.probed |= poll.probe && matches!(polled, Polled::Failed | Polled::Garbled);

@@ -17,6 +17,7 @@ use crate::drive::raw_writes;
 use crate::history::RecorderOptions;
 use crate::history::budget::Budget;
 use crate::history::{line, trend};
+use crate::north::slot::Slot;
 use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
@@ -268,7 +269,26 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
     (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
-    text + &summary(bus, &prediction) + &memory(bus, &settings.recordings) + &raw_writes(bus, settings)
+    text + &summary(bus, &prediction)
+        + &memory(bus, &settings.recordings)
+        + &slots(bus, settings)
+        + &raw_writes(bus, settings)
+}
+
+/// Where tools reach the line, one line a slot.
+fn slots(bus: &BusSettings, settings: &Settings) -> String {
+    let all = settings.slots.iter().flat_map(|slots| &slots.slots);
+    let of_bus = all.filter(|slot| slot.bus == bus.spec.name);
+    let line = |slot: &Slot| {
+        let ways = [
+            slot.listen.map(|address| format!("{address} (bare frames)")),
+            slot.rfc2217.map(|address| format!("{address} (RFC 2217)")),
+            slot.pty.as_ref().map(|path| path.display().to_string()),
+        ];
+        let ways: Vec<String> = ways.into_iter().flatten().collect();
+        format!("  tool slot   {}: {}\n", ways.join(", "), slot.access.meaning())
+    };
+    of_bus.map(line).collect()
 }
 
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {

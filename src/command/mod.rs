@@ -9,12 +9,16 @@
 
 mod admit;
 mod audit;
+mod background;
 mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
+pub use background::{
+    BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
+};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
@@ -52,11 +56,13 @@ pub enum SourceKind {
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
+    /// A tool at a slot of the bus.
+    Slot,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 9] = [
+    pub const ALL: [SourceKind; 10] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -66,6 +72,7 @@ impl SourceKind {
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
         SourceKind::OtherMaster,
+        SourceKind::Slot,
     ];
 
     /// The label of metrics and audit lines.
@@ -80,6 +87,7 @@ impl SourceKind {
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
             SourceKind::OtherMaster => "other_master",
+            SourceKind::Slot => "slot",
         }
     }
 

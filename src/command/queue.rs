@@ -9,6 +9,7 @@ use std::time::Instant;
 use rustix::event::{EventfdFlags, eventfd};
 use tokio::sync::oneshot;
 
+use super::background::{Background, BackgroundRequest};
 use super::{Command, Order, Outcome, SourceKind, Urgency};
 
 /// Commands and forwarded reads that may wait on one bus, besides two stops for each drive.
@@ -376,6 +377,7 @@ fn same_points(older: &Order, newer: &Order) -> bool {
 #[derive(Debug)]
 pub struct CommandQueue {
     pending: Mutex<Pending>,
+    background: Mutex<Background>,
     wake: OwnedFd,
 }
 
@@ -388,6 +390,7 @@ impl CommandQueue {
         let wake = eventfd(0, EventfdFlags::CLOEXEC | EventfdFlags::NONBLOCK)?;
         Ok(CommandQueue {
             pending: Mutex::default(),
+            background: Mutex::default(),
             wake,
         })
     }
@@ -398,6 +401,17 @@ impl CommandQueue {
         self.wake();
     }
 
+    /// Takes a background request in and wakes the bus.
+    pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
+        self.background().push(request, now);
+        self.wake();
+    }
+
+    /// The waiting background requests, for the bus.
+    pub fn background(&self) -> MutexGuard<'_, Background> {
+        self.background.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+
     /// The waiting commands, for the bus.
     pub fn lock(&self) -> MutexGuard<'_, Pending> {
         self.pending.lock().unwrap_or_else(PoisonError::into_inner)
@@ -405,6 +419,7 @@ impl CommandQueue {
 
     /// Answers everything that waits, and all that comes from now on, with `outcome`.
     pub fn close(&self, outcome: Outcome, now: Instant) {
+        self.background().close(&outcome, now);
         let mut pending = self.lock();
         pending.remove(now, &outcome, |_| true);
         pending.closed = Some(outcome);
@@ -414,6 +429,7 @@ impl CommandQueue {
     /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
     pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<String>> {
         let (report, missing) = oneshot::channel();
+        self.background().close(&Outcome::ShuttingDown, now);
         let mut pending = self.lock();
         pending.remove(now, &Outcome::ShuttingDown, |c| c.urgency != Urgency::Stop);
         pending.stops_only = true;
@@ -425,7 +441,11 @@ impl CommandQueue {
 
     /// Takes commands again.
     pub fn open(&self) {
-        self.lock().closed = None;
+        let mut pending = self.lock();
+        pending.closed = None;
+        if !pending.stops_only {
+            self.background().open();
+        }
     }
 
     /// Wakes the bus from its wait.

@@ -18,6 +18,7 @@ mod north;
 mod raw_writes;
 mod recordings;
 mod shutdown;
+mod slot;
 mod unique;
 mod values;
 
@@ -39,7 +40,7 @@ use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
-use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
+use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
@@ -71,6 +72,8 @@ pub struct Settings {
     pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
+    /// Slots of all buses; absent: there is none.
+    pub slots: Option<slot_server::Options>,
     /// Absent: not started.
     pub modbus_tcp: Option<modbus_tcp_server::Options>,
     /// Absent: not started.
@@ -248,6 +251,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
 
     judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
 
+    let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
+    let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
     Some(Settings {
         gateway: name?,
         socket,
@@ -262,6 +267,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         },
         stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
+        slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
         http: flipped(http.map(|http| http.options))?,
@@ -285,11 +291,14 @@ fn judge(
     }
     let http_listener = http.and_then(|http| http.listener.as_ref());
     let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
+    let slots = || buses.iter().flat_map(|bus| &bus.slots);
+    let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);
     let commanded = modbus_tcp.is_some_and(|m| m.commands)
         || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
-        || http.is_some_and(|http| http.commands);
+        || http.is_some_and(|http| http.commands)
+        || slots().any(|slot| slot.writes);
     if !commanded {
         warn_of_idle_control(reader, buses);
     }

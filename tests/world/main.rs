@@ -33,6 +33,7 @@ mod recorder;
 mod rig;
 mod scenario;
 mod situations;
+mod slot;
 mod world;
 
 use std::ops::Range;

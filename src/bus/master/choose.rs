@@ -1,4 +1,4 @@
-//! What goes on the line next: stops, other commands, forwarded reads, polls.
+//! What goes on the line next: stops, other commands, forwarded reads, polls, background exchanges.
 
 use std::time::{Duration, Instant};
 
@@ -7,7 +7,7 @@ use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, Order, Outcome, Urgency};
+use crate::command::{Chosen, Command, Interruption, Order, Outcome, Urgency};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
@@ -96,6 +96,7 @@ impl Master {
         let mut commands = self.commands(now);
         let rank = self.turns.rank(|rank| commands.waits(rank));
         if self.shutdown.is_some() {
+            self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             // Polls cease: the line belongs to the stops.
             return match rank {
                 Some(rank) => self.command(rank, &mut commands, now),
@@ -104,8 +105,16 @@ impl Master {
         }
         let highest = RANKS.into_iter().find(|rank| commands.waits(*rank));
         match self.schedule.next_of(now, rank, highest) {
-            Decision::Poll(poll) => self.poll(poll, now),
-            Decision::Idle(until) => Some(Err(commands.wake_at.map_or(until, |at| at.min(until)))),
+            // A stop waits for one poll at most, and for nothing else.
+            Decision::Poll(poll) if highest == Some(Urgency::Stop) => self.poll(poll, now),
+            Decision::Poll(poll) => match self.background(false, now) {
+                Ok(turn) => Some(Ok(turn)),
+                Err(_) => self.poll(poll, now),
+            },
+            Decision::Idle(until) => Some(self.background(true, now).map_err(|again| {
+                let wake = commands.wake_at.into_iter().chain(again);
+                wake.fold(until, Instant::min)
+            })),
             Decision::Command(rank) => self.command(rank, &mut commands, now),
         }
     }
@@ -287,6 +296,9 @@ impl Master {
 
     /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.
     pub fn is_still_due(&mut self, turn: &Turn, now: Instant) -> bool {
+        if turn.purpose == Purpose::Background {
+            return self.background_is_due(now);
+        }
         let Some(slot) = turn.slot() else { return true };
         let run = self.drives.get_mut(turn.drive).and_then(|drive| drive.run(slot));
         let Some(run) = run.filter(|run| !run.is_late(now)) else {

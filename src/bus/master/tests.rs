@@ -17,6 +17,8 @@ use crate::process_image::{
     Access, BusImage, BusSpec, DriveSpec, LeaseAction, Link, OnShutdown, Supervision as Settings,
 };
 
+mod background;
+
 /// What an exchange takes.
 const COST: Duration = Duration::from_millis(20);
 /// What one without an answer takes.
@@ -87,6 +89,10 @@ impl Rig {
     }
 
     fn of(drives: u8, profile: &str, protocol: Protocol) -> Rig {
+        Rig::at(drives, profile, protocol, Duration::from_millis(10))
+    }
+
+    fn at(drives: u8, profile: &str, protocol: Protocol, cycle: Duration) -> Rig {
         let profile = Profiles::built_in().get(profile).unwrap().clone();
         let spec = |address| DriveSpec {
             access: Access::Control,
@@ -105,7 +111,7 @@ impl Rig {
             port: "none".to_string(),
             protocol,
             format: LineFormat::new(38_400, "8N1").unwrap(),
-            cycle: Duration::from_millis(10),
+            cycle,
             slow_cycle: Duration::from_secs(1),
         };
         let bus = BusHandle {
@@ -158,6 +164,7 @@ impl Rig {
                         began,
                         took,
                         mangled,
+                        frame: Vec::new(),
                     },
                     self.now,
                 ));
@@ -409,6 +416,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
             began: rig.now,
             took: COST,
             mangled: false,
+            frame: Vec::new(),
         };
         rig.now += COST;
         rig.master.done(&turn, end, rig.now);
@@ -530,6 +538,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
             began: rig.now,
             took: COST,
             mangled,
+            frame: Vec::new(),
         };
         let garbled = end(Ended::Corrupt("checksum"));
         let mut turn = read(&mut rig);

@@ -19,6 +19,8 @@ impl Schedule {
             false => passed.mul_f64(self.slow_share),
         };
         self.slow_credit = (self.slow_credit + earned).min(self.most_credit);
+        let of_slow_polls = std::mem::take(&mut self.slow_took);
+        self.background.earn(of_polls.saturating_sub(of_slow_polls));
     }
 
     pub(super) fn start_round(&mut self, now: Instant) {

@@ -347,6 +347,16 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         requests.add(labels, SeriesValue::Count(count));
     }
     all.push(requests);
+    let mut tools = Family::new(
+        Kind::Counter,
+        "drivegate_slot_requests_total",
+        "Requests of tools at the slots, by outcome.",
+    );
+    for (bus, outcome, count) in stats.slots.requests() {
+        let labels = vec![("bus", bus), ("outcome", outcome.name().to_string())];
+        tools.add(labels, SeriesValue::Count(count));
+    }
+    all.push(tools);
     let mut refused = Family::new(
         Kind::Counter,
         "drivegate_connections_refused_total",

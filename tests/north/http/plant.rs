@@ -14,8 +14,8 @@ use drivegate::drive::model::Kind;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthStats;
 use drivegate::north::http::{self, Http, Options};
+use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
 use tokio_util::sync::CancellationToken;
@@ -207,6 +207,7 @@ pub(crate) fn count_a_write(plant: &Plant) {
 /// Figures of all north sides.
 pub(crate) fn stats() -> Arc<NorthStats> {
     let stats = NorthStats::default();
+    stats.slots.count("line1", SlotOutcome::Answered);
     stats.modbus_tcp.connected();
     stats.modbus_tcp.answered(3, 0);
     stats.modbus_tcp.answered(6, 1);

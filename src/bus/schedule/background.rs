@@ -1,0 +1,104 @@
+//! What background exchanges may take of the line: the time that is left over, and else a small share of wire time.
+
+use std::time::{Duration, Instant};
+
+use super::{Schedule, Turn};
+use crate::command::Pace;
+
+/// What the shares have earned and not used, in seconds of wire time; less than nothing after an exchange that took longer
+/// than it had earned.
+#[derive(Debug, Default)]
+pub(super) struct BackgroundShare {
+    balance: [f64; 2],
+    /// The longest exchange that was wanted: so much is saved up at most.
+    longest: Duration,
+    /// By how much exchanges took longer than reckoned of late: drives are slower than their profiles say.
+    overrun: Duration,
+}
+
+/// Whether a background exchange may go now.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Admission {
+    /// In time that is left over: its share pays for what it takes beyond what was reckoned.
+    InIdleTime(Duration),
+    /// In place of a poll that is due: its share pays for it.
+    InShare,
+    /// Not before then, unless the line rests earlier.
+    NotBefore(Instant),
+}
+
+impl BackgroundShare {
+    /// Shares earn from the time that process data has, so that they are shares of its rate: what commands and slow polls take
+    /// is not process data's to give.
+    pub(super) fn earn(&mut self, passed: Duration) {
+        for (pace, balance) in Pace::ALL.into_iter().zip(&mut self.balance) {
+            // What was not used in an hour is no burst afterwards.
+            let most = self.longest.as_secs_f64().max(*balance);
+            *balance = (*balance + passed.as_secs_f64() * pace.share()).min(most);
+        }
+    }
+
+    fn balance(&self, pace: Pace) -> f64 {
+        self.balance.get(pace as usize).copied().unwrap_or(0.0)
+    }
+
+    /// Time until the share of that pace has earned `wanted`.
+    fn missing(&self, pace: Pace, wanted: f64) -> Duration {
+        Duration::from_secs_f64(((wanted - self.balance(pace)) / pace.share()).max(0.0))
+    }
+}
+
+impl Schedule {
+    /// Whether an exchange of that pace may go at `now`, which takes about `cost`. `idle`: nothing else is due. In idle time it
+    /// does not delay the next round of process data, and goes only where its share owes nothing; in place of a poll
+    /// that is due it goes once its share has earned it.
+    pub fn admits_background(&mut self, pace: Pace, cost: Duration, idle: bool, now: Instant) -> Admission {
+        let share = &mut self.background;
+        let cost = cost + share.overrun;
+        share.longest = share.longest.max(cost);
+        let fits = self.round_started.is_none() || now + cost <= self.round_due;
+        let owes_nothing = share.balance(pace) >= 0.0;
+        if idle && fits && owes_nothing {
+            return Admission::InIdleTime(cost);
+        }
+        // Reads that a command asked for and probes are few, and slow polls on credit pay for themselves.
+        let instead_of_process_data = idle || self.turn == Turn::Due;
+        let missing = share.missing(pace, cost.as_secs_f64() * (1.0 - 1e-9));
+        if missing.is_zero() && instead_of_process_data {
+            return Admission::InShare;
+        }
+        Admission::NotBefore(now + missing.max(Duration::from_millis(1)))
+    }
+
+    /// What is on account of the share of that pace took so long, and was no background exchange.
+    pub fn background_owes(&mut self, pace: Pace, took: Duration) {
+        if let Some(balance) = self.background.balance.get_mut(pace as usize) {
+            *balance -= took.as_secs_f64();
+        }
+    }
+
+    /// A background exchange is over, for which the line was taken for `took`. `answered`: the drive replied.
+    pub fn background_done(&mut self, pace: Pace, admission: Admission, answered: bool, took: Duration) {
+        let share = &mut self.background;
+        let paid = match admission {
+            Admission::InIdleTime(cost) => took.saturating_sub(cost),
+            Admission::InShare | Admission::NotBefore(_) => took,
+        };
+        if matches!(admission, Admission::InShare) {
+            // It had the turn of a poll: what waited for that waits no longer.
+            self.share.polled(Duration::ZERO);
+        }
+        if answered && let Admission::InIdleTime(cost) = admission {
+            let over = (took + share.overrun).saturating_sub(cost);
+            share.overrun = over.max(share.overrun.mul_f64(0.9));
+        }
+        if let Some(balance) = share.balance.get_mut(pace as usize) {
+            // There was room for it, so the next one will find room too.
+            let before = match admission {
+                Admission::InIdleTime(_) => balance.min(0.0),
+                Admission::InShare | Admission::NotBefore(_) => *balance,
+            };
+            *balance = before - paid.as_secs_f64();
+        }
+    }
+}

@@ -1,0 +1,171 @@
+//! Background exchanges: requests of the lowest rank, for work that has time, such as reading all parameters of a drive.
+//! Pure: time is an argument.
+//!
+//! Each request is one exchange, answered exactly once: with the drive's reply, or with the reason why there is none. The
+//! bus sends one where the line rests long enough for it, and else within a small share of the line ([`Pace`]); whoever
+//! waits for a longer work asks again and again, one request behind the other, and so can be interrupted between any two.
+
+use std::collections::VecDeque;
+use std::time::Instant;
+
+use tokio::sync::oneshot;
+
+use super::{Outcome, Ticket};
+use crate::codec::RequestPdu;
+
+/// Background requests that may wait on one bus.
+pub const BACKGROUND_CAPACITY: usize = 32;
+/// Background requests of one client that may wait on one bus.
+pub const BACKGROUND_PER_CLIENT: usize = 8;
+
+/// How much of a busy line background exchanges take, as shares of the wire time of process data; where the line rests they
+/// may have all of the rest. All of both kinds together take no more than a fifth of a busy line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum Pace {
+    /// 18 %: somebody waits for the reply.
+    Brisk,
+    /// 1.5 %: nobody is to notice it.
+    Slow,
+}
+
+impl Pace {
+    /// All, in the order in which they have their turn.
+    pub const ALL: [Pace; 2] = [Pace::Brisk, Pace::Slow];
+
+    /// The share of a busy line.
+    pub const fn share(self) -> f64 {
+        match self {
+            Pace::Brisk => 0.18,
+            Pace::Slow => 0.015,
+        }
+    }
+}
+
+/// The index of no drive: that of a request to an address of the line at which none is configured.
+pub const NO_DRIVE: usize = usize::MAX;
+
+/// A request of the lowest rank: one exchange with one drive.
+#[derive(Debug)]
+pub struct BackgroundRequest {
+    /// Index of the drive on its bus, or [`NO_DRIVE`].
+    pub drive: usize,
+    /// What is asked. Whoever submits a write has checked that it is allowed.
+    pub pdu: RequestPdu,
+    /// How much of a busy line it may take.
+    pub pace: Pace,
+    /// Not sent after this.
+    pub expires: Instant,
+    /// Answers it.
+    pub ticket: Ticket,
+    /// What a request has beside that which is passed on for somebody else; none of one of the gateway itself.
+    pub passed_on: Option<PassedOn>,
+}
+
+/// A request that is passed on for a tool, which gets what the drive said.
+#[derive(Debug)]
+pub struct PassedOn {
+    /// The address on the line; 0 is the broadcast, except on N2.
+    pub address: u8,
+    /// It may change anything in whoever hears it.
+    pub may_write: bool,
+    /// Where the frame of the reply goes, as the drive sent it.
+    pub frame: oneshot::Sender<Vec<u8>>,
+}
+
+impl BackgroundRequest {
+    /// Whether the tool for which it is passed on has gone, or asked for something else.
+    pub fn is_unwanted(&self) -> bool {
+        self.passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.frame.is_closed())
+    }
+
+    /// As [`BackgroundRequest::answer`], with the frame of the reply.
+    pub fn answer_with(mut self, outcome: Outcome, frame: Vec<u8>, now: Instant) {
+        if let Some(passed_on) = self.passed_on.take() {
+            // The tool may have gone.
+            let _ = passed_on.frame.send(frame);
+        }
+        self.answer(outcome, now);
+    }
+
+    /// Answers whoever waits for it.
+    pub fn answer(self, outcome: Outcome, now: Instant) {
+        self.ticket.answer(outcome, now);
+    }
+}
+
+/// The background requests that wait on one bus, in the order in which they came.
+#[derive(Debug, Default)]
+pub struct Background {
+    waiting: VecDeque<BackgroundRequest>,
+    /// Set while the bus takes none: the answer that each gets.
+    closed: Option<Outcome>,
+}
+
+impl Background {
+    /// Takes a request in, unless 32 wait, 8 of the same client, or the bus takes none.
+    pub fn push(&mut self, request: BackgroundRequest, now: Instant) {
+        if let Some(outcome) = &self.closed {
+            request.answer(outcome.clone(), now);
+            return;
+        }
+        let client = request.ticket.client();
+        let own = self.waiting.iter().filter(|r| r.ticket.client() == client).count();
+        if own >= BACKGROUND_PER_CLIENT || self.waiting.len() >= BACKGROUND_CAPACITY {
+            request.answer(Outcome::QueueFull, now);
+            return;
+        }
+        self.waiting.push_back(request);
+    }
+
+    /// The number of the oldest request of that pace that `may` go.
+    pub fn next(&self, pace: Pace, mut may: impl FnMut(&BackgroundRequest) -> bool) -> Option<usize> {
+        self.waiting.iter().position(|r| r.pace == pace && may(r))
+    }
+
+    /// The request of that number, as [`Background::next`] gave it.
+    pub fn get(&self, number: usize) -> Option<&BackgroundRequest> {
+        self.waiting.get(number)
+    }
+
+    /// Takes the request of that number.
+    pub fn take(&mut self, number: usize) -> Option<BackgroundRequest> {
+        self.waiting.remove(number)
+    }
+
+    /// A request that was taken and not sent waits again, before all others.
+    pub fn put_back(&mut self, request: BackgroundRequest, now: Instant) {
+        match &self.closed {
+            Some(outcome) => request.answer(outcome.clone(), now),
+            None => self.waiting.push_front(request),
+        }
+    }
+
+    /// Answers and removes the requests that `which` names.
+    pub fn remove(&mut self, now: Instant, outcome: &Outcome, which: impl Fn(&BackgroundRequest) -> bool) {
+        for request in std::mem::take(&mut self.waiting) {
+            if which(&request) {
+                request.answer(outcome.clone(), now);
+            } else {
+                self.waiting.push_back(request);
+            }
+        }
+    }
+
+    /// Answers everything that waits, and all that comes from now on, with `outcome`.
+    pub fn close(&mut self, outcome: &Outcome, now: Instant) {
+        self.remove(now, outcome, |_| true);
+        self.closed = Some(outcome.clone());
+    }
+
+    /// Takes requests again.
+    pub fn open(&mut self) {
+        self.closed = None;
+    }
+
+    /// Whether none waits.
+    pub fn is_empty(&self) -> bool {
+        self.waiting.is_empty()
+    }
+}
