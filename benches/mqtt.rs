@@ -156,6 +156,8 @@ fn plant(drives: u16) -> Result<Plant, Box<dyn Error>> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
+        history: Default::default(),
     })
 }
 
@@ -231,15 +233,9 @@ fn events(runtime: &Runtime, broker: &Broker, port: u16) -> Result<(f64, f64), B
     let gateway = Gateway::start(runtime, port, 1, Duration::ZERO)?;
     let publish = |n: u32| {
         gateway.plant.load().events.publish(Event {
-            id: 0,
-            time: SystemTime::now(),
-            kind: EventKind::Online,
             bus: "line".to_string(),
             drive: Some("d1".to_string()),
-            fault_code: None,
-            count: None,
-            text: n.to_string(),
-            recording: None,
+            ..Event::new(EventKind::Online, SystemTime::now(), n.to_string())
         });
     };
     let mut trips = Vec::new();

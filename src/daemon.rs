@@ -19,10 +19,10 @@ use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
-use crate::history::{RecorderTask, Recordings};
+use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::parameters::keep_reading;
-use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
@@ -32,7 +32,7 @@ const STOP_SLACK: Duration = Duration::from_millis(300);
 /// Time limit for the bus threads to end.
 const STOP_BUSES: Duration = Duration::from_secs(2);
 
-/// Time limit for the audit file to be written.
+/// Time limit for the audit file, and for events and counters, to be written.
 const STOP_AUDIT: Duration = Duration::from_secs(1);
 /// Interval at which refusals are reported whose count is due.
 const REFUSALS_REPORTED: Duration = Duration::from_millis(250);
@@ -47,7 +47,7 @@ pub enum StartError {
     #[error("cannot start bus `{0}`: {1}; free memory or file descriptors")]
     Bus(String, std::io::Error),
     /// The system does not provide a thread for the recorder.
-    #[error("cannot start the recorder: {0}; free memory, or set max_count = 0 in [recordings]")]
+    #[error("cannot start the recorder: {0}; free memory or threads")]
     Recorder(std::io::Error),
 }
 
@@ -63,13 +63,17 @@ pub struct Daemon {
     modbus_tcp: ServerSlot<modbus_tcp::Server>,
     mqtt: ServerSlot<mqtt::Mqtt>,
     http: ServerSlot<http::Http>,
+    slots: ServerSlot<slot::Server>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
     /// Readings of parameters.
     vault: Arc<Vault>,
     /// Reads parameters every so often.
     reader: Option<tokio::task::JoinHandle<()>>,
+    history: Arc<History>,
     recorder: Option<RecorderTask>,
+    /// Keeps events and counters on disk.
+    keeper: Option<Keeper>,
     /// Reports refusals whose count is due.
     reporter: tokio::task::JoinHandle<()>,
     pulse: Pulse,
@@ -77,7 +81,12 @@ pub struct Daemon {
     control: Option<Control>,
 }
 
-type PreparedServers = (Prepared<modbus_tcp::Server>, Prepared<http::Http>);
+/// The servers that listen on the network, prepared.
+struct PreparedServers {
+    modbus_tcp: Prepared<modbus_tcp::Server>,
+    slots: Prepared<slot::Server>,
+    http: Prepared<http::Http>,
+}
 
 impl Daemon {
     /// Starts all buses and servers. A port that cannot be opened is not an error: its bus keeps trying.
@@ -97,6 +106,7 @@ impl Daemon {
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
         let vault = Arc::new(Vault::default());
+        let history = Arc::new(History::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
@@ -105,6 +115,7 @@ impl Daemon {
             writes: writes.clone(),
             recordings: recordings.clone(),
             parameters: vault.clone(),
+            history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
         let mut daemon = Daemon {
@@ -117,15 +128,20 @@ impl Daemon {
             modbus_tcp: ServerSlot::default(),
             mqtt: ServerSlot::default(),
             http: ServerSlot::default(),
+            slots: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
             vault,
             reader: None,
+            history,
             recorder: None,
+            keeper: None,
             reporter: report_refusals(shared),
             pulse: Pulse::default(),
             control,
         };
+        // Before anything happens: it knows what happened earlier.
+        daemon.apply_keeper(&settings).await;
         daemon.apply_audit(&settings).await;
         // MQTT first, so that it misses no event; the servers that report readiness last.
         daemon.apply_mqtt(&settings).await?;
@@ -153,6 +169,11 @@ impl Daemon {
     pub fn modbus_tcp_addresses(&self) -> Vec<std::net::SocketAddr> {
         let server = self.modbus_tcp.server();
         server.map(modbus_tcp::Server::addresses).unwrap_or_default()
+    }
+
+    /// The addresses of the tool slots.
+    pub fn slot_addresses(&self) -> Vec<std::net::SocketAddr> {
+        self.slots.server().map(slot::Server::addresses).unwrap_or_default()
     }
 
     /// Path of the local socket, if it is open.
@@ -190,6 +211,7 @@ impl Daemon {
         self.apply_local(&settings).await;
         self.apply_params(&settings);
         self.apply_audit(&settings).await;
+        self.apply_keeper(&settings).await;
         let changes = changes::between(&self.settings, &settings);
         self.settings = settings;
         Ok(changes)
@@ -211,6 +233,7 @@ impl Daemon {
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         self.watch(&kept);
+        let queues: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             leases.extend(drives.zip(left.leases));
@@ -226,6 +249,11 @@ impl Daemon {
                     Lease::default()
                 }
             };
+            // So does a login that commanded one of them last.
+            for (index, drive) in bus.drives.iter().enumerate() {
+                let commander = queues.iter().find_map(|before| commander_of(before, drive));
+                task.handle().queue.lock().set_commander(index, commander);
+            }
             task.begin(Handover {
                 leases: bus.drives.iter().map(lease).collect(),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
@@ -252,9 +280,11 @@ impl Daemon {
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
             parameters: self.vault.clone(),
+            history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
-            recorder.adopt(kept.iter().map(|(_, task)| task.handle().image.clone()).collect());
+            let images = kept.iter().map(|(_, task)| task.handle().image.clone());
+            recorder.adopt(images.collect(), settings.stale_after);
         }
         self.buses = kept;
     }
@@ -289,11 +319,10 @@ impl Daemon {
             // A thread of it that panicked has logged that.
             let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
         }
-        if settings.recordings.max_count > 0 {
-            let (recordings, events) = (self.recordings.clone(), self.events.clone());
-            let started = RecorderTask::start(settings.recordings.clone(), recordings, events, &self.writes);
-            self.recorder = Some(started.map_err(StartError::Recorder)?);
-        }
+        let (recordings, history) = (self.recordings.clone(), self.history.clone());
+        let options = settings.recordings.clone();
+        let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
+        self.recorder = Some(started.map_err(StartError::Recorder)?);
         Ok(())
     }
 
@@ -312,28 +341,66 @@ impl Daemon {
         self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
     }
 
+    /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
+    async fn apply_keeper(&mut self, settings: &Settings) {
+        let same = |keeper: &Keeper| keeper.dir() == settings.state_dir;
+        if !settings.keeps_history || self.keeper.as_ref().is_some_and(same) {
+            return;
+        }
+        let first = self.keeper.is_none();
+        self.stop_keeper().await;
+        match Keeper::start(&settings.state_dir, first, self.history.clone(), &self.events) {
+            Ok(keeper) => self.keeper = Some(keeper),
+            Err(error) => {
+                tracing::error!(
+                    "cannot start the thread that keeps events and counters: {error}; free memory or threads"
+                );
+            }
+        }
+    }
+
+    async fn stop_keeper(&mut self) {
+        if let Some(keeper) = self.keeper.take() {
+            within(STOP_AUDIT, "the history of events", keeper.stop()).await;
+        }
+    }
+
     /// Prepares the servers that listen on the network: all of them or none.
     async fn prepare_servers(&mut self, settings: &Settings) -> Result<PreparedServers, ServerError> {
         let (plant, stats) = (&self.plant, &self.stats);
         let options = settings.modbus_tcp.as_ref();
         let modbus_tcp = self.modbus_tcp.prepare(options, plant, stats).await?;
-        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
-            Ok(http) => Ok((modbus_tcp, http)),
+        let slots = match self.slots.prepare(settings.slots.as_ref(), plant, stats).await {
+            Ok(slots) => slots,
             Err(error) => {
+                self.modbus_tcp.abort(modbus_tcp).await;
+                return Err(error);
+            }
+        };
+        match self.http.prepare(settings.http.as_ref(), plant, stats).await {
+            Ok(http) => Ok(PreparedServers {
+                modbus_tcp,
+                slots,
+                http,
+            }),
+            Err(error) => {
+                self.slots.abort(slots).await;
                 self.modbus_tcp.abort(modbus_tcp).await;
                 Err(error)
             }
         }
     }
 
-    async fn abort_servers(&mut self, (modbus_tcp, http): PreparedServers) {
-        self.modbus_tcp.abort(modbus_tcp).await;
-        self.http.abort(http).await;
+    async fn abort_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.abort(prepared.modbus_tcp).await;
+        self.slots.abort(prepared.slots).await;
+        self.http.abort(prepared.http).await;
     }
 
-    async fn commit_servers(&mut self, (modbus_tcp, http): PreparedServers) {
-        self.modbus_tcp.commit(modbus_tcp).await;
-        self.http.commit(http).await;
+    async fn commit_servers(&mut self, prepared: PreparedServers) {
+        self.modbus_tcp.commit(prepared.modbus_tcp).await;
+        self.slots.commit(prepared.slots).await;
+        self.http.commit(prepared.http).await;
     }
 
     async fn apply_mqtt(&mut self, settings: &Settings) -> Result<(), ServerError> {
@@ -378,10 +445,11 @@ impl Daemon {
         }
     }
 
-    /// Shuts down in order: no new commands of local and Modbus TCP clients, the configured stop commands, the buses,
+    /// Shuts down in order: no new commands of local clients, tools and Modbus TCP clients, the configured stop commands, the buses,
     /// the last MQTT messages.
     pub async fn stop(mut self) {
         self.local.stop().await;
+        self.slots.stop().await;
         self.modbus_tcp.stop().await;
         self.stop_drives().await;
         let buses = std::mem::take(&mut self.buses);
@@ -404,6 +472,7 @@ impl Daemon {
             .report_refusals(Instant::now() + Duration::from_secs(60));
         self.mqtt.stop().await;
         self.http.stop().await;
+        self.stop_keeper().await;
         let audit = self.writes.audit();
         if let Some(file) = audit.file() {
             within(STOP_AUDIT, "the audit file", file.stop()).await;
@@ -445,6 +514,13 @@ impl Daemon {
             );
         }
     }
+}
+
+/// The login that commanded that drive last, as its bus before the reload knows.
+fn commander_of(before: &BusHandle, drive: &DriveSpec) -> Option<Arc<str>> {
+    let same = |image: &Arc<DriveImage>| (&image.spec.name, image.spec.address) == (&drive.name, drive.address);
+    let index = before.image.drives.iter().position(same)?;
+    before.queue.lock().commander(index).cloned()
 }
 
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.

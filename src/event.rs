@@ -1,16 +1,19 @@
 //! What happened: state changes that people and the cloud want to know of, each published once.
 
 mod fair_ring;
+mod log;
 mod refusals;
 
+use std::borrow::Cow;
 use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Instant, SystemTime};
 
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
 pub use fair_ring::FairRing;
+pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
 /// Events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
@@ -21,7 +24,7 @@ const KEPT: usize = 4096;
 const REFUSALS_KEPT: usize = 512;
 
 /// What kind of thing happened.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
 pub enum EventKind {
     /// A drive answers (again).
@@ -66,11 +69,13 @@ pub enum EventKind {
     ForeignCommand,
     /// Parameters changed that the gateway did not write.
     ParametersChanged,
+    /// A verdict about a line came, became firmer, or went.
+    Diagnosis,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 21] = [
+    pub const ALL: [EventKind; 22] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -92,6 +97,7 @@ impl EventKind {
         EventKind::ReloadRefused,
         EventKind::ForeignCommand,
         EventKind::ParametersChanged,
+        EventKind::Diagnosis,
     ];
 
     /// Whether somebody should look: the log has it as a warning.
@@ -105,6 +111,7 @@ impl EventKind {
             | EventKind::Unsupervised
             | EventKind::NotConfirmed
             | EventKind::BusDown
+            | EventKind::Diagnosis
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -145,6 +152,7 @@ impl EventKind {
             EventKind::ReloadRefused => "reload_refused",
             EventKind::ForeignCommand => "foreign_command",
             EventKind::ParametersChanged => "parameters_changed",
+            EventKind::Diagnosis => "diagnosis",
         }
     }
 }
@@ -152,9 +160,10 @@ impl EventKind {
 /// One event.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Event {
-    /// Running number within this process, from 1; shown with the [`boot`] of the process.
-    #[serde(flatten, serialize_with = "numbered")]
+    /// Running number within a run of the process, from 1.
     pub id: u64,
+    /// The run.
+    pub boot: Boot,
     /// When it happened.
     #[serde(serialize_with = "rfc3339")]
     pub time: SystemTime,
@@ -173,6 +182,9 @@ pub struct Event {
     /// Refused commands only: how many of one client it stands for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub count: Option<u64>,
+    /// Starts and stops only: who ordered it, where an order of this gateway was the cause.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub by: Option<String>,
     /// For people.
     pub text: String,
     /// The recording that was made.
@@ -186,9 +198,55 @@ pub struct RecordingMade {
     /// Its id.
     pub id: String,
     /// What made it.
-    pub trigger: &'static str,
+    pub trigger: Cow<'static, str>,
     /// What it shows, for people.
     pub summary: String,
+}
+
+impl Event {
+    /// An event of this run of the whole gateway; its number is set when it is published.
+    pub fn new(kind: EventKind, time: SystemTime, text: String) -> Event {
+        Event {
+            id: 0,
+            boot: Boot::default(),
+            time,
+            kind,
+            bus: String::new(),
+            drive: None,
+            fault_code: None,
+            count: None,
+            by: None,
+            text,
+            recording: None,
+        }
+    }
+}
+
+/// A run of the process: this one, or an earlier one by its name.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Boot(Option<Arc<str>>);
+
+impl Boot {
+    /// The run of that name.
+    pub fn named(name: &str) -> Boot {
+        Boot(Some(name).filter(|name| *name != boot()).map(Arc::from))
+    }
+
+    /// Whether it is this one.
+    pub fn is_this(&self) -> bool {
+        self.0.is_none()
+    }
+
+    /// Its name.
+    pub fn name(&self) -> &str {
+        self.0.as_deref().unwrap_or_else(|| boot())
+    }
+}
+
+impl Serialize for Boot {
+    fn serialize<S: serde::Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
 }
 
 /// The name of this run of the process, different at every start: with it, the number of an event is unique.
@@ -199,15 +257,6 @@ pub fn boot() -> &'static str {
         let random = RandomState::new().hash_one((now.unwrap_or_default(), std::process::id()));
         format!("{random:016x}")
     })
-}
-
-fn numbered<S: serde::Serializer>(id: &u64, serializer: S) -> Result<S::Ok, S::Error> {
-    #[derive(Serialize)]
-    struct Numbered {
-        id: u64,
-        boot: &'static str,
-    }
-    Numbered { id: *id, boot: boot() }.serialize(serializer)
 }
 
 /// RFC 3339 with milliseconds, UTC.
@@ -240,7 +289,10 @@ pub struct Events {
 /// The last events. Those of drives and buses are apart from refused commands, and no drive or kind pushes out another.
 #[derive(Debug)]
 struct Store {
+    /// Of the last event of this run.
     number: u64,
+    /// Events of earlier runs, which come before all of this one.
+    earlier: u64,
     kept: FairRing<(EventKind, String), Arc<Event>>,
     refused: FairRing<String, Arc<Event>>,
     limit: RefusalLimit<Event>,
@@ -252,6 +304,7 @@ impl Default for Events {
             sender: broadcast::channel(BURST).0,
             store: Arc::new(Mutex::new(Store {
                 number: 0,
+                earlier: 0,
                 kept: FairRing::new(KEPT),
                 refused: FairRing::new(REFUSALS_KEPT),
                 limit: RefusalLimit::default(),
@@ -280,12 +333,8 @@ impl Events {
         } else {
             tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, count = event.count, "{}", event.text);
         }
-        let (number, event) = (event.id, Arc::new(event));
-        let source = event.drive.clone().unwrap_or_else(|| event.bus.clone());
-        match event.kind {
-            EventKind::RefusedCommand => store.refused.push(source, number, event.clone()),
-            kind => store.kept.push((kind, source), number, event.clone()),
-        }
+        let event = Arc::new(event);
+        store.keep(event.clone());
         // Nobody listening is no error.
         let _ = self.sender.send(event);
     }
@@ -294,15 +343,9 @@ impl Events {
     /// stands for all of them.
     pub fn publish_refusal(&self, refused: RefusedCommand<'_>, now: Instant) {
         let event = Event {
-            id: 0,
-            time: SystemTime::now(),
-            kind: EventKind::RefusedCommand,
             bus: refused.bus.to_string(),
             drive: Some(refused.drive.to_string()),
-            fault_code: None,
-            count: None,
-            text: refused.text,
-            recording: None,
+            ..Event::new(EventKind::RefusedCommand, SystemTime::now(), refused.text)
         };
         let mut store = self.store();
         let passed = store
@@ -334,13 +377,44 @@ impl Events {
         self.sender.subscribe()
     }
 
-    /// The last 4,096 events of drives and buses and the last 512 refused commands, oldest first.
+    /// Takes in what was kept of earlier runs, oldest first. To be called before the first event of this one.
+    pub fn remember(&self, earlier: Vec<Event>) {
+        let mut store = self.store();
+        for event in earlier {
+            store.earlier += 1;
+            store.keep(Arc::new(event));
+        }
+    }
+
+    /// The last events of this run, oldest first: 4,096 of drives and buses and 512 refused commands at most.
     pub fn recent(&self) -> Vec<Arc<Event>> {
-        let store = self.store();
-        let all = store.kept.iter().chain(store.refused.iter());
-        let mut all: Vec<_> = all.map(|(_, event)| event.clone()).collect();
-        all.sort_unstable_by_key(|event| event.id);
+        let mut all = self.store().all();
+        all.retain(|event| event.boot.is_this());
         all
+    }
+
+    /// The newest events that match, newest first, also those of earlier runs.
+    pub fn search(&self, search: &Search) -> Vec<Arc<Event>> {
+        let all = self.store().all();
+        log::newest(&all, search)
+    }
+}
+
+impl Store {
+    fn keep(&mut self, event: Arc<Event>) {
+        let number = self.earlier + self.number;
+        let source = event.drive.clone().unwrap_or_else(|| event.bus.clone());
+        match event.kind {
+            EventKind::RefusedCommand => self.refused.push(source, number, event),
+            kind => self.kept.push((kind, source), number, event),
+        }
+    }
+
+    /// All that are kept, oldest first.
+    fn all(&self) -> Vec<Arc<Event>> {
+        let mut all: Vec<_> = self.kept.iter().chain(self.refused.iter()).collect();
+        all.sort_unstable_by_key(|(number, _)| *number);
+        all.into_iter().map(|(_, event)| event.clone()).collect()
     }
 }
 
@@ -352,15 +426,8 @@ mod tests {
 
     fn event(text: String) -> Event {
         Event {
-            id: 0,
-            time: SystemTime::UNIX_EPOCH,
-            kind: EventKind::Offline,
             bus: "line1".to_string(),
-            drive: None,
-            fault_code: None,
-            count: None,
-            text,
-            recording: None,
+            ..Event::new(EventKind::Offline, SystemTime::UNIX_EPOCH, text)
         }
     }
 
@@ -373,7 +440,8 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
                 | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged => true,
+                ParametersChanged => false,
+                Diagnosis => true,
             };
             assert_eq!(kind as usize, place);
             assert_eq!(last, place + 1 == EventKind::ALL.len());

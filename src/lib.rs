@@ -18,14 +18,16 @@
 //! In the order in which they may use each other, a later one the earlier ones; `tests/repository/layering.rs` holds them to it.
 //!
 //! - [`document`]: TOML that knows the line of every key and collects all faults.
+//! - [`files`]: files that grow or are replaced while the gateway runs.
 //! - [`codec`]: requests and replies to and from bytes: Modbus RTU ([`codec::rtu`]) and ASCII ([`codec::ascii`]), Metasys N2
 //!   ([`codec::n2`], whose objects lie in the tables of Modbus). Pure.
 //! - [`drive`]: points, units and quality; profiles, which are data (`profiles/*.toml`); points made of others
 //!   ([`drive::derive`]); which requests read them ([`drive::plan`]); how a family is known ([`drive::identify`]). Pure.
 //! - [`event`]: what happened, published once.
+//! - [`diagnosis`]: what is wrong with a line, from what is seen on it: counters and rules. Pure.
 //! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
-//! - [`history`]: the trip recorder: what was read and sent before and after a fault, kept on disk.
+//! - [`history`]: trends and counters; the trip recorder: what was read and sent before and after a fault, kept on disk.
 //! - [`parameters`]: the parameter vault: what a reading asks next, files, differences.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
@@ -55,9 +57,11 @@ pub mod codec;
 pub mod command;
 pub mod config;
 pub mod daemon;
+pub mod diagnosis;
 pub mod document;
 pub mod drive;
 pub mod event;
+pub mod files;
 pub mod history;
 pub mod line;
 pub mod north;

@@ -1,5 +1,6 @@
 //! What the north sides see: images to read from, queues to write into. No clock: time is an argument.
 
+mod exchange;
 mod placed;
 mod why;
 
@@ -17,10 +18,11 @@ use crate::command::{
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, Events, RefusedCommand};
-use crate::history::Recordings;
+use crate::history::{History, Recordings};
 use crate::parameters::Vault;
 use crate::process_image::{BusImage, DriveImage, Reading};
 
+pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::Placed;
 pub(crate) use self::why::explain;
 
@@ -53,6 +55,8 @@ pub struct Plant {
     pub recordings: Arc<Recordings>,
     /// Readings of parameters.
     pub parameters: Arc<Vault>,
+    /// The past of the drives.
+    pub history: Arc<History>,
 }
 
 /// One drive and the way to it.
@@ -217,6 +221,11 @@ impl DriveHandle {
         self.bus.queue.lock().stops(self.index)
     }
 
+    /// The login that commanded the drive last, unless another client did since.
+    pub fn commander(&self) -> Option<Arc<str>> {
+        self.bus.queue.lock().commander(self.index).cloned()
+    }
+
     /// Whether the drive of `reading` runs, and why not.
     pub fn why(&self, reading: &Reading<'_>) -> Explanation {
         explain(reading, &self.bus.image, &self.writes)
@@ -295,6 +304,7 @@ impl DriveHandle {
             pace,
             expires: now + expiry,
             ticket,
+            passed_on: None,
         };
         self.bus.queue.submit_background(request, now);
         // A ticket answers even when it is dropped; a lost sender can only mean that the process ends.

@@ -16,6 +16,7 @@ mod gateway {
     mod commands;
     mod demo;
     mod drive_access;
+    mod history;
     mod listening;
     mod living;
     mod local_socket;

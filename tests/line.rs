@@ -16,4 +16,5 @@ mod line {
     mod rig;
     mod serial;
     mod sim_peers;
+    mod slot;
 }

@@ -54,6 +54,7 @@ static PLANT: LazyLock<SharedPlant> = LazyLock::new(|| {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }))
 });
 

@@ -171,6 +171,13 @@ impl CommandRun {
         self.urgency != Urgency::Read && self.tickets.iter().any(|ticket| !own.contains(&kind(ticket)))
     }
 
+    /// Whether a tool gave it: its share of the line is that of background exchanges.
+    pub fn is_of_tool(&self) -> bool {
+        self.tickets
+            .iter()
+            .any(|ticket| ticket.origin().kind == SourceKind::Slot)
+    }
+
     /// Whether only supervision wants it.
     pub fn is_of_supervision(&self) -> bool {
         let kind = |ticket: &Ticket| ticket.origin().kind;

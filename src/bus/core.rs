@@ -15,6 +15,7 @@ use crate::codec::{Exception, Reply, Request};
 use crate::command::{Outcome, Urgency, WriteStats};
 use crate::event::Events;
 use crate::plant::BusHandle;
+use crate::process_image::Taping;
 
 /// What is to be done with the port.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,7 +72,7 @@ impl BusCore {
         BusCore {
             line: LineState::new(spec.protocol, spec.format, silence, now),
             master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
-            report: Report::new(bus.image.clone(), events, writes, now),
+            report: Report::new(bus.image.clone(), options, events, writes, now),
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
@@ -96,7 +97,7 @@ impl BusCore {
         self.bus.queue.close(Outcome::BusDown, now);
         (self.chosen, self.asked, self.tap) = (None, None, None);
         self.master.lost(now);
-        self.report.bus_down(why);
+        self.report.bus_down(why, now);
     }
 
     /// The bus ends: everybody who waits is answered. What the bus that comes after has to know; the reply to an exchange
@@ -143,18 +144,33 @@ impl BusCore {
             Ok(turn) => turn,
             Err(until) => return Some(until),
         };
-        let image = self.bus.image.drives.get(turn.drive)?;
-        let request = Request {
-            address: image.spec.address,
-            pdu: turn.pdu().clone(),
-            n2: image.spec.profile.n2,
+        let request = match self.master.stranger(&turn) {
+            Some(address) => Request::new(address, turn.pdu().clone()),
+            None => {
+                let image = self.bus.image.drives.get(turn.drive)?;
+                Request {
+                    address: image.spec.address,
+                    pdu: turn.pdu().clone(),
+                    n2: image.spec.profile.n2,
+                }
+            }
         };
         let mut frame = Vec::with_capacity(32);
         self.bus.image.spec.protocol.encode(&request, &mut frame);
         if frame.is_empty() {
             // The protocol has no such request, so that the drive has no such address.
             let refused = Ended::Reply(Reply::Exception(Exception::ADDRESS));
-            self.done(&turn, refused, now, now, Duration::ZERO, false);
+            self.done(
+                &turn,
+                TurnEnd {
+                    ended: refused,
+                    began: now,
+                    took: Duration::ZERO,
+                    mangled: false,
+                    frame: Vec::new(),
+                },
+                now,
+            );
             return None;
         }
         self.chosen = Some(Chosen {
@@ -194,7 +210,11 @@ impl BusCore {
             tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
         }
         let quiet_since = self.line.quiet_since();
-        self.tap = self.report.tap(Some(turn.drive), &request, &frame, quiet_since, now);
+        self.report
+            .diagnosis
+            .sending(now.saturating_duration_since(quiet_since));
+        let drive = Some(turn.drive).filter(|drive| *drive < self.bus.image.drives.len());
+        self.tap = self.report.tap(drive, &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
         self.line.send(request, frame.clone(), sending, late, now);
@@ -207,6 +227,7 @@ impl BusCore {
         if !self.line.is_underway() {
             if !bytes.is_empty() {
                 self.report.noise(bytes, self.line.quiet_since(), now);
+                self.report.diagnosis.figures().stray(bytes);
                 self.line.heard(bytes, now);
             }
             return;
@@ -228,17 +249,19 @@ impl BusCore {
         }
         self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
+        let frame = exchanged.transaction.take_reply_frame();
         let Exchanged { ended, began, took, .. } = exchanged;
-        self.done(&turn, ended, began, now, took, mangled);
-    }
-
-    fn done(&mut self, turn: &Turn, ended: Ended, began: Instant, now: Instant, took: Duration, mangled: bool) {
         let end = TurnEnd {
             ended,
             began,
             took,
             mangled,
+            frame,
         };
+        self.done(&turn, end, now);
+    }
+
+    fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant) {
         let news = self.master.done(turn, end, now);
         self.report_all(&news, now);
     }
@@ -246,7 +269,7 @@ impl BusCore {
     fn report_all(&mut self, news: &[News], now: Instant) {
         for one in news {
             if let Some(drive) = self.report.apply(one, now)
-                && self.bus.image.tape.is_on()
+                && self.bus.image.tape.takes(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
             }

@@ -196,6 +196,8 @@ enum Look<'r> {
     Read(u8, usize),
     /// Function, first address and count of a write of several items.
     Several(u8, u16, usize),
+    /// The function of a request that is not decoded.
+    Function(u8),
     /// Everything: the request comes back whole.
     Whole(&'r RequestPdu),
 }
@@ -206,6 +208,7 @@ impl Look<'_> {
             RequestPdu::Read { .. } | RequestPdu::ReadWrite { .. } => Look::Read(pdu.function(), pdu.reply_len()),
             RequestPdu::WriteRegisters { start, values } => Look::Several(16, *start, values.len()),
             RequestPdu::WriteCoils { start, bits } => Look::Several(15, *start, bits.len()),
+            RequestPdu::Other(_) => Look::Function(pdu.function()),
             other => Look::Whole(other),
         }
     }

@@ -53,6 +53,8 @@ pub struct Exchanged {
     pub began: Instant,
     /// When the drive knew that the request was over.
     pub sent: Instant,
+    /// When the last bytes came; the end of the request where none did.
+    pub heard_at: Instant,
     /// Time on the wire of what came.
     pub reply_time: Duration,
     /// How long the line was taken, with the silence behind.
@@ -218,6 +220,7 @@ impl LineState {
             ended,
             began,
             sent,
+            heard_at: self.quiet_since,
             reply_time,
             took: now.saturating_duration_since(began) + self.silence,
         })

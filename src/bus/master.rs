@@ -9,6 +9,7 @@ mod choose;
 mod results;
 mod shutdown;
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -18,7 +19,7 @@ use self::shutdown::Shutdown;
 use super::BusOptions;
 use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
-use super::late_replies::{FORGOTTEN_AFTER, look_alike};
+use super::late_replies::{FORGOTTEN_AFTER, LateReplies, look_alike};
 use super::line_state::Sending;
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
@@ -116,6 +117,8 @@ pub struct TurnEnd {
     pub took: Duration,
     /// What could not be believed was the drive's own reply, mangled.
     pub mangled: bool,
+    /// The frame of the reply, as the drive sent it.
+    pub frame: Vec<u8>,
 }
 
 /// What a bus that ends leaves to the one that comes after it on the same line.
@@ -145,6 +148,8 @@ pub struct Master {
     turns: Turns,
     /// The background request that has its turn, or is on the line.
     background: Option<Begun>,
+    /// Replies that may still come from addresses at which no drive is configured.
+    strangers: BTreeMap<u8, LateReplies>,
     shutdown: Option<Shutdown>,
     /// The line was spoken on before it was opened: by this bus, or by the one before it.
     successor: bool,
@@ -203,6 +208,7 @@ impl Master {
             last_answered: None,
             turns: Turns::default(),
             background: None,
+            strangers: BTreeMap::new(),
             shutdown: None,
             successor: before.quiet_until.is_some(),
             writes,
@@ -240,7 +246,12 @@ impl Master {
         };
         let leases = self.drives.iter_mut().map(close).collect();
         self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
-        let late = self.drives.iter().filter_map(|drive| drive.late.until());
+        let late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
+        let late = late.filter_map(LateReplies::until);
         let window = match self.sessions.is_empty() {
             true => FORGOTTEN_AFTER,
             false => N2_LATE * self.response_timeout,
@@ -302,7 +313,12 @@ impl Master {
         if turn.purpose == Purpose::Background {
             self.background_sent();
         }
-        self.late_before = self.n2_late.may_come(now) || self.drives.iter().any(|drive| drive.late.may_come(now));
+        let mut late = self
+            .drives
+            .iter()
+            .map(|drive| &drive.late)
+            .chain(self.strangers.values());
+        self.late_before = self.n2_late.may_come(now) || late.any(|late| late.may_come(now));
         let last = self.last_answered.as_ref();
         let n2 = !self.sessions.is_empty();
         Sending {
@@ -318,6 +334,9 @@ impl Master {
     }
 
     fn timeout_of(&self, turn: &Turn) -> Duration {
+        if let Some(timeout) = self.passed_on_timeout(turn) {
+            return timeout;
+        }
         let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
         let patient = probes <= self.retries || probes.is_multiple_of(PATIENT_PROBES);
         if self.schedule.is_online(turn.drive) || patient || turn.slot().is_some() {

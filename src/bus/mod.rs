@@ -10,6 +10,7 @@
 //!   still send ([`late_replies`]).
 //! - [`n2_session`] and [`n2_late_replies`]: what N2 needs beyond that, for the whole line.
 //! - [`listener`]: the bus without its thread on a line that another master owns: it decodes and never sends.
+//! - `line_diagnosis`: feeds [`crate::diagnosis`] and shows what comes of it.
 //! - [`news`]: what the master has to say; `report` applies it to the process image, to events and to the log.
 //!
 //! Only `line_loop` and [`prober`] do I/O and look at the clock; everything else takes time as an argument. `report` and
@@ -20,6 +21,7 @@ pub mod confirm;
 pub mod core;
 mod drive_state;
 pub mod late_replies;
+mod line_diagnosis;
 mod line_loop;
 pub mod line_state;
 pub mod listener;

@@ -123,6 +123,7 @@ fn has_form(form: Form, answer: &Answer) -> bool {
         Form::Float => matches!(digits, 8 | 10),
         // Records have five digits or thirteen.
         Form::Changes => digits == 0 || digits >= 5,
+        Form::Any => true,
     }
 }
 
@@ -142,7 +143,7 @@ impl Late {
 impl Form {
     /// Whether a late reply of this form could pass for one of that. A late identity is distinguished from a state by its value.
     fn is_like(self, wanted: Form) -> bool {
-        use Form::{Acknowledgement, Changes, Float, Identity, Integer, State};
+        use Form::{Acknowledgement, Any, Changes, Float, Identity, Integer, State};
         matches!(
             (self, wanted),
             (Acknowledgement | Changes, Acknowledgement | Changes)
@@ -152,6 +153,8 @@ impl Form {
                 | (Identity, Identity)
                 | (Integer, Integer)
                 | (Float, Float)
+                | (Any, _)
+                | (_, Any)
         )
     }
 }

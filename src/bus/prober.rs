@@ -6,6 +6,7 @@ use super::line_state::{Exchanged, LineState, Sending};
 use super::n2_late_replies::N2LateReplies;
 use super::transaction::Ended;
 use crate::codec::{LineFormat, Protocol, Reply, Request};
+use crate::diagnosis::signature::{self, Shape};
 use crate::line::{Line, Lost, Woken};
 
 /// A line with its settings.
@@ -29,11 +30,15 @@ pub struct Answer {
     pub echoed: bool,
     /// Bytes that came, beside such an echo.
     pub bytes: usize,
+    /// What they look like.
+    pub shape: Shape,
 }
 
 impl Answer {
-    fn of(exchanged: Exchanged, sent: &[u8], now: Instant) -> Answer {
+    fn of(protocol: Protocol, exchanged: Exchanged, sent: &[u8], now: Instant) -> Answer {
         let seen = exchanged.transaction.seen();
+        let answered = matches!(exchanged.ended, Ended::Reply(_));
+        let signature = signature::of(protocol, exchanged.transaction.request(), sent, seen, answered);
         let echoed = seen.starts_with(sent);
         let values = matches!(&exchanged.ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
         let turnaround = exchanged.transaction.first_byte().filter(|_| values).map(|first| {
@@ -46,6 +51,7 @@ impl Answer {
             turnaround,
             echoed,
             bytes: seen.len() - if echoed { sent.len() } else { 0 },
+            shape: signature.shape,
             ended: exchanged.ended,
         }
     }
@@ -125,11 +131,11 @@ impl Prober<'_> {
         loop {
             let now = Instant::now();
             let until = match self.state.on_time(now) {
-                Ok(exchanged) => return Ok(Answer::of(exchanged, &frame, now)),
+                Ok(exchanged) => return Ok(Answer::of(self.protocol, exchanged, &frame, now)),
                 Err(until) => until.unwrap_or_else(Instant::now),
             };
             if let Some(exchanged) = self.listen(until)? {
-                return Ok(Answer::of(exchanged, &frame, Instant::now()));
+                return Ok(Answer::of(self.protocol, exchanged, &frame, Instant::now()));
             }
         }
     }

@@ -1,9 +1,14 @@
 //! Applies what the master has to say to the process image, and turns it into events and log lines.
 
+mod changes;
+
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+use self::changes::{WATCHED, Watched};
+use super::BusOptions;
 use super::confirm::Unconfirmed;
+use super::line_diagnosis::LineDiagnosis;
 use super::line_state::Exchanged;
 use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
@@ -15,35 +20,13 @@ use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
 use crate::plant::explain;
 use crate::process_image::{
-    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, Taped, TapedRead,
+    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Taping,
 };
 
 /// The load of the line is reckoned over this time.
 const LOAD_WINDOW: Duration = Duration::from_secs(1);
 /// What was read longer ago shows neither faults nor parameters.
 const RECENT: Duration = Duration::from_secs(60);
-
-/// Points whose changes are events: what they are when the point comes and goes, in words.
-const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
-    (
-        ModelPoint::Running,
-        [(EventKind::Started, "has started"), (EventKind::Stopped, "has stopped")],
-    ),
-    (
-        ModelPoint::Warning,
-        [
-            (EventKind::Warning, "reports a warning"),
-            (EventKind::WarningEnd, "reports no warning any more"),
-        ],
-    ),
-    (
-        ModelPoint::Remote,
-        [
-            (EventKind::ControlPlace, "is controlled by the fieldbus"),
-            (EventKind::ControlPlace, "is no longer controlled by the fieldbus"),
-        ],
-    ),
-];
 
 /// Reports what a bus does.
 #[derive(Debug)]
@@ -55,25 +38,35 @@ pub(super) struct Report {
     busy: Duration,
     /// Fault code of each drive as last reported; `None` is no fault.
     faults: Vec<Option<i64>>,
-    /// What else was reported of each drive, in the order of [`WATCHED`]; `None` before the first read.
-    watched: Vec<[Option<bool>; WATCHED.len()]>,
+    /// What else was reported of each drive, in the order of [`WATCHED`].
+    watched: Vec<[Watched; WATCHED.len()]>,
     /// Drives whose own response to a silent master was looked at since they came online.
     looked_at: Vec<bool>,
+    /// What is wrong with the line.
+    pub(super) diagnosis: LineDiagnosis,
     up: bool,
     reason: String,
 }
 
 impl Report {
-    pub(super) fn new(image: Arc<BusImage>, events: Events, writes: Arc<WriteStats>, now: Instant) -> Report {
+    pub(super) fn new(
+        image: Arc<BusImage>,
+        options: &BusOptions,
+        events: Events,
+        writes: Arc<WriteStats>,
+        now: Instant,
+    ) -> Report {
         let faults = vec![None; image.drives.len()];
+        let silence = image.spec.protocol.silence(options.silence, &image.spec.format);
         Report {
+            diagnosis: LineDiagnosis::new(image.clone(), silence, options.response_timeout, now),
             image,
             events,
             writes,
             window: now,
             busy: Duration::ZERO,
             looked_at: vec![false; faults.len()],
-            watched: vec![[None; WATCHED.len()]; faults.len()],
+            watched: vec![[Watched::default(); WATCHED.len()]; faults.len()],
             faults,
             up: false,
             reason: String::new(),
@@ -139,16 +132,17 @@ impl Report {
     }
 
     fn event(&self, kind: EventKind, drive: Option<String>, fault_code: Option<i64>, text: String) {
-        self.events.publish(Event {
-            id: 0,
-            time: SystemTime::now(),
-            kind,
-            bus: self.image.spec.name.clone(),
+        self.publish(Event {
             drive,
             fault_code,
-            count: None,
-            text,
-            recording: None,
+            ..Event::new(kind, SystemTime::now(), text)
+        });
+    }
+
+    fn publish(&self, event: Event) {
+        self.events.publish(Event {
+            bus: self.image.spec.name.clone(),
+            ..event
         });
     }
 
@@ -156,14 +150,11 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return;
         };
-        self.image.tape.append(|| {
-            let read = TapedRead {
-                at,
-                table: read.table,
-                start: read.start,
-                words: words.into(),
-            };
-            Taped::Read(index, read)
+        self.image.tape.read(index, || TapedRead {
+            at,
+            table: read.table,
+            start: read.start,
+            words: words.into(),
         });
         drive.update(|snapshot: &mut Snapshot| {
             snapshot.store(read.table, read.start, words, at);
@@ -221,6 +212,7 @@ impl Report {
     }
 
     pub(super) fn bus_up(&mut self, now: Instant) {
+        self.diagnosis.figures().port_opened(now);
         self.up = true;
         self.reason.clear();
         self.window = now;
@@ -239,7 +231,8 @@ impl Report {
 
     /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
     /// for each reason, not at every try.
-    pub(super) fn bus_down(&mut self, why: &str) {
+    pub(super) fn bus_down(&mut self, why: &str, now: Instant) {
+        self.diagnosis.figures().port_lost(now);
         let news = self.up || self.reason != why;
         let drives = self.image.drives.iter().enumerate();
         let gone: Vec<usize> = drives
@@ -395,26 +388,6 @@ impl Report {
         active.is_some()
     }
 
-    /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
-    /// event; what changed while the drive was offline is one.
-    fn look_at_state(&mut self, index: usize, now: Instant) {
-        let Some(drive) = self.drive(index) else { return };
-        let reading = drive.reading(now, RECENT);
-        for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
-            let Some(Value::Bool(value)) = reading.model(point).good() else {
-                continue;
-            };
-            let Some(known) = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place)) else {
-                continue;
-            };
-            if known.replace(value).is_some_and(|before| before != value) {
-                let [comes, goes] = changes;
-                let (kind, words) = if value { comes } else { goes };
-                self.drive_event(index, kind, None, |name| format!("drive {name} {words}"));
-            }
-        }
-    }
-
     pub(super) fn fast_round(&self, cycle: Option<Duration>) {
         if let Some(cycle) = cycle {
             self.image.fast_cycles.observe(cycle);
@@ -449,7 +422,7 @@ impl Report {
         quiet_since: Instant,
         began: Instant,
     ) -> Option<Tap> {
-        if !self.image.trace.wanted() && !self.image.tape.is_on() {
+        if !self.image.trace.wanted() && !self.image.tape.takes(Taping::Everything) {
             return None;
         }
         let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);
@@ -486,17 +459,11 @@ impl Report {
         let Some(drive) = self.image.drives.get(index) else {
             return false;
         };
-        self.image.tape.append(|| {
-            let words = words.into();
-            Taped::Read(
-                index,
-                TapedRead {
-                    at,
-                    table,
-                    start,
-                    words,
-                },
-            )
+        self.image.tape.read(index, || TapedRead {
+            at,
+            table,
+            start,
+            words: words.into(),
         });
         let mut fast = false;
         drive.update(|snapshot| fast = snapshot.hear(table, start, words, at));
@@ -519,19 +486,31 @@ impl Report {
             return;
         };
         drive.count(counted(&exchanged.ended));
+        let mut turnaround = None;
         if let (Ended::Reply(reply), Some(first)) = (&exchanged.ended, transaction.first_byte()) {
             // Where the driver hands a reply over whole, its first byte came a reply's time earlier.
             let by_first = first.saturating_duration_since(exchanged.sent);
             let by_last = now.saturating_duration_since(exchanged.sent);
             let by_last = by_last.saturating_sub(exchanged.reply_time);
             if !matches!(reply, Reply::Exception(_)) {
-                drive.set_turnaround(by_first.min(by_last));
+                let measured = by_first.min(by_last);
+                drive.set_turnaround(measured);
+                turnaround = Some(measured);
             }
         }
+        self.diagnosis.exchanged(index, exchanged, turnaround, now);
     }
 
-    /// Reckons the load once a second.
+    /// Asks the diagnosis every 5 s, and reckons the load once a second.
     pub(super) fn tick(&mut self, now: Instant) {
+        for (drive, text) in self.diagnosis.tick(now) {
+            let drive = drive
+                .and_then(|drive| self.drive(drive))
+                .map(|drive| drive.spec.name.clone());
+            let about = drive.as_ref().map_or(String::new(), |drive| format!(", drive {drive}"));
+            let text = format!("line of bus {}{about}: {text}", self.image.spec.name);
+            self.event(EventKind::Diagnosis, drive, None, text);
+        }
         let window = now.saturating_duration_since(self.window);
         if window < LOAD_WINDOW {
             return;

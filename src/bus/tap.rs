@@ -9,7 +9,7 @@ use std::time::{Duration, Instant, SystemTime};
 use super::transaction::Ended;
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
-use crate::process_image::{BusImage, Direction, FrameRecord, Taped, TapedFrame, Verdict};
+use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
 
 /// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
 const KEPT: usize = 2048;
@@ -99,7 +99,7 @@ impl Tap {
     }
 
     fn tape(&self, bytes: &[u8], verdict: Verdict, at: Instant) {
-        self.image.tape.append(|| frame(self.index, bytes, verdict, at));
+        self.image.tape.frame(|| frame(self.index, bytes, verdict, at));
     }
 
     fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {
@@ -115,13 +115,13 @@ impl Tap {
     }
 }
 
-fn frame(drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) -> Taped {
-    Taped::Frame(TapedFrame {
+fn frame(drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) -> TapedFrame {
+    TapedFrame {
         at,
         drive,
         verdict,
         bytes: bytes.into(),
-    })
+    }
 }
 
 fn taped(ended: &Ended) -> Verdict {
@@ -137,7 +137,7 @@ fn taped(ended: &Ended) -> Verdict {
 pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
     image
         .tape
-        .append(|| frame(None, bytes.get(..KEPT).unwrap_or(bytes), Verdict::Foreign, now));
+        .frame(|| frame(None, bytes.get(..KEPT).unwrap_or(bytes), Verdict::Foreign, now));
     image.trace.publish(|| {
         let mut hearing = Hearing::new(image.spec.format, quiet_since);
         hearing.add(bytes, now);

@@ -18,6 +18,9 @@ const MOST_BYTES: usize = 1024;
 /// Silence, in characters, behind garbage after which no more of it is expected.
 const GARBAGE_GAP: u32 = 4;
 
+/// Silence behind a reply whose length nothing shows, after which it is whole: longer than a USB adapter holds bytes back.
+const WHOLE_AFTER: Duration = Duration::from_millis(20);
+
 /// Why the answer of an exchange is not believed that may be a late one to an earlier request.
 pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
@@ -53,6 +56,10 @@ pub struct Transaction {
     reply_time: Duration,
     /// What came cannot be believed; until when the rest is waited for.
     garbage: Option<(&'static str, Instant)>,
+    /// What came may be the whole reply: until when more of it is waited for.
+    whole_at: Option<Instant>,
+    /// The frame of the reply, as it came.
+    reply_frame: Vec<u8>,
     first_byte: Option<Instant>,
     foreign: u32,
     echo: bool,
@@ -89,6 +96,8 @@ impl Transaction {
             deadline: end_of_transmission + response_timeout + reply_time,
             reply_time,
             garbage: None,
+            whole_at: None,
+            reply_frame: Vec::new(),
             first_byte: None,
             foreign: 0,
             echo,
@@ -143,6 +152,11 @@ impl Transaction {
         self.deadline
     }
 
+    /// The frame of the request.
+    pub fn frame(&self) -> &[u8] {
+        &self.frame
+    }
+
     /// The request.
     pub fn request(&self) -> &Request {
         &self.request
@@ -153,6 +167,7 @@ impl Transaction {
         self.first_byte.get_or_insert(now);
         self.behind_doubted |= self.doubted && !bytes.is_empty();
         self.received.extend_from_slice(bytes);
+        self.whole_at = None;
         let room = MOST_BYTES.saturating_sub(self.seen.len());
         self.seen.extend(bytes.iter().take(room));
         if self.received.len() > MOST_BYTES {
@@ -174,7 +189,13 @@ impl Transaction {
                 Taken::Doubtful => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
             }
             match self.protocol.decode(&self.request, &self.received) {
-                Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => return self.replied(used, reply),
+                Decoded::Reply { .. } if self.may_go_on() => {
+                    self.whole_at = Some(now + WHOLE_AFTER);
+                    return self.on_time(now);
+                }
+                Decoded::Reply { used, reply } if !self.is_too_early(&reply, now) => {
+                    return self.replied(0, used, reply);
+                }
                 Decoded::Reply { used, .. } | Decoded::Foreign { used } => {
                     self.foreign += 1;
                     self.received.drain(..used.min(self.received.len()));
@@ -216,9 +237,28 @@ impl Transaction {
         early && !matches!(reply, Reply::Exception(_))
     }
 
-    fn replied(&mut self, used: usize, reply: Reply) -> Step {
-        self.received.drain(..used.min(self.received.len()));
+    fn replied(&mut self, at: usize, used: usize, reply: Reply) -> Step {
+        let taken = self.received.drain(..(at + used).min(self.received.len()));
+        self.reply_frame = taken.skip(at).collect();
         Step::Done(Ended::Reply(reply))
+    }
+
+    /// Whether more may belong to a reply that could be whole.
+    fn may_go_on(&self) -> bool {
+        let regular = self.received.get(1).is_some_and(|function| function & 0x80 == 0);
+        self.protocol == Protocol::ModbusRtu && matches!(self.request.pdu, RequestPdu::Other(_)) && regular
+    }
+
+    /// The frame of the reply, as the drive sent it.
+    pub fn take_reply_frame(&mut self) -> Vec<u8> {
+        let mut frame = std::mem::take(&mut self.reply_frame);
+        let before = match self.protocol {
+            // Blanks and glitches of a line that changes direction.
+            Protocol::N2 => frame.iter().position(u8::is_ascii_graphic).unwrap_or(0),
+            protocol => protocol.noise(&frame),
+        };
+        frame.drain(..before.min(frame.len()));
+        frame
     }
 
     /// The reply that stands whole behind garbage.
@@ -243,7 +283,7 @@ impl Transaction {
             }
         })?;
         self.foreign += 1;
-        Some(self.replied(at + used, reply))
+        Some(self.replied(at, used, reply))
     }
 
     /// How long characters that belong to the garbage may still come.
@@ -258,6 +298,15 @@ impl Transaction {
         let until = self
             .garbage
             .map_or(self.deadline, |(_, until)| until.min(self.deadline));
+        if let Some(at) = self.whole_at.map(|at| at.min(until))
+            && let Decoded::Reply { used, reply } = self.protocol.decode(&self.request, &self.received)
+        {
+            return if now < at {
+                Step::Wait(at)
+            } else {
+                self.replied(0, used, reply)
+            };
+        }
         if now < until {
             return Step::Wait(until);
         }
@@ -315,10 +364,10 @@ impl Transaction {
 
 /// Whether an echo of the request cannot pass for its reply.
 pub fn is_unlike_its_reply(pdu: &RequestPdu) -> bool {
-    use RequestPdu::{Diagnostics, MaskWrite, WriteCoil, WriteRegister};
+    use RequestPdu::{Diagnostics, MaskWrite, Other, WriteCoil, WriteRegister};
     !matches!(
         pdu,
-        WriteCoil { .. } | WriteRegister { .. } | Diagnostics { .. } | MaskWrite { .. }
+        WriteCoil { .. } | WriteRegister { .. } | Diagnostics { .. } | MaskWrite { .. } | Other(_)
     )
 }
 

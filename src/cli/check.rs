@@ -16,6 +16,8 @@ use crate::document::Problem;
 use crate::drive::raw_writes;
 use crate::history::RecorderOptions;
 use crate::history::budget::Budget;
+use crate::history::{line, trend};
+use crate::north::slot::Slot;
 use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
@@ -61,6 +63,8 @@ struct Bus<'a> {
     shutdown_worst_ms: f64,
     /// Memory that the recorder takes at most.
     recorder_bytes: usize,
+    /// Memory that the trends of its drives and the last hour of the line take at most.
+    trend_bytes: usize,
     /// Addresses of drives that may be commanded which `raw_writes` excludes.
     raw_writes_refused: Vec<Refused<'a>>,
     requests: Vec<Request<'a>>,
@@ -137,6 +141,7 @@ fn bus_report<'a>(bus: &'a BusSettings, recorder: &RecorderOptions) -> Bus<'a> {
         shutdown_ms: milliseconds(shutdown.answered),
         shutdown_worst_ms: milliseconds(shutdown.unanswered),
         recorder_bytes: Budget::of(&bus.spec, &bus.drives, recorder).total(),
+        trend_bytes: trend_bytes(bus).0,
         raw_writes_refused: commanded(bus).flat_map(refused).collect(),
         requests: prediction.requests.iter().map(request).collect(),
     }
@@ -264,7 +269,26 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
     (3..6).for_each(|column| table.align_right(column));
     text += &report::lines(&table);
     text.push('\n');
-    text + &summary(bus, &prediction) + &memory(bus, &settings.recordings) + &raw_writes(bus, settings)
+    text + &summary(bus, &prediction)
+        + &memory(bus, &settings.recordings)
+        + &slots(bus, settings)
+        + &raw_writes(bus, settings)
+}
+
+/// Where tools reach the line, one line a slot.
+fn slots(bus: &BusSettings, settings: &Settings) -> String {
+    let all = settings.slots.iter().flat_map(|slots| &slots.slots);
+    let of_bus = all.filter(|slot| slot.bus == bus.spec.name);
+    let line = |slot: &Slot| {
+        let ways = [
+            slot.listen.map(|address| format!("{address} (bare frames)")),
+            slot.rfc2217.map(|address| format!("{address} (RFC 2217)")),
+            slot.pty.as_ref().map(|path| path.display().to_string()),
+        ];
+        let ways: Vec<String> = ways.into_iter().flatten().collect();
+        format!("  tool slot   {}: {}\n", ways.join(", "), slot.access.meaning())
+    };
+    of_bus.map(line).collect()
 }
 
 fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
@@ -286,20 +310,37 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         + &shutdown(bus)
 }
 
-/// Memory of the recorder; empty where it is off.
+/// Memory of trends and the last hour of a line, bytes: all of it, and of the drive with most points.
+fn trend_bytes(bus: &BusSettings) -> (usize, usize) {
+    let drives = bus
+        .drives
+        .iter()
+        .map(|drive| trend::bytes_of(&drive.profile) + line::BYTES.1);
+    let most = drives.clone().max().unwrap_or(0);
+    (drives.sum::<usize>() + line::BYTES.0, most)
+}
+
+/// Memory of trends and of the recorder, which may be off.
 fn memory(bus: &BusSettings, recorder: &RecorderOptions) -> String {
+    let kilobytes = |bytes: usize| bytes.div_ceil(1000);
+    let (all, drive) = trend_bytes(bus);
+    let trends = format!(
+        "  trends      {} kB of memory at most: {} kB a drive\n",
+        kilobytes(all),
+        kilobytes(drive)
+    );
     let budget = Budget::of(&bus.spec, &bus.drives, recorder);
     if budget.total() == 0 {
-        return String::new();
+        return trends;
     }
-    let kilobytes = |bytes: usize| bytes.div_ceil(1000);
     let drive = budget.samples.iter().max().map_or(0, |samples| samples + budget.notes);
-    format!(
-        "  recorder    {} kB of memory at most: {} kB a drive, {} kB for the line\n",
-        kilobytes(budget.total()),
-        kilobytes(drive),
-        kilobytes(budget.frames)
-    )
+    trends
+        + &format!(
+            "  recorder    {} kB of memory at most: {} kB a drive, {} kB for the line\n",
+            kilobytes(budget.total()),
+            kilobytes(drive),
+            kilobytes(budget.frames)
+        )
 }
 
 /// Duration of the stops at shutdown; empty where there are none.

@@ -311,5 +311,10 @@ fn configuration(place: &Place, sides: &Sides) -> String {
     }
     text += &format!("\n[modbus_tcp]\nlisten = [\"{modbus}\"]\nwrite = [\"127.0.0.0/8\"]\n");
     text += &format!("\n[mqtt]\nurl = \"mqtt://{mqtt}\"\nclient_id = \"drivegate-demo\"\ncommands = true\n");
-    text + &format!("\n[http]\nlisten = \"{http}\"\n")
+    text += &format!("\n[http]\nlisten = \"{http}\"\n");
+    text + &match place.written.as_ref().and_then(Written::users) {
+        Some(users) => format!("commands = true\nusers_file = {:?}\n", users.display().to_string()),
+        None => "# Operating from the page: `drivegate user add --file users alice` here, then start the demo anew.\n"
+            .to_string(),
+    }
 }

@@ -147,6 +147,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     })
 }
 

@@ -10,7 +10,9 @@ mod audit;
 mod backup;
 mod check;
 mod client;
+mod credentials_file;
 mod demo;
+mod diagnose;
 mod drive_access;
 mod health;
 mod listen;
@@ -35,6 +37,7 @@ mod simulate;
 mod token;
 mod trace;
 mod trial;
+mod user;
 mod watch;
 mod why;
 mod write;
@@ -106,6 +109,7 @@ commands! {
     Read => read,
     Write => write,
     Why => why,
+    Diagnose => diagnose,
     Record => record,
     Recordings => recordings,
     Params => params,
@@ -117,6 +121,7 @@ commands! {
     Map => map,
     Audit => audit,
     Token => token,
+    User => user,
     Backup => backup,
     Restore => restore,
     Schema => schema,

@@ -8,8 +8,9 @@ use super::drive_access::target;
 use super::{DEFAULT_CONFIG, EXIT_CONFIG, EXIT_FAILED, EXIT_USAGE, report};
 use crate::config::{Settings, environment};
 use crate::drive::parameters::RawValue;
+use crate::files;
 use crate::north::local::protocol::ParamsOutcome;
-use crate::parameters::{Names, ParameterFile, Store, differences, read as read_file, write_whole};
+use crate::parameters::{Names, ParameterFile, Store, differences, read as read_file};
 
 /// Reads, compares and shows the parameters of drives.
 ///
@@ -116,7 +117,7 @@ fn read_drive(config: &Path, args: &ReadArgs) -> Result<ExitCode, ExitCode> {
     let Some(output) = &args.output else {
         return Ok(report::print(&file.text()));
     };
-    write_whole(output, &file.text()).map_err(|error| {
+    files::replace(output, file.text().as_bytes()).map_err(|error| {
         failed(&format!(
             "cannot write the file: {error}; {}; name another place",
             output.display()

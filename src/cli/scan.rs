@@ -5,6 +5,7 @@ mod progress;
 mod search;
 mod settings;
 mod snippet;
+pub(super) mod verdict;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -107,19 +108,10 @@ fn finish(args: &Args, search: &Search<'_>, outcome: Result<(), String>) -> Exit
         report::error(&message);
         return ExitCode::from(EXIT_FAILED);
     }
-    if let Some((setting, address)) = search.heard.garbage.first() {
-        report::note(&format!(
-            "received invalid frames {} times, first at {setting}, address {address}: the line may have another baud, \
-             format or protocol, or two drives the same address",
-            search.heard.garbage.len(),
-        ));
-    }
     if search.found.is_empty() {
-        report::error(&format!(
-            "no drive answered; {}; check power, wiring (swap - and +) and termination, and try --baud all \
-             --format all",
-            args.port
-        ));
+        report::error(&verdict::nobody_answers(&search.heard, &args.port));
+    } else if let Some(told) = verdict::beside_answers(&search.heard) {
+        report::note(&told);
     }
     printed
 }

@@ -2,7 +2,6 @@
 
 mod dialog;
 mod serving;
-mod verdict;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -14,7 +13,7 @@ use tokio::signal::unix::{SignalKind, signal};
 use tokio_util::sync::CancellationToken;
 
 use self::dialog::{check_new, choose_port};
-use super::scan::{self, Extent, Options, Search, parse_port};
+use super::scan::{self, Extent, Options, Search, parse_port, verdict};
 use super::{EXIT_FAILED, EXIT_USAGE, report};
 
 /// How long the line is listened to before anything is sent.

@@ -78,11 +78,19 @@ pub fn request(request: &RequestPdu) -> String {
             format!("device identification: code {code} from object {object}")
         }
         RequestPdu::N2(_) => n2_words::command(request).unwrap_or_default(),
+        RequestPdu::Other(pdu) => format!(
+            "function {}, {} of data",
+            request.function(),
+            counted(pdu.len().saturating_sub(1), "byte")
+        ),
     }
 }
 
 /// A request as that protocol's users know it: `read AI 2 value` and not `read input 2..3` on N2.
 pub fn request_on(protocol: Protocol, pdu: &RequestPdu) -> String {
+    if let (Protocol::N2, RequestPdu::Other(digits)) = (protocol, pdu) {
+        return format!("command {}", text(digits));
+    }
     let own = (protocol == Protocol::N2).then(|| n2_words::command(pdu)).flatten();
     own.unwrap_or_else(|| request(pdu))
 }
@@ -132,6 +140,7 @@ fn answer(reply: &Reply) -> String {
         Reply::Identified(device) => format!("device type {device:02X}h"),
         Reply::Changes(digits) if digits.is_empty() => "nothing new".to_string(),
         Reply::Changes(digits) => format!("changes: {}", counted(digits.len(), "digit")),
+        Reply::Other(pdu) => counted(pdu.len(), "byte"),
         Reply::Exception(code) => code.to_string(),
     }
 }

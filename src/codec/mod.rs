@@ -6,6 +6,7 @@
 pub mod ascii;
 pub(crate) mod checksum;
 pub mod describe;
+pub(crate) mod frames;
 pub mod modbus;
 pub mod n2;
 pub mod rtu;
@@ -119,6 +120,15 @@ impl Protocol {
             Protocol::ModbusRtu => rtu::encode_request(request, out),
             Protocol::ModbusAscii => ascii::encode_request(request, out),
             Protocol::N2 => n2::encode_request(request, out),
+        }
+    }
+
+    /// A frame of that PDU, appended to `out`; nothing in N2, whose frames hold none.
+    pub fn encode_frame(self, address: u8, pdu: &[u8], out: &mut Vec<u8>) {
+        match self {
+            Protocol::ModbusRtu => rtu::encode_frame(address, pdu, out),
+            Protocol::ModbusAscii => ascii::encode_frame(address, pdu, out),
+            Protocol::N2 => {}
         }
     }
 

@@ -131,8 +131,10 @@ fn switch(address: u16, on: bool) -> Option<Command> {
 
 /// Appends the request's frame to `out`; nothing for a request that means no object.
 pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
-    if let Some(command) = command_of(&request.pdu) {
-        command.encode(request.address, request.n2.region_width, out);
+    match (&request.pdu, command_of(&request.pdu)) {
+        (RequestPdu::Other(text), _) => command::encode_text(request.address, text, out),
+        (_, Some(command)) => command.encode(request.address, request.n2.region_width, out),
+        (_, None) => {}
     }
 }
 
@@ -151,10 +153,15 @@ pub enum Form {
     Changes,
     /// Nothing.
     Acknowledgement,
+    /// Whatever a request that is not decoded is answered with.
+    Any,
 }
 
 /// The form of the regular reply to a request; none of one that means no object.
 pub fn form(pdu: &RequestPdu) -> Option<Form> {
+    if matches!(pdu, RequestPdu::Other(_)) {
+        return Some(Form::Any);
+    }
     Some(match command_of(pdu)? {
         Command::Read { object, .. } => match object.region {
             Region::Bi | Region::Bo => Form::State,
@@ -214,6 +221,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
         // The drive saw a wrong checksum: the line, not the drive, refuses.
         Answer::Nak(command::CHECKSUM) => return Err("the drive saw a wrong checksum (N02)"),
         Answer::Nak(code) => return Ok(Reply::Exception(Exception::n2(code))),
+        Answer::Ack | Answer::Data(_) if expected == Form::Any => return Ok(Reply::Other(line.to_vec())),
         Answer::Data(digits) if expected == Form::Changes => return Ok(Reply::Changes(digits)),
         Answer::Data(digits) => bytes_of(&digits).ok_or("an odd number of digits")?,
         Answer::Ack => Vec::new(),
@@ -233,7 +241,7 @@ fn reply_in(request: &Request, line: &[u8]) -> Result<Reply, &'static str> {
         (Form::State, _) => Err("the reply has not the length of a status byte"),
         (Form::Integer, _) => Err("the reply has not the length of an integer"),
         (Form::Float, _) => Err("the reply has not the length of a float"),
-        (Form::Changes, _) => Err("the reply is no report of changes"),
+        (Form::Changes | Form::Any, _) => Err("the reply is no report of changes"),
     }
 }
 
@@ -258,6 +266,9 @@ fn bytes_of(digits: &[u8]) -> Option<Vec<u8>> {
 
 /// Characters of the request's frame, with a region of two characters.
 pub fn request_chars(request: &RequestPdu) -> usize {
+    if let RequestPdu::Other(text) = request {
+        return framed(2 + text.len());
+    }
     let mut frame = Vec::with_capacity(24);
     if let Some(command) = command_of(request) {
         command.encode(1, RegionWidth::Two, &mut frame);
@@ -270,7 +281,7 @@ pub fn reply_chars(request: &RequestPdu) -> usize {
     framed(match form(request) {
         Some(Form::Float) => 10,
         Some(Form::Integer) => 6,
-        Some(Form::Changes) => command::LONGEST_REPORT,
+        Some(Form::Changes | Form::Any) => command::LONGEST_REPORT,
         Some(Form::State | Form::Identity) => 2,
         Some(Form::Acknowledgement) | None => 0,
     })
@@ -282,7 +293,7 @@ pub fn least_reply_chars(request: &RequestPdu) -> usize {
         Some(Form::Float) => 8,
         Some(Form::Integer) => 4,
         Some(Form::State | Form::Identity) => 2,
-        Some(Form::Changes | Form::Acknowledgement) | None => 0,
+        Some(Form::Changes | Form::Acknowledgement | Form::Any) | None => 0,
     })
 }
 

@@ -40,8 +40,20 @@ pub fn open_frame(frame: &[u8]) -> Option<(u8, &[u8])> {
 /// The end of a reply is known from its own first bytes, so no silence has to be waited for: the
 /// regular reply has a fixed length, an exception five characters, 43/14 counts its objects.
 /// Bytes that begin another drive's or another function's frame are measured the same way and
-/// dropped when their CRC is right. A length that no frame has is refused as soon as it is announced.
+/// dropped when their CRC is right. A length that no frame has is refused as soon as it is announced. Of a function that is not
+/// decoded no length is known: all that came is its reply as soon as the CRC is right, and silence shows whether it was all.
 pub fn decode_reply(request: &Request, bytes: &[u8]) -> Decoded {
+    let begins_it = || bytes.starts_with(&[request.address, request.pdu.function()]);
+    if matches!(request.pdu, RequestPdu::Other(_)) && begins_it() {
+        return match open_frame(bytes) {
+            Some((_, pdu)) => Decoded::Reply {
+                used: bytes.len(),
+                reply: Reply::Other(pdu.to_vec()),
+            },
+            None if bytes.len() < LONGEST => Decoded::Incomplete,
+            None => Decoded::Corrupt("no end of a frame in the characters of the longest one"),
+        };
+    }
     let Some(len) = frame_len(request, bytes) else {
         return Decoded::Incomplete;
     };
@@ -101,6 +113,11 @@ fn device_identification_len(bytes: &[u8]) -> Option<usize> {
         at += 2 + usize::from(*bytes.get(at + 1)?);
     }
     Some(at + 2)
+}
+
+/// Whether requests of that function are decoded here, so that their length is known.
+pub fn is_known(function: u8) -> bool {
+    matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43)
 }
 
 /// Splits what a slave or a listener received into the first frame of a master and the rest.

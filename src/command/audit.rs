@@ -86,11 +86,13 @@ fn bare_or_null<S: Serializer>(value: &Option<Value>, serializer: S) -> Result<S
     crate::process_image::value_or_null(*value).serialize(serializer)
 }
 
-fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
+/// Serializes a time as milliseconds with three decimals.
+pub(crate) fn milliseconds<S: Serializer>(time: &Duration, serializer: S) -> Result<S::Ok, S::Error> {
     serializer.serialize_f64((time.as_secs_f64() * 1e6).round() / 1e3)
 }
 
-fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
+/// The same, `null` without a time.
+pub(crate) fn milliseconds_or_null<S: Serializer>(time: &Option<Duration>, serializer: S) -> Result<S::Ok, S::Error> {
     match time {
         Some(time) => milliseconds(time, serializer),
         None => serializer.serialize_none(),
@@ -160,6 +162,17 @@ pub struct Audit {
     sender: OnceLock<broadcast::Sender<Arc<AuditRecord>>>,
 }
 
+/// An order to run or to stop that was sent to a drive.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RunOrdered {
+    /// Run, or stop.
+    pub run: bool,
+    /// Who gave it: source and client.
+    pub who: String,
+    /// When its answer came, or was given up.
+    pub at: Instant,
+}
+
 /// Records that a listener may be behind.
 const IN_FLIGHT: usize = 4096;
 
@@ -171,6 +184,8 @@ struct Records {
     /// By drive the last command that concerns its run command, or that reset its fault, and when it ended. As many as
     /// there are drives.
     runs: HashMap<String, (Arc<AuditRecord>, Instant)>,
+    /// By drive the last order to run or to stop that was sent. As many as there are drives.
+    ordered: HashMap<String, RunOrdered>,
     refusals: RefusalLimit<AuditRecord>,
 }
 
@@ -181,6 +196,7 @@ impl Default for Records {
             sent: FairRing::new(AUDIT_KEPT),
             unsent: FairRing::new(UNSENT_KEPT),
             runs: HashMap::new(),
+            ordered: HashMap::new(),
             refusals: RefusalLimit::default(),
         }
     }
@@ -256,6 +272,16 @@ impl Audit {
         if let Some(file) = &*self.file.load() {
             file.push(record, sent);
         }
+    }
+
+    /// Notes an order that was sent to a drive, before it is known whether it shows its effect.
+    pub(super) fn ordered(&self, drive: &str, ordered: RunOrdered) {
+        self.records().ordered.insert(drive.to_string(), ordered);
+    }
+
+    /// The last order to run or to stop that was sent to a drive.
+    pub fn last_ordered(&self, drive: &str) -> Option<RunOrdered> {
+        self.records().ordered.get(drive).cloned()
     }
 
     /// The last command to that drive that concerns its run command or was sent to reset its fault, and when it ended.

@@ -8,6 +8,8 @@
 use std::collections::VecDeque;
 use std::time::Instant;
 
+use tokio::sync::oneshot;
+
 use super::{Outcome, Ticket};
 use crate::codec::RequestPdu;
 
@@ -39,10 +41,13 @@ impl Pace {
     }
 }
 
+/// The index of no drive: that of a request to an address of the line at which none is configured.
+pub const NO_DRIVE: usize = usize::MAX;
+
 /// A request of the lowest rank: one exchange with one drive.
 #[derive(Debug)]
 pub struct BackgroundRequest {
-    /// Index of the drive on its bus.
+    /// Index of the drive on its bus, or [`NO_DRIVE`].
     pub drive: usize,
     /// What is asked. Whoever submits a write has checked that it is allowed.
     pub pdu: RequestPdu,
@@ -52,9 +57,38 @@ pub struct BackgroundRequest {
     pub expires: Instant,
     /// Answers it.
     pub ticket: Ticket,
+    /// What a request has beside that which is passed on for somebody else; none of one of the gateway itself.
+    pub passed_on: Option<PassedOn>,
+}
+
+/// A request that is passed on for a tool, which gets what the drive said.
+#[derive(Debug)]
+pub struct PassedOn {
+    /// The address on the line; 0 is the broadcast, except on N2.
+    pub address: u8,
+    /// It may change anything in whoever hears it.
+    pub may_write: bool,
+    /// Where the frame of the reply goes, as the drive sent it.
+    pub frame: oneshot::Sender<Vec<u8>>,
 }
 
 impl BackgroundRequest {
+    /// Whether the tool for which it is passed on has gone, or asked for something else.
+    pub fn is_unwanted(&self) -> bool {
+        self.passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.frame.is_closed())
+    }
+
+    /// As [`BackgroundRequest::answer`], with the frame of the reply.
+    pub fn answer_with(mut self, outcome: Outcome, frame: Vec<u8>, now: Instant) {
+        if let Some(passed_on) = self.passed_on.take() {
+            // The tool may have gone.
+            let _ = passed_on.frame.send(frame);
+        }
+        self.answer(outcome, now);
+    }
+
     /// Answers whoever waits for it.
     pub fn answer(self, outcome: Outcome, now: Instant) {
         self.ticket.answer(outcome, now);

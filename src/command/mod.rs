@@ -14,9 +14,11 @@ mod queue;
 mod ticket;
 
 pub use admit::{Admitted, admit, sets_twice, written};
-pub(crate) use audit::SENT;
-pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, chain};
-pub use background::{BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, Pace};
+pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
+pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
+pub use background::{
+    BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
+};
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
@@ -42,6 +44,8 @@ pub enum SourceKind {
     Mqtt,
     /// Command of a Sparkplug host.
     Sparkplug,
+    /// HTTP: the status page, or a program.
+    Http,
     /// Lease that ran out.
     Supervision,
     /// The gateway stops.
@@ -54,20 +58,24 @@ pub enum SourceKind {
     OtherMaster,
     /// What the gateway does every so often. It reads only.
     Schedule,
+    /// A tool at a slot of the bus.
+    Slot,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 9] = [
+    pub const ALL: [SourceKind; 11] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
+        SourceKind::Http,
         SourceKind::Supervision,
         SourceKind::Shutdown,
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
         SourceKind::OtherMaster,
         SourceKind::Schedule,
+        SourceKind::Slot,
     ];
 
     /// The label of metrics and audit lines.
@@ -76,13 +84,23 @@ impl SourceKind {
             SourceKind::ModbusTcp => "modbus_tcp",
             SourceKind::Mqtt => "mqtt",
             SourceKind::Sparkplug => "sparkplug",
+            SourceKind::Http => "http",
             SourceKind::Supervision => "supervision",
             SourceKind::Shutdown => "shutdown",
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
             SourceKind::OtherMaster => "other_master",
             SourceKind::Schedule => "schedule",
+            SourceKind::Slot => "slot",
         }
+    }
+
+    /// Whether a client commands; the gateway itself is none.
+    pub fn is_client(self) -> bool {
+        !matches!(
+            self,
+            SourceKind::Supervision | SourceKind::Shutdown | SourceKind::Schedule
+        )
     }
 }
 
@@ -103,6 +121,7 @@ pub struct Origin {
     /// Address, topic or certificate name, as the audit shows it.
     pub who: String,
     client: Arc<str>,
+    login: Option<Arc<str>>,
 }
 
 impl Origin {
@@ -110,14 +129,30 @@ impl Origin {
     pub fn new(kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
         let client = format!("{} {who}", kind.name()).into();
-        Origin { kind, who, client }
+        Origin::of(client, kind, who)
     }
 
     /// One that is `client` in all that is shared among clients: turns and places in the queue, records of the audit. A
     /// client gains nothing there by more connections or topics, as long as they all name the same `client`.
     pub fn of(client: Arc<str>, kind: SourceKind, who: impl Into<String>) -> Origin {
         let who = who.into();
-        Origin { kind, who, client }
+        Origin {
+            kind,
+            who,
+            client,
+            login: None,
+        }
+    }
+
+    /// The same with a login, which may renew the lease of the drive until another client commands it.
+    pub fn with_login(mut self, login: Arc<str>) -> Origin {
+        self.login = Some(login);
+        self
+    }
+
+    /// The login, if the client has one.
+    pub fn login(&self) -> Option<&Arc<str>> {
+        self.login.as_ref()
     }
 
     /// The client, whatever connection or topic it uses.

@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
-use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Instant;
 
 use rustix::event::{EventfdFlags, eventfd};
@@ -36,6 +36,9 @@ pub struct Pending {
     numbered: u64,
     /// Stops taken in so far, by drive.
     stops: BTreeMap<usize, u64>,
+    /// The login whose command was the last that a client gave, by drive; without an entry there was none, or its client
+    /// has no login.
+    commanders: BTreeMap<usize, Arc<str>>,
     /// The stops that the gateway wants before it ends, until the bus takes note of it.
     stopping: Option<Stopping>,
 }
@@ -88,8 +91,12 @@ impl Pending {
             self.push_stop(command, now);
             return;
         }
-        if let Some(older) = self.replaced_by(&command) {
-            std::mem::replace(older, command).answer(&Outcome::Replaced, now);
+        if let Some(index) = self.replaced_by(&command)
+            && let Some(older) = self.waiting.remove(index)
+        {
+            older.answer(&Outcome::Replaced, now);
+            self.note_commander(&command);
+            self.waiting.insert(index, command);
             return;
         }
         let others = self.waiting.iter().filter(|c| c.urgency != Urgency::Stop).count();
@@ -102,13 +109,36 @@ impl Pending {
                 }
             }
         }
+        self.note_commander(&command);
         self.waiting.push_back(command);
+    }
+
+    /// Keeps who gave a command that is taken in.
+    fn note_commander(&mut self, command: &Command) {
+        let origin = command.ticket.origin();
+        if command.urgency != Urgency::Read && origin.kind.is_client() {
+            self.set_commander(command.drive, origin.login().cloned());
+        }
+    }
+
+    /// The login that commanded a drive last, unless another client did since.
+    pub fn commander(&self, drive: usize) -> Option<&Arc<str>> {
+        self.commanders.get(&drive)
+    }
+
+    /// Keeps who commanded a drive last, which a bus that starts anew knows from the one before.
+    pub fn set_commander(&mut self, drive: usize, login: Option<Arc<str>>) {
+        match login {
+            Some(login) => self.commanders.insert(drive, login),
+            None => self.commanders.remove(&drive),
+        };
     }
 
     /// Of each drive one stop waits that does nothing else, and one that does. Later ones join theirs if they ask for the
     /// same, and are answered with it; of two that do different things besides the newer one is sent.
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
+        self.note_commander(&stop);
         *self.stops.entry(drive).or_default() += 1;
         self.remove(now, &Outcome::Purged, |c| {
             c.drive == drive && c.urgency == Urgency::Command
@@ -132,10 +162,9 @@ impl Pending {
     }
 
     /// The queued reference whose place a newer one takes.
-    fn replaced_by(&mut self, command: &Command) -> Option<&mut Command> {
-        let same =
-            |c: &&mut Command| c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order);
-        self.waiting.iter_mut().filter(|_| command.reference_only).find(same)
+    fn replaced_by(&self, command: &Command) -> Option<usize> {
+        let same = |c: &Command| c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order);
+        command.reference_only.then(|| self.waiting.iter().position(same))?
     }
 
     /// Whose place a command takes in a full queue: the youngest of the client that has the most, or else, within its own

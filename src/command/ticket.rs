@@ -6,7 +6,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::oneshot;
 
-use super::audit::{Audit, AuditRecord, Change};
+use super::audit::{Audit, AuditRecord, Change, Reach, RunOrdered};
 use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind};
 use crate::process_image::{Histogram, HistogramSnapshot};
 
@@ -131,9 +131,20 @@ impl Ticket {
         let answer = Answer { outcome, latency };
         if self.write {
             self.stats.note(self.origin.kind, &answer);
+            self.note_run(&answer.outcome, now);
         }
         // The client may have gone: the command was answered all the same.
         let _ = sender.send(answer);
+    }
+
+    /// Who started or stopped a motor is asked as soon as the next read shows it.
+    fn note_run(&self, outcome: &Outcome, now: Instant) {
+        let run = self.changes.iter().rev().find_map(|change| change.run);
+        let may_be_done = outcome.reach() == Reach::Sent && !matches!(outcome, Outcome::Exception(_));
+        if let Some(run) = run.filter(|_| may_be_done) {
+            let who = format!("{} {}", self.origin.kind.name(), self.origin.who);
+            self.stats.audit.ordered(&self.drive, RunOrdered { run, who, at: now });
+        }
     }
 
     fn audit(&mut self) {

@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use super::drive::{self, Surroundings};
 use super::keys::BUS;
-use super::{BusSettings, line, values};
+use super::{BusSettings, line, slot, values};
 use crate::bus::predict::faster_points;
 use crate::bus::{BusOptions, Mode};
 use crate::codec::wire::Silence;
@@ -25,6 +25,7 @@ pub(super) struct Found {
     pub(super) port: Option<(String, Place)>,
     pub(super) drives: Vec<drive::Found>,
     pub(super) settings: Option<BusSettings>,
+    pub(super) slots: Vec<slot::Found>,
     /// Places of `cycle` and `slow_cycle`.
     pub(super) cadence: (Place, Place),
 }
@@ -52,6 +53,17 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
     if options.mode == Mode::Listen {
         check_listening(reader, &drives);
     }
+    let slots = slot::read(
+        reader,
+        base,
+        &slot::Surroundings {
+            bus: name.as_ref().map(|(name, _)| name.as_str()),
+            protocol,
+            format,
+            mode: options.mode,
+            drives: drives.iter().map(|drive| drive.access.0).collect(),
+        },
+    );
     reader.finish();
     let access = |mut spec: DriveSpec| {
         if options.mode == Mode::Listen {
@@ -85,6 +97,7 @@ pub(super) fn read(reader: &Reader<'_>, base: &Path, profiles: &Profiles, profil
         name,
         drives,
         settings,
+        slots,
     }
 }
 

@@ -21,6 +21,7 @@ use crate::codec::wire::Silence;
 use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
+use crate::north::slot::SlotAccess;
 use crate::process_image::{Access, LeaseAction, OnShutdown};
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
@@ -94,6 +95,12 @@ pub(super) const MODBUS_ADDRESSES: Number = Number(1..=247, BROADCAST);
 /// Addresses on a line of N2; each family has its own range within.
 pub(super) const N2_ADDRESSES: Number = Number(1..=255, BROADCAST);
 const CONNECTIONS: Number = Number(1..=10_000, None);
+const SOCKET: Parsed<SocketAddr> = Parsed {
+    parse: values::socket,
+    words: &[],
+    pattern: "",
+    range: "an address with a port",
+};
 const PATH: Text = Text("", "a path in quotes");
 const STRING: Text = Text("", "a string in quotes");
 
@@ -184,7 +191,8 @@ keys! {
         /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps: [recordings](recordings.md), [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
+        /// Directory of what the gateway keeps: [recordings](recordings.md), [events, run hours and starts](history.md),
+        /// [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
@@ -257,6 +265,32 @@ keys! {
         }, default "spec";
         /// The drives on the line.
         drive: Present = Own { schema: || each(Drive::schema()), range: "[[bus.drive]]" }, or "none";
+        /// Where vendors' tools reach the line, see [Tool slot](tool-slot.md).
+        slot: Present = Own { schema: || each(SlotTable::schema()), range: "[[bus.slot]]" }, or "none";
+    }
+
+    /// A slot for vendors' tools: a program that speaks the protocol of the line, as if it were alone on it.
+    SLOT: SlotTable {
+        /// Address with the bare frames of the line: Modbus RTU or ASCII over TCP (not Modbus TCP), or N2.
+        listen: SocketAddr = SOCKET, or "none";
+        /// Address with a COM port by RFC 2217, for programs on Windows behind a COM port redirector.
+        rfc2217: SocketAddr = SOCKET, or "none";
+        /// Path of a serial port (a link to a pseudo-terminal, mode 0660) that a program on this machine opens. Its baud rate and
+        /// format have no effect.
+        pty: PathBuf = PATH, or "none";
+        /// `"read"`: every request that may write is refused. `"write"`: writes are passed on as those of a Modbus TCP client
+        /// that may write: to drives with `access = "control"`, within limits and `raw_writes`. `"raw"`: also what cannot be
+        /// checked: broadcasts, functions that drivegate does not decode, writes to addresses without a configured drive.
+        access: SlotAccess = Words(&[
+            ("read", SlotAccess::Read), ("write", SlotAccess::Write), ("raw", SlotAccess::Raw),
+        ]), default "read";
+        /// Who may connect to `listen` and `rfc2217`.
+        allow: Vec<IpNet> = NETWORKS, default ["127.0.0.0/8", "::1/128"];
+        /// A connection without a request for this time is closed.
+        idle_timeout: Option<Duration> = Parsed {
+            parse: modbus_tcp::parse_idle, words: &["off"], pattern: DURATION,
+            range: "\"off\", or \"1s\" to \"168h\"",
+        }, default "10min";
     }
 
     /// One drive.
@@ -528,11 +562,9 @@ keys! {
 
     /// HTTP server for metrics, health and the status page; not started without this section.
     HTTP: Http {
-        /// Status page, metrics, health and JSON interface. Read-only; open to everybody who can connect unless there is
-        /// a `tokens_file`.
-        listen: SocketAddr = Parsed {
-            parse: values::socket, words: &[], pattern: "", range: "an address with a port",
-        }, default "127.0.0.1:9488";
+        /// Status page, metrics, health and JSON interface. Read-only without `commands`; open to everybody who can connect
+        /// unless there is a `tokens_file`.
+        listen: SocketAddr = SOCKET, default "127.0.0.1:9488";
         /// Names and addresses, without a port, under which the server is reached besides `localhost`, the host name of
         /// this machine and its own addresses: that of a reverse proxy, a container, a name in DNS. Requests for any
         /// other [host](http.md#hosts) get 421.
@@ -540,6 +572,11 @@ keys! {
         /// File of access [tokens](http.md#tokens), made by `drivegate token add`. With it, all paths except `/healthz`
         /// and `/readyz` require a token.
         tokens_file: PathBuf = PATH, or "none";
+        /// Whether [users](operating.md) may command drives with `access = "control"`, from the status page and by
+        /// programs. Needs `users_file`, and `certificate` or a `listen` on the loopback.
+        commands: bool = Flag, default false;
+        /// File of the users who may command, made by `drivegate user add`.
+        users_file: PathBuf = PATH, or "none";
         /// PEM file with the server's certificate chain, for [https](http.md#tls); needs `key`.
         certificate: PathBuf = PATH, or "none";
         /// PEM file of the certificate's private key.

@@ -19,6 +19,7 @@ mod params;
 mod raw_writes;
 mod recordings;
 mod shutdown;
+mod slot;
 mod unique;
 mod values;
 
@@ -41,7 +42,7 @@ use crate::document::{self, Document, Finding, Place, Problem, Reader};
 use crate::drive::profile::Profiles;
 use crate::history::RecorderOptions;
 use crate::north::local::SocketPath;
-use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client};
+use crate::north::{http, modbus_tcp as modbus_tcp_server, mqtt as mqtt_client, slot as slot_server};
 use crate::process_image::{Access, BusSpec, DriveSpec};
 use keys::{DRIVE, GATEWAY, MODBUS_TCP, ROOT};
 
@@ -59,6 +60,8 @@ pub struct Settings {
     pub socket: SocketPath,
     /// Directory of what the gateway keeps.
     pub state_dir: PathBuf,
+    /// Whether events and counters are kept there: always true as configured, false where something less than a gateway runs.
+    pub keeps_history: bool,
     /// What the recorder keeps.
     pub recordings: RecorderOptions,
     /// How parameters are read and kept.
@@ -73,6 +76,8 @@ pub struct Settings {
     pub stale_after_written: bool,
     /// In the order of the file.
     pub buses: Vec<BusSettings>,
+    /// Slots of all buses; absent: there is none.
+    pub slots: Option<slot_server::Options>,
     /// Absent: not started.
     pub modbus_tcp: Option<modbus_tcp_server::Options>,
     /// Absent: not started.
@@ -238,12 +243,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .mqtt
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
-    let (http, http_listener) = ROOT
-        .http
-        .table(reader)
-        .map(|table| north::read_http(&table, base))
-        .unzip();
-    let http_listener = http_listener.flatten();
+    let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
     let audit = ROOT
         .audit
         .table(reader)
@@ -255,19 +255,16 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
-    judge(
-        reader,
-        &buses,
-        modbus_tcp.as_ref(),
-        mqtt.as_ref(),
-        http_listener.as_ref(),
-    );
+    judge(reader, &buses, modbus_tcp.as_ref(), mqtt.as_ref(), http.as_ref());
 
+    let slots = buses.iter().flat_map(|bus| &bus.slots).map(|slot| slot.slot.clone());
+    let slots: Vec<slot_server::Slot> = slots.collect::<Option<_>>()?;
     Some(Settings {
         gateway: name?,
         socket,
         params: params.unwrap_or_else(|| ParamsSettings::below(&state_dir)),
         state_dir,
+        keeps_history: true,
         recordings: recordings?,
         profile_dirs,
         profiles,
@@ -277,9 +274,10 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         },
         stale_after_written: modbus_tcp.as_ref().is_some_and(|m| m.stale_written),
         buses: buses.into_iter().map(|bus| bus.settings).collect::<Option<_>>()?,
+        slots: (!slots.is_empty()).then_some(slot_server::Options { slots }),
         modbus_tcp: flipped(modbus_tcp.map(|m| m.options))?,
         mqtt: flipped(mqtt)?,
-        http: flipped(http)?,
+        http: flipped(http.map(|http| http.options))?,
         audit,
         log: log?,
     })
@@ -291,18 +289,23 @@ fn judge(
     buses: &[bus::Found],
     modbus_tcp: Option<&modbus_tcp::ModbusTcp>,
     mqtt: Option<&Option<mqtt_client::Options>>,
-    http: Option<&north::Listener>,
+    http: Option<&north::Http>,
 ) {
     unique::check(reader.document(), buses);
     // Without Modbus TCP units are not used, and a gateway may have more drives than there are units.
     if let Some(modbus_tcp) = modbus_tcp {
         unique::check_units(reader.document(), buses, &modbus_tcp.selections);
     }
-    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http);
+    let http_listener = http.and_then(|http| http.listener.as_ref());
+    let listeners = modbus_tcp.into_iter().flat_map(|m| &m.addresses).chain(http_listener);
+    let slots = || buses.iter().flat_map(|bus| &bus.slots);
+    let listeners = listeners.chain(slots().flat_map(|slot| &slot.listeners));
     unique::check_listeners(reader.document(), listeners);
     warn_of_emptiness(reader);
-    let commanded =
-        modbus_tcp.is_some_and(|m| m.commands) || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands));
+    let commanded = modbus_tcp.is_some_and(|m| m.commands)
+        || mqtt.is_some_and(|m| m.as_ref().is_none_or(|m| m.commands))
+        || http.is_some_and(|http| http.commands)
+        || slots().any(|slot| slot.writes);
     if !commanded {
         warn_of_idle_control(reader, buses);
     }
@@ -494,7 +497,7 @@ fn warn_of_idle_control(reader: &Reader<'_>, buses: &[bus::Found]) {
         reader.document().warning(
             place,
             format!("drive `{name}` accepts commands but no client may send any"),
-            "set `write` of [modbus_tcp] or `commands = true` of [mqtt]",
+            "set `write` of [modbus_tcp], or `commands = true` of [mqtt] or [http]",
         );
     }
 }

@@ -17,7 +17,7 @@ pub(crate) enum FileKind {
     Profile,
     /// Certificates or revocation lists, which are no secret.
     Certificate,
-    /// A private key, a password or tokens.
+    /// A private key, passwords or tokens.
     Secret,
 }
 
@@ -67,7 +67,7 @@ pub(crate) fn named_files(path: &Path, env: impl Iterator<Item = (String, String
     }
     if let Some(http) = ROOT.http.table(&reader) {
         found.add(&http, &HTTP.certificate, FileKind::Certificate);
-        for key in [&HTTP.key, &HTTP.tokens_file] {
+        for key in [&HTTP.key, &HTTP.tokens_file, &HTTP.users_file] {
             found.add(&http, key, FileKind::Secret);
         }
     }
@@ -118,7 +118,7 @@ mod tests {
         std::fs::create_dir(folder.path().join("profiles")).unwrap();
         std::fs::write(folder.path().join("profiles/own.toml"), "").unwrap();
         let text = "[gateway]\nnme = \"x\"\nprofile_dirs = [\"profiles\"]\n[modbus_tcp.tls]\ncertificate = \"a.crt\"\nkey = \"a.key\"\n\
-            client_ca = \"ca.crt\"\n[mqtt]\npassword_file = \"/run/password\"\nca = \"b.crt\"\n[http]\ntokens_file = \"tokens\"\n";
+            client_ca = \"ca.crt\"\n[mqtt]\npassword_file = \"/run/password\"\nca = \"b.crt\"\n[http]\ntokens_file = \"tokens\"\nusers_file = \"users\"\n";
         std::fs::write(&file, text).unwrap();
         let env = [("DRIVEGATE__HTTP__KEY".to_string(), "h.key".to_string())];
         let found = named_files(&file, env.into_iter());
@@ -136,6 +136,7 @@ mod tests {
             ("mqtt.password_file", "/run/password", FileKind::Secret),
             ("http.key", "h.key", FileKind::Secret),
             ("http.tokens_file", "tokens", FileKind::Secret),
+            ("http.users_file", "users", FileKind::Secret),
         ];
         let expected = expected.map(|(key, path, kind)| (key.to_string(), path.to_string(), kind));
         assert_eq!(found.iter().map(short).collect::<Vec<_>>(), expected);

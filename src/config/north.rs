@@ -7,32 +7,51 @@ use std::time::SystemTime;
 use super::keys::HTTP;
 use super::{files, values};
 use crate::document::{Finding, Place, Reader};
-use crate::north::http::{self, Tokens};
+use crate::north::http::{self, Tokens, Users};
 use crate::north::{ServerIdentity, TlsFile};
 
 /// An address that a server listens on, and its place.
 pub(super) type Listener = (SocketAddr, Place);
 
-pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> (Option<http::Options>, Option<Listener>) {
+/// `[http]`, as far as it is valid.
+pub(super) struct Http {
+    pub(super) options: Option<http::Options>,
+    pub(super) listener: Option<Listener>,
+    /// Clients may command, by what is written.
+    pub(super) commands: bool,
+}
+
+pub(super) fn read_http(reader: &Reader<'_>, base: &Path) -> Http {
     let listen = HTTP.listen.read(reader);
     let hosts = HTTP.hosts.get(reader);
     let tokens = read_tokens(reader, base);
+    let users = read_users(reader, base);
     let identity = read_identity(reader, base);
+    let commands = HTTP.commands.get(reader);
     reader.finish();
     if let Some(listen) = listen {
         warn_of_reach(reader, listen);
     }
+    let users_are_told = users.is_some() || reader.has(HTTP.users_file.name);
+    let may_command = !commands || is_safe_to_command(reader, listen, users_are_told);
     // Both are reported if they are there and cannot be used.
     let usable = (tokens.is_some() || !reader.has(HTTP.tokens_file.name))
-        && (identity.is_some() || !reader.has(HTTP.certificate.name));
+        && (users.is_some() || !reader.has(HTTP.users_file.name))
+        && (identity.is_some() || !reader.has(HTTP.certificate.name))
+        && may_command;
     let options = listen.filter(|_| usable).map(|listen| http::Options {
         listen,
         hosts,
         tokens,
+        users: users.filter(|_| commands),
         identity,
         max_connections: http::MAX_CONNECTIONS,
     });
-    (options, listen.map(|listen| (listen, HTTP.listen.place(reader))))
+    Http {
+        options,
+        listener: listen.map(|listen| (listen, HTTP.listen.place(reader))),
+        commands,
+    }
 }
 
 pub(super) fn parse_host(text: &str) -> Result<String, Finding> {
@@ -64,6 +83,53 @@ fn read_tokens(reader: &Reader<'_>, base: &Path) -> Option<Tokens> {
             None
         }
     }
+}
+
+fn read_users(reader: &Reader<'_>, base: &Path) -> Option<Users> {
+    let key = &HTTP.users_file;
+    let path = values::resolved(base, key.read(reader)?);
+    files::warn_of_readers(reader, key.name, &path);
+    let text = std::fs::read_to_string(&path).map_err(|error| files::cannot_read(&path, &error));
+    let text = reader.accept(key.name, text)?;
+    match Users::parse(&text) {
+        Ok(users) => {
+            if users.list().is_empty() {
+                let what = format!("{} contains no user, so nobody can log in", path.display());
+                reader.warning(key.name, what, "add one with `drivegate user add`");
+            }
+            if !HTTP.commands.get(reader) {
+                let what = "the users are not used while `commands` is off";
+                reader.warning(key.name, what, "set commands = true, or remove users_file");
+            }
+            Some(users)
+        }
+        Err((line, error)) => {
+            let remedy = "remove the line, and make another with `drivegate user add`";
+            reader.problem(key.name, format!("{}:{line}: {error}", path.display()), remedy);
+            None
+        }
+    }
+}
+
+/// Whether commands can be on: somebody has to be known, and passwords must not travel in clear text.
+fn is_safe_to_command(reader: &Reader<'_>, listen: Option<SocketAddr>, has_users: bool) -> bool {
+    let key = HTTP.commands.name;
+    if !has_users {
+        reader.problem(
+            key,
+            "commands need users, and there is no `users_file`",
+            "set users_file to a file made by `drivegate user add`",
+        );
+    }
+    let is_private = reader.has(HTTP.certificate.name) || listen.is_none_or(|listen| listen.ip().is_loopback());
+    if !is_private {
+        reader.problem(
+            key,
+            "commands without TLS would send passwords in clear text over the network",
+            "set certificate and key, or listen on 127.0.0.1, for instance behind a reverse proxy with TLS",
+        );
+    }
+    has_users && is_private
 }
 
 fn read_identity(reader: &Reader<'_>, base: &Path) -> Option<ServerIdentity> {

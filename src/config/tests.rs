@@ -55,6 +55,8 @@ key = "DIR/gateway.key"
 [[bus.drive.trigger]]
 point = "motor_current"
 above = 120.0
+[[bus.slot]]
+listen = "127.0.0.1:4001"
 "#;
 
 fn load(source: &str) -> (Loaded, Vec<String>) {
@@ -65,6 +67,30 @@ fn settings(source: &str) -> Settings {
     let (loaded, _) = load(source);
     assert_eq!(loaded.errors, []);
     loaded.settings.unwrap()
+}
+
+#[test]
+fn slots_read_only_and_take_this_machine_unless_told_otherwise() {
+    use crate::north::slot::SlotAccess;
+    let all = settings(&FULL);
+    let slot = &all.slots.as_ref().unwrap().slots[0];
+    assert_eq!(
+        (slot.bus.as_str(), slot.protocol.name(), slot.format.baud),
+        ("b", "modbus-rtu", 9600)
+    );
+    assert_eq!(
+        (slot.access, slot.idle_timeout),
+        (SlotAccess::Read, Some(Duration::from_secs(600)))
+    );
+    assert!(slot.allow.iter().all(|network| network.network().is_loopback()));
+    assert_eq!((slot.rfc2217, slot.pty.as_ref()), (None, None));
+    let without = FULL.replace("[[bus.slot]]\nlisten = \"127.0.0.1:4001\"\n", "");
+    let without = settings(&without);
+    assert_eq!(without.slots, None);
+    assert_eq!(
+        without.buses, all.buses,
+        "a slot is no part of its bus, which a reload leaves alone"
+    );
 }
 
 #[test]

@@ -19,6 +19,7 @@ pub(super) fn check(document: &Document, buses: &[Found]) {
         drives().filter_map(|drive| drive.name.as_ref()),
     );
     check_ports(document, buses);
+    check_ptys(document, buses);
     check_addresses(document, buses);
 }
 
@@ -70,6 +71,28 @@ fn check_ports(document: &Document, buses: &[Found]) {
             format!("the port {port} already belongs to bus{owner}{how}"),
             "give each bus its own port",
         );
+    }
+}
+
+/// A slot makes the serial port of its tool: it is no other slot's, and not that of a line.
+fn check_ptys(document: &Document, buses: &[Found]) {
+    let mut seen: Vec<(&Path, String)> = Vec::new();
+    for (port, place) in buses.iter().filter_map(|bus| bus.port.as_ref()) {
+        seen.push((Path::new(port), format!("{}{}", place.key, line(place))));
+    }
+    for (path, place) in buses
+        .iter()
+        .flat_map(|bus| &bus.slots)
+        .filter_map(|slot| slot.pty.as_ref())
+    {
+        if let Some((_, owner)) = seen.iter().find(|(other, _)| other == path) {
+            document.problem(
+                place,
+                format!("the path {} already belongs to {owner}", path.display()),
+                "give each slot a path of its own",
+            );
+        }
+        seen.push((path, format!("{}{}", place.key, line(place))));
     }
 }
 

@@ -15,6 +15,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
     ];
     let sections = [
         section("Modbus TCP", &before.modbus_tcp, &after.modbus_tcp),
+        section("the tool slots", &before.slots, &after.slots),
         section("MQTT", &before.mqtt, &after.mqtt),
         section("HTTP", &before.http, &after.http),
         section("the audit file", &before.audit, &after.audit),

@@ -4,7 +4,7 @@
 use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 
 use crate::config::Settings;
-use crate::north::{http, modbus_tcp};
+use crate::north::{http, modbus_tcp, slot};
 
 /// Files that the process itself has open: logs, runtimes, queues, the configuration, MQTT with its buffer, local clients.
 const OWN_FILES: usize = 64;
@@ -56,6 +56,8 @@ fn raise(wanted: usize) -> usize {
 #[derive(Debug, Clone)]
 struct Wanted {
     buses: usize,
+    /// Of the tool slots.
+    slots: usize,
     modbus_tcp: Option<modbus_tcp::Options>,
     http: Option<http::Options>,
 }
@@ -64,6 +66,7 @@ impl Wanted {
     fn of(settings: &Settings) -> Wanted {
         Wanted {
             buses: settings.buses.len(),
+            slots: settings.slots.as_ref().map_or(0, slot::Options::files),
             modbus_tcp: settings.modbus_tcp.clone(),
             http: settings.http.clone(),
         }
@@ -72,7 +75,7 @@ impl Wanted {
     fn files(&self) -> usize {
         let modbus_tcp = self.modbus_tcp.as_ref().map_or(0, modbus_tcp::Options::files);
         let http = self.http.as_ref().map_or(0, http::Options::files);
-        OWN_FILES + BUS_FILES * self.buses + modbus_tcp + http
+        OWN_FILES + BUS_FILES * self.buses + self.slots + modbus_tcp + http
     }
 
     fn connections(&self) -> usize {
@@ -116,6 +119,7 @@ mod tests {
     fn wanted(buses: usize, modbus_tcp: usize, http: usize) -> Wanted {
         Wanted {
             buses,
+            slots: 0,
             modbus_tcp: Some(modbus_tcp::Options {
                 listeners: Vec::new(),
                 tls: None,

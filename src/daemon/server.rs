@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use tokio_util::sync::CancellationToken;
 
-use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt};
+use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::SharedPlant;
 
 /// Time limit for a server to stop.
@@ -217,6 +217,40 @@ impl Reconfigure for modbus_tcp::Server {
     }
 }
 
+impl Server for slot::Server {
+    const NAME: &'static str = "the tool slots";
+    type Options = slot::Options;
+
+    async fn start(
+        options: Self::Options,
+        plant: SharedPlant,
+        stats: Arc<NorthStats>,
+        cancel: CancellationToken,
+    ) -> Result<Self, ServerError> {
+        slot::start(options, plant, stats, cancel).await
+    }
+
+    async fn stopped(self) {
+        slot::Server::stopped(&self).await;
+    }
+}
+
+impl Reconfigure for slot::Server {
+    type Change = slot::Change;
+
+    async fn prepare(&mut self, options: Self::Options) -> Result<Self::Change, ServerError> {
+        slot::Server::prepare(self, options).await
+    }
+
+    fn commit(&mut self, change: Self::Change) {
+        slot::Server::commit(self, change);
+    }
+
+    fn abort(&mut self, change: Self::Change) {
+        slot::Server::abort(self, change);
+    }
+}
+
 impl Server for local::Local {
     const NAME: &'static str = "the local socket";
     type Options = local::Options;
@@ -365,6 +399,7 @@ mod tests {
             writes: Default::default(),
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         };
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())
     }

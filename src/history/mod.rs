@@ -1,20 +1,28 @@
-//! The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
+//! The past of the drives. Trends: what their values were over the last day, in memory. The trip recorder: what a drive said, what it was told and what was on its line, from some time before a trigger until some
 //! time after it; one file a recording.
 //!
 //! - [`trigger`]: what makes a recording, seen in the samples of a drive and on its line.
+//! - [`trend`]: least, greatest and last values in steps of time; [`counters`]: starts and run time; [`line`]: the last hour of a
+//!   line. [`drives`]: those of all drives and buses, as the rest of the gateway sees them.
 //! - [`recorder`]: the rings in memory and the recordings under way. Pure: time is an argument.
 //! - [`capture`]: reads captures of lines, its own and others, for `drivegate replay`.
 //! - [`budget`]: how much memory the rings take at most.
 //! - [`assemble`]: the raw words of a ring as points, and what they show in one sentence (`summary`).
 //! - [`recording`]: the form of a file, its parts and its faults; [`export`] and [`pcapng`] turn one into other forms.
 //! - [`store`]: the directory of the recordings; [`retention`] decides which of them go.
-//! - `task`: the two threads: one takes what the buses taped, the other writes files. [`Recordings`] is how the rest of the
+//! - `keeper`: the thread that writes events and counters, so that they survive a restart.
+//! - `task`: the two threads of the recorder: one takes what the buses taped, the other writes files. [`Recordings`] is how the rest of the
 //!   gateway sees them.
 
 pub mod assemble;
+mod buckets;
 pub mod budget;
 pub mod capture;
+pub mod counters;
+pub mod drives;
 pub mod export;
+mod keeper;
+pub mod line;
 pub mod pcapng;
 pub mod recorder;
 pub mod recording;
@@ -23,11 +31,14 @@ mod ring;
 pub mod store;
 mod summary;
 mod task;
+pub mod trend;
 pub mod trigger;
 
 use std::path::PathBuf;
 use std::time::{Duration, Instant, SystemTime};
 
+pub use drives::{DriveHistory, History};
+pub use keeper::Keeper;
 pub use recorder::{Capture, Recorder};
 pub use recording::{Recording, RecordingError};
 pub use store::{Entry, Store};
@@ -52,6 +63,11 @@ pub struct RecorderOptions {
 }
 
 impl RecorderOptions {
+    /// Whether anything is recorded.
+    pub fn is_on(&self) -> bool {
+        self.max_count > 0
+    }
+
     /// Time that a ring must hold: the whole recording, and what passes until it is taken out.
     pub(crate) fn window(&self) -> Duration {
         self.before + self.after + Duration::from_secs(1)

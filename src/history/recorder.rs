@@ -1,16 +1,20 @@
-//! The rings of all buses and the recordings under way. Pure: time is an argument, what the buses taped is taken from their
+//! The rings of all buses, the recordings under way, and what feeds the trends. Pure: time is an argument, what the buses taped is taken from their
 //! images.
 
 use std::collections::BTreeMap;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use super::budget::Budget;
+use super::drives::{DriveHistory, History};
+use super::line::LineHistory;
 use super::ring::{Ring, Timed};
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
 use crate::drive::Plan;
-use crate::process_image::{BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead};
+use crate::process_image::{
+    BusImage, DriveImage, DriveSpec, Link, Reading, Snapshot, Taped, TapedFrame, TapedRead, Taping,
+};
 
 /// Triggers of a recording that are noted beside the first.
 const MOST_TRIGGERS: usize = 32;
@@ -138,6 +142,9 @@ pub struct Capture {
 #[derive(Debug)]
 struct DriveRing {
     image: Arc<DriveImage>,
+    history: Arc<DriveHistory>,
+    /// Whether it answered when it was last looked at, and since when.
+    link: Link,
     samples: Ring<TapedRead>,
     notes: Ring<Note>,
     /// What was known before the oldest sample, and what is known now.
@@ -160,6 +167,7 @@ struct Pending {
 #[derive(Debug)]
 struct LineRing {
     bus: Arc<BusImage>,
+    last_hour: Arc<Mutex<LineHistory>>,
     drives: Vec<DriveRing>,
     frames: Ring<TapedFrame>,
     errors: LineErrors,
@@ -170,36 +178,51 @@ struct LineRing {
 #[derive(Debug)]
 pub struct Recorder {
     options: RecorderOptions,
+    history: Arc<History>,
+    /// Age from which process data is stale.
+    stale_after: Duration,
     lines: Vec<LineRing>,
 }
 
 impl Recorder {
-    /// A recorder without buses.
-    pub fn new(options: RecorderOptions) -> Recorder {
+    /// A recorder without buses, which keeps trends in `history`.
+    pub fn new(options: RecorderOptions, history: Arc<History>) -> Recorder {
         Recorder {
             options,
+            history,
+            stale_after: Duration::from_secs(1),
             lines: Vec::new(),
         }
     }
 
     /// Records these buses from now on. Those that are there already keep their rings; what was recorded of the others ends
-    /// now.
-    pub fn adopt(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
+    /// now. Process data is stale from `stale_after` on.
+    pub fn adopt(&mut self, buses: &[Arc<BusImage>], stale_after: Duration, clock: Clock) -> Vec<Capture> {
+        self.stale_after = stale_after;
+        let captures = self.leave_all_but(buses, clock);
+        self.history.keep_only(buses);
+        for bus in buses {
+            if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
+                self.lines.push(LineRing::new(bus, &self.options, &self.history, clock));
+                bus.tape.switch(match self.options.is_on() {
+                    true => Taping::Everything,
+                    false => Taping::Reads,
+                });
+            }
+        }
+        captures
+    }
+
+    fn leave_all_but(&mut self, buses: &[Arc<BusImage>], clock: Clock) -> Vec<Capture> {
         let mut captures = Vec::new();
         let (kept, gone): (Vec<_>, Vec<_>) = std::mem::take(&mut self.lines)
             .into_iter()
             .partition(|line| buses.iter().any(|bus| Arc::ptr_eq(bus, &line.bus)));
         self.lines = kept;
         for mut line in gone {
-            line.take_in(&self.options, clock);
-            line.bus.tape.switch(false);
+            line.take_in(&self.options, self.stale_after, clock);
+            line.bus.tape.switch(Taping::Off);
             captures.extend(line.ended(&self.options, clock, true));
-        }
-        for bus in buses {
-            if !self.lines.iter().any(|line| Arc::ptr_eq(bus, &line.bus)) {
-                self.lines.push(LineRing::new(bus, &self.options));
-                bus.tape.switch(true);
-            }
         }
         captures
     }
@@ -234,7 +257,7 @@ impl Recorder {
     pub fn tick(&mut self, clock: Clock) -> Vec<Capture> {
         let mut captures = Vec::new();
         for line in &mut self.lines {
-            line.take_in(&self.options, clock);
+            line.take_in(&self.options, self.stale_after, clock);
             captures.extend(line.ended(&self.options, clock, false));
         }
         captures
@@ -243,12 +266,12 @@ impl Recorder {
     /// Ends all recordings now; the tapes stop.
     pub fn end(&mut self, clock: Clock) -> Vec<Capture> {
         let captures = self.tick(clock);
-        captures.into_iter().chain(self.adopt(&[], clock)).collect()
+        captures.into_iter().chain(self.leave_all_but(&[], clock)).collect()
     }
 }
 
 impl LineRing {
-    fn new(bus: &Arc<BusImage>, options: &RecorderOptions) -> LineRing {
+    fn new(bus: &Arc<BusImage>, options: &RecorderOptions, history: &History, clock: Clock) -> LineRing {
         let specs: Vec<DriveSpec> = bus.drives.iter().map(|drive| drive.spec.clone()).collect();
         let budget = Budget::of(&bus.spec, &specs, options);
         let window = options.window();
@@ -256,6 +279,8 @@ impl LineRing {
             let base = Arc::new(empty_snapshot(&image.spec));
             DriveRing {
                 image: image.clone(),
+                history: history.of(&image.spec, clock),
+                link: image.snapshot().link,
                 samples: Ring::new(*samples, window),
                 notes: Ring::new(budget.notes, window),
                 now: base.clone(),
@@ -270,18 +295,22 @@ impl LineRing {
             frames: Ring::new(budget.frames, window),
             errors: LineErrors::default(),
             lost: 0,
+            last_hour: history.of_line(bus, clock),
             bus: bus.clone(),
         }
     }
 
-    fn take_in(&mut self, options: &RecorderOptions, clock: Clock) {
+    fn take_in(&mut self, options: &RecorderOptions, stale_after: Duration, clock: Clock) {
         let (entries, lost) = self.bus.tape.take();
         self.lost += lost;
+        let mut last_hour = self.last_hour.lock().unwrap_or_else(PoisonError::into_inner);
+        last_hour.look(&self.bus, clock.now);
+        drop(last_hour);
         for entry in entries {
             match entry {
                 Taped::Read(index, read) => {
                     if let Some(drive) = self.drives.get_mut(index)
-                        && let Some(trigger) = drive.read(read, options.warnings)
+                        && let Some(trigger) = drive.read(read, options, stale_after, clock)
                     {
                         drive.trigger(trigger, clock);
                     }
@@ -299,6 +328,7 @@ impl LineRing {
                 }
             }
         }
+        self.drives.iter_mut().for_each(DriveRing::look_at_link);
     }
 
     fn answers(&self, drive: usize) -> bool {
@@ -337,14 +367,35 @@ impl LineRing {
 }
 
 impl DriveRing {
-    fn read(&mut self, read: TapedRead, warnings: bool) -> Option<Trigger> {
+    /// Whatever a drive does while it is away, nobody sees. To be called when all is taken in that was read before.
+    fn look_at_link(&mut self) {
+        let link = self.image.snapshot().link;
+        let before = std::mem::replace(&mut self.link, link);
+        if before.is_online() && before != link {
+            self.history.interrupt();
+        }
+    }
+
+    fn read(
+        &mut self,
+        read: TapedRead,
+        options: &RecorderOptions,
+        stale_after: Duration,
+        clock: Clock,
+    ) -> Option<Trigger> {
         let at = read.at;
         Arc::make_mut(&mut self.now).store(read.table, read.start, &read.words, at);
+        let reading = reading(&self.image.spec, &self.now, at);
+        let known = self.image.reading(clock.now, stale_after);
+        self.history.read(&read, &reading, &known);
+        if !options.is_on() {
+            return None;
+        }
         let base = &mut self.base;
         self.samples.push(read, |gone| {
             Arc::make_mut(base).store(gone.table, gone.start, &gone.words, gone.at);
         });
-        self.watch.look(&reading(&self.image.spec, &self.now, at), at, warnings)
+        self.watch.look(&reading, at, options.warnings)
     }
 
     fn trigger(&mut self, trigger: Trigger, clock: Clock) -> Option<String> {

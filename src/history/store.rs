@@ -1,7 +1,7 @@
 //! The directory of the recordings. A file is written aside, synced and renamed, so that there are only whole ones.
 
 use std::fs::{self, File};
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::SystemTime;
@@ -12,9 +12,8 @@ use super::RecorderOptions;
 use super::recording::{ENDING, Header, Recording, RecordingError};
 use super::retention::{Kept, Storm, surplus};
 use super::trigger::TriggerKind;
+use crate::files::{self, PARTIAL};
 
-/// Ending of files that are being written.
-const PARTIAL: &str = "partial";
 /// Longest header that is looked for when a directory is listed.
 const MOST_HEADER: u64 = 1 << 20;
 /// Largest file that is read.
@@ -214,17 +213,7 @@ impl Store {
             return Err(io::Error::new(io::ErrorKind::FileTooLarge, what));
         }
         let path = path_of(&self.dir, &recording.header.id);
-        let aside = path.with_extension(PARTIAL);
-        let written = self
-            .write_aside(&aside, &bytes)
-            .and_then(|()| fs::rename(&aside, &path));
-        if let Err(error) = written {
-            // It may not have been created at all.
-            let _ = fs::remove_file(&aside);
-            return Err(error);
-        }
-        // The rename is on disk when the directory is; without that only the newest name is at stake.
-        let _ = File::open(&self.dir).and_then(|dir| dir.sync_all());
+        files::replace(&path, &bytes)?;
         let entry = Arc::new(Entry::new(&recording.header, size));
         let at = self
             .entries
@@ -232,13 +221,6 @@ impl Store {
         self.entries.insert(at, entry.clone());
         self.make_room();
         Ok(entry)
-    }
-
-    fn write_aside(&self, path: &Path, bytes: &[u8]) -> io::Result<()> {
-        fs::create_dir_all(&self.dir)?;
-        let mut file = File::create(path)?;
-        file.write_all(bytes)?;
-        file.sync_all()
     }
 
     fn make_room(&mut self) {

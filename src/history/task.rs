@@ -1,5 +1,5 @@
-//! The recorder at work: a thread that takes what the buses taped, and one that writes files. A slow disk holds up neither the
-//! buses nor the rings.
+//! The recorder at work: a thread that takes what the buses taped, for recordings and trends, and one that writes files. A slow
+//! disk holds up neither the buses nor the rings.
 
 use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
@@ -14,7 +14,7 @@ use super::assemble::assemble;
 use super::recorder::{Capture, Note, NoteBody, Recorder};
 use super::store::{self, Entry, ReadError, Store};
 use super::trigger::{Trigger, TriggerKind, is_refused_stop};
-use super::{Clock, RecorderOptions, Recording};
+use super::{Clock, History, RecorderOptions, Recording};
 use crate::command::{AuditRecord, WriteStats};
 use crate::event::{Event, EventKind, Events, RecordingMade};
 use crate::process_image::BusImage;
@@ -38,7 +38,7 @@ pub enum NotRecorded {
 }
 
 enum Control {
-    Buses(Vec<Arc<BusImage>>),
+    Buses(Vec<Arc<BusImage>>, Duration),
     Record(String, String, oneshot::Sender<Option<String>>),
     Stop,
 }
@@ -65,6 +65,15 @@ impl Recordings {
     /// What is on disk, oldest first.
     pub fn list(&self) -> Vec<Arc<Entry>> {
         self.shared().entries.clone()
+    }
+
+    /// Time before and after the trigger that a recording has; nothing while the recorder is off.
+    pub fn span(&self) -> (Duration, Duration) {
+        let shared = self.shared();
+        shared
+            .options
+            .as_ref()
+            .map_or_else(Default::default, |options| (options.before, options.after))
     }
 
     /// Recordings made since the gateway started, by what made them.
@@ -112,7 +121,7 @@ impl Recordings {
     }
 }
 
-/// The recorder of a gateway, at work.
+/// The recorder of a gateway, at work; without recordings for trends only.
 #[derive(Debug)]
 pub struct RecorderTask {
     recordings: Arc<Recordings>,
@@ -128,26 +137,28 @@ impl RecorderTask {
     pub fn start(
         options: RecorderOptions,
         recordings: Arc<Recordings>,
+        history: Arc<History>,
         events: Events,
         writes: &Arc<WriteStats>,
     ) -> std::io::Result<RecorderTask> {
         let (control, orders) = channel();
         let (captures, waiting) = sync_channel(WAITING);
-        let store = Store::open(&options);
+        // Without recordings the directory is left alone.
+        let store = options.is_on().then(|| Store::open(&options));
         {
             let mut shared = recordings.shared();
-            shared.entries = store.entries().to_vec();
+            shared.entries = store.as_ref().map_or_else(Vec::new, |store| store.entries().to_vec());
             shared.control = Some(control.clone());
-            shared.options = Some(options.clone());
+            shared.options = Some(options.clone()).filter(RecorderOptions::is_on);
         }
-        let writer = Writer {
+        let writer = store.map(|store| Writer {
             store,
             recordings: recordings.clone(),
             events: events.clone(),
             failing: false,
-        };
+        });
         let taker = Taker {
-            recorder: Recorder::new(options),
+            recorder: Recorder::new(options, history),
             events: events.clone(),
             heard: events.subscribe(),
             commands: writes.audit().subscribe(),
@@ -155,19 +166,20 @@ impl RecorderTask {
             left_out: 0,
         };
         let thread = |name: &str| std::thread::Builder::new().name(name.to_string());
-        let writer = thread("recordings").spawn(move || writer.run(&waiting))?;
+        let writer = writer.map(|writer| thread("recordings").spawn(move || writer.run(&waiting)));
+        let writer = writer.transpose()?;
         let taker = thread("recorder").spawn(move || taker.run(&orders))?;
         Ok(RecorderTask {
             recordings,
             control,
-            threads: vec![taker, writer],
+            threads: [taker].into_iter().chain(writer).collect(),
         })
     }
 
-    /// Records these buses from now on.
-    pub fn adopt(&self, buses: Vec<Arc<BusImage>>) {
+    /// Records these buses from now on; process data is stale from `stale_after` on.
+    pub fn adopt(&self, buses: Vec<Arc<BusImage>>, stale_after: Duration) {
         // The thread only ends when this is stopped.
-        let _ = self.control.send(Control::Buses(buses));
+        let _ = self.control.send(Control::Buses(buses, stale_after));
     }
 
     /// Ends what is being recorded, and waits until it is on disk.
@@ -203,7 +215,9 @@ impl Taker {
             self.take_notes(clock);
             let mut captures = self.recorder.tick(clock);
             match order {
-                Ok(Control::Buses(buses)) => captures.extend(self.recorder.adopt(&buses, clock)),
+                Ok(Control::Buses(buses, stale_after)) => {
+                    captures.extend(self.recorder.adopt(&buses, stale_after, clock));
+                }
                 Ok(Control::Record(drive, who, reply)) => {
                     let trigger = Trigger {
                         kind: TriggerKind::Command,
@@ -338,7 +352,7 @@ impl Writer {
                     let text = format!("recording {}: {}", entry.id, entry.summary);
                     let made = RecordingMade {
                         id: entry.id.clone(),
-                        trigger: entry.trigger.name(),
+                        trigger: entry.trigger.name().into(),
                         summary: entry.summary.clone(),
                     };
                     publish(&self.events, bus, Some(drive), text, Some(made));
@@ -361,14 +375,9 @@ impl Writer {
 
 fn publish(events: &Events, bus: String, drive: Option<String>, text: String, recording: Option<RecordingMade>) {
     events.publish(Event {
-        id: 0,
-        time: std::time::SystemTime::now(),
-        kind: EventKind::Recording,
         bus,
         drive,
-        fault_code: None,
-        count: None,
-        text,
         recording,
+        ..Event::new(EventKind::Recording, std::time::SystemTime::now(), text)
     });
 }

@@ -8,6 +8,7 @@ mod arrival;
 mod clock;
 mod names;
 mod options;
+mod pty;
 mod receiver;
 mod remote;
 mod rfc2217;
@@ -19,8 +20,10 @@ use clock::WakeUps;
 pub use clock::{poll_until, sharpen_timers, wait_until};
 pub use names::Names;
 pub use options::{Level, LineOptions, MOST_RTS_DELAY, Rs485, Spin};
+pub(crate) use pty::Pty;
 pub use receiver::Receiver;
 use remote::{Raw, Remote};
+pub(crate) use rfc2217::{ServedPort, escape as telnet_escaped};
 
 use std::cell::Cell;
 use std::fmt;

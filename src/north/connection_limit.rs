@@ -145,7 +145,8 @@ impl Rights {
         }
     }
 
-    fn set(&self, authority: Authority) {
+    /// From now on.
+    pub(super) fn set(&self, authority: Authority) {
         self.0.store(authority == Authority::Write, Ordering::Relaxed);
     }
 }

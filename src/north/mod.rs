@@ -1,7 +1,8 @@
-//! The north sides: Modbus TCP, MQTT, HTTP and the local socket. They read the process image and queue commands; they never
+//! The north sides: Modbus TCP, MQTT, HTTP, the local socket and the tool slots. They read the process image and queue commands; they never
 //! name the bus.
 
 mod certificate;
+mod command_json;
 mod connection_limit;
 pub mod http;
 mod identity;
@@ -16,6 +17,7 @@ mod pem;
 mod readiness;
 mod refusals;
 pub(crate) mod register_map;
+pub mod slot;
 mod stats;
 
 use std::io;
@@ -25,7 +27,7 @@ pub(crate) use identity::client_tls;
 pub use identity::{IdentityFault, ServerIdentity, TlsFile, certificate_warnings};
 pub use stats::{
     ConnectionRefusal, LostListeners, ModbusTcpStats, MqttLoss, MqttStats, NorthStats, RefusalStats, ReloadStats,
-    ServerKind,
+    ServerKind, SlotOutcome, SlotStats,
 };
 
 /// Why a server cannot start.

@@ -56,6 +56,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     let store = vault.store();
     let last = latest(store.clone(), name.clone()).await;
     let names = vault.names(&drive.image.spec.profile.name);
+    let begun = Instant::now();
     let result = read(
         &vault,
         &drive,
@@ -66,9 +67,9 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     .await;
     if let Ok(file) = &result {
         if let Some(last) = &last {
-            compare(&vault, &drive, last, file);
+            compare(&vault, &drive, last, file, begun);
         }
-        drive.image.forget_written();
+        drive.image.forget_written(begun);
         if let Some(store) = store {
             keep(store, file.clone()).await;
         }
@@ -123,7 +124,7 @@ async fn read(
 }
 
 /// Tells what changed since the last reading, what the gateway wrote itself apart.
-fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &ParameterFile) {
+fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &ParameterFile, begun: Instant) {
     let spec = &drive.image.spec;
     if last.family != file.family {
         return;
@@ -133,24 +134,23 @@ fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &Para
         .filter(|change| change.before.is_some() && change.after.is_some())
         .filter(|change| {
             let address = spec.profile.parameters.address(change.id.name());
-            let written = address.and_then(|address| drive.image.written(address));
-            !matches!((written, change.after), (Some(own), Some(RawValue::Word(value))) if own == value)
+            match address.and_then(|address| drive.image.written(address)) {
+                // It is not known whether it was read before that or after; the next reading tells.
+                Some((_, at)) if at >= begun => false,
+                Some((own, _)) => change.after != Some(RawValue::Word(own)),
+                None => true,
+            }
         })
         .collect();
     if changes.is_empty() {
         return;
     }
     vault.count_changed(&spec.bus, &spec.name, changes.len() as u64);
+    let text = told(&spec.name, &last.time, &changes);
     drive.publish(Event {
-        id: 0,
-        time: SystemTime::now(),
-        kind: EventKind::ParametersChanged,
         bus: spec.bus.clone(),
         drive: Some(spec.name.clone()),
-        fault_code: None,
-        count: None,
-        text: told(&spec.name, &last.time, &changes),
-        recording: None,
+        ..Event::new(EventKind::ParametersChanged, SystemTime::now(), text)
     });
 }
 

@@ -13,6 +13,8 @@ pub struct NorthStats {
     pub modbus_tcp: ModbusTcpStats,
     /// Of the MQTT client.
     pub mqtt: MqttStats,
+    /// Of the tool slots.
+    pub slots: SlotStats,
     /// Refused connections of all servers.
     pub refused: RefusalStats,
     /// Listeners that do not work.
@@ -63,17 +65,20 @@ pub enum ServerKind {
     ModbusTcp,
     /// HTTP.
     Http,
+    /// The tool slots.
+    Slot,
 }
 
 impl ServerKind {
     /// All servers.
-    pub const ALL: [ServerKind; 2] = [ServerKind::ModbusTcp, ServerKind::Http];
+    pub const ALL: [ServerKind; 3] = [ServerKind::ModbusTcp, ServerKind::Http, ServerKind::Slot];
 
     /// Name in the metrics.
     pub fn name(self) -> &'static str {
         match self {
             ServerKind::ModbusTcp => "modbus_tcp",
             ServerKind::Http => "http",
+            ServerKind::Slot => "slot",
         }
     }
 
@@ -82,6 +87,7 @@ impl ServerKind {
         match self {
             ServerKind::ModbusTcp => "Modbus TCP",
             ServerKind::Http => "HTTP",
+            ServerKind::Slot => "tool slot",
         }
     }
 }
@@ -218,6 +224,81 @@ impl ModbusTcpStats {
             }
         }
         all
+    }
+}
+
+/// How a request of a tool ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum SlotOutcome {
+    /// Answered with what the drive said; a broadcast: sent.
+    Answered,
+    /// The drive refused it.
+    Exception,
+    /// The gateway refused it.
+    Refused,
+    /// There was no answer to pass on: the drive is silent or away, or the request was not sent.
+    NoAnswer,
+    /// The tool asked again before it was answered.
+    Abandoned,
+    /// No answer came within a second.
+    Late,
+    /// No sound frame.
+    Broken,
+}
+
+impl SlotOutcome {
+    /// All outcomes.
+    pub const ALL: [SlotOutcome; 7] = [
+        SlotOutcome::Answered,
+        SlotOutcome::Exception,
+        SlotOutcome::Refused,
+        SlotOutcome::NoAnswer,
+        SlotOutcome::Abandoned,
+        SlotOutcome::Late,
+        SlotOutcome::Broken,
+    ];
+
+    /// Name in the metrics.
+    pub fn name(self) -> &'static str {
+        match self {
+            SlotOutcome::Answered => "answered",
+            SlotOutcome::Exception => "exception",
+            SlotOutcome::Refused => "refused",
+            SlotOutcome::NoAnswer => "no_answer",
+            SlotOutcome::Abandoned => "abandoned",
+            SlotOutcome::Late => "late",
+            SlotOutcome::Broken => "broken",
+        }
+    }
+}
+
+/// Counters of the tool slots, by bus.
+#[derive(Debug, Default)]
+pub struct SlotStats(Mutex<BTreeMap<String, [u64; SlotOutcome::ALL.len()]>>);
+
+impl SlotStats {
+    /// Counts a request of a tool.
+    pub fn count(&self, bus: &str, outcome: SlotOutcome) {
+        let mut all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        if !all.contains_key(bus) {
+            all.insert(bus.to_string(), Default::default());
+        }
+        if let Some(counter) = all.get_mut(bus).and_then(|counts| counts.get_mut(outcome as usize)) {
+            *counter += 1;
+        }
+    }
+
+    /// Requests so far by bus and outcome, without zeros.
+    pub fn requests(&self) -> Vec<(String, SlotOutcome, u64)> {
+        let all = self.0.lock().unwrap_or_else(PoisonError::into_inner);
+        let of_bus = |(bus, counts): (&String, &[u64; SlotOutcome::ALL.len()])| {
+            let named = SlotOutcome::ALL.into_iter().zip(*counts);
+            let bus = bus.clone();
+            named
+                .filter(|(_, count)| *count > 0)
+                .map(move |(outcome, count)| (bus.clone(), outcome, count))
+        };
+        all.iter().flat_map(of_bus).collect()
     }
 }
 

@@ -13,5 +13,5 @@ pub use difference::{Difference, differences};
 pub use file::{Entry, FileError, Id, ParameterFile};
 pub use names::Names;
 pub use reading::{Next, Reading};
-pub use store::{Kept, Store, read, write_whole};
+pub use store::{Kept, Store, read};
 pub use vault::{Status, Vault};

@@ -1,10 +1,11 @@
 //! Readings kept on disk: `DIR/DRIVE/20260302T074012Z.params`.
 
 use std::fs::{self, File};
-use std::io::{self, Read as _, Write as _};
+use std::io::{self, Read as _};
 use std::path::{Path, PathBuf};
 
 use super::file::{MOST_BYTES, ParameterFile};
+use crate::files;
 
 /// Readings kept of one drive.
 const KEPT: usize = 100;
@@ -43,10 +44,9 @@ impl Store {
     /// When the disk refuses it.
     pub fn keep(&self, file: &ParameterFile) -> io::Result<PathBuf> {
         let dir = self.dir.join(&file.drive);
-        fs::create_dir_all(&dir)?;
         let name: String = file.time.chars().filter(|c| c.is_ascii_alphanumeric()).collect();
         let path = dir.join(format!("{name}.{EXTENSION}"));
-        write_whole(&path, &file.text())?;
+        files::replace(&path, file.text().as_bytes())?;
         let mut kept = self.of(&file.drive)?;
         let checksum = file.checksum();
         let same = |path: &PathBuf| read(path).is_ok_and(|other| other.checksum() == checksum);
@@ -133,29 +133,6 @@ pub fn read(path: &Path) -> Result<ParameterFile, String> {
         ));
     }
     ParameterFile::parse(&text).map_err(|error| format!("{shown}: {error}"))
-}
-
-/// Writes a file that is there whole or not at all, also when the power fails.
-///
-/// # Errors
-/// When the disk refuses it.
-pub fn write_whole(path: &Path, text: &str) -> io::Result<()> {
-    let aside = path.with_extension("new");
-    let written = (|| {
-        let mut file = File::create(&aside)?;
-        file.write_all(text.as_bytes())?;
-        file.sync_all()?;
-        fs::rename(&aside, path)?;
-        match path.parent() {
-            Some(dir) if !dir.as_os_str().is_empty() => File::open(dir)?.sync_all(),
-            _ => Ok(()),
-        }
-    })();
-    if written.is_err() {
-        // What is left of it is in nobody's way.
-        let _ = fs::remove_file(&aside);
-    }
-    written
 }
 
 #[cfg(test)]

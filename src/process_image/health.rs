@@ -75,9 +75,15 @@ const BOUNDS: [f64; 16] = [
     0.001, 0.002, 0.003, 0.005, 0.0075, 0.010, 0.0125, 0.015, 0.020, 0.030, 0.050, 0.1, 0.25, 0.5, 1.0, 5.0,
 ];
 
+/// Upper bounds of turnarounds, s.
+pub(super) const TURNAROUNDS: [f64; BOUNDS.len()] = [
+    0.000_25, 0.0005, 0.001, 0.0015, 0.002, 0.003, 0.004, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.050, 0.1, 0.5,
+];
+
 /// A histogram of times that any thread may add to.
 #[derive(Debug)]
 pub struct Histogram {
+    bounds: &'static [f64; BOUNDS.len()],
     counts: [AtomicU64; BOUNDS.len() + 1],
     sum_nanos: AtomicU64,
 }
@@ -100,9 +106,15 @@ impl Default for Histogram {
 }
 
 impl Histogram {
-    /// An empty histogram.
+    /// An empty histogram of exchanges and cycles.
     pub fn new() -> Histogram {
+        Histogram::of(&BOUNDS)
+    }
+
+    /// An empty histogram with these upper bounds, s.
+    pub(super) fn of(bounds: &'static [f64; BOUNDS.len()]) -> Histogram {
         Histogram {
+            bounds,
             counts: Default::default(),
             sum_nanos: AtomicU64::new(0),
         }
@@ -111,7 +123,7 @@ impl Histogram {
     /// Adds one time.
     pub fn observe(&self, time: Duration) {
         let seconds = time.as_secs_f64();
-        let bucket = BOUNDS.partition_point(|bound| *bound < seconds);
+        let bucket = self.bounds.partition_point(|bound| *bound < seconds);
         if let Some(count) = self.counts.get(bucket) {
             count.fetch_add(1, Ordering::Relaxed);
         }
@@ -121,7 +133,7 @@ impl Histogram {
 
     /// The figures now.
     pub fn snapshot(&self) -> HistogramSnapshot {
-        let bounds = BOUNDS.iter().copied().chain([f64::MAX]);
+        let bounds = self.bounds.iter().copied().chain([f64::MAX]);
         let buckets: Vec<_> = bounds
             .zip(&self.counts)
             .map(|(b, c)| (b, c.load(Ordering::Relaxed)))

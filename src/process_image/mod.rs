@@ -11,7 +11,7 @@ mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
 pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
-pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Verdict};
+pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
 
 use std::collections::BTreeMap;
@@ -23,7 +23,9 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use tokio::sync::Notify;
 
+use self::health::TURNAROUNDS;
 use crate::codec::{LineFormat, Protocol};
+use crate::diagnosis::Diagnosis;
 use crate::drive::{ModelPoint, Plan, Point, PollClass, Profile, RawWrites, Value};
 
 /// Whether a drive may be commanded.
@@ -155,12 +157,14 @@ pub struct DriveImage {
     outcomes: [AtomicU64; Outcome::ALL.len()],
     /// Turnaround measured, ns; 0 is none yet.
     turnaround: AtomicU64,
+    /// Turnarounds measured.
+    turnarounds: Histogram,
     /// The last heartbeat that the bus has not taken note of.
     heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
     unsupervised: AtomicBool,
-    /// Values of parameters that the gateway wrote since they were read last, by address.
-    written: Mutex<BTreeMap<u16, u16>>,
+    /// Values of parameters that the gateway wrote since they were read last, and when, by address.
+    written: Mutex<BTreeMap<u16, (u16, Instant)>>,
 }
 
 impl DriveImage {
@@ -178,6 +182,7 @@ impl DriveImage {
             listeners: ArcSwap::default(),
             outcomes,
             turnaround: AtomicU64::new(0),
+            turnarounds: Histogram::of(&TURNAROUNDS),
             heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
@@ -186,22 +191,24 @@ impl DriveImage {
     }
 
     /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
-    pub(crate) fn note_written(&self, items: &[(u16, u16)]) {
+    pub(crate) fn note_written(&self, items: &[(u16, u16)], now: Instant) {
         let parameters = &self.spec.profile.parameters;
         let is_parameter = |address: u16| parameters.id(address).is_some();
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
-        written.extend(items.iter().copied().filter(|(address, _)| is_parameter(*address)));
+        let parameters = items.iter().filter(|(address, _)| is_parameter(*address));
+        written.extend(parameters.map(|(address, value)| (*address, (*value, now))));
     }
 
-    /// The value that the gateway wrote to that parameter since the parameters were read last.
-    pub fn written(&self, address: u16) -> Option<u16> {
+    /// The value that the gateway wrote to that parameter since the parameters were read last, and when.
+    pub fn written(&self, address: u16) -> Option<(u16, Instant)> {
         let written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         written.get(&address).copied()
     }
 
-    /// The parameters were read.
-    pub fn forget_written(&self) {
-        self.written.lock().unwrap_or_else(PoisonError::into_inner).clear();
+    /// The parameters were read, from `begun` on: what was written before that is in what was read.
+    pub fn forget_written(&self, begun: Instant) {
+        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.retain(|_, (_, at)| *at >= begun);
     }
 
     /// Process data is not stale before that age: the line cannot renew it faster.
@@ -275,6 +282,7 @@ impl DriveImage {
 
     /// Notes a time from the end of a request to the beginning of its answer; single late wake-ups are smoothed out.
     pub fn set_turnaround(&self, time: Duration) {
+        self.turnarounds.observe(time);
         let last = self.turnaround.load(Ordering::Relaxed);
         let time = u64::try_from(time.as_nanos()).unwrap_or(u64::MAX).max(1);
         let smooth = if last == 0 { time } else { last - last / 8 + time / 8 };
@@ -287,6 +295,11 @@ impl DriveImage {
             0 => None,
             nanos => Some(Duration::from_nanos(nanos)),
         }
+    }
+
+    /// Turnarounds so far.
+    pub fn turnarounds(&self) -> HistogramSnapshot {
+        self.turnarounds.snapshot()
     }
 
     /// A commanding client sent its heartbeat: the lease runs anew.
@@ -342,8 +355,10 @@ pub struct BusImage {
     pub slow_cycles: Histogram,
     /// The frames on the line, for whoever listens.
     pub trace: Trace,
-    /// What is read and what is on the line, for the recorder.
+    /// What is read and what is on the line, for recorder, trends and counters.
     pub tape: Tape,
+    /// What is wrong with the line. Only the bus itself may store one.
+    pub diagnosis: ArcSwap<Diagnosis>,
     health: Mutex<BusHealth>,
 }
 
@@ -358,6 +373,7 @@ impl BusImage {
             slow_cycles: Histogram::new(),
             trace: Trace::default(),
             tape: Tape::default(),
+            diagnosis: ArcSwap::default(),
             health: Mutex::new(BusHealth::default()),
         }
     }

@@ -259,17 +259,43 @@ impl Reading<'_> {
         }
     }
 
+    /// For how long a value of that point is good once it was read, as long as the drive answers: that of its registers that
+    /// age first.
+    pub fn good_for(&self, point: usize) -> Duration {
+        let Some(point) = self.spec.profile.points.get(point) else {
+            return Duration::ZERO;
+        };
+        let limit = |raw: &Raw| {
+            let cells = raw
+                .addresses()
+                .filter_map(|address| self.snapshot.cell(raw.table, address));
+            let limits = cells.filter_map(|(class, cell)| self.limit_of(class, cell));
+            limits.min().unwrap_or(Duration::MAX)
+        };
+        match &point.source {
+            Source::Raw(raw) => limit(raw),
+            Source::Derived(derived) => {
+                let sources = derived.sources().into_iter().map(|source| self.good_for(source));
+                sources.min().unwrap_or(Duration::ZERO)
+            }
+        }
+    }
+
+    /// Age from which a cell is stale; `None`: never while the drive answers.
+    fn limit_of(&self, class: PollClass, cell: &Cell) -> Option<Duration> {
+        match self.snapshot.heard {
+            Some(_) => Some(self.stale_after.max(cell.cadence.good_for())),
+            None => self.age_limit(class),
+        }
+    }
+
     fn quality(&self, class: PollClass, cell: &Cell) -> Quality {
         match (cell.refused, cell.at) {
             (Some(_), _) | (None, None) => Quality::Bad,
             _ if !self.snapshot.link.is_online() || cell.outlived => Quality::Stale,
             (None, Some(at)) => {
                 let age = self.now.saturating_duration_since(at);
-                let limit = match self.snapshot.heard {
-                    Some(_) => Some(self.stale_after.max(cell.cadence.good_for())),
-                    None => self.age_limit(class),
-                };
-                let old = limit.is_some_and(|limit| age > limit);
+                let old = self.limit_of(class, cell).is_some_and(|limit| age > limit);
                 if old { Quality::Stale } else { Quality::Good }
             }
         }

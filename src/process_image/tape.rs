@@ -1,9 +1,10 @@
-//! What a bus read and what was on its line, on the way to the recorder; costs nothing while there is none.
+//! What a bus read and what was on its line, on the way to recorder, trends and counters; costs nothing while there is nobody
+//! who takes it.
 //!
 //! The bus only appends and the recorder takes all there is at once, so the bus never waits longer than for the swap of two
 //! lists.
 
-use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::atomic::{AtomicU8, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -116,33 +117,55 @@ struct Waiting {
     lost: u64,
 }
 
+/// What a tape takes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+#[repr(u8)]
+pub enum Taping {
+    /// Nothing.
+    Off,
+    /// What is read: for trends and counters.
+    Reads,
+    /// What is read and what is on the line: for the recorder, too.
+    Everything,
+}
+
 /// The tape of one bus.
 #[derive(Debug, Default)]
 pub struct Tape {
-    on: AtomicBool,
+    /// A [`Taping`].
+    taping: AtomicU8,
     waiting: Mutex<Waiting>,
 }
 
 impl Tape {
-    /// Lets the tape run from now on, or stops and clears it.
-    pub fn switch(&self, on: bool) {
-        self.on.store(on, Ordering::Relaxed);
-        if !on {
+    /// What is taken from now on; without anything the tape is cleared.
+    pub fn switch(&self, taping: Taping) {
+        self.taping.store(taping as u8, Ordering::Relaxed);
+        if taping == Taping::Off {
             self.take();
         }
     }
 
-    /// Whether a recorder takes what is appended.
-    pub fn is_on(&self) -> bool {
-        self.on.load(Ordering::Relaxed)
+    /// Whether that is taken.
+    pub fn takes(&self, taping: Taping) -> bool {
+        self.taping.load(Ordering::Relaxed) >= taping as u8
     }
 
-    /// Appends an entry, which is only built while the tape runs. Only the bus itself may call this.
-    pub fn append(&self, entry: impl FnOnce() -> Taped) {
-        if !self.is_on() {
-            return;
+    /// The drive at that place was read. `read` is only called while somebody takes it. Only the bus itself may call this.
+    pub fn read(&self, drive: usize, read: impl FnOnce() -> TapedRead) {
+        if self.takes(Taping::Reads) {
+            self.append(Taped::Read(drive, read()));
         }
-        let entry = entry();
+    }
+
+    /// Something was on the line; as [`Tape::read`].
+    pub fn frame(&self, frame: impl FnOnce() -> TapedFrame) {
+        if self.takes(Taping::Everything) {
+            self.append(Taped::Frame(frame()));
+        }
+    }
+
+    fn append(&self, entry: Taped) {
         let size = entry.size();
         let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
         if waiting.bytes + size > TAPE_BYTES {
@@ -167,27 +190,36 @@ mod tests {
     #[test]
     fn a_tape_that_nobody_takes_is_bounded() {
         let tape = Tape::default();
-        let frame = |bytes: usize| {
-            Taped::Frame(TapedFrame {
-                at: Instant::now(),
-                drive: None,
-                verdict: Verdict::Foreign,
-                bytes: vec![0; bytes].into(),
-            })
+        let frame = |bytes: usize| TapedFrame {
+            at: Instant::now(),
+            drive: None,
+            verdict: Verdict::Foreign,
+            bytes: vec![0; bytes].into(),
         };
-        tape.append(|| unreachable!("it is off"));
-        tape.switch(true);
+        tape.frame(|| unreachable!("it is off"));
+        tape.read(0, || unreachable!("it is off"));
+        tape.switch(Taping::Everything);
         for _ in 0..2000 {
-            tape.append(|| frame(1000));
+            tape.frame(|| frame(1000));
         }
         let (entries, lost) = tape.take();
         assert_eq!(entries.len() as u64 + lost, 2000);
         assert_eq!(entries.len(), TAPE_BYTES / frame(1000).size());
-        tape.append(|| frame(1));
+        tape.frame(|| frame(1));
         assert_eq!((tape.take().0.len(), tape.take().0.len()), (1, 0));
-        tape.append(|| frame(1));
-        tape.switch(false);
-        tape.append(|| unreachable!("it is off"));
+        tape.switch(Taping::Reads);
+        tape.frame(|| unreachable!("nobody records"));
+        tape.read(0, || TapedRead {
+            at: Instant::now(),
+            table: Table::Holding,
+            start: 1,
+            words: [7].into(),
+        });
+        assert_eq!(tape.take().0.len(), 1);
+        tape.switch(Taping::Everything);
+        tape.frame(|| frame(1));
+        tape.switch(Taping::Off);
+        tape.frame(|| unreachable!("it is off"));
         assert_eq!(tape.take(), (Vec::new(), 0));
     }
 }

@@ -1,7 +1,7 @@
 //! Where a master reaches the simulated line: a pseudo-terminal, a real serial port, or a TCP port.
 
-use super::pty::Pty;
 use crate::codec::{LineFormat, Parity};
+use crate::line::Pty;
 use rustix::event::{PollFd, PollFlags};
 use rustix::fs::{FlockOperation, flock};
 use rustix::termios::{ControlModes, OptionalActions, QueueSelector, ioctl_tiocexcl, tcflush, tcgetattr, tcsetattr};
@@ -82,7 +82,7 @@ impl Endpoint {
     pub(super) fn poll_fds(&self) -> Vec<PollFd<'_>> {
         let wanted = |fd| PollFd::from_borrowed_fd(fd, PollFlags::IN);
         match self {
-            Endpoint::Pty(pty) => vec![wanted(pty.master.as_fd())],
+            Endpoint::Pty(pty) => vec![wanted(pty.as_fd())],
             Endpoint::Port(file, _) => vec![wanted(file.as_fd())],
             Endpoint::Tcp { listener, master } => {
                 let master = master.as_ref().map(|stream| wanted(stream.as_fd()));
@@ -97,7 +97,7 @@ impl Endpoint {
     /// The port is gone.
     pub(super) fn receive(&mut self, buffer: &mut [u8]) -> io::Result<usize> {
         match self {
-            Endpoint::Pty(pty) => no_wait(rustix::io::read(&pty.master, buffer).map_err(io::Error::from)),
+            Endpoint::Pty(pty) => no_wait(pty.read(buffer)),
             Endpoint::Port(file, path) => match file.read(buffer) {
                 // With nothing to read a port says so; an end of file means that it was unplugged.
                 Ok(0) => Err(io::Error::new(
@@ -127,7 +127,7 @@ impl Endpoint {
     /// The port is gone.
     pub(super) fn send(&mut self, bytes: &[u8]) -> io::Result<usize> {
         match self {
-            Endpoint::Pty(pty) => no_wait(rustix::io::write(&pty.master, bytes).map_err(io::Error::from)),
+            Endpoint::Pty(pty) => no_wait(pty.write(bytes)),
             Endpoint::Port(file, _) => no_wait(file.write(bytes)),
             Endpoint::Tcp { master, .. } => {
                 let Some(stream) = master else { return Ok(0) };

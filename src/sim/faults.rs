@@ -17,6 +17,8 @@ pub enum Foreign {
     Function,
     /// Of another length.
     Length,
+    /// In nothing but its data.
+    Data,
 }
 
 /// Something that goes wrong with one exchange.
@@ -50,11 +52,28 @@ pub enum Fault {
     Split,
     /// The drive refuses with this exception code; it does not act.
     Exception(u8),
+    /// The first character of the reply is lost: the adapter turns to receiving too late.
+    ReplyStart,
+    /// The last character of the request is lost: the adapter turns to receiving too early.
+    CutRequest,
+    /// The same, and the adapter hears itself.
+    CutEcho,
+    /// A zero comes directly before the reply: the line floats until the drive takes it.
+    ZeroBefore,
+    /// A stray character comes after the reply, while nobody speaks.
+    IdleNoise,
+    /// Another drive has the same address, and its reply begins somewhat later.
+    Twin,
+    /// The drive does not hear a request that begins so soon behind a reply.
+    NeedsPause(Duration),
+    /// The character of the reply is damaged that is on the line at the peak of the mains, whose frequency is this, Hz.
+    Mains(u8),
 }
 
 /// Every name that a fault has in text, for messages.
 pub const NAMES: &str = "deaf, drop, truncate, corrupt, double, late:50ms, foreign-address, foreign-function, \
-    foreign-length, stray-address, stray-function, stray-length, echo, deaf-echo, noise-before, noise-after, split, exception:4, busy";
+    foreign-length, stray-address, stray-function, stray-length, echo, deaf-echo, noise-before, noise-after, split, exception:4, busy, reply-start, cut-request, cut-echo, zero-before, \
+    idle-noise, twin, needs-pause:10ms, mains:50";
 
 impl FromStr for Fault {
     type Err = String;
@@ -67,6 +86,10 @@ impl FromStr for Fault {
             ("late", argument) => Fault::Late(
                 parse_duration(argument.unwrap_or("50ms")).map_err(|error| Finding::from(error).to_string())?,
             ),
+            ("needs-pause", argument) => Fault::NeedsPause(
+                parse_duration(argument.unwrap_or("10ms")).map_err(|error| Finding::from(error).to_string())?,
+            ),
+            ("mains", argument) => Fault::Mains(mains(argument.unwrap_or("50"))?),
             ("exception", Some(code)) => Fault::Exception(exception_code(code)?),
             (_, Some(_)) => {
                 return Err(format!(
@@ -91,10 +114,21 @@ impl FromStr for Fault {
             ("split", None) => Fault::Split,
             ("exception", None) => Fault::Exception(4),
             ("busy", None) => Fault::Exception(6),
+            ("reply-start", None) => Fault::ReplyStart,
+            ("cut-request", None) => Fault::CutRequest,
+            ("cut-echo", None) => Fault::CutEcho,
+            ("zero-before", None) => Fault::ZeroBefore,
+            ("idle-noise", None) => Fault::IdleNoise,
+            ("twin", None) => Fault::Twin,
             _ => return Err(format!("`{text}` is not a fault; valid faults: {NAMES}")),
         };
         Ok(fault)
     }
+}
+
+fn mains(text: &str) -> Result<u8, String> {
+    let hertz = text.parse().ok().filter(|hertz| [50, 60].contains(hertz));
+    hertz.ok_or_else(|| format!("`{text}` is not a frequency of the mains; write mains:50 or mains:60"))
 }
 
 fn exception_code(text: &str) -> Result<u8, String> {
@@ -140,6 +174,9 @@ pub struct FaultPlan {
     only: Vec<u8>,
     /// A register that one drive refuses to read: address, table, register.
     refused: Option<(u8, Table, u16)>,
+    while_running: bool,
+    /// Asked where this plan has no fault.
+    other: Option<Box<FaultPlan>>,
     random: Random,
     asked: u64,
 }
@@ -158,6 +195,8 @@ impl FaultPlan {
             script: BTreeMap::new(),
             only: Vec::new(),
             refused: None,
+            while_running: false,
+            other: None,
             random: Random::new(seed),
             asked: 0,
         }
@@ -175,6 +214,20 @@ impl FaultPlan {
     #[must_use]
     pub fn only(mut self, addresses: &[u8]) -> FaultPlan {
         self.only = addresses.to_vec();
+        self
+    }
+
+    /// Confines the faults to times at which a drive of the line runs.
+    #[must_use]
+    pub fn while_running(mut self) -> FaultPlan {
+        self.while_running = true;
+        self
+    }
+
+    /// A second cause beside this one.
+    #[must_use]
+    pub fn and(mut self, other: FaultPlan) -> FaultPlan {
+        self.other = Some(Box::new(other));
         self
     }
 
@@ -197,9 +250,19 @@ impl FaultPlan {
         self.refused.is_some_and(reads)
     }
 
-    /// The fault that the next request, one to `address`, meets.
-    pub fn next(&mut self, address: u8) -> Option<Fault> {
-        if !self.only.is_empty() && !self.only.contains(&address) {
+    /// The fault that the next request, one to `address`, meets; `runs` tells whether a drive of the line runs.
+    pub fn next(&mut self, address: u8, runs: impl Fn() -> bool) -> Option<Fault> {
+        let own = self.own(address, &runs);
+        own.or_else(|| self.other.as_mut()?.next_of_other(address, &runs))
+    }
+
+    fn next_of_other(&mut self, address: u8, runs: &dyn Fn() -> bool) -> Option<Fault> {
+        let own = self.own(address, runs);
+        own.or_else(|| self.other.as_mut()?.next_of_other(address, runs))
+    }
+
+    fn own(&mut self, address: u8, runs: &dyn Fn() -> bool) -> Option<Fault> {
+        if !self.only.is_empty() && !self.only.contains(&address) || self.while_running && !runs() {
             return None;
         }
         self.asked += 1;
@@ -239,8 +302,9 @@ impl FaultPlan {
             ..burst(bytes)
         };
         match fault {
-            None | Some(Fault::Exception(_)) => vec![burst(reply)],
-            Some(Fault::Deaf | Fault::Drop) => Vec::new(),
+            // Which character the mains hit is known on the line only.
+            None | Some(Fault::Exception(_) | Fault::Mains(_)) => vec![burst(reply)],
+            Some(Fault::Deaf | Fault::Drop | Fault::CutRequest | Fault::NeedsPause(_)) => Vec::new(),
             Some(Fault::Truncate) => vec![burst(cut(reply, random))],
             Some(Fault::Corrupt) => vec![burst(corrupt(protocol, reply, random))],
             Some(Fault::Double) => vec![burst(reply.clone()), provoked(reply)],
@@ -269,6 +333,20 @@ impl FaultPlan {
                 kind: Kind::Echo,
                 ..burst(request.to_vec())
             }],
+            Some(Fault::CutEcho) => vec![Burst {
+                kind: Kind::Echo,
+                ..burst(request.split_last().map_or(Vec::new(), |(_, rest)| rest.to_vec()))
+            }],
+            Some(Fault::ReplyStart) => vec![burst(reply.get(1..).unwrap_or_default().to_vec())],
+            Some(Fault::ZeroBefore) => vec![burst(vec![0]), burst(reply)],
+            Some(Fault::IdleNoise) => vec![
+                burst(reply),
+                Burst {
+                    gap: silence / 2,
+                    ..provoked(vec![random.byte()])
+                },
+            ],
+            Some(Fault::Twin) => twin(protocol, reply, random).into_iter().map(burst).collect(),
             Some(Fault::NoiseBefore) => vec![burst(noise(random)), burst(reply)],
             Some(Fault::NoiseAfter) => vec![burst(reply), provoked(noise(random))],
             Some(Fault::Split) => vec![Burst {
@@ -301,6 +379,26 @@ pub struct Burst {
     pub bytes: Vec<u8>,
     /// What it is to the line.
     pub kind: Kind,
+}
+
+/// Two replies at once: while both drives speak a low bit of either wins, and the later one is heard to its end.
+fn twin(protocol: Protocol, reply: Vec<u8>, random: &mut Random) -> Vec<Vec<u8>> {
+    let later = match foreign(Foreign::Data, protocol, &reply) {
+        // A frame of N2 names nobody.
+        none if none.is_empty() => reply.clone(),
+        later => later,
+    };
+    let behind = random.within(1..=reply.len() as u64 + 4) as usize;
+    if behind >= reply.len() {
+        return vec![reply, later];
+    }
+    let mut both = reply;
+    both.resize(behind + later.len(), 0xFF);
+    both.iter_mut()
+        .skip(behind)
+        .zip(&later)
+        .for_each(|(byte, other)| *byte &= other);
+    vec![both]
 }
 
 fn cut(mut reply: Vec<u8>, random: &mut Random) -> Vec<u8> {
@@ -353,6 +451,7 @@ fn foreign(what: Foreign, protocol: Protocol, reply: &[u8]) -> Vec<u8> {
     pdu.iter_mut().skip(2).for_each(|byte| *byte ^= 0x55);
     let mut address = address;
     match what {
+        Foreign::Data => {}
         Foreign::Address => address = if address >= 247 { 1 } else { address + 1 },
         Foreign::Function => {
             if let Some(function) = pdu.first_mut() {
@@ -431,18 +530,18 @@ mod tests {
     fn chance_script_and_addresses() {
         let rates: Rates = "drop=0.1,corrupt=0.2".parse().unwrap();
         let mut plan = FaultPlan::new(rates.clone(), 5);
-        let seen: Vec<_> = (0..10_000).map(|_| plan.next(1)).collect();
+        let seen: Vec<_> = (0..10_000).map(|_| plan.next(1, || false)).collect();
         let count = |wanted| seen.iter().filter(|fault| **fault == wanted).count();
         assert!((900..1100).contains(&count(Some(Fault::Drop))));
         assert!((1850..2150).contains(&count(Some(Fault::Corrupt))));
         let mut again = FaultPlan::new(rates, 5);
         assert!(
-            seen.iter().all(|fault| *fault == again.next(1)),
+            seen.iter().all(|fault| *fault == again.next(1, || false)),
             "the same seed, the same faults"
         );
 
         let mut script = FaultPlan::default().at(2, Fault::Echo).only(&[7]);
-        let seen: Vec<_> = [1, 7, 1, 7, 7].map(|address| script.next(address)).to_vec();
+        let seen: Vec<_> = [1, 7, 1, 7, 7].map(|address| script.next(address, || false)).to_vec();
         assert_eq!(seen, [None, None, None, Some(Fault::Echo), None]);
     }
 

@@ -24,6 +24,8 @@ pub enum Delivery {
     Whole,
     /// In chunks of so many characters, as a UART empties its FIFO (14 of 16 is usual); 1 is one by one.
     Chunks(u8),
+    /// Whole, at the next multiple of this time: the latency timer of a USB adapter.
+    Steps(Duration),
 }
 
 /// What is between the simulated drives and the master.
@@ -142,6 +144,8 @@ pub struct HalfDuplex {
     last_end: Option<SimTime>,
     /// End of the last reply that the master could expect; it may lie ahead.
     reply_end: Option<SimTime>,
+    /// Time from the last reply to the request that was heard last.
+    pause_before: Duration,
     /// End of the last characters that fault injection put there; it may lie ahead.
     provoked_end: Option<SimTime>,
     statistics: Statistics,
@@ -162,6 +166,7 @@ impl HalfDuplex {
             outgoing: Vec::new(),
             last_end: None,
             reply_end: None,
+            pause_before: Duration::MAX,
             provoked_end: None,
             statistics: Statistics::default(),
             lateness: Lateness::default(),
@@ -311,6 +316,9 @@ impl HalfDuplex {
 
     fn finish(&mut self, frame: &Incoming) {
         let heard_at = frame.end + self.silence();
+        self.pause_before = self
+            .reply_end
+            .map_or(Duration::MAX, |end| frame.start.saturating_sub(end));
         self.last_end = Some(frame.end);
         let met_fault = self.provoked_end.is_some_and(|end| frame.start < end + self.silence());
         self.statistics.provoked_overlaps += u64::from(met_fault && self.rules.wire != Wire::Instant);
@@ -387,7 +395,12 @@ impl HalfDuplex {
 
     fn reply(&mut self, frame: &Incoming, asked: &Asked, now: SimTime) {
         self.statistics.requests += 1;
-        let fault = self.faults.next(asked.address);
+        let slaves = &self.slaves;
+        let fault = self.faults.next(asked.address, || slaves.any_runs());
+        let fault = match fault {
+            Some(Fault::NeedsPause(pause)) if self.pause_before >= pause => None,
+            fault => fault,
+        };
         self.statistics.faults += u64::from(fault.is_some());
         let mut reply = Vec::with_capacity(64);
         let refused = asked
@@ -396,7 +409,8 @@ impl HalfDuplex {
             .is_ok_and(|pdu| self.faults.refuses(asked.address, pdu));
         match fault {
             None if refused => refuse(asked, Exception::ADDRESS, &mut reply),
-            Some(Fault::Deaf) => return,
+            Some(Fault::Deaf | Fault::NeedsPause(_)) => return,
+            Some(Fault::CutRequest | Fault::CutEcho) => return self.cut_request(frame, asked, fault, now),
             Some(Fault::DeafEcho) => {}
             Some(Fault::Exception(code)) => refuse(asked, Exception(code), &mut reply),
             _ => {
@@ -414,6 +428,35 @@ impl HalfDuplex {
             }
         }
         self.respond(frame, asked, fault, reply, now);
+    }
+
+    /// The drives hear the request without its last character.
+    fn cut_request(&mut self, frame: &Incoming, asked: &Asked, fault: Option<Fault>, now: SimTime) {
+        let cut = frame.bytes.split_last().map_or(&[][..], |(_, rest)| rest);
+        self.statistics.bad_crc += 1;
+        let heard = self.slaves.hear(self.rules.protocol, cut, now);
+        if fault == Some(Fault::CutEcho) {
+            self.respond(frame, asked, fault, Vec::new(), now);
+        } else if let Heard::Damaged(asked, exception) = heard {
+            let mut reply = Vec::new();
+            refuse(&asked, exception, &mut reply);
+            self.respond(frame, &asked, None, reply, now);
+        }
+    }
+
+    /// Damages the character that is on the line at the peak of the mains, if there is one.
+    fn hum(&self, hertz: u8, start: SimTime, bytes: &mut [u8]) {
+        let period = Duration::from_secs(1) / u32::from(hertz.max(1));
+        let character = self.chars(1);
+        let mut at = start;
+        for byte in bytes {
+            // The peak lasts for a twentieth of the period.
+            if at.as_nanos() % period.as_nanos() < period.as_nanos() / 20 + character.as_nanos() {
+                *byte ^= 0x24;
+                return;
+            }
+            at += character;
+        }
     }
 
     /// Puts a reply onto the wire, with what a fault makes of it.
@@ -436,6 +479,10 @@ impl HalfDuplex {
                 };
                 self.send(start, burst);
             } else {
+                let mut burst = burst;
+                if let Some(Fault::Mains(hertz)) = fault {
+                    self.hum(hertz, at, &mut burst.bytes);
+                }
                 at = self.send(at + burst.gap, burst);
             }
         }
@@ -458,7 +505,7 @@ impl HalfDuplex {
         });
         let chunk = match (burst.kind, self.rules.delivery) {
             (Kind::Split, _) => 1,
-            (Kind::Echo, _) | (_, Delivery::Whole) => bytes.len(),
+            (Kind::Echo, _) | (_, Delivery::Whole | Delivery::Steps(_)) => bytes.len(),
             (_, Delivery::Chunks(size)) => usize::from(size),
         };
         if !bytes.is_empty() && self.outgoing.len() < MOST_OUTGOING {
@@ -476,9 +523,13 @@ impl HalfDuplex {
     /// When the next chunk of a burst is due: at the end of its last character, or, when a real UART sends it, at the
     /// beginning of its first.
     fn due(&self, burst: &Outgoing) -> SimTime {
-        match self.rules.wire {
+        let due = match self.rules.wire {
             Wire::Real => burst.start + self.chars(burst.sent),
             _ => burst.start + self.chars((burst.sent + burst.chunk).min(burst.bytes.len())),
+        };
+        match self.rules.delivery {
+            Delivery::Steps(step) if !step.is_zero() => step * due.div_duration_f64(step).ceil() as u32,
+            _ => due,
         }
     }
 

@@ -32,7 +32,6 @@ pub(crate) mod motor;
 pub(crate) mod n2;
 pub mod nx;
 pub(crate) mod parameter_set;
-pub(crate) mod pty;
 pub mod random;
 pub mod slave;
 pub mod statistics;

@@ -86,6 +86,11 @@ impl Slaves {
         self.drives.get_mut(&address)
     }
 
+    /// Whether any drive runs.
+    pub fn any_runs(&self) -> bool {
+        self.drives.values().any(|drive| drive.state().running)
+    }
+
     /// Addresses on the line, ascending.
     pub fn addresses(&self) -> impl Iterator<Item = u8> {
         self.drives.keys().copied()

@@ -174,7 +174,8 @@ fn the_report_of_a_sound_configuration() {
             "requests",
             "shutdown_ms",
             "shutdown_worst_ms",
-            "slow_cycle_ms"
+            "slow_cycle_ms",
+            "trend_bytes"
         ]
     );
     assert_eq!(

@@ -89,7 +89,7 @@ fn a_recording_by_command_is_listed_shown_and_exported() {
 #[test]
 fn a_fault_makes_a_recording_and_a_directory_that_cannot_be_written_costs_that_only() {
     let (site, gateway, line) = start("");
-    fs::create_dir(site.file("state")).unwrap();
+    fs::create_dir_all(site.file("state")).unwrap();
     fs::write(site.file("state/recordings"), "in the way").unwrap();
     let trip = |code| assert!(line.with_drive(1, |drive, _| drive.trip(code)).is_some());
     trip(1);

@@ -121,6 +121,7 @@ impl Rig {
             writes,
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         };
         Rig {
             plant,

@@ -54,6 +54,7 @@ pub(crate) fn plant(gateway: &str, stale_after: Duration, buses: Vec<BusHandle>)
         writes: Arc::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }
 }
 

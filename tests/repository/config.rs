@@ -171,7 +171,14 @@ fn fenced(text: &str) -> Vec<String> {
 /// What must be mended in a configuration that ships. Secrets, certificates and profile directories lie on the
 /// machine it is made for.
 fn faults(path: &Path, source: &str) -> Vec<String> {
-    let elsewhere = [".password_file", ".ca", ".certificate", ".key", ".profile_dirs"];
+    let elsewhere = [
+        ".password_file",
+        ".ca",
+        ".certificate",
+        ".key",
+        ".users_file",
+        ".profile_dirs",
+    ];
     Settings::parse(path, source, std::iter::empty())
         .errors
         .iter()

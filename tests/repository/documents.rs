@@ -63,6 +63,7 @@ fn every_configuration_that_ships_is_valid() {
         &[&tls, "server", "gateway", "pump-house.example", "192.168.1.5"],
     );
     fs::write(dir.path().join("tokens"), "").unwrap();
+    fs::write(dir.path().join("users"), "").unwrap();
     for document in documents() {
         for (i, block) in blocks(&read(&document), "toml").iter().enumerate() {
             if is_profile(block) {

@@ -14,6 +14,7 @@ macro_rules! targets {
 targets! {
     ascii "../../fuzz/cases/ascii.rs",
     audit_file "../../fuzz/cases/audit_file.rs",
+    capture "../../fuzz/cases/capture.rs",
     certificate "../../fuzz/cases/certificate.rs",
     configuration "../../fuzz/cases/configuration.rs",
     http_request "../../fuzz/cases/http_request.rs",

@@ -9,11 +9,13 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 17] = [
+const ROOMS: [&str; 19] = [
     "document",
+    "files",
     "codec",
     "drive",
     "event",
+    "diagnosis",
     "process_image",
     "command",
     "history",

@@ -4,7 +4,7 @@ use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
-use std::sync::atomic::{AtomicU16, Ordering};
+use std::sync::atomic::{AtomicU16, AtomicU32, Ordering};
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
@@ -94,14 +94,19 @@ impl Drop for Running {
     }
 }
 
-/// The program, with runtime files away from those of gateways on this machine.
+/// The program, with runtime files away from those of gateways on this machine, and a state directory of its own.
 pub(crate) fn drivegate(arguments: &[&str]) -> Command {
+    static STARTED: AtomicU32 = AtomicU32::new(0);
+    let number = STARTED.fetch_add(1, Ordering::Relaxed);
+    let state = Path::new(env!("CARGO_TARGET_TMPDIR")).join(format!("state/{number}"));
+    // Of an earlier run of the tests.
+    let _ = std::fs::remove_dir_all(&state);
     let mut command = Command::new(env!("CARGO_BIN_EXE_drivegate"));
     command
         .args(arguments)
         .env_remove("RUNTIME_DIRECTORY")
         .env("XDG_RUNTIME_DIR", env!("CARGO_TARGET_TMPDIR"))
-        .env("STATE_DIRECTORY", concat!(env!("CARGO_TARGET_TMPDIR"), "/state"));
+        .env("STATE_DIRECTORY", state);
     command
 }
 

@@ -36,6 +36,8 @@ pub struct Asked {
     pub last_read: Option<Instant>,
     /// What the drive answered, if it acted upon the request.
     pub reply: Option<Reply>,
+    /// The frame of that.
+    pub frame: Vec<u8>,
 }
 
 /// Something that happened on the line.
@@ -280,12 +282,13 @@ impl WorldBus {
             is_poll: matches!(turn.purpose, Purpose::Poll(_)),
             last_read: match turn.pdu() {
                 RequestPdu::Read { table, start, .. } => {
-                    let image = &self.handle.image.drives[turn.drive];
-                    image.snapshot().read_at(*table, *start)
+                    let image = self.handle.image.drives.get(turn.drive);
+                    image.and_then(|image| image.snapshot().read_at(*table, *start))
                 }
                 _ => None,
             },
             reply: None,
+            frame: Vec::new(),
         };
         seen.push(Seen::Sent(asked.clone()));
         self.asked = Some(asked);
@@ -316,7 +319,13 @@ impl WorldBus {
             let Some(asked) = self.asked.as_mut().or(self.ended.as_mut()) else {
                 continue;
             };
-            let spec = &self.handle.image.drives[asked.drive].spec;
+            asked.frame = act.reply.clone();
+            let Some(image) = self.handle.image.drives.get(asked.drive) else {
+                // None is configured at that address.
+                seen.push(Seen::Acted(asked.clone()));
+                continue;
+            };
+            let spec = &image.spec;
             assert_eq!(spec.address, act.address, "a drive acted that was not asked");
             let request = Request {
                 address: spec.address,

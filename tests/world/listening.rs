@@ -10,12 +10,14 @@ use drivegate::bus::{BusOptions, Mode};
 use drivegate::codec::n2::Session;
 use drivegate::codec::{Decoded, Exception, LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
 use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, SourceKind, WriteStats};
+use drivegate::diagnosis::Cause;
 use drivegate::drive::{ModelPoint, Quality, Value};
 use drivegate::event::{EventKind, Events};
 use drivegate::line::LineOptions;
 use drivegate::plant::{BusHandle, Plant};
 use drivegate::process_image::{Access, BusImage, DriveImage, DriveSpec, Outcome as Counted};
 use drivegate::sim::SimTime;
+use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::half_duplex::{HalfDuplex, LineRules};
 use drivegate::sim::random::Random;
 use drivegate::sim::slave::Slaves;
@@ -533,6 +535,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         writes: scene.writes.clone(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     };
     let profile = scene.handle.image.drives[0].spec.profile.clone();
     let index = |point: ModelPoint| profile.model_index(point).unwrap();
@@ -586,4 +589,36 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
     }
     // The core has no way to send; the only bytes on the line are those of the other master.
     assert_eq!((scene.wire.statistics().bytes_in, tried), (before.bytes_in, 7200));
+}
+
+/// Verdicts about a line that another master polls, after a minute and a half.
+fn verdicts(line: Line, faults: FaultPlan) -> Vec<Cause> {
+    let mut scene = Scene::new(line, Noise::default(), 7);
+    scene.wire.set_faults(faults);
+    while scene.now < Duration::from_secs(90) {
+        scene.cycles(20);
+    }
+    let diagnosis = scene.handle.image.diagnosis.load();
+    assert!(diagnosis.at.is_some());
+    diagnosis.verdicts.iter().map(|verdict| verdict.verdict).collect()
+}
+
+#[test]
+fn what_is_wrong_with_a_line_shows_to_a_listener() {
+    let plan = |rates: &str| FaultPlan::new(rates.parse().unwrap(), 3);
+    for (family, protocol, baud) in [
+        ("vacon-nx", Protocol::ModbusRtu, 38_400),
+        ("teco-7300pa", Protocol::ModbusAscii, 19_200),
+        ("vacon-nx-n2", Protocol::N2, 9600),
+    ] {
+        let line = || rig::line(family, protocol, baud, 4);
+        assert_eq!(verdicts(line(), plan("")), [], "{family}");
+        let bad = plan("corrupt=0.15,drop=0.15").only(&[2]);
+        assert_eq!(verdicts(line(), bad), [Cause::OneDrive], "{family}");
+        assert_eq!(
+            verdicts(line(), plan("reply-start=0.2")),
+            [Cause::ReplyStartLost],
+            "{family}"
+        );
+    }
 }

@@ -18,6 +18,7 @@
 mod bus;
 mod clients;
 mod cost;
+mod diagnosis;
 mod drives;
 mod families;
 mod history;
@@ -33,6 +34,7 @@ mod recorder;
 mod rig;
 mod scenario;
 mod situations;
+mod slot;
 mod world;
 
 use std::ops::Range;
@@ -96,7 +98,7 @@ fn run_all(seeds: Range<u64>) {
     println!("{all}; in {took:.1?}: {speed:.1} bus-minutes a second");
 }
 
-fn number(name: &str) -> Option<u64> {
+pub(crate) fn number(name: &str) -> Option<u64> {
     std::env::var(name).ok().map(|text| text.parse().expect("a number"))
 }
 

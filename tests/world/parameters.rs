@@ -31,6 +31,7 @@ impl Rig {
             pace: Pace::Slow,
             expires: self.now + PATIENCE,
             ticket,
+            passed_on: None,
         };
         self.bus.handle.queue.submit_background(request, self.now);
         self.bus.command_came(self.now);

@@ -102,6 +102,7 @@ impl Rig {
             writes,
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         };
         Rig { bus, now, plant }
     }
@@ -171,6 +172,7 @@ impl Rig {
             writes: self.plant.writes.clone(),
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         }))
     }
 

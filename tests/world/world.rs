@@ -247,5 +247,6 @@ fn plant_of(buses: &[WorldBus], events: &Events, writes: &Arc<WriteStats>) -> Pl
         writes: writes.clone(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }
 }

@@ -76,7 +76,7 @@ impl ListenCore {
         ListenCore {
             drives: bus.image.drives.iter().map(known).collect(),
             decoder: decoder(&bus),
-            report: Report::new(bus.image.clone(), events, writes.clone(), now),
+            report: Report::new(bus.image.clone(), options, events, writes.clone(), now),
             bus,
             writes,
             retries: options.retries,
@@ -100,7 +100,7 @@ impl ListenCore {
     /// The port is gone or cannot be opened.
     pub fn lost(&mut self, why: &str, now: Instant) {
         self.refuse_all(now);
-        self.report.bus_down(why);
+        self.report.bus_down(why, now);
     }
 
     /// Answers whatever came into the queue all the same, which [`crate::command::admit`] prevents, and a gateway that is about to
@@ -150,7 +150,10 @@ impl ListenCore {
     fn take(&mut self, heard: &mut Vec<Heard>, now: Instant) {
         for one in heard.drain(..) {
             match one {
-                Heard::Stray { bytes, at, quiet_since } => self.report.noise(&bytes, quiet_since, at),
+                Heard::Stray { bytes, at, quiet_since } => {
+                    self.report.noise(&bytes, quiet_since, at);
+                    self.report.diagnosis.figures().stray(&bytes);
+                }
                 Heard::Exchange(exchange) => self.exchange(&exchange, now),
             }
         }
@@ -215,6 +218,7 @@ impl ListenCore {
         let (Some(image), Some(known)) = (self.bus.image.drives.get(index), self.drives.get_mut(index)) else {
             return;
         };
+        self.report.diagnosis.overheard(index, exchange);
         let answered = matches!(exchange.ended, Some(Ended::Reply(_)));
         // Bytes behind a command that is not known may be its reply.
         let is_known = exchange.request.is_some();

@@ -17,10 +17,10 @@
 use std::collections::BTreeMap;
 use std::time::{Duration, Instant};
 
-use super::frames::{Cut, Frames, GLITCH, Piece, are_sound, may_be_request};
 use crate::bus::late_replies::{FORGOTTEN_AFTER, LateReplies};
 use crate::bus::n2_late_replies::{N2LateReplies, Taken};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
+use crate::codec::frames::{Cut, Frames, GLITCH, HELD_BACK, Piece, are_sound, may_be_request};
 use crate::codec::n2::{self, N2Options};
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu};
 
@@ -127,7 +127,7 @@ impl Decoder {
     pub fn new(protocol: Protocol, format: LineFormat, n2: BTreeMap<u8, N2Options>) -> Decoder {
         Decoder {
             protocol,
-            frames: Frames::new(protocol, format),
+            frames: Frames::new(protocol, format, HELD_BACK),
             n2,
             open: None,
             garbage: Vec::new(),

@@ -1,6 +1,6 @@
 //! A line that another master owns: the gateway only listens.
 //!
-//! - [`decoder`]: bytes and their times in, exchanges of the other master out; [`frames`] cuts the bytes. Pure.
+//! - [`decoder`]: bytes and their times in, exchanges of the other master out; `codec::frames` cuts the bytes. Pure.
 //! - [`core`](self::core): the bus without its thread: what was heard goes into the process image, events and the audit. Pure.
 //! - [`commands`]: what the other master commands, reported when it changes. Pure.
 //! - [`survey`]: who speaks to whom how often, for `drivegate listen`. Pure.
@@ -12,7 +12,6 @@
 pub mod commands;
 pub mod core;
 pub mod decoder;
-pub mod frames;
 pub mod guess;
 pub mod n2_survey;
 pub mod survey;

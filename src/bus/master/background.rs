@@ -7,10 +7,16 @@ use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::Admission;
 use crate::bus::transaction::Ended;
-use crate::codec::{Exception, Reply, Table};
-use crate::command::{BackgroundRequest, Interruption, Outcome, Pace, Urgency, written};
-use crate::drive::PlannedRead;
+use crate::codec::rtu::LONGEST;
+use crate::codec::{Exception, Reply, RequestPdu, Table};
+use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Urgency, written};
 use crate::drive::plan::WireTime;
+use crate::drive::{PlannedRead, PollClass};
+
+/// Time of an exchange whose request is not decoded, at most.
+const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
+/// Time that drives have to carry out a broadcast before the next request (MODBUS over Serial Line 1.02, 2.4.1).
+const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 
 /// A background request that has its turn.
 #[derive(Debug)]
@@ -58,7 +64,10 @@ impl Master {
         let mut queue = bus.queue.background();
         if !queue.is_empty() {
             queue.remove(now, &Outcome::Expired, |r| r.expires <= now);
-            queue.remove(now, &Outcome::Offline, |r| !schedule.is_online(r.drive));
+            queue.remove(now, &Outcome::Replaced, BackgroundRequest::is_unwanted);
+            queue.remove(now, &Outcome::Offline, |r| {
+                r.drive != NO_DRIVE && !schedule.is_online(r.drive)
+            });
         }
     }
 
@@ -74,6 +83,7 @@ impl Master {
             drives,
             sessions,
             n2_late,
+            strangers,
             ..
         } = self;
         let may = |request: &BackgroundRequest| {
@@ -82,7 +92,11 @@ impl Master {
                 blocked = blocked.into_iter().chain([now + super::LOOK_ROUND]).min();
                 return false;
             }
-            let late = drives.get_mut(request.drive).map(|drive| &mut drive.late);
+            let late = match (&request.passed_on, drives.get_mut(request.drive)) {
+                (_, Some(drive)) => Some(&mut drive.late),
+                (Some(passed_on), None) => strangers.get_mut(&passed_on.address),
+                (None, None) => None,
+            };
             let late = late.and_then(|late| late.blocks(&request.pdu, now));
             let until = late.max(n2_late.blocks(&request.pdu, now));
             blocked = blocked.into_iter().chain(until).min();
@@ -141,7 +155,7 @@ impl Master {
     }
 
     /// A background exchange is over: it is answered, whatever came of it.
-    pub(super) fn background_over(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
+    pub(super) fn background_over(&mut self, turn: &Turn, mut end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         let index = turn.drive;
         let heard = self.sessions.heard(index, &end.ended);
         if heard == Progress::Restarted {
@@ -156,11 +170,101 @@ impl Master {
         if answered {
             self.schedule.seen(index, now);
         }
-        let outcome = self.background_outcome(turn, end, now);
-        if turn.pdu.is_write() {
+        let frame = std::mem::take(&mut end.frame);
+        let outcome = match self.is_broadcast_of(&begun.request) && end.ended == Ended::Silent {
+            true => Outcome::Acknowledged(Reply::Written),
+            false => self.background_outcome(turn, end, now),
+        };
+        if begun
+            .request
+            .passed_on
+            .as_ref()
+            .is_some_and(|passed_on| passed_on.may_write)
+        {
+            self.unchecked_write(&begun.request, &outcome, now);
+        } else if turn.pdu.is_write() {
             self.note_background_write(turn, &outcome, now);
         }
-        begun.request.answer(outcome, now);
+        if let Outcome::Acknowledged(reply) = &outcome {
+            self.note_background_read(turn, reply, now, news);
+        }
+        begun.request.answer_with(outcome, frame, now);
+    }
+
+    /// What was read fills the process image, too. A drive that was identified, or asked for its changes, may have started
+    /// anew or told what the gateway has not heard: it is read again.
+    fn note_background_read(&mut self, turn: &Turn, reply: &Reply, now: Instant, news: &mut Vec<News>) {
+        match (&turn.pdu, reply) {
+            (RequestPdu::Read { table, start, count }, reply) => {
+                let read = PlannedRead {
+                    class: PollClass::Slow,
+                    table: *table,
+                    start: *start,
+                    count: *count,
+                    wide: 0,
+                };
+                if let Some(words) = reply.words() {
+                    self.learn(turn.drive, read, words, now, news);
+                }
+            }
+            (_, Reply::Identified(_)) => {
+                if let Some(drive) = self.drives.get_mut(turn.drive) {
+                    drive.restarted();
+                }
+                self.schedule.read_again(turn.drive, now);
+            }
+            (_, Reply::Changes(digits)) if !digits.is_empty() => self.schedule.read_again(turn.drive, now),
+            _ => {}
+        }
+    }
+
+    /// What may have written anything: nothing that is known of the command words of those who heard it holds.
+    fn unchecked_write(&mut self, request: &BackgroundRequest, outcome: &Outcome, now: Instant) {
+        if matches!(outcome, Outcome::Exception(_)) {
+            return;
+        }
+        let broadcast = self.is_broadcast_of(request);
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            if broadcast || index == request.drive {
+                drive.restarted();
+                self.schedule.read_again(index, now);
+            }
+        }
+    }
+
+    /// The address that a turn asks where no drive is configured at it.
+    pub fn stranger(&self, turn: &Turn) -> Option<u8> {
+        let begun = self
+            .background
+            .as_ref()
+            .filter(|_| turn.purpose == Purpose::Background)?;
+        let passed_on = begun.request.passed_on.as_ref()?;
+        (turn.drive == NO_DRIVE).then_some(passed_on.address)
+    }
+
+    /// Whether a turn asks everybody, and nobody answers.
+    pub(super) fn is_broadcast(&self, turn: &Turn) -> bool {
+        self.stranger(turn) == Some(0) && self.sessions.is_empty()
+    }
+
+    fn is_broadcast_of(&self, request: &BackgroundRequest) -> bool {
+        let address = request.passed_on.as_ref().map(|passed_on| passed_on.address);
+        address == Some(0) && request.drive == NO_DRIVE && self.sessions.is_empty()
+    }
+
+    /// How long the first byte of the reply is waited for where that is not as with the gateway's own requests: after a broadcast
+    /// the drives have time to carry it out, and a request that is not decoded takes no more of the line than
+    /// [`LONGEST_UNCHECKED`].
+    pub(super) fn passed_on_timeout(&self, turn: &Turn) -> Option<Duration> {
+        if self.is_broadcast(turn) {
+            return Some(BROADCAST_PAUSE);
+        }
+        let RequestPdu::Other(_) = &turn.pdu else { return None };
+        let spec = &self.bus.image.spec;
+        let wire = WireTime::of(spec.protocol, &spec.format, &turn.pdu);
+        // How long the reply is shows only when it is there.
+        let patient = self.response_timeout + spec.format.chars(LONGEST);
+        Some(patient.min(LONGEST_UNCHECKED.saturating_sub(wire.request + wire.reply)))
     }
 
     fn background_outcome(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Outcome {
@@ -196,7 +300,7 @@ impl Master {
         if let Some((table, items)) = written(&turn.pdu) {
             let image = self.bus.image.drives.get(turn.drive);
             if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
-                image.note_written(&items);
+                image.note_written(&items, now);
             }
             let covers = |read: &PlannedRead| items.iter().any(|(address, _)| read.covers(table, *address));
             self.schedule.refresh(turn.drive, covers, now);

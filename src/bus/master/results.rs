@@ -10,7 +10,7 @@ use crate::bus::schedule::{Change, Poll, Polled};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Outcome, Urgency, written};
+use crate::command::{Command, Outcome, Pace, Urgency, written};
 use crate::drive::{PlannedRead, Point, Raw};
 
 /// First wait before a stop is tried again at a drive that did not answer one.
@@ -56,12 +56,17 @@ impl Master {
     /// What may still come of the exchange: nothing where the drive's own reply came mangled, unless a late reply of an
     /// earlier exchange may have been that.
     fn note_late(&mut self, turn: &Turn, end: &TurnEnd, now: Instant) {
-        let Some(drive) = self.drives.get_mut(turn.drive) else {
+        if self.is_broadcast(turn) {
+            // Nobody answers it.
             return;
-        };
+        }
+        let stranger = self.stranger(turn);
+        let mut drive = self.drives.get_mut(turn.drive);
         match &end.ended {
             Ended::Reply(_) => {
-                drive.silent_until = None;
+                if let Some(drive) = &mut drive {
+                    drive.silent_until = None;
+                }
                 if let Some(probes) = self.probes.get_mut(turn.drive) {
                     *probes = 0;
                 }
@@ -72,7 +77,17 @@ impl Master {
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
             Ended::Silent | Ended::Corrupt(_) if self.sessions.is_empty() => {
-                drive.late.given_up(&turn.pdu, end.began, now);
+                let late = match (drive, stranger) {
+                    (Some(drive), _) => Some(&mut drive.late),
+                    (None, Some(address)) => {
+                        self.strangers.retain(|_, late| late.may_come(now));
+                        Some(self.strangers.entry(address).or_default())
+                    }
+                    (None, None) => None,
+                };
+                if let Some(late) = late {
+                    late.given_up(&turn.pdu, end.began, now);
+                }
             }
             Ended::Corrupt(MAY_BE_LATE) => {
                 let window = super::N2_LATE * self.response_timeout;
@@ -180,14 +195,29 @@ impl Master {
     /// The drive answered a read of the plan.
     fn read(&mut self, poll: &Poll, reply: &Reply, now: Instant, news: &mut Vec<News>) {
         let (read, pdu) = (poll.read, poll.read.pdu());
-        let (Some(drive), Some(image)) = (self.drives.get_mut(poll.drive), self.bus.image.drives.get(poll.drive))
-        else {
+        let Some(drive) = self.drives.get_mut(poll.drive) else {
             return;
         };
         let at = drive.late.asked_by(&pdu, now);
         drive.late.answered(&pdu, now);
+        if let Some(words) = reply.words() {
+            self.learn(poll.drive, read, words, at, news);
+        }
+    }
+
+    /// What the drive has at the addresses of a read, as of `at`.
+    pub(super) fn learn(
+        &mut self,
+        index: usize,
+        read: PlannedRead,
+        words: Vec<u16>,
+        at: Instant,
+        news: &mut Vec<News>,
+    ) {
+        let (Some(drive), Some(image)) = (self.drives.get_mut(index), self.bus.image.drives.get(index)) else {
+            return;
+        };
         drive.was_read = true;
-        let Some(words) = reply.words() else { return };
         let written = image.spec.profile.points.iter().filter(|point| point.write);
         let commanded = written.filter_map(Point::raw).filter(|raw| raw.table == read.table);
         for address in commanded.flat_map(Raw::addresses) {
@@ -197,7 +227,7 @@ impl Master {
             }
         }
         news.push(News::Read {
-            drive: poll.drive,
+            drive: index,
             read,
             words,
             at,
@@ -217,6 +247,14 @@ impl Master {
         news: &mut Vec<News>,
     ) {
         self.schedule.command_done(rank, end.took);
+        let of_tool = self
+            .drives
+            .get_mut(index)
+            .and_then(|drive| drive.run(slot))
+            .is_some_and(|run| run.is_of_tool());
+        if of_tool && slot != Urgency::Stop {
+            self.schedule.background_owes(Pace::Brisk, end.took);
+        }
         if self.sessions.heard(index, &end.ended) == Progress::Restarted {
             self.restarted(index, now, news);
         }
@@ -250,7 +288,7 @@ impl Master {
         if let Some((Table::Holding, items)) = written(&step.pdu)
             && !matches!(reply, Reply::Exception(_))
         {
-            image.note_written(&items);
+            image.note_written(&items, now);
         }
         let outcome = drive.answered(slot, step, reply);
         if let Some(outcome) = outcome {

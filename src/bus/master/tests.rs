@@ -164,6 +164,7 @@ impl Rig {
                         began,
                         took,
                         mangled,
+                        frame: Vec::new(),
                     },
                     self.now,
                 ));
@@ -415,6 +416,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
             began: rig.now,
             took: COST,
             mangled: false,
+            frame: Vec::new(),
         };
         rig.now += COST;
         rig.master.done(&turn, end, rig.now);
@@ -536,6 +538,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
             began: rig.now,
             took: COST,
             mangled,
+            frame: Vec::new(),
         };
         let garbled = end(Ended::Corrupt("checksum"));
         let mut turn = read(&mut rig);

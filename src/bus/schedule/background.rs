@@ -70,6 +70,13 @@ impl Schedule {
         Admission::NotBefore(now + missing.max(Duration::from_millis(1)))
     }
 
+    /// What is on account of the share of that pace took so long, and was no background exchange.
+    pub fn background_owes(&mut self, pace: Pace, took: Duration) {
+        if let Some(balance) = self.background.balance.get_mut(pace as usize) {
+            *balance -= took.as_secs_f64();
+        }
+    }
+
     /// A background exchange is over, for which the line was taken for `took`. `answered`: the drive replied.
     pub fn background_done(&mut self, pace: Pace, admission: Admission, answered: bool, took: Duration) {
         let share = &mut self.background;

@@ -51,6 +51,11 @@ impl Written {
         self.dir.join("drivegate.sock")
     }
 
+    /// The users who may operate the demo from the page, if somebody made that file.
+    pub(super) fn users(&self) -> Option<PathBuf> {
+        Some(self.dir.join("users")).filter(|users| users.exists())
+    }
+
     pub(super) fn state_dir(&self) -> PathBuf {
         self.dir.join("state")
     }

@@ -45,6 +45,7 @@ impl Direct {
                 ..target.bus.clone()
             }],
             socket: SocketPath::Off,
+            keeps_history: false,
             modbus_tcp: None,
             mqtt: None,
             http: None,

@@ -35,6 +35,7 @@ fn plant() -> Plant {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }
 }
 

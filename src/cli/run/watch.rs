@@ -77,17 +77,11 @@ impl Watch<'_> {
         let why = summary(&outcome.errors);
         self.stats.reload.ended(why.is_none(), now);
         if let Some(why) = &why {
-            self.plant.load().events.publish(Event {
-                id: 0,
-                time: now,
-                kind: EventKind::ReloadRefused,
-                bus: String::new(),
-                drive: None,
-                fault_code: None,
-                count: None,
-                text: format!("the configuration was not applied, the former one goes on: {why}"),
-                recording: None,
-            });
+            self.plant.load().events.publish(Event::new(
+                EventKind::ReloadRefused,
+                now,
+                format!("the configuration was not applied, the former one goes on: {why}"),
+            ));
         }
         self.refused = why.map(|why| (now, why));
         self.status = status(&self.plant.load(), self.refused.as_ref());
@@ -137,6 +131,7 @@ mod tests {
             writes: Default::default(),
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         };
         assert_eq!(status(&plant, None), "0 of 0 buses up, 0 of 0 drives online");
         let refused = (SystemTime::UNIX_EPOCH, summary(&errors).unwrap());

@@ -12,6 +12,7 @@ use crate::bus::prober::{Answer, Prober};
 use crate::bus::transaction::Ended;
 use crate::codec::n2::Session;
 use crate::codec::{LineFormat, Protocol, Reply, Request, RequestPdu, Silence, Table};
+use crate::diagnosis::signature::Shape;
 use crate::drive::profile::{Profile, Profiles};
 use crate::drive::{Probe, identify};
 use crate::line::{Line, LineOptions};
@@ -27,6 +28,12 @@ pub(in crate::cli) struct Heard {
     pub(in crate::cli) unasked: usize,
     /// Requests that the adapter sent back.
     pub(in crate::cli) echoes: usize,
+    /// Replies that are sound but for their beginning, which was lost.
+    pub(in crate::cli) start_lost: usize,
+    /// Echoes that lack their end.
+    pub(in crate::cli) cut_echoes: usize,
+    /// Stray bytes directly before a reply.
+    pub(in crate::cli) stray_before: usize,
     /// Requests.
     pub(in crate::cli) requests: usize,
 }
@@ -188,6 +195,12 @@ impl<'a> Search<'a> {
         let answer = prober.ask(request).map_err(|lost| self.lost(&lost.to_string()))?;
         self.heard.requests += 1;
         self.heard.bytes += answer.bytes;
+        match answer.shape {
+            Shape::StartLost => self.heard.start_lost += 1,
+            Shape::CutEcho => self.heard.cut_echoes += 1,
+            Shape::Led(_) => self.heard.stray_before += 1,
+            _ => {}
+        }
         self.heard.echoes += usize::from(answer.echoed);
         Ok(answer)
     }

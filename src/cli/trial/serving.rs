@@ -35,6 +35,7 @@ pub(super) fn serve(args: &Args, stop: &Stop, text: &str) -> Result<ExitCode, Ex
     // What a gateway keeps on disk, and its socket, are not for a trial.
     settings.socket = SocketPath::Off;
     settings.recordings.max_count = 0;
+    settings.keeps_history = false;
     settings.http = Some(http::Options::at(
         demo::free_port("the status page", HTTP).map_err(|e| fail(&e))?,
     ));

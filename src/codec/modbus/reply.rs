@@ -19,6 +19,8 @@ pub enum Reply {
     Identified(u8),
     /// To a poll of N2: the digits of the report, none where nothing changed.
     Changes(Vec<u8>),
+    /// To a request that is not decoded: the PDU, or on N2 the line without its CR.
+    Other(Vec<u8>),
     /// Refused.
     Exception(Exception),
 }
@@ -63,6 +65,7 @@ impl Reply {
                 out.extend_from_slice(&[43, 14]);
                 out.extend_from_slice(body);
             }
+            Reply::Other(pdu) => out.extend_from_slice(pdu),
             Reply::Identified(_) | Reply::Changes(_) => encode_exception(request.function(), Exception::FUNCTION, out),
             Reply::Written | Reply::Exception(_) => encode_echo(request, out),
         }
@@ -106,6 +109,7 @@ impl Reply {
                 [14, rest @ ..] if rest.len() >= 5 => Ok(Reply::DeviceIdentification(rest.to_vec())),
                 _ => Err(Misfit),
             },
+            RequestPdu::Other(_) => Ok(Reply::Other(pdu.to_vec())),
             _ => {
                 let mut echo = Vec::with_capacity(8);
                 encode_echo(request, &mut echo);

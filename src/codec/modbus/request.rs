@@ -79,6 +79,9 @@ pub enum RequestPdu {
     },
     /// What only a bus of N2 says: no function of Modbus, never encoded as one.
     N2(Session),
+    /// A request that is passed on as it is: the PDU of a function that is not decoded here, or on N2 the digits of a command
+    /// between address and checksum.
+    Other(Vec<u8>),
 }
 
 impl RequestPdu {
@@ -95,10 +98,11 @@ impl RequestPdu {
             RequestPdu::ReadWrite { .. } => 23,
             RequestPdu::DeviceIdentification { .. } => 43,
             RequestPdu::N2(_) => 0,
+            RequestPdu::Other(pdu) => pdu.first().copied().unwrap_or_default(),
         }
     }
 
-    /// Whether the request changes something in the drive.
+    /// Whether the request changes something in the drive, as far as it is decoded.
     pub fn is_write(&self) -> bool {
         matches!(
             self,
@@ -122,10 +126,11 @@ impl RequestPdu {
             RequestPdu::ReadWrite { values, .. } => 10 + 2 * values.len(),
             RequestPdu::DeviceIdentification { .. } => 4,
             RequestPdu::N2(_) => 0,
+            RequestPdu::Other(pdu) => pdu.len(),
         }
     }
 
-    /// Bytes of the regular reply's PDU; for 43/14, whose length only the reply shows, its shortest.
+    /// Bytes of the regular reply's PDU; where only the reply shows its length, its shortest.
     pub fn reply_len(&self) -> usize {
         match self {
             RequestPdu::Read { table, count, .. } => {
@@ -138,18 +143,20 @@ impl RequestPdu {
             RequestPdu::ReadWrite { read_count, .. } => 2 + 2 * usize::from(*read_count),
             RequestPdu::MaskWrite { .. } => 7,
             RequestPdu::DeviceIdentification { .. } => 7,
+            RequestPdu::Other(_) => 1,
             _ => 5,
         }
     }
 
     /// Appends the PDU to `out`.
     pub fn encode(&self, out: &mut Vec<u8>) {
-        if matches!(self, RequestPdu::N2(_)) {
-            return;
-        }
-        out.push(self.function());
         match self {
-            RequestPdu::N2(_) => {}
+            RequestPdu::N2(_) => return,
+            RequestPdu::Other(pdu) => return out.extend_from_slice(pdu),
+            _ => out.push(self.function()),
+        }
+        match self {
+            RequestPdu::N2(_) | RequestPdu::Other(_) => {}
             RequestPdu::Read { start, count, .. } => {
                 put(out, *start);
                 put(out, *count);

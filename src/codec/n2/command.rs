@@ -71,6 +71,14 @@ pub enum Command {
     Other,
 }
 
+/// Appends the frame of a command whose digits, between address and checksum, are `text`.
+pub(super) fn encode_text(address: u8, text: &[u8], out: &mut Vec<u8>) {
+    let mut body = Vec::with_capacity(2 + text.len());
+    put(address, &mut body);
+    body.extend_from_slice(text);
+    seal(b'>', &body, out);
+}
+
 /// A command as a drive hears it: the address and the command, or the error code that is due.
 pub type Heard = (u8, Result<Command, u8>);
 

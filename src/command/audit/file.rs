@@ -2,18 +2,17 @@
 //! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost.
 
 use std::collections::VecDeque;
-use std::fs::{self, File, OpenOptions};
-use std::io::{self, Read, Seek, SeekFrom, Write};
-use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::fs::File;
+use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant, SystemTime};
 
-use rustix::fs::{FlockOperation, flock};
 use tokio::sync::watch;
 
 use super::AuditRecord;
 use super::chain::{self, Chain, Entry, Hash, Tail};
+use crate::files::Rotated;
 
 /// Records that wait for the disk: of commands that were sent, and others.
 const WAITING: (usize, usize) = (8192, 1024);
@@ -147,23 +146,14 @@ impl AuditFile {
     }
 }
 
-/// The open file.
-#[derive(Debug)]
-struct Open {
-    file: File,
-    bytes: u64,
-}
-
 #[derive(Debug)]
 struct Writer {
-    options: AuditFileOptions,
+    file: Rotated,
     shared: Arc<Shared>,
-    open: Option<Open>,
     /// `None` until the file was opened once.
     chain: Option<Chain>,
     /// Logged once, until a write succeeds.
     failing: bool,
-    unsynced: bool,
     /// Losses that the file has.
     recorded: (u64, u64),
     logged: (Option<Hash>, Instant),
@@ -172,12 +162,10 @@ struct Writer {
 impl Writer {
     fn new(options: AuditFileOptions, shared: Arc<Shared>) -> Writer {
         Writer {
-            options,
+            file: Rotated::new(options.path, options.max_bytes, FILES),
             shared,
-            open: None,
             chain: None,
             failing: false,
-            unsynced: false,
             recorded: (0, 0),
             logged: (None, Instant::now()),
         }
@@ -201,8 +189,8 @@ impl Writer {
 
     /// Writes what waits; `due` is once a second.
     fn work(&mut self, due: bool) -> io::Result<()> {
-        if due && self.is_replaced() {
-            self.open = None;
+        if due && self.file.is_replaced() {
+            self.file.close();
         }
         while let Some((record, sent)) = self.shared.next() {
             let entry = if sent {
@@ -228,26 +216,23 @@ impl Writer {
                 "audit file: {sent} records of commands that were sent and {not_sent} others were lost; the log has them"
             );
         }
-        if self.open.is_none() {
-            self.open = Some(self.open()?);
+        if !self.file.is_open() {
+            self.open()?;
         }
-        if let Some(open) = self.open.as_ref().filter(|_| self.unsynced) {
-            open.file.sync_data()?;
-            self.unsynced = false;
-        }
-        Ok(())
+        self.file.sync()
     }
 
     /// Logs a failure once, its end, and now and then the hash of the last line.
     fn report(&mut self, done: io::Result<()>, end: bool) {
-        let path = self.options.path.display();
+        let path = self.file.path().to_path_buf();
+        let path = path.display();
         match done {
             Ok(()) if std::mem::replace(&mut self.failing, false) => {
                 tracing::warn!("audit file: {path} is written again");
             }
             Ok(()) => {}
             Err(error) => {
-                self.open = None;
+                self.file.close();
                 if !std::mem::replace(&mut self.failing, true) {
                     tracing::error!(
                         "audit file: cannot write {path}: {error}; commands are carried out all the same and are in the log; \
@@ -274,102 +259,55 @@ impl Writer {
     }
 
     fn write(&mut self, entry: &Entry<'_>) -> io::Result<()> {
-        let mut open = match self.open.take() {
-            Some(open) => open,
-            None => self.open()?,
-        };
+        if !self.file.is_open() {
+            self.open()?;
+        }
         let chain = self.chain.unwrap_or_default();
         let (line, after) = chain.line(entry)?;
-        if open.bytes > 0 && open.bytes + line.len() as u64 > self.options.max_bytes / FILES {
-            open = self.rotate(open)?;
+        if self.file.is_full(line.len()) {
+            self.file.rotate()?;
+            self.open()?;
         }
-        if let Err(error) = open.file.write_all(&line) {
-            // A part of the line may be there. If it cannot be removed, it is named when the file is opened again.
-            let _ = open.file.set_len(open.bytes);
-            return Err(error);
-        }
-        open.bytes += line.len() as u64;
-        self.open = Some(open);
+        // A part of a line that could not be removed is named when the file is opened again.
+        self.file.append(&line)?;
         self.chain = Some(after);
-        self.unsynced = true;
         Ok(())
     }
 
-    fn numbered(&self, number: u64) -> PathBuf {
-        let mut name = self.options.path.clone().into_os_string();
-        name.push(format!(".{number}"));
-        name.into()
-    }
-
-    /// Begins a new file and removes the oldest one.
-    fn rotate(&mut self, full: Open) -> io::Result<Open> {
-        full.file.sync_data()?;
-        for number in (1..FILES - 1).rev() {
-            ignore_missing(fs::rename(self.numbered(number), self.numbered(number + 1)))?;
-        }
-        ignore_missing(fs::rename(&self.options.path, self.numbered(1)))?;
-        self.open()
-    }
-
-    /// Whether the file was moved, removed or replaced by another.
-    fn is_replaced(&self) -> bool {
-        let Some(open) = &self.open else { return false };
-        let same = |there: fs::Metadata| {
-            let own = open.file.metadata().ok()?;
-            Some((own.dev(), own.ino()) == (there.dev(), there.ino()))
-        };
-        fs::metadata(&self.options.path).ok().and_then(same) != Some(true)
-    }
-
     /// Opens the file and finds the end of the chain: in it, or, if it is empty, in memory or in the file before.
-    fn open(&mut self) -> io::Result<Open> {
-        let path = &self.options.path;
-        if let Some(dir) = path.parent() {
-            fs::create_dir_all(dir)?;
+    fn open(&mut self) -> io::Result<()> {
+        let opened = self.find_end();
+        if opened.is_err() {
+            self.file.close();
         }
-        let mut file = OpenOptions::new()
-            .read(true)
-            .append(true)
-            .create(true)
-            .mode(0o640)
-            .open(path)?;
-        flock(&file, FlockOperation::NonBlockingLockExclusive)
-            .map_err(|_| io::Error::other("another process writes it; give each gateway its own"))?;
-        let bytes = file.metadata()?.len();
-        let found = read_tail(&mut file, bytes)?;
+        opened
+    }
+
+    fn find_end(&mut self) -> io::Result<()> {
+        let (file, bytes) = self.file.open()?;
+        let found = read_tail(file, bytes)?;
+        let (fragment, ended) = match found {
+            Some(tail) => (tail.fragment, tail.ended),
+            None => only_fragment(file, bytes)?,
+        };
         let before = match (found, self.chain) {
             (Some(tail), _) => Some(tail.chain),
             (None, Some(chain)) => Some(chain),
-            (None, None) => last_of(&self.numbered(1))?,
+            (None, None) => last_of(&self.file.older(1))?,
         };
         self.chain = Some(before.unwrap_or_default());
-        let (fragment, ended) = match found {
-            Some(tail) => (tail.fragment, tail.ended),
-            None => only_fragment(&mut file, bytes)?,
-        };
-        let mut open = Open { file, bytes };
-        if open.bytes > 0 && !ended {
-            open.file.write_all(b"\n")?;
-            open.bytes += 1;
+        if bytes > 0 && !ended {
+            self.file.append(b"\n")?;
         }
         if let Some((bytes, sha256)) = fragment {
             tracing::warn!(
                 "audit file: {} ends with {bytes} bytes of a line that was cut; they are kept and named",
-                path.display()
+                self.file.path().display()
             );
             let time = SystemTime::now();
-            self.open = Some(open);
             self.write(&Entry::Fragment { time, bytes, sha256 })?;
-            return self.open.take().ok_or_else(|| io::Error::other("closed"));
         }
-        Ok(open)
-    }
-}
-
-fn ignore_missing(done: io::Result<()>) -> io::Result<()> {
-    match done {
-        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
-        done => done,
+        Ok(())
     }
 }
 

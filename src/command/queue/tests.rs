@@ -384,3 +384,45 @@ fn supervision_is_withdrawn_and_nothing_else() {
     bench.pending.withdraw_supervision(3, bench.now);
     assert_eq!((outcome(&mut stop), outcome(&mut joined)), (None, None));
 }
+
+#[test]
+fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
+    let mut bench = Bench::new();
+    let commander = |bench: &Bench, drive| bench.pending.commander(drive).map(ToString::to_string);
+    let push = |bench: &mut Bench, kind, login: Option<&str>, urgency, reference_only| {
+        let origin = Origin::new(kind, "c");
+        let origin = login.map_or(origin.clone(), |login| origin.with_login(login.into()));
+        let (ticket, _answer) = Ticket::new(origin, "d", String::new(), true, bench.now, bench.stats.clone());
+        let admitted = Admitted {
+            order: points(&[0]),
+            urgency,
+            reference_only,
+        };
+        let command = Command::new(1, admitted, bench.now + EXPIRY, ticket);
+        bench.pending.push(command, bench.now);
+    };
+    use SourceKind::{Http, ModbusTcp, Shutdown, Supervision};
+    use Urgency::{Read, Stop};
+    let order = Urgency::Command;
+    push(&mut bench, Http, Some("alice#1"), order, true);
+    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
+    assert_eq!(commander(&bench, 2), None);
+    // What is no command of a client.
+    push(&mut bench, ModbusTcp, None, Read, false);
+    push(&mut bench, Supervision, None, Stop, false);
+    push(&mut bench, Shutdown, None, Stop, false);
+    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
+    // Whether it waits, takes the place of an older one, or joins another one.
+    push(&mut bench, Http, Some("bob#2"), order, true);
+    push(&mut bench, Http, Some("carol#3"), order, true);
+    assert_eq!(commander(&bench, 1).as_deref(), Some("carol#3"));
+    push(&mut bench, Http, Some("bob#2"), Stop, false);
+    push(&mut bench, Http, Some("alice#1"), Stop, false);
+    assert_eq!(commander(&bench, 1).as_deref(), Some("alice#1"));
+    push(&mut bench, ModbusTcp, None, Stop, false);
+    assert_eq!(commander(&bench, 1), None);
+    // What is not taken in.
+    bench.pending.closed = Some(Outcome::BusDown);
+    push(&mut bench, Http, Some("alice#1"), Stop, false);
+    assert_eq!(commander(&bench, 1), None);
+}

@@ -136,3 +136,27 @@ fn secrets_that_everybody_can_read() {
         assert_eq!(found.count(), warned, "{mode:o}");
     }
 }
+
+#[test]
+fn users_are_read_and_pointed_out() {
+    let dir = tempfile::tempdir().unwrap();
+    let file = dir.path().join("users");
+    let alice = crate::north::http::User::new("alice", "correct horse").unwrap();
+    let said = |text: &str, mode, commands: bool| {
+        std::fs::write(&file, text).unwrap();
+        set_permissions(&file, Permissions::from_mode(mode)).unwrap();
+        let path = file.display();
+        let (loaded, _) = load(&format!(
+            "[gateway]\nname = \"g\"\n[http]\nusers_file = \"{path}\"\ncommands = {commands}\n"
+        ));
+        let problems = loaded.errors.iter().chain(&loaded.warnings);
+        let found = problems.filter(|problem| problem.key.starts_with("http."));
+        found.map(ToString::to_string).collect::<Vec<_>>().join("\n")
+    };
+    assert_eq!(said(&alice.to_string(), 0o600, true), "");
+    assert!(said(&alice.to_string(), 0o644, true).contains("holds a secret"));
+    assert!(said("", 0o600, true).contains("contains no user, so nobody can log in"));
+    assert!(said(&alice.to_string(), 0o600, false).contains("not used while `commands` is off"));
+    let bad = said(&format!("{alice}\nbob password\n"), 0o600, true);
+    assert!(bad.contains("users:2: the hash is not one of Argon2id"), "{bad}");
+}

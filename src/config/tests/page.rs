@@ -10,6 +10,7 @@ fn with_tables(page: &str) -> String {
         ("[[bus.drive]]", "Drive"),
         ("[bus.drive.supervision]", "Supervision"),
         ("[[bus.drive.trigger]]", "Trigger"),
+        ("[[bus.slot]]", "SlotTable"),
         ("[modbus_tcp]", "ModbusTcp"),
         ("[[modbus_tcp.listener]]", "Listener"),
         ("[modbus_tcp.tls]", "Tls"),

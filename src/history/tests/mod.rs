@@ -1,6 +1,7 @@
 //! The recorder as a whole, in virtual time: what a bus tapes by hand becomes recordings.
 
 mod files;
+mod trends;
 
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
@@ -10,12 +11,15 @@ use super::recorder::{Note, NoteBody};
 use super::recording::Recording;
 use super::*;
 use crate::codec::{LineFormat, Protocol, Table};
+use crate::drive::ModelPoint;
 use crate::drive::profile::Profiles;
 use crate::process_image::{
-    BusImage, BusSpec, DriveImage, DriveSpec, Link, PointTrigger, Taped, TapedFrame, TapedRead, TriggerLimit, Verdict,
+    BusImage, BusSpec, DriveImage, DriveSpec, Link, Outcome, PointTrigger, TapedFrame, TapedRead, Taping, TriggerLimit,
+    Verdict,
 };
 
 const POLL: Duration = Duration::from_millis(10);
+const STALE_AFTER: Duration = Duration::from_secs(1);
 /// Bits of the status word: ready, running, fault, warning.
 const RUNS: u16 = 0x0003;
 const FAULT: u16 = 0x0008;
@@ -36,6 +40,7 @@ pub(super) fn options() -> RecorderOptions {
 pub(super) struct Rig {
     pub(super) bus: Arc<BusImage>,
     pub(super) recorder: Recorder,
+    pub(super) history: Arc<History>,
     pub(super) clock: Clock,
 }
 
@@ -64,9 +69,23 @@ impl Rig {
             now: Instant::now() + Duration::from_secs(3600),
             wall: SystemTime::UNIX_EPOCH + Duration::from_millis(1_770_000_000_000),
         };
-        let mut recorder = Recorder::new(options);
-        assert!(recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
-        Rig { bus, recorder, clock }
+        let history = Arc::<History>::default();
+        let mut recorder = Recorder::new(options, history.clone());
+        assert!(
+            recorder
+                .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
+                .is_empty()
+        );
+        Rig {
+            bus,
+            recorder,
+            history,
+            clock,
+        }
+    }
+
+    pub(super) fn history(&self) -> Arc<DriveHistory> {
+        self.history.drive("pump-1").unwrap()
     }
 
     pub(super) fn pass(&mut self, time: Duration) {
@@ -78,29 +97,21 @@ impl Rig {
     pub(super) fn poll(&mut self, drive: usize, status: u16, current: u16, code: u16) {
         let at = self.clock.now;
         let words = [status, 0, 8200, 4100, 1200, current, 0, 0, 0, 655, code];
-        self.bus.tape.append(|| {
-            let (table, start, words) = (Table::Holding, 2100, words.into());
-            Taped::Read(
-                drive,
-                TapedRead {
-                    at,
-                    table,
-                    start,
-                    words,
-                },
-            )
+        self.bus.tape.read(drive, || TapedRead {
+            at,
+            table: Table::Holding,
+            start: 2100,
+            words: words.into(),
         });
     }
 
     pub(super) fn fail(&mut self, drive: usize) {
         let at = self.clock.now;
-        self.bus.tape.append(|| {
-            Taped::Frame(TapedFrame {
-                at,
-                drive: Some(drive),
-                verdict: Verdict::Timeout,
-                bytes: [].into(),
-            })
+        self.bus.tape.frame(|| TapedFrame {
+            at,
+            drive: Some(drive),
+            verdict: Verdict::Timeout,
+            bytes: [].into(),
         });
     }
 
@@ -369,10 +380,14 @@ fn a_reload_keeps_what_stays_and_ends_what_goes() {
         rig.poll(0, if n == 300 { FAULT } else { RUNS }, 0, 5)
     });
     let (bus, clock) = (rig.bus.clone(), rig.clock);
-    assert!(rig.recorder.adopt(std::slice::from_ref(&bus), clock).is_empty());
-    assert!(bus.tape.is_on());
-    let made = rig.recorder.adopt(&[], clock);
-    assert!(!bus.tape.is_on());
+    assert!(
+        rig.recorder
+            .adopt(std::slice::from_ref(&bus), STALE_AFTER, clock)
+            .is_empty()
+    );
+    assert!(bus.tape.takes(Taping::Reads));
+    let made = rig.recorder.adopt(&[], STALE_AFTER, clock);
+    assert!(!bus.tape.takes(Taping::Reads));
     let [recording] = &made.iter().map(assemble).collect::<Vec<_>>()[..] else {
         panic!()
     };

@@ -5,20 +5,20 @@ use super::telnet::{Command, Decoder, IAC, SB, SE, Verb, escape};
 use crate::codec::{LineFormat, Parity};
 use crate::line::options::Level;
 
-const BINARY: u8 = 0;
-const SUPPRESS_GO_AHEAD: u8 = 3;
-const COM_PORT: u8 = 44;
+pub(super) const BINARY: u8 = 0;
+pub(super) const SUPPRESS_GO_AHEAD: u8 = 3;
+pub(super) const COM_PORT: u8 = 44;
 
-const SET_BAUD: u8 = 1;
-const SET_DATA_BITS: u8 = 2;
-const SET_PARITY: u8 = 3;
-const SET_STOP_BITS: u8 = 4;
-const SET_CONTROL: u8 = 5;
-const SET_LINE_STATE_MASK: u8 = 10;
-const SET_MODEM_STATE_MASK: u8 = 11;
-const PURGE: u8 = 12;
+pub(super) const SET_BAUD: u8 = 1;
+pub(super) const SET_DATA_BITS: u8 = 2;
+pub(super) const SET_PARITY: u8 = 3;
+pub(super) const SET_STOP_BITS: u8 = 4;
+pub(super) const SET_CONTROL: u8 = 5;
+pub(super) const SET_LINE_STATE_MASK: u8 = 10;
+pub(super) const SET_MODEM_STATE_MASK: u8 = 11;
+pub(super) const PURGE: u8 = 12;
 /// The answer of the server to a command has its number plus this.
-const ANSWER: u8 = 100;
+pub(super) const ANSWER: u8 = 100;
 
 const NO_FLOW_CONTROL: u8 = 1;
 const DTR: (u8, u8) = (8, 9);
@@ -150,11 +150,7 @@ impl Session {
         }
         self.state = State::Setting;
         let Settings { format, rts, dtr } = self.settings;
-        let parity = match format.parity {
-            Parity::None => 1,
-            Parity::Odd => 2,
-            Parity::Even => 3,
-        };
+        let parity = parity_code(format.parity);
         let level = |level, (on, off)| match level {
             Level::Driver => None,
             Level::On => Some(on),
@@ -203,7 +199,17 @@ impl Session {
     }
 }
 
-fn set(replies: &mut Vec<u8>, command: u8, value: &[u8]) {
+/// The number of a parity in commands and answers.
+pub(super) fn parity_code(parity: Parity) -> u8 {
+    match parity {
+        Parity::None => 1,
+        Parity::Odd => 2,
+        Parity::Even => 3,
+    }
+}
+
+/// Appends a command, or the answer to one, with its value.
+pub(super) fn set(replies: &mut Vec<u8>, command: u8, value: &[u8]) {
     replies.extend([IAC, SB, COM_PORT, command]);
     replies.extend(escape(value));
     replies.extend([IAC, SE]);

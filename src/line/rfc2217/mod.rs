@@ -1,8 +1,11 @@
-//! A serial port behind a device server that is set up over the network: telnet with its COM port option (RFC 2217).
-//! Codec and negotiation are pure; whoever owns the connection passes bytes in and out.
+//! A serial port behind a device server that is set up over the network: telnet with its COM port option (RFC 2217),
+//! and the other side, for programs that open a port of this gateway. Codec and negotiation are pure; whoever owns the connection passes bytes in and out.
 
 mod com_port;
+mod server;
 mod telnet;
 
 pub(super) use com_port::{Session, Settings, State};
-pub(super) use telnet::{escape, is_greeting};
+pub(crate) use server::ServedPort;
+pub(crate) use telnet::escape;
+pub(super) use telnet::is_greeting;

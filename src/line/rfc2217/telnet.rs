@@ -116,7 +116,7 @@ impl Decoder {
 }
 
 /// Data as it is sent: each 255 doubled.
-pub(in crate::line) fn escape(data: &[u8]) -> Vec<u8> {
+pub(crate) fn escape(data: &[u8]) -> Vec<u8> {
     let mut escaped = Vec::with_capacity(data.len() + 4);
     for &byte in data {
         escaped.push(byte);

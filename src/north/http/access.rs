@@ -36,6 +36,16 @@ pub(super) enum AccessError {
     MissingScope(Scope),
 }
 
+impl AccessError {
+    /// Whether another way to show who asks can take the place of the token.
+    pub(super) fn is_for_want_of_a_token(&self) -> bool {
+        matches!(
+            self,
+            AccessError::NoToken | AccessError::UnknownToken | AccessError::MissingScope(_)
+        )
+    }
+}
+
 impl Access {
     /// Whether a request on a connection to the address `local` of this machine may be answered.
     ///

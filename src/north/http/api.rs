@@ -1,12 +1,15 @@
 //! The JSON objects of drives and buses. Fields are added, never renamed or removed.
 
+use std::collections::HashSet;
 use std::time::{Duration, Instant, SystemTime};
 
 use serde::ser::SerializeMap;
 use serde::{Serialize, Serializer};
 
+use crate::diagnosis::{self, Counted, Verdict};
 use crate::drive::why::Cause;
-use crate::drive::{self, Quality, State};
+use crate::drive::{self, ModelPoint, Quality, State};
+use crate::history::History;
 use crate::plant::{BusHandle, DriveHandle};
 use crate::process_image::{Access, BusImage, Link, Outcome, PollCycle, Reading, public_points, value_or_null};
 
@@ -66,11 +69,16 @@ pub(super) struct Drive<'d> {
     why: Vec<Cause>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
+    /// `null` where the drive does not say whether it runs.
+    starts: Option<u64>,
+    running_seconds: Option<f64>,
+    /// `null` where the drive does not count it.
+    energy_kwh: Option<f64>,
     points: Points<'d>,
 }
 
 impl<'d> Drive<'d> {
-    pub(super) fn new(drive: &'d DriveHandle, clock: Clock) -> Drive<'d> {
+    pub(super) fn new(drive: &'d DriveHandle, history: &History, clock: Clock) -> Drive<'d> {
         let image = &drive.image;
         let spec = &image.spec;
         let reading = drive.reading(clock.now);
@@ -79,6 +87,8 @@ impl<'d> Drive<'d> {
             Link::Online(since) | Link::Offline(since) => Some(Time(since)),
         };
         let why = drive.why(&reading);
+        let totals = history.totals(&spec.name);
+        let tells_running = spec.profile.model_index(ModelPoint::Running).is_some();
         Drive {
             name: &spec.name,
             bus: &spec.bus,
@@ -99,8 +109,21 @@ impl<'d> Drive<'d> {
             why: why.causes,
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
-            points: Points { reading, clock },
+            starts: tells_running.then_some(totals.starts),
+            running_seconds: tells_running.then(|| rounded(totals.running_seconds, 1000.0)),
+            energy_kwh: totals.energy_kwh,
+            points: Points {
+                reading,
+                clock,
+                shown: None,
+            },
         }
+    }
+
+    /// Only these of its points.
+    pub(super) fn only(mut self, shown: Option<&'d HashSet<String>>) -> Drive<'d> {
+        self.points.shown = shown;
+        self
     }
 }
 
@@ -129,14 +152,16 @@ impl Outcomes {
 struct Points<'d> {
     reading: Reading<'d>,
     clock: Clock,
+    shown: Option<&'d HashSet<String>>,
 }
 
 impl Serialize for Points<'_> {
     fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
         let profile = &self.reading.spec.profile;
         let names = public_points(profile);
-        let mut map = serializer.serialize_map(Some(names.len()))?;
-        for (index, name) in names {
+        let mut map = serializer.serialize_map(None)?;
+        let wanted = |name: &str| self.shown.is_none_or(|shown| shown.contains(name));
+        for (index, name) in names.into_iter().filter(|(_, name)| wanted(name)) {
             let Some(point) = profile.points.get(index) else {
                 continue;
             };
@@ -263,15 +288,40 @@ impl<'b> Bus<'b> {
     }
 }
 
+/// What is wrong with the line of a bus.
+#[derive(Debug, Serialize)]
+pub(super) struct Diagnosis<'d> {
+    bus: &'d str,
+    /// `null` before the first five seconds are over.
+    time: Option<Time>,
+    verdicts: &'d [Verdict],
+    /// Sound replies of addresses that were not asked, in the last minute.
+    wrong_address: u32,
+    /// Counted in the last minute.
+    drives: &'d [Counted],
+}
+
+impl<'d> Diagnosis<'d> {
+    pub(super) fn new(bus: &'d str, diagnosis: &'d diagnosis::Diagnosis) -> Diagnosis<'d> {
+        Diagnosis {
+            bus,
+            time: diagnosis.at.map(Time),
+            verdicts: &diagnosis.verdicts,
+            wrong_address: diagnosis.wrong_address,
+            drives: &diagnosis.drives,
+        }
+    }
+}
+
 fn millis(time: Duration) -> u64 {
     u64::try_from(time.as_millis()).unwrap_or(u64::MAX)
 }
 
 /// Milliseconds, rounded to the microsecond.
-fn fine_millis(time: Duration) -> f64 {
+pub(super) fn fine_millis(time: Duration) -> f64 {
     rounded(time.as_secs_f64() * 1000.0, 1000.0)
 }
 
-fn rounded(value: f64, parts: f64) -> f64 {
+pub(super) fn rounded(value: f64, parts: f64) -> f64 {
     (value * parts).round() / parts
 }

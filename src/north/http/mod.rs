@@ -1,19 +1,26 @@
-//! HTTP: status page, Prometheus metrics, health and the JSON interface. GET and HEAD only.
+//! HTTP: status page, Prometheus metrics, health and the JSON interface; commands of users, where they are on.
 //!
 //! hyper serves the connections directly, because axum's own loop gives a client unlimited time to send its request.
 //! The cancellation ends everything, including open event streams.
 
 mod access;
 mod api;
+mod body;
+mod event_log;
 mod hosts;
 mod in_use;
+mod line;
 mod offline;
+mod operating;
 mod page;
 mod params;
+mod query;
 mod routes;
 mod streams;
 mod terms;
 mod tokens;
+mod trend;
+mod users;
 
 use std::net::{IpAddr, SocketAddr};
 use std::pin::pin;
@@ -36,6 +43,7 @@ use tokio_util::task::TaskTracker;
 
 use self::hosts::Host;
 use self::in_use::InUse;
+use self::operating::Operating;
 use self::routes::Reached;
 use self::terms::{Terms, Tls};
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
@@ -43,11 +51,12 @@ use super::listener::{ConnectionHandler, ListenerSpec, Listeners, NewSockets};
 use super::log_throttle::LogThrottle;
 use super::refusals::Refusals;
 use super::{NorthStats, ServerError, ServerIdentity, ServerKind};
-use crate::command::Authority;
+use crate::history::History;
 use crate::plant::{DriveHandle, SharedPlant};
 
 pub use self::offline::Offline;
 pub use self::tokens::{Scope, Token, TokenError, Tokens};
+pub use self::users::{MAX_PASSWORD, MIN_PASSWORD, User, UserError, Users};
 
 /// Maximum number of open connections. A connection whose request is incomplete, and one between two requests, yields to
 /// a newer one.
@@ -94,6 +103,8 @@ pub struct Options {
     pub hosts: Vec<String>,
     /// Who may read what; `None`: everybody everything.
     pub tokens: Option<Tokens>,
+    /// Who may command; `None`: nobody, commands are off.
+    pub users: Option<Users>,
     /// Certificate and key; `None`: without TLS.
     pub identity: Option<ServerIdentity>,
     /// Maximum number of open connections: [`MAX_CONNECTIONS`], or fewer where the system allows fewer open files.
@@ -107,6 +118,7 @@ impl Options {
             listen,
             hosts: Vec::new(),
             tokens: None,
+            users: None,
             identity: None,
             max_connections: MAX_CONNECTIONS,
         }
@@ -117,9 +129,13 @@ impl Options {
         self.limits().files() + HEALTH.files()
     }
 
-    /// Half of the connections can be those of one address.
+    /// Half of the connections can be those of one address. Where commands are on, some are for addresses of users only.
     fn limits(&self) -> Limits {
-        Limits::new(self.max_connections, self.max_connections.div_ceil(2))
+        let limits = Limits::new(self.max_connections, self.max_connections.div_ceil(2));
+        match self.users {
+            Some(_) => limits.with_reserve(),
+            None => limits,
+        }
     }
 }
 
@@ -135,6 +151,7 @@ pub struct Http {
     terms: Arc<ArcSwap<Terms>>,
     plant: SharedPlant,
     stats: Arc<NorthStats>,
+    operating: Arc<Operating>,
     tasks: TaskTracker,
 }
 
@@ -185,11 +202,12 @@ impl Http {
             terms,
         } = change;
         terms.replace(&self.terms);
-        let (plant, stats, terms) = (&self.plant, &self.stats, &self.terms);
+        self.operating.set_users(options.users.clone());
+        let (plant, stats, terms, operating) = (&self.plant, &self.stats, &self.terms, &self.operating);
         self.listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
                 Some(handler) => handler.clone(),
-                None => Arc::new(HttpConnections::new(&options, plant, stats, terms, cancel)),
+                None => Arc::new(HttpConnections::new(&options, plant, stats, terms, operating, cancel)),
             };
             handler.limit.set_limits(options.limits());
             (handler, Handle::current())
@@ -221,6 +239,7 @@ pub async fn start(
         terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
         plant,
         stats,
+        operating: Arc::new(Operating::new()),
         tasks,
     };
     let change = http.prepare(options).await?;
@@ -238,6 +257,7 @@ struct HttpConnections {
     refusals: Refusals,
     /// Limits the log of requests without access.
     no_access: Arc<LogThrottle>,
+    operating: Arc<Operating>,
     cancel: CancellationToken,
 }
 
@@ -251,7 +271,7 @@ struct HttpPermit {
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Coverage {
     Everything,
-    /// `/healthz` and `/readyz`; the rest is refused with 503.
+    /// `/healthz`, `/readyz` and commands of users; the rest is refused with 503.
     Health,
 }
 
@@ -271,10 +291,12 @@ impl HttpConnections {
         plant: &SharedPlant,
         stats: &Arc<NorthStats>,
         terms: &Arc<ArcSwap<Terms>>,
+        operating: &Arc<Operating>,
         cancel: &CancellationToken,
     ) -> HttpConnections {
         HttpConnections {
-            router: routes::router(plant.clone(), stats.clone(), cancel.clone()),
+            router: routes::router(plant.clone(), stats.clone(), operating.clone(), cancel.clone()),
+            operating: operating.clone(),
             terms: terms.clone(),
             limit: ConnectionLimit::new(options.limits()),
             health: ConnectionLimit::new(HEALTH),
@@ -299,9 +321,9 @@ impl ConnectionHandler for HttpConnections {
             Instant::now(),
         );
         limits.into_iter().find_map(|(limit, coverage)| {
-            let permit = self
-                .refusals
-                .acquire(limit, newcomer, remedy, || Some(Authority::ReadOnly))?;
+            let permit = self.refusals.acquire(limit, newcomer, remedy, || {
+                Some(self.operating.authority_at(address, now))
+            })?;
             permit.place().use_at(now, false);
             Some(HttpPermit { permit, coverage })
         })
@@ -345,6 +367,8 @@ impl HttpConnections {
             peer,
             refusals: self.no_access.clone(),
             access: terms.access.clone(),
+            tls: terms.tls.is_some(),
+            place: Some(place.clone()),
         };
         let client = routes::Client {
             address: peer.ip(),
@@ -353,6 +377,10 @@ impl HttpConnections {
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
+            // Somebody may have logged in, or out, since the connection came.
+            place
+                .rights()
+                .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
             let reply = router.call(request);
@@ -413,6 +441,11 @@ fn set_socket_options(stream: &TcpStream) {
 ///
 /// # Errors
 /// None is known; a value that JSON cannot express would be one.
-pub fn drive_json(drive: &DriveHandle, now: Instant, wall: SystemTime) -> serde_json::Result<serde_json::Value> {
-    serde_json::to_value(api::Drive::new(drive, api::Clock::new(now, wall)))
+pub fn drive_json(
+    drive: &DriveHandle,
+    history: &History,
+    now: Instant,
+    wall: SystemTime,
+) -> serde_json::Result<serde_json::Value> {
+    serde_json::to_value(api::Drive::new(drive, history, api::Clock::new(now, wall)))
 }

@@ -15,6 +15,7 @@ use tokio_util::sync::CancellationToken;
 use super::Coverage;
 use super::access::Access;
 use super::hosts::Hosts;
+use super::operating::Operating;
 use super::routes::{self, Client, Reached};
 use crate::plant::SharedPlant;
 
@@ -38,7 +39,12 @@ impl Offline {
     /// # Errors
     /// The system does not provide what a timer needs.
     pub fn new(plant: SharedPlant) -> io::Result<Offline> {
-        let router = routes::router(plant, Default::default(), CancellationToken::new());
+        let router = routes::router(
+            plant,
+            Default::default(),
+            Arc::new(Operating::new()),
+            CancellationToken::new(),
+        );
         let service = TowerToHyperService::new(router);
         let address = IpAddr::V4(Ipv4Addr::LOCALHOST);
         let reached = Reached {
@@ -49,6 +55,8 @@ impl Offline {
                 tokens: None,
             }),
             refusals: Arc::default(),
+            tls: false,
+            place: None,
         };
         let client = Client {
             address,

@@ -6,21 +6,22 @@ use std::sync::Arc;
 use std::time::{Instant, SystemTime};
 
 use axum::Router;
-use axum::extract::{Path, Request, State};
+use axum::extract::{Extension, Path, RawQuery, Request, State};
 use axum::http::header::{self, HeaderMap, HeaderName, HeaderValue};
 use axum::http::{Method, StatusCode, Uri};
 use axum::middleware::{self, Next};
 use axum::response::{Html, IntoResponse, Response};
-use axum::routing::get;
+use axum::routing::{get, post};
 use axum::{Json, response};
 use tokio::sync::{Semaphore, SemaphorePermit};
 use tokio_util::sync::CancellationToken;
 
-use super::access::Access;
+use super::access::{Access, AccessError};
+use super::operating::{self, Cookies, Operating};
 use super::params::Parameters;
-use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, page, streams};
+use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, streams, trend};
 use crate::history::export;
-use crate::north::connection_limit::{ConnectionLimit, Limits};
+use crate::north::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
 use crate::parameters::ParameterFile;
@@ -39,12 +40,18 @@ pub(super) struct AppState {
     rendering: Semaphore,
     /// The permit for reading a recording: what waits for the disk holds up nothing else.
     files: Semaphore,
+    pub(super) operating: Arc<Operating>,
 }
 
 impl AppState {
     /// A turn to render a large reply.
-    async fn turn(&self) -> Option<SemaphorePermit<'_>> {
+    pub(super) async fn turn(&self) -> Option<SemaphorePermit<'_>> {
         self.rendering.acquire().await.ok()
+    }
+
+    /// The cookies of this gateway, on a connection that came like that.
+    pub(super) fn cookies(&self, reached: &Reached) -> Cookies {
+        Cookies::of(&self.plant.load().gateway, reached.tls)
     }
 }
 
@@ -64,10 +71,19 @@ pub(super) struct Reached {
     pub(super) access: Arc<Access>,
     /// Limits the log of refused requests.
     pub(super) refusals: Arc<LogThrottle>,
+    /// The connection has TLS.
+    pub(super) tls: bool,
+    /// The place of the connection; `None` without a socket.
+    pub(super) place: Option<Arc<Place>>,
 }
 
 /// All routes.
-pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Router {
+pub(super) fn router(
+    plant: SharedPlant,
+    stats: Arc<NorthStats>,
+    operating: Arc<Operating>,
+    cancel: CancellationToken,
+) -> Router {
     let app = Arc::new(AppState {
         plant,
         stats,
@@ -75,51 +91,76 @@ pub(super) fn router(plant: SharedPlant, stats: Arc<NorthStats>, cancel: Cancell
         listeners: ConnectionLimit::new(Limits::new(MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS)),
         rendering: Semaphore::new(1),
         files: Semaphore::new(1),
+        operating,
     });
     Router::new()
         .route("/", get(status_page))
-        .route(
-            "/assets/style.css",
-            get(|| asset("text/css; charset=utf-8", page::STYLE)),
-        )
-        .route(
-            "/assets/page.js",
-            get(|| asset("text/javascript; charset=utf-8", page::SCRIPT)),
-        )
-        .route("/assets/icon.svg", get(|| asset("image/svg+xml", page::ICON)))
+        .route("/assets/{name}", get(asset))
         .route("/metrics", get(exposition))
         .route("/healthz", get(|| async { "ok\n" }))
         .route("/readyz", get(ready))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
         .route("/api/v1/drives/{name}/params", get(params))
+        .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
+        .route("/api/v1/buses/{name}", get(line::bus))
+        .route("/api/v1/buses/{name}/diagnosis", get(diagnosis))
         .route("/api/v1/audit", get(audit))
         .route("/api/v1/recordings", get(recordings))
         .route("/api/v1/recordings/{id}", get(recording))
         .route("/api/v1/events", get(streams::events))
+        .route("/api/v1/events/log", get(event_log::log))
         .route("/api/v1/trace", get(streams::trace))
+        .route("/api/v1/login", post(operating::log_in))
+        .route("/api/v1/logout", post(operating::log_out))
+        .route("/api/v1/session", get(operating::session))
+        .route(
+            "/api/v1/drives/{name}/commands",
+            get(operating::commands_of).post(operating::command),
+        )
+        .route("/api/v1/drives/{name}/heartbeat", post(operating::heartbeat))
         .fallback(unknown)
-        .with_state(app)
-        .layer(middleware::from_fn(guard))
+        .with_state(app.clone())
+        .layer(middleware::from_fn_with_state(app, guard))
 }
 
-/// Refuses requests that are meant for another host or lack a token, and all methods that could change something;
-/// sets the common headers of all replies.
-async fn guard(request: Request, next: Next) -> Response {
+/// Refuses requests that are meant for another host or lack a token, and all methods that could change something, commands
+/// apart; sets the common headers of all replies.
+async fn guard(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    request: Request,
+    next: Next,
+) -> Response {
     let coverage = request.extensions().get::<Client>().map(|client| client.coverage);
-    let is_health = ["/healthz", "/readyz"].contains(&request.uri().path());
-    let mut response = if let Some(refusal) = refused(&request) {
+    let (method, path) = (request.method(), request.uri().path());
+    let is_on = app.operating.is_on();
+    // A command of somebody who may give it is served on the last connection too.
+    let is_urgent = ["/healthz", "/readyz"].contains(&path) || (is_on && operating::is_command(method, path));
+    let access = reached.access.check(request.uri(), request.headers(), reached.address);
+    let refusal = match access {
+        Ok(()) => None,
+        Err(error) => refused(&app, &reached, error, request.uri().clone(), request.headers().clone()).await,
+    };
+    let mut response = if let Some(refusal) = refusal {
         refusal
-    } else if coverage == Some(Coverage::Health) && !is_health {
+    } else if coverage == Some(Coverage::Health) && !is_urgent {
         let text = "too many connections are open; close some and try again\n";
         (StatusCode::SERVICE_UNAVAILABLE, [(header::RETRY_AFTER, "5")], text).into_response()
-    } else if matches!(*request.method(), Method::GET | Method::HEAD) {
+    } else if is_on && operating::may_change(method, path) {
         next.run(request).await
-    } else {
-        let text = "this interface is read only: use GET or HEAD\n";
+    } else if !matches!(*method, Method::GET | Method::HEAD) {
+        let text = match is_on {
+            true => "this is read only: use GET or HEAD\n",
+            false => "this interface is read only: use GET or HEAD\n",
+        };
         let allow = [(header::ALLOW, HeaderValue::from_static("GET, HEAD"))];
         (StatusCode::METHOD_NOT_ALLOWED, allow, text).into_response()
+    } else if !is_on && operating::is_operating(path) {
+        unknown(request.uri().clone()).await
+    } else {
+        next.run(request).await
     };
     const SET: [(HeaderName, &str); 3] = [
         (header::CACHE_CONTROL, "no-store"),
@@ -132,14 +173,33 @@ async fn guard(request: Request, next: Next) -> Response {
     response
 }
 
-/// The reply to a request that is not answered, because of its host or its token.
-fn refused(request: &Request) -> Option<Response> {
-    let Some(reached) = request.extensions().get::<Reached>() else {
-        // The server adds it to every request.
-        return Some(StatusCode::INTERNAL_SERVER_ERROR.into_response());
-    };
-    let admitted = reached.access.check(request.uri(), request.headers(), reached.address);
-    let refusal = admitted.err()?;
+/// The reply to a request that is not answered because of its host or its token; `None` if it is answered all the same.
+async fn refused(
+    app: &AppState,
+    reached: &Reached,
+    refusal: AccessError,
+    uri: Uri,
+    headers: HeaderMap,
+) -> Option<Response> {
+    let path = uri.path();
+    if refusal.is_for_want_of_a_token() && app.operating.is_on() && path != "/metrics" {
+        // Users read as bearers of tokens do, and have to get as far as the login.
+        if operating::is_operating(path) || path.starts_with("/assets/") {
+            return None;
+        }
+        let cookies = app.cookies(reached);
+        if app
+            .operating
+            .operator(&headers, &cookies, reached.peer.ip())
+            .await
+            .is_ok()
+        {
+            return None;
+        }
+        if path == "/" {
+            return Some(document(page::render_login(&app.plant.load())));
+        }
+    }
     if let Some(suppressed) = reached.refusals.permit(Instant::now()) {
         let peer = reached.peer;
         tracing::warn!(target: "drivegate::http", %peer, suppressed, "HTTP: request refused: {refusal}");
@@ -149,12 +209,19 @@ fn refused(request: &Request) -> Option<Response> {
 
 async fn status_page(State(app): State<Arc<AppState>>) -> impl IntoResponse {
     let _turn = app.turn().await;
-    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
-    (policy, Html(page::render(&app.plant.load(), Instant::now())))
+    document(page::render(&app.plant.load(), app.operating.is_on(), Instant::now()))
 }
 
-async fn asset(content_type: &'static str, body: &'static str) -> impl IntoResponse {
-    ([(header::CONTENT_TYPE, content_type)], body)
+fn document(html: String) -> Response {
+    let policy = [(header::CONTENT_SECURITY_POLICY, page::SECURITY_POLICY)];
+    (policy, Html(html)).into_response()
+}
+
+async fn asset(Path(name): Path<String>, uri: Uri) -> Response {
+    match page::ASSETS.iter().find(|asset| asset.name == name) {
+        Some(asset) => ([(header::CONTENT_TYPE, asset.content_type)], asset.body).into_response(),
+        None => unknown(uri).await,
+    }
 }
 
 async fn exposition(State(app): State<Arc<AppState>>, headers: HeaderMap) -> Response {
@@ -190,12 +257,17 @@ async fn ready(State(app): State<Arc<AppState>>) -> Response {
     (StatusCode::SERVICE_UNAVAILABLE, text).into_response()
 }
 
-async fn drives(State(app): State<Arc<AppState>>) -> Response {
+/// All drives; with `points=` only these points of each.
+async fn drives(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let shown = query::names(query.as_deref(), "points");
     let _turn = app.turn().await;
     let plant = app.plant.load();
     let clock = api::Clock::new(Instant::now(), SystemTime::now());
     let all: Vec<_> = plant.drives().collect();
-    let all: Vec<_> = all.iter().map(|drive| api::Drive::new(drive, clock)).collect();
+    let all: Vec<_> = all
+        .iter()
+        .map(|drive| api::Drive::new(drive, &plant.history, clock).only(shown.as_ref()))
+        .collect();
     Json(all).into_response()
 }
 
@@ -204,12 +276,9 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
     match plant.drive(&name) {
         Some(drive) => {
             let clock = api::Clock::new(Instant::now(), SystemTime::now());
-            Json(api::Drive::new(&drive, clock)).into_response()
+            Json(api::Drive::new(&drive, &plant.history, clock)).into_response()
         }
-        None => {
-            let known = plant.drives().map(|d| d.image.spec.name.clone());
-            not_found(format!("there is no drive `{name}`"), known.collect())
-        }
+        None => no_drive(&plant, &name),
     }
 }
 
@@ -256,11 +325,34 @@ async fn buses(State(app): State<Arc<AppState>>) -> Response {
     Json(all).into_response()
 }
 
-/// The last commands, newest last.
-async fn audit(State(app): State<Arc<AppState>>) -> Response {
+/// What is wrong with the line of a bus.
+async fn diagnosis(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load();
+    match plant.buses.iter().find(|bus| bus.image.spec.name == name) {
+        Some(bus) => Json(api::Diagnosis::new(&name, &bus.image.diagnosis.load())).into_response(),
+        None => {
+            let known = plant.buses.iter().map(|bus| bus.image.spec.name.clone());
+            not_found(format!("there is no bus `{name}`"), known.collect())
+        }
+    }
+}
+
+/// The last commands, newest last; with `drive` those to one drive.
+async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let [drive] = match query::parameters(query.as_deref(), &["drive"]) {
+        Ok(wanted) => wanted,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let plant = app.plant.load();
+    if let Some(drive) = drive.as_ref().filter(|drive| plant.drive(drive).is_none()) {
+        return no_drive(&plant, drive);
+    }
     let _turn = app.turn().await;
-    let records = app.plant.load().writes.audit().recent();
-    Json(records.iter().map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+    let records = plant.writes.audit().recent();
+    let wanted = records
+        .iter()
+        .filter(|record| drive.as_ref().is_none_or(|drive| record.drive == *drive));
+    Json(wanted.map(Arc::as_ref).collect::<Vec<_>>()).into_response()
 }
 
 /// The recordings, oldest first.
@@ -302,6 +394,12 @@ async fn unknown(uri: Uri) -> Response {
     }
     let text = "there is nothing here; the status page is at /\n";
     (StatusCode::NOT_FOUND, text).into_response()
+}
+
+/// The reply where there is no such drive.
+pub(super) fn no_drive(plant: &Plant, name: &str) -> Response {
+    let known = plant.drives().map(|drive| drive.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
 }
 
 /// A 404 reply that lists the known names.

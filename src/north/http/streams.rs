@@ -14,14 +14,13 @@ use axum::http::{HeaderMap, HeaderName, StatusCode, header};
 use axum::response::sse::{Event as Message, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::{Stream, StreamExt, stream};
-use percent_encoding::percent_decode_str;
 use serde::Serialize;
 use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
 
-use super::api;
 use super::routes::{AppState, Client, not_found};
+use super::{api, query};
 use crate::codec::{Protocol, describe};
 use crate::command::Authority;
 use crate::event::Event;
@@ -76,16 +75,9 @@ pub(super) async fn trace(
     Extension(client): Extension<Client>,
     RawQuery(query): RawQuery,
 ) -> Response {
-    let wanted = match query.as_deref().map(bus_of) {
-        None | Some(Ok(None)) => None,
-        Some(Ok(Some(name))) => Some(name),
-        Some(Err(error)) => {
-            let reply = api::ErrorReply {
-                error: error.to_string(),
-                known: Vec::new(),
-            };
-            return (StatusCode::BAD_REQUEST, Json(reply)).into_response();
-        }
+    let wanted = match query::parameters(query.as_deref(), &["bus"]) {
+        Ok([bus]) => bus,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
     };
     let plant = app.plant.load();
     let buses = plant.buses.iter().map(|bus| &bus.image);
@@ -256,39 +248,9 @@ fn hex(bytes: &[u8]) -> String {
     text
 }
 
-/// A parameter of a query that is not supported.
-#[derive(Debug, PartialEq, Eq, thiserror::Error)]
-#[error("unknown parameter `{0}`; the only one is `bus`")]
-struct UnknownParameter(String);
-
-/// The bus in a query; an empty name means none.
-fn bus_of(query: &str) -> Result<Option<String>, UnknownParameter> {
-    let mut bus = None;
-    for pair in query.split('&').filter(|pair| !pair.is_empty()) {
-        match pair.split_once('=').unwrap_or((pair, "")) {
-            ("bus", name) => {
-                let name = percent_decode_str(name).decode_utf8_lossy().into_owned();
-                bus = Some(name).filter(|name| !name.is_empty());
-            }
-            (other, _) => return Err(UnknownParameter(other.to_string())),
-        }
-    }
-    Ok(bus)
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn queries() {
-        assert_eq!(bus_of(""), Ok(None));
-        assert_eq!(bus_of("bus="), Ok(None));
-        assert_eq!(bus_of("bus=line1"), Ok(Some("line1".to_string())));
-        assert_eq!(bus_of("&bus=line%201&"), Ok(Some("line 1".to_string())));
-        assert!(bus_of("line=1").is_err());
-        assert!(bus_of("bus=%ff").is_ok(), "not a name, but valid");
-    }
 
     #[test]
     fn event_ids_of_other_runs_are_ignored() {

@@ -24,7 +24,7 @@ pub enum Scope {
     Read,
     /// `/metrics`.
     Metrics,
-    /// Commands over HTTP, which this version does not have.
+    /// Nothing yet: commands are given by users, who have names.
     Control,
 }
 
@@ -137,11 +137,7 @@ impl Tokens {
     /// The first bad line, counted from 1, and why.
     pub fn parse(text: &str) -> Result<Tokens, (usize, TokenError)> {
         let mut tokens: Vec<Token> = Vec::new();
-        for (line, text) in (1..).zip(text.lines()) {
-            let text = text.trim();
-            if text.is_empty() || text.starts_with('#') {
-                continue;
-            }
+        for (line, text) in entries(text) {
             let token: Token = text.parse().map_err(|error| (line, error))?;
             if tokens.iter().any(|other| other.name == token.name) {
                 return Err((line, TokenError::Repeated(token.name)));
@@ -172,22 +168,35 @@ impl Tokens {
     }
 }
 
-fn check_name(name: &str) -> Result<String, TokenError> {
+/// The lines of a file of tokens or users, counted from 1, without empty ones and those that begin with `#`.
+pub(super) fn entries(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    let lines = (1..).zip(text.lines().map(str::trim));
+    lines.filter(|(_, text)| !text.is_empty() && !text.starts_with('#'))
+}
+
+/// Whether a token or a user can have that name.
+pub(super) fn is_name(name: &str) -> bool {
     let sound = |c: char| c.is_ascii_alphanumeric() || matches!(c, '-' | '_' | '.');
-    match !name.is_empty() && name.len() <= 64 && name.chars().all(sound) {
+    !name.is_empty() && name.len() <= 64 && name.chars().all(sound)
+}
+
+fn check_name(name: &str) -> Result<String, TokenError> {
+    match is_name(name) {
         true => Ok(name.to_string()),
         false => Err(TokenError::Name(name.chars().take(64).collect())),
     }
 }
 
-fn hash(secret: &str) -> [u8; BYTES] {
+/// The SHA-256 of a secret.
+pub(super) fn hash(secret: &str) -> [u8; BYTES] {
     let mut bytes = [0; BYTES];
     // Both have the length of a SHA-256.
     bytes.copy_from_slice(digest(&SHA256, secret.as_bytes()).as_ref());
     bytes
 }
 
-fn hex(bytes: &[u8]) -> String {
+/// Lower-case hexadecimal digits.
+pub(super) fn hex(bytes: &[u8]) -> String {
     bytes.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 

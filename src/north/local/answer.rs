@@ -14,7 +14,7 @@ use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refus
 use crate::document::nearest;
 use crate::drive::why::Explanation;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
-use crate::north::mqtt::point_value;
+use crate::north::command_json::resolve;
 use crate::north::parameters::{How, begin_reading};
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
@@ -331,8 +331,8 @@ fn value_of(profile: &Profile, setting: &Setting) -> Result<(usize, Value), Refu
         _ => None,
     };
     match code {
-        Some((code, _)) => point_value(profile, &setting.point, &(*code).into()),
-        None => point_value(profile, &setting.point, &setting.value),
+        Some((code, _)) => resolve(profile, &setting.point, &(*code).into()),
+        None => resolve(profile, &setting.point, &setting.value),
     }
 }
 

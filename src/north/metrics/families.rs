@@ -70,6 +70,7 @@ impl Family {
 pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
     let mut all = Vec::new();
     drives(plant, now, &mut all);
+    runs(plant, &mut all);
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
     recordings(plant, &mut all);
@@ -165,6 +166,29 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
     all.extend([point, transactions, turnaround, supervision, unsupervised]);
 }
 
+/// What was counted of the drives that say whether they run.
+fn runs(plant: &Plant, all: &mut Vec<Family>) {
+    let counter = |name, help| Family::new(Kind::Counter, name, help);
+    let mut starts = counter(
+        "drivegate_drive_starts_total",
+        "Starts of the motor that were seen; kept over restarts of the gateway.",
+    );
+    let mut running = counter(
+        "drivegate_drive_running_seconds_total",
+        "Time that the motor was seen running; kept over restarts of the gateway.",
+    );
+    for drive in plant.drives() {
+        let spec = &drive.image.spec;
+        if spec.profile.model_index(ModelPoint::Running).is_some() {
+            let totals = plant.history.totals(&spec.name);
+            let labels = labels_of(&drive.image);
+            starts.add(labels.clone(), SeriesValue::Count(totals.starts));
+            running.add(labels, SeriesValue::Total(totals.running_seconds));
+        }
+    }
+    all.extend([starts, running]);
+}
+
 /// The good points of a drive; `model` has the families of [`MODEL`], in its order.
 fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &mut Family) {
     let profile = &reading.spec.profile;
@@ -235,8 +259,18 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         "drivegate_bus_queue_depth",
         "Commands and forwarded reads that wait for the bus.",
     );
+    let mut diagnosis = Family::new(
+        Kind::Gauge,
+        "drivegate_line_diagnosis",
+        "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
+    );
     for (labels, handle, _) in looks {
         let image = &handle.image;
+        for verdict in &image.diagnosis.load().verdicts {
+            let mut labels = with(&labels, "drive", verdict.drive.as_deref().unwrap_or_default());
+            labels.push(("verdict", verdict.verdict.name().to_string()));
+            diagnosis.add(labels, SeriesValue::Value(1.0));
+        }
         for (class, times) in [
             (PollClass::Fast, &image.fast_cycles),
             (PollClass::Slow, &image.slow_cycles),
@@ -249,7 +283,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         transactions.add(labels.clone(), SeriesValue::Histogram(image.transactions.snapshot()));
         queue.add(labels, SeriesValue::Value(handle.queue.lock().len() as f64));
     }
-    all.extend([cycles, transactions, queue]);
+    all.extend([cycles, transactions, queue, diagnosis]);
 }
 
 fn writes(plant: &Plant, all: &mut Vec<Family>) {
@@ -329,6 +363,16 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         requests.add(labels, SeriesValue::Count(count));
     }
     all.push(requests);
+    let mut tools = Family::new(
+        Kind::Counter,
+        "drivegate_slot_requests_total",
+        "Requests of tools at the slots, by outcome.",
+    );
+    for (bus, outcome, count) in stats.slots.requests() {
+        let labels = vec![("bus", bus), ("outcome", outcome.name().to_string())];
+        tools.add(labels, SeriesValue::Count(count));
+    }
+    all.push(tools);
     let mut refused = Family::new(
         Kind::Counter,
         "drivegate_connections_refused_total",

@@ -196,6 +196,7 @@ mod tests {
             writes: Arc::new(WriteStats::default()),
             recordings: Default::default(),
             parameters: Default::default(),
+            history: Default::default(),
         }
     }
 

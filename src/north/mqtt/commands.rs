@@ -1,22 +1,19 @@
 //! The set topics: turns a message into one command, and the answer to that command into one result. Time is an
 //! argument; a task only has to wait.
 
-mod memory;
-
 use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
 use std::time::{Duration, Instant, SystemTime};
 
-use self::memory::{Memory, Repetition};
 use super::outbox::Message;
 use super::payload::Topics;
 use super::reply::{Reply, ResponseTopics};
-use super::request::{self, Id, Incoming, MAX_NAME, excerpt};
+use super::request::{self, Incoming};
 use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
-use crate::document::nearest;
 use crate::drive::ModelPoint;
+use crate::north::command_json::{Id, Memory, Repetition, excerpt, unknown_drive};
 use crate::plant::{Placed, Plant};
 
 /// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
@@ -40,7 +37,7 @@ pub(super) struct Commands {
     waiting: PendingCommands,
     /// In the order of acknowledgement.
     confirming: PendingCommands,
-    memory: Memory,
+    memory: Memory<Message>,
     rules: Rules,
 }
 
@@ -130,10 +127,11 @@ impl Commands {
         };
         let run = profile.model_index(ModelPoint::Run);
         let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
-        let print = self.memory.fingerprint(&incoming, request.id.as_ref().map(Id::text));
+        let taken = incoming.taken();
+        let print = self.memory.fingerprint(&taken, request.id.as_ref().map(Id::text));
         let stops = drive.stops();
         if !stop {
-            match self.memory.repeated(&incoming, print, stops, now) {
+            match self.memory.repeated(&taken, print, stops, now) {
                 None => {}
                 Some(Repetition::Pending) => return None,
                 Some(Repetition::Answered(previous)) => return Some(reply.again(previous)),
@@ -148,7 +146,7 @@ impl Commands {
         }
         let number = match stop {
             true => 0,
-            false => self.memory.remember(&incoming, print, stops, now),
+            false => self.memory.remember(&taken, print, stops, now),
         };
         let pending = PendingCommand {
             number,
@@ -294,15 +292,6 @@ impl PendingCommands {
     fn is_empty(&self) -> bool {
         self.commands.is_empty()
     }
-}
-
-pub(super) fn unknown_drive(name: &str, plant: &Plant) -> String {
-    let drives: Vec<_> = plant.drives().map(|d| d.image.spec.name.clone()).collect();
-    let near = (name.len() <= MAX_NAME).then(|| nearest(name, drives.iter().map(String::as_str)));
-    let hint = near
-        .flatten()
-        .map_or(String::new(), |near| format!("; did you mean `{near}`?"));
-    format!("there is no drive {}{hint}", excerpt(name.as_bytes()))
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@ use crate::plant::{BusHandle, Plant};
 use crate::process_image::{Access, BusImage, BusSpec, DriveImage, DriveSpec, Link};
 
 /// A bus `line1` with NX drives of these names; all may be commanded.
-pub(super) fn plant(drives: &[&str]) -> Plant {
+pub(in crate::north) fn plant(drives: &[&str]) -> Plant {
     let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
     let images = drives.iter().zip(1..).map(|(name, address)| {
         let spec = DriveSpec {
@@ -41,11 +41,12 @@ pub(super) fn plant(drives: &[&str]) -> Plant {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }
 }
 
 /// The process data of an NX: status word and output frequency, 0.01 Hz, read at `now`.
-pub(super) fn read(plant: &Plant, drive: &str, status: u16, frequency: u16, now: Instant) {
+pub(in crate::north) fn read(plant: &Plant, drive: &str, status: u16, frequency: u16, now: Instant) {
     plant.drive(drive).unwrap().image.update(|s| {
         s.link = Link::Online(SystemTime::now());
         s.fast_at = Some(now);

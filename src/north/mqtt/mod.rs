@@ -19,7 +19,7 @@ mod client;
 mod commands;
 mod connection;
 #[cfg(test)]
-mod fixture;
+pub(super) mod fixture;
 mod history;
 mod home_assistant;
 mod journal;
@@ -49,7 +49,6 @@ use crate::plant::SharedPlant;
 pub use self::offline::{Offline, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
-pub(super) use self::request::resolve as point_value;
 
 /// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]

@@ -465,14 +465,14 @@ mod tests {
         let topics = Topics::new("drivegate", "hall");
         let mut object = Event {
             id: 4,
-            time: SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
-            kind: crate::event::EventKind::FaultEnd,
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
             fault_code: Some(53),
-            count: None,
-            text: "gone".to_string(),
-            recording: None,
+            ..Event::new(
+                crate::event::EventKind::FaultEnd,
+                SystemTime::UNIX_EPOCH + Duration::from_millis(1_700_000_000_001),
+                "gone".to_string(),
+            )
         };
         let plant = super::super::fixture::plant(&["p1", "p2"]);
         let (to, payload) = event(&topics, &object, &plant);
@@ -485,7 +485,7 @@ mod tests {
         assert_eq!(recording(&topics, &object), None);
         object.recording = Some(crate::event::RecordingMade {
             id: "20231114T221320.001Z-p1".to_string(),
-            trigger: "fault",
+            trigger: "fault".into(),
             summary: "fault 53".to_string(),
         });
         let (topic, payload) = recording(&topics, &object).unwrap();

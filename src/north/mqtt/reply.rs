@@ -2,12 +2,10 @@
 
 use std::time::{Duration, SystemTime};
 
-use serde::Serialize;
-
 use super::outbox::Message;
-use super::payload;
-use super::request::{Id, Incoming};
-use crate::command::{Answer, CONFIRMED};
+use super::request::Incoming;
+use crate::command::Answer;
+use crate::north::command_json::{CommandResult, Id};
 
 /// Maximum number of levels of a response topic.
 const LEVELS: usize = 128;
@@ -71,27 +69,6 @@ pub(super) struct Reply {
     drive: String,
 }
 
-#[derive(Serialize)]
-struct ResultObject<'r> {
-    id: Option<&'r Id>,
-    drive: &'r str,
-    ok: bool,
-    result: &'r str,
-    #[serde(skip_serializing_if = "Option::is_none")]
-    error: Option<ErrorObject<'r>>,
-    latency_ms: f64,
-    /// From acceptance to the read that showed the effect.
-    #[serde(skip_serializing_if = "Option::is_none")]
-    confirmed_ms: Option<f64>,
-    time: String,
-}
-
-#[derive(Serialize)]
-struct ErrorObject<'r> {
-    code: &'r str,
-    message: String,
-}
-
 impl Reply {
     /// The response topic of the request, or the result topic of the drive if it has none.
     pub(super) fn to(incoming: &Incoming, result: String, drive: &str, allowed: &ResponseTopics) -> Reply {
@@ -129,23 +106,7 @@ impl Reply {
         confirmed: Option<Duration>,
         time: SystemTime,
     ) -> Message {
-        let code = match confirmed {
-            Some(_) => CONFIRMED,
-            None => answer.outcome.code(),
-        };
-        let error = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
-        let object = ResultObject {
-            id: id.as_ref(),
-            drive: &self.drive,
-            ok: error.is_none(),
-            result: code,
-            error: error.map(|message| ErrorObject { code, message }),
-            latency_ms: payload::milliseconds(answer.latency),
-            confirmed_ms: confirmed.map(payload::milliseconds),
-            time: payload::rfc3339(time),
-        };
-        // Strings, numbers and previous JSON can always be serialized.
-        let payload = serde_json::to_vec(&object).unwrap_or_default();
+        let payload = CommandResult::new(id.as_ref(), &self.drive, answer, confirmed, time).to_json();
         Message {
             correlation: self.correlation.clone(),
             ..Message::not_retained(self.topic.as_str(), payload)

@@ -2,13 +2,14 @@
 
 use super::super::faults::Fault;
 use super::super::half_duplex::Delivery;
-use super::super::pty::Pty;
 use super::super::statistics::Direction;
 use super::*;
 use crate::codec::LineFormat;
+use crate::line::Pty;
 use std::fs::{File, OpenOptions};
 use std::io::{Read, Write};
 use std::net::TcpStream;
+use std::os::fd::AsFd;
 use std::os::unix::fs::OpenOptionsExt;
 use std::path::Path;
 
@@ -183,7 +184,7 @@ fn a_serial_device_server() {
 
 #[test]
 fn a_real_port_keeps_its_own_time() {
-    let mut other_end = Pty::open(None).unwrap();
+    let other_end = Pty::open(None).unwrap();
     let mut options = options(38_400);
     let format = options.rules.format;
     options.endpoint = EndpointOptions::Port {
@@ -191,10 +192,7 @@ fn a_real_port_keeps_its_own_time() {
     };
     let bus = SimulatedBus::start(options).unwrap();
     assert_eq!(Path::new(&bus.address()), other_end.path());
-    let mut master = File::from(std::mem::replace(
-        &mut other_end.master,
-        File::open("/dev/null").unwrap().into(),
-    ));
+    let mut master = File::from(other_end.as_fd().try_clone_to_owned().unwrap());
     for _ in 0..2 {
         master.write_all(&ASK).unwrap();
         assert_eq!(read(&mut master, REPLY.len(), LONG), REPLY);

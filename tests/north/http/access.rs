@@ -136,6 +136,7 @@ async fn a_token_opens_what_its_scopes_say() {
         "/assets/page.js",
         "/api/v1/drives",
         "/api/v1/audit",
+        "/api/v1/buses/line1/diagnosis",
         "/api/v1/recordings",
         "/api/v1/recordings/x",
         "/api/v1/events",

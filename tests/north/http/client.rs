@@ -32,6 +32,21 @@ impl Reply {
     }
 }
 
+impl Reply {
+    /// A reply without its connection.
+    fn parse(text: &str) -> Reply {
+        let (head, body) = text.split_once("\r\n\r\n").expect("a head");
+        let status = head.split(' ').nth(1).and_then(|s| s.parse().ok()).expect("a status");
+        let chunked = head.to_ascii_lowercase().contains("transfer-encoding: chunked");
+        let body = if chunked { unchunked(body) } else { body.to_string() };
+        Reply {
+            status,
+            head: head.to_string(),
+            body,
+        }
+    }
+}
+
 /// Sends one request on a connection of its own and reads to its end.
 pub(crate) async fn request(address: SocketAddr, method: &str, path: &str, headers: &str) -> Reply {
     let head = format!("{method} {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}\r\n");
@@ -47,15 +62,7 @@ pub(crate) async fn raw(address: SocketAddr, request: &str) -> Reply {
         String::from_utf8(bytes).expect("text")
     };
     let text = timeout(PATIENCE, exchange).await.expect("a reply in time");
-    let (head, body) = text.split_once("\r\n\r\n").expect("a head");
-    let status = head.split(' ').nth(1).and_then(|s| s.parse().ok()).expect("a status");
-    let chunked = head.to_ascii_lowercase().contains("transfer-encoding: chunked");
-    let body = if chunked { unchunked(body) } else { body.to_string() };
-    Reply {
-        status,
-        head: head.to_string(),
-        body,
-    }
+    Reply::parse(&text)
 }
 
 fn unchunked(mut body: &str) -> String {
@@ -69,6 +76,15 @@ fn unchunked(mut body: &str) -> String {
         }
     }
     whole
+}
+
+/// Sends a POST with a body on a connection of its own and reads to its end.
+pub(crate) async fn post(address: SocketAddr, path: &str, headers: &str, body: &str) -> Reply {
+    let length = body.len();
+    let head = format!(
+        "POST {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n{headers}Content-Length: {length}\r\n\r\n"
+    );
+    raw(address, &(head + body)).await
 }
 
 pub(crate) async fn get(address: SocketAddr, path: &str) -> Reply {

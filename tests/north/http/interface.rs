@@ -18,7 +18,7 @@ use tokio_util::sync::CancellationToken;
 use super::client::{get, raw, request};
 use super::plant::{self, HOLDING, STALE_AFTER, Server};
 
-const PLACES: [&str; 14] = [
+const PLACES: [&str; 15] = [
     "/",
     "/assets/style.css",
     "/assets/page.js",
@@ -29,6 +29,7 @@ const PLACES: [&str; 14] = [
     "/api/v1/drives",
     "/api/v1/drives/pump-1",
     "/api/v1/buses",
+    "/api/v1/buses/line1/diagnosis",
     "/api/v1/audit",
     "/api/v1/recordings",
     "/api/v1/events",
@@ -160,6 +161,7 @@ async fn a_good_drive() {
             "name": "pump-1", "bus": "line1", "address": 1, "unit": 1, "profile": "vacon-nx", "access": "monitor",
             "state": "running", "quality": "good", "online": true, "since": "…", "age_ms": "…", "fault_text": "", "blocked_by": [], "why": [],
             "turnaround_ms": 1.9, "transactions": {"ok": 1, "exception": 0, "timeout": 0, "corrupt": 0},
+            "starts": 0, "running_seconds": 0.0, "energy_kwh": null,
         })
     );
     let names: Vec<&String> = points.as_object().unwrap().keys().collect();
@@ -292,6 +294,37 @@ async fn buses() {
 }
 
 #[tokio::test]
+async fn what_is_wrong_with_a_line() {
+    let server = Server::of(plant::mixed()).await;
+    let of = async |bus: &str| get(server.address, &format!("/api/v1/buses/{bus}/diagnosis")).await;
+    let before = of("line1").await.json();
+    assert_eq!(
+        before,
+        json!({"bus": "line1", "time": null, "verdicts": [], "wrong_address": 0, "drives": []})
+    );
+    plant::diagnose(&server.plant().buses[0]);
+    let told = of("line1").await.json();
+    assert_eq!(told["time"], json!("1970-01-01T00:00:00.000Z"));
+    let verdict = &told["verdicts"][0];
+    for (field, value) in [
+        ("verdict", "one_drive"),
+        ("drive", "pump-1"),
+        ("certainty", "likely"),
+        ("evidence", "7 of 90 exchanges failed"),
+        ("since", "2026-03-02T06:11:09.480Z"),
+    ] {
+        assert_eq!(verdict[field], json!(value));
+    }
+    assert_eq!(told["drives"].as_array().unwrap().len(), 3);
+    let unknown = of("line9").await;
+    assert_eq!(unknown.status, 404);
+    assert_eq!(
+        unknown.json(),
+        json!({"error": "there is no bus `line9`", "known": ["line1", "line2"]})
+    );
+}
+
+#[tokio::test]
 async fn a_reload_shows_at_once() {
     let server = Server::of(plant::mixed()).await;
     let bus = plant::bus("hall", vec![plant::drive("hall", "press", 9, &plant::nx())]);
@@ -335,6 +368,7 @@ async fn the_page_without_scripts_has_tables() {
     for (place, kind) in [
         ("/assets/style.css", "text/css"),
         ("/assets/page.js", "text/javascript"),
+        ("/assets/overview.js", "text/javascript"),
         ("/assets/icon.svg", "image/svg+xml"),
     ] {
         let reply = get(server.address, place).await;

@@ -3,10 +3,12 @@
 
 mod access;
 mod client;
+mod commands;
 mod dashboards;
 mod interface;
 mod limits;
 mod metrics;
+mod operate;
 mod page;
 mod plant;
 mod streams;

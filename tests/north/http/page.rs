@@ -1,92 +1,89 @@
 //! The status page in a real browser.
 
-use super::plant::{self, Server, event};
-use crate::support::tools::{root, run, tool};
+#[path = "page/lively.rs"]
+mod lively;
+#[path = "page/pictures.rs"]
+mod pictures;
+
+use std::time::{Duration, Instant};
+
+use super::plant::{self as hand_made, Server, event};
+use crate::support::tools::{root, tool};
 
 use drivegate::event::EventKind;
 
-/// The document after its script has run for some seconds of the browser's own time, without the tables
-/// that are there for browsers without scripts.
-fn dom(address: std::net::SocketAddr) -> String {
-    let profile = tempfile::tempdir().expect("a directory");
-    let profile = format!("--user-data-dir={}", profile.path().display());
-    let url = format!("http://{address}/");
-    let arguments = [
-        "120",
-        "chromium",
-        "--headless",
-        "--no-sandbox",
-        "--disable-gpu",
-        "--disable-quic",
-        "--no-first-run",
-        "--disable-background-networking",
-        "--disable-component-update",
-        "--disable-sync",
-        &profile,
-        "--virtual-time-budget=5000",
-        "--dump-dom",
-        &url,
-    ];
-    let output = run(&tool("timeout"), &arguments);
+use self::lively::Lively;
+
+/// A text that must stay one.
+const NASTY: &str = "<img src=x onerror=window.hacked=1>";
+
+/// Runs a script of `tests/north/http/page`, which drives the browser; what it printed.
+async fn browse(script: &str, arguments: Vec<String>) -> String {
+    let script = root().join("tests/north/http/page").join(script);
+    let run = move || {
+        std::process::Command::new(tool("timeout"))
+            .arg("900")
+            .arg(tool("node"))
+            .arg(script)
+            .args(arguments)
+            .env("NODE_PATH", root().join(".tools/node/node_modules"))
+            .output()
+            .expect("it runs")
+    };
+    let output = tokio::task::spawn_blocking(run).await.expect("it ends");
     let errors = String::from_utf8_lossy(&output.stderr);
-    assert!(
-        output.status.success(),
-        "{}: is Debian's package chromium installed?\n{errors}",
-        output.status
-    );
-    let document = String::from_utf8(output.stdout).expect("text");
-    let mut rest = document.as_str();
-    let mut live = String::new();
-    while let Some((before, after)) = rest.split_once("<noscript>") {
-        live += before;
-        rest = after.split_once("</noscript>").map_or("", |(_, after)| after);
-    }
-    live + rest
+    assert!(output.status.success(), "{}\n{errors}", output.status);
+    String::from_utf8(output.stdout).expect("text")
 }
 
+fn url(server: &Server) -> String {
+    format!("http://{}/", server.address)
+}
+
+/// Contents, size and accessibility of every view, in light and dark, from desktop to phone, by keyboard alone.
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
-async fn the_page_shows_the_plant() {
-    let plant = plant::mixed();
-    plant
-        .events
-        .publish(event(EventKind::Fault, "saw-4", "fault 7: <saturation> trip"));
-    plant.buses[1].image.update_health(|health| {
-        health.up = false;
+async fn every_view_is_complete_and_accessible() {
+    let Lively {
+        mut plant,
+        mut going_on,
+    } = Lively::new();
+    let nasty = hand_made::drive("line3", NASTY, 9, &hand_made::nx());
+    let never = hand_made::drive("line3", "never-1", 2, &hand_made::nx());
+    plant.buses.push(hand_made::bus("line3", vec![nasty.clone(), never]));
+    plant.buses.push(hand_made::bus("line4", Vec::new()));
+    hand_made::open(&plant.buses[2]);
+    plant.buses[3].image.update_health(|health| {
+        health.tried = true;
         health.reason = Some("the adapter is gone".to_string());
     });
+    plant.events.publish(event(EventKind::Fault, NASTY, NASTY));
     let server = Server::of(plant).await;
-    let address = server.address;
-    let document = tokio::task::spawn_blocking(move || dom(address))
-        .await
-        .expect("a document");
-    for wanted in [
-        ">Live<",
-        "aria-expanded=\"false\">pump-1</button>",
-        "▶ running",
-        "<span class=\"value main\">25.00</span><span class=\"unit\"> Hz</span>",
-        ">fan-2<",
-        "✕ offline",
-        "<span class=\"value stale\" title=\"stale, ",
-        ">mixer-3<",
-        "<span class=\"value bad\">never read</span>",
-        ">saw-4<",
-        "▲ fault",
-        "F7 saturation trip",
-        "1 of 3</dd>",
-        "12.5 ms (aim 10 ms)",
-        "43.8 %",
-        "the adapter is gone",
-        "fault 7: &lt;saturation&gt; trip",
-    ] {
-        assert!(document.contains(wanted), "{wanted}\nis missing in\n{document}");
-    }
+    let _answering = keep_answering(move || {
+        hand_made::answer(&nasty, Instant::now(), hand_made::nx_faulted);
+        going_on.answer();
+    });
+    browse("views.js", vec![url(&server)]).await;
 }
 
-/// What a row shows of points that a reload replaced, of texts, ages, speeds that a newer state contradicts, and causes.
-#[test]
-fn rows_follow_their_drive() {
-    let here = root().join("tests/north/http/page_rows.js");
-    let script = root().join("src/north/http/page/page.js");
-    let output = run(&tool("node"), &[here.to_str().unwrap(), script.to_str().unwrap()]);
-    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+/// What the views show when drives, profiles, filters and the connection change under them.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn the_page_follows_its_gateway() {
+    browse("changes.js", Vec::new()).await;
+}
+
+/// The time that an update takes grows with the number of drives and no faster.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_thousand_drives_stay_smooth() {
+    let printed = browse("load.js", Vec::new()).await;
+    println!("{printed}");
+}
+
+/// Calls it every second until it is dropped.
+fn keep_answering(mut answer: impl FnMut() + Send + 'static) -> tokio_util::task::AbortOnDropHandle<()> {
+    tokio_util::task::AbortOnDropHandle::new(tokio::spawn(async move {
+        loop {
+            answer();
+            tokio::time::sleep(Duration::from_millis(900)).await;
+        }
+    }))
 }

@@ -9,12 +9,13 @@ use std::time::{Duration, Instant, SystemTime};
 use arc_swap::ArcSwap;
 use drivegate::codec::{Exception, Protocol, Table};
 use drivegate::command::{self, Origin, SourceKind, Ticket};
+use drivegate::diagnosis::{Cause, Certainty, Counted, Diagnosis, Verdict};
 use drivegate::drive::model::Kind;
 use drivegate::drive::profile::Profiles;
 use drivegate::drive::{ModelPoint, Profile};
 use drivegate::event::{Event, EventKind};
-use drivegate::north::NorthStats;
 use drivegate::north::http::{self, Http, Options};
+use drivegate::north::{NorthStats, SlotOutcome};
 use drivegate::plant::{BusHandle, Plant, SharedPlant};
 use drivegate::process_image::{DriveImage, DriveSpec, LeaseAction, Link, Outcome, PollCycle, Supervision};
 use tokio_util::sync::CancellationToken;
@@ -153,15 +154,10 @@ pub(crate) fn plant(buses: Vec<BusHandle>) -> Plant {
 
 pub(crate) fn event(kind: EventKind, drive: &str, text: &str) -> Event {
     Event {
-        id: 0,
-        time: SystemTime::now(),
-        kind,
         bus: "line1".to_string(),
         drive: Some(drive.to_string()),
         fault_code: (kind == EventKind::Fault).then_some(7),
-        count: None,
-        text: text.to_string(),
-        recording: None,
+        ..Event::new(kind, SystemTime::now(), text.to_string())
     }
 }
 
@@ -211,6 +207,7 @@ pub(crate) fn count_a_write(plant: &Plant) {
 /// Figures of all north sides.
 pub(crate) fn stats() -> Arc<NorthStats> {
     let stats = NorthStats::default();
+    stats.slots.count("line1", SlotOutcome::Answered);
     stats.modbus_tcp.connected();
     stats.modbus_tcp.answered(3, 0);
     stats.modbus_tcp.answered(6, 1);
@@ -270,3 +267,26 @@ impl Server {
 
 /// The table of all words that the hand-made drives have.
 pub(crate) const HOLDING: Table = Table::Holding;
+
+/// A verdict about the line of a bus.
+pub(crate) fn diagnose(bus: &BusHandle) {
+    let verdict = Verdict {
+        verdict: Cause::OneDrive,
+        drive: Some(bus.image.drives[0].spec.name.clone()),
+        certainty: Certainty::Likely,
+        meaning: Cause::OneDrive.meaning().to_string(),
+        evidence: "7 of 90 exchanges failed".to_string(),
+        remedy: Cause::OneDrive.remedy().to_string(),
+        since: "2026-03-02T06:11:09.480Z".to_string(),
+    };
+    let counted = |drive: &Arc<DriveImage>| Counted {
+        drive: drive.spec.name.clone(),
+        ..Counted::default()
+    };
+    bus.image.diagnosis.store(Arc::new(Diagnosis {
+        at: Some(SystemTime::UNIX_EPOCH),
+        verdicts: vec![verdict],
+        wrong_address: 0,
+        drives: bus.image.drives.iter().map(counted).collect(),
+    }));
+}

@@ -192,7 +192,7 @@ async fn unknown_buses_are_told() {
     assert_eq!(reply.status, 400);
     assert_eq!(
         reply.json(),
-        json!({"error": "unknown parameter `line`; the only one is `bus`"})
+        json!({"error": "unknown parameter `line`", "known": ["bus"]})
     );
 }
 

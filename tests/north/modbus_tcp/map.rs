@@ -71,6 +71,7 @@ fn plant(settings: &Settings) -> Plant {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     }
 }
 

@@ -11,6 +11,6 @@ mod offline;
 mod peers;
 mod requests;
 mod revocation;
-mod rig;
+pub(crate) mod rig;
 mod second_opinion;
 mod tls;

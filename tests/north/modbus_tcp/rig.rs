@@ -87,7 +87,7 @@ pub(crate) struct FakeBus {
 }
 
 impl FakeBus {
-    fn start(queue: Arc<CommandQueue>) -> FakeBus {
+    pub(crate) fn start(queue: Arc<CommandQueue>) -> FakeBus {
         let mut bus = FakeBus {
             queue,
             seen: Arc::default(),

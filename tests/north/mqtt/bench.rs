@@ -441,15 +441,9 @@ impl Gateway {
     pub(crate) fn publish_event(&self, drive: &str, kind: EventKind, text: &str) -> SystemTime {
         let time = SystemTime::now();
         self.plant.load().events.publish(Event {
-            id: 0,
-            time,
-            kind,
             bus: "line1".to_string(),
             drive: Some(drive.to_string()),
-            fault_code: None,
-            count: None,
-            text: text.to_string(),
-            recording: None,
+            ..Event::new(kind, time, text.to_string())
         });
         time
     }

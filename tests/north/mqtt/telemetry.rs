@@ -187,15 +187,8 @@ fn bus_events_reach_the_topics_of_its_drives() {
     let gateway = Gateway::start(options(broker.port), plant(&["p1", "p2"]));
     gateway.wait_connected(true);
     gateway.plant.load().events.publish(Event {
-        id: 0,
-        time: SystemTime::now(),
-        kind: EventKind::BusDown,
         bus: "line1".to_string(),
-        drive: None,
-        fault_code: None,
-        count: None,
-        text: "unplugged".to_string(),
-        recording: None,
+        ..Event::new(EventKind::BusDown, SystemTime::now(), "unplugged".to_string())
     });
     for drive in ["p1", "p2"] {
         let topic = format!("drivegate/hall/drive/{drive}/event");

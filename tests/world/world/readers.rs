@@ -25,7 +25,7 @@ impl World {
         let count = plant.drives().count();
         let drive = plant.drives().nth(reading % count).unwrap();
         let wall = SystemTime::UNIX_EPOCH + (self.now - self.began);
-        let json = http::drive_json(&drive, self.now, wall).unwrap();
+        let json = http::drive_json(&drive, &Default::default(), self.now, wall).unwrap();
         check_json(&drive, &plant, &json, self.now);
         if reading.is_multiple_of(EVERY.1) {
             let text = metrics::encode(&plant, &NorthStats::default(), self.now, Format::Prometheus).unwrap();

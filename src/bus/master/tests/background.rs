@@ -24,6 +24,7 @@ impl Rig {
             pace,
             expires: self.now + Duration::from_secs(60),
             ticket,
+            passed_on: None,
         };
         self.bus.queue.submit_background(request, self.now);
         answer

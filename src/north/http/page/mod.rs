@@ -1,7 +1,7 @@
-//! The status page: one document with its style and its script, all served by this server.
+//! The status page: one document, its styles and its scripts, all served by this server.
 //!
-//! The script shows the JSON interface live. Without scripts the page has the tables rendered here and reloads every
-//! few seconds. A column has its heading in `index.html` and its cells in `page.js`; those without scripts are in
+//! The scripts show the JSON interface live; `page.js` opens the views: `overview.js`, `drive.js`, `lines.js`, `events.js`,
+//! `recording.js`. Without scripts the page has the tables rendered here and reloads every few seconds; their columns are in
 //! `COLUMNS`.
 
 use std::fmt::{self, Write as _};
@@ -13,14 +13,33 @@ use crate::process_image::Reading;
 
 const DOCUMENT: &str = include_str!("index.html");
 
-/// Style sheet.
-pub(in crate::north::http) const STYLE: &str = include_str!("style.css");
+/// A file that the document names, or one of its scripts.
+#[derive(Debug)]
+pub(in crate::north::http) struct Asset {
+    /// Its path is `/assets/NAME`.
+    pub(in crate::north::http) name: &'static str,
+    pub(in crate::north::http) content_type: &'static str,
+    pub(in crate::north::http) body: &'static str,
+}
 
-/// Script.
-pub(in crate::north::http) const SCRIPT: &str = include_str!("page.js");
+macro_rules! assets {
+    ($($content_type:literal: $($name:literal),+;)+) => {
+        &[$($(Asset { name: $name, content_type: $content_type, body: include_str!($name) }),+),+]
+    };
+}
 
-/// Icon.
-pub(in crate::north::http) const ICON: &str = include_str!("icon.svg");
+/// All of them.
+pub(in crate::north::http) const ASSETS: &[Asset] = assets! {
+    "image/svg+xml": "icon.svg";
+    "text/css; charset=utf-8": "operate.css", "style.css", "views.css";
+    "text/javascript; charset=utf-8":
+        "common.js", "drive.js", "events.js", "gateway.js", "lines.js", "operate.js", "overview.js", "page.js", "plot.js",
+        "recording.js", "strips.js", "trend.js";
+};
+
+/// What the document has in its head for the operating part; its script comes before the page's.
+const OPERATE_HEAD: &str = "<link rel=\"stylesheet\" href=\"assets/operate.css\">\n\
+    <script src=\"assets/operate.js\" defer></script>";
 
 /// Only this server's own files, no inline code, no forms.
 pub(in crate::north::http) const SECURITY_POLICY: &str = "default-src 'none'; script-src 'self'; style-src 'self'; \
@@ -34,15 +53,30 @@ const COLUMNS: [(ModelPoint, &str); 4] = [
     (ModelPoint::MotorTorque, "Torque"),
 ];
 
-/// The document with the state of the plant at `now`.
-pub(in crate::north::http) fn render(plant: &Plant, now: Instant) -> String {
+/// The document with the state of the plant at `now`; `operating` says whether it has the part that commands.
+pub(in crate::north::http) fn render(plant: &Plant, operating: bool, now: Instant) -> String {
     let mut tables = String::new();
     // Writing to a string cannot fail.
     let _ = buses(&mut tables, plant).and_then(|()| drives(&mut tables, plant, now));
+    document(plant, operating, &tables)
+}
+
+/// The document without any value, for somebody who has to log in first.
+pub(in crate::north::http) fn render_login(plant: &Plant) -> String {
+    document(plant, true, "<p>Log in to see the drives; that needs scripts.</p>")
+}
+
+fn document(plant: &Plant, operating: bool, tables: &str) -> String {
+    let (head, mode) = match operating {
+        true => (OPERATE_HEAD, "commands after login"),
+        false => ("", "read only"),
+    };
     DOCUMENT
+        .replace("{{operate}}", head)
+        .replace("{{mode}}", mode)
         .replace("{{version}}", env!("CARGO_PKG_VERSION"))
         .replace("{{gateway}}", &Escaped(&plant.gateway).to_string())
-        .replace("{{tables}}", &tables)
+        .replace("{{tables}}", tables)
 }
 
 fn buses(out: &mut String, plant: &Plant) -> fmt::Result {
@@ -129,7 +163,10 @@ impl fmt::Display for Escaped<'_> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeSet;
+
     use super::*;
+    use crate::event::EventKind;
 
     #[test]
     fn text_cannot_become_markup() {
@@ -141,15 +178,54 @@ mod tests {
 
     #[test]
     fn nothing_comes_from_elsewhere_and_no_code_is_inline() {
-        for text in [DOCUMENT, STYLE, SCRIPT] {
-            for foreign in ["http://", "https://", "@import", "eval("] {
-                let own = text.replace("http://www.w3.org/2000/svg", "");
-                assert!(!own.contains(foreign), "{foreign}");
+        for text in ASSETS.iter().map(|asset| asset.body).chain([DOCUMENT]) {
+            let own = text.replace("http://www.w3.org/2000/svg", "");
+            for foreign in [
+                "http://",
+                "https://",
+                "@import",
+                "eval(",
+                "innerHTML",
+                "insertAdjacentHTML",
+            ] {
+                assert!(
+                    !own.contains(foreign),
+                    "{foreign}: texts of drives must not become markup"
+                );
             }
         }
         for inline in ["<style", " style=", " onclick=", "<script>", "javascript:"] {
             assert!(!DOCUMENT.contains(inline), "{inline}");
         }
-        assert!(!SCRIPT.contains("innerHTML"), "texts of drives must not become markup");
+    }
+
+    /// Searching for another kind would be refused.
+    #[test]
+    fn the_kinds_of_events_are_those_that_there_are() {
+        let script = ASSETS
+            .iter()
+            .find(|asset| asset.name == "events.js")
+            .map(|asset| asset.body);
+        let (_, list) = script
+            .and_then(|text| text.split_once("const KINDS = ["))
+            .unwrap_or_default();
+        let (list, _) = list.split_once(']').unwrap_or_default();
+        let listed: BTreeSet<&str> = list.split('"').skip(1).step_by(2).collect();
+        assert_eq!(listed, EventKind::ALL.iter().map(|kind| kind.name()).collect());
+    }
+
+    #[test]
+    fn every_file_that_is_named_is_served() {
+        let served = |name: &str| ASSETS.iter().any(|asset| asset.name == name);
+        for named in DOCUMENT.split("\"assets/").skip(1) {
+            let name = named.split('"').next().unwrap_or_default();
+            assert!(served(name), "index.html names {name}");
+        }
+        for asset in ASSETS.iter().filter(|asset| asset.name.ends_with(".js")) {
+            for imported in asset.body.split("from \"./").skip(1) {
+                let name = imported.split('"').next().unwrap_or_default();
+                assert!(served(name), "{} imports {name}", asset.name);
+            }
+        }
     }
 }

@@ -48,6 +48,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         writes: Default::default(),
         recordings: Default::default(),
         parameters: Default::default(),
+        history: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
     let state = ServerState::new(options, stats.clone());

@@ -44,15 +44,9 @@ async fn client(buffer: Option<Buffer>) -> Client {
 async fn burst(client: &mut Client, count: usize) {
     for n in 0..count {
         client.plant.load().events.publish(Event {
-            id: 0,
-            time: SystemTime::UNIX_EPOCH,
-            kind: EventKind::Offline,
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
-            fault_code: None,
-            count: None,
-            text: format!("event {n}"),
-            recording: None,
+            ..Event::new(EventKind::Offline, SystemTime::UNIX_EPOCH, format!("event {n}"))
         });
     }
     let received = client.events.recv().await;
@@ -100,15 +94,14 @@ async fn a_fault_and_a_flood(client: &mut Client, refusals: usize) -> (u64, u64)
     burst(client, 1).await;
     for n in 0..refusals {
         let event = Event {
-            id: 0,
-            time: SystemTime::UNIX_EPOCH,
-            kind: EventKind::RefusedCommand,
             bus: "line1".to_string(),
             drive: Some("p1".to_string()),
-            fault_code: None,
             count: Some(1),
-            text: format!("refused {n}"),
-            recording: None,
+            ..Event::new(
+                EventKind::RefusedCommand,
+                SystemTime::UNIX_EPOCH,
+                format!("refused {n}"),
+            )
         };
         client.on_event(Ok(Arc::new(event)));
     }

@@ -1,10 +1,10 @@
 use serde_json::Value as Json;
 
 use super::super::fixture;
-use super::memory::REMEMBERED;
 use super::*;
 use crate::codec::Reply as BusReply;
 use crate::command::{Outcome, Receipt, Urgency};
+use crate::north::command_json::REMEMBERED;
 
 struct Bench {
     plant: Plant,

@@ -10,13 +10,13 @@ use std::time::{Duration, Instant};
 
 use serde_json::Value as Json;
 
-use super::super::commands::unknown_drive;
-use super::super::request::{self, Incoming, excerpt};
+use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command::{Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Refusal, SourceKind};
 use crate::drive::{ModelPoint, Profile, Value};
+use crate::north::command_json::{excerpt, resolve, unknown_drive};
 use crate::plant::{Placed, Plant};
 
 /// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
@@ -255,7 +255,7 @@ impl Request {
                     "{name} has no value that can be commanded (null, a text, not finite)"
                 ))
             })?;
-            request::resolve(profile, &name, &value)
+            resolve(profile, &name, &value)
         };
         metrics.iter().map(point).collect()
     }

@@ -2,13 +2,14 @@
 
 use std::time::Duration;
 
-use crate::cli::scan::{Heard, Setting};
+use super::{Heard, Setting};
+use crate::diagnosis::Cause;
 
 /// Bytes that come of switching the port on, or are single disturbances.
 const FEW_BYTES: usize = 8;
 
 /// What to do if bytes came before anything was sent.
-pub(super) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> Option<String> {
+pub(in crate::cli) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> Option<String> {
     (heard.unasked >= FEW_BYTES).then(|| {
         format!(
             "{} bytes came within {listened:?} before anything was sent, so nothing was sent: another master speaks on this \
@@ -20,8 +21,11 @@ pub(super) fn somebody_speaks(heard: &Heard, port: &str, listened: Duration) -> 
 }
 
 /// Why no drive may have answered, and what to do.
-pub(super) fn nobody_answers(heard: &Heard, port: &str) -> String {
+pub(in crate::cli) fn nobody_answers(heard: &Heard, port: &str) -> String {
     let requests = heard.requests;
+    if let Some(told) = told_by_shape(heard) {
+        return format!("no drive answered, but {told}; {port}");
+    }
     if let Some((setting, count)) = most_garbage(heard) {
         return format!(
             "no drive answered, but {} bytes came that are no valid reply, most of them at {setting} ({count} times): \
@@ -50,6 +54,49 @@ pub(super) fn nobody_answers(heard: &Heard, port: &str) -> String {
          well as on a dead line, so first check power, wiring (swap - and +), termination and that the bus is enabled at the \
          drive, and whether the transmit light blinks; then try --baud all --format all"
     )
+}
+
+/// What the shape of the bytes says, where it says something.
+fn told_by_shape(heard: &Heard) -> Option<String> {
+    let Heard {
+        start_lost,
+        cut_echoes,
+        stray_before,
+        requests,
+        ..
+    } = heard;
+    let told = [
+        (
+            *start_lost,
+            format!("{start_lost} replies came that are sound once their first bytes are put back"),
+            Cause::ReplyStartLost,
+        ),
+        (
+            *cut_echoes,
+            format!("{cut_echoes} of {requests} requests came back as the adapter's own echo without their end"),
+            Cause::RequestEndLost,
+        ),
+        (
+            *stray_before,
+            format!("{stray_before} replies came with stray bytes before them"),
+            Cause::Bias,
+        ),
+    ];
+    let (count, seen, cause) = told.into_iter().max_by_key(|(count, ..)| *count)?;
+    (count >= 2).then(|| format!("{seen}: {}; {}", cause.meaning(), cause.remedy()))
+}
+
+/// What is to be said of a line on which drives answered, too.
+pub(in crate::cli) fn beside_answers(heard: &Heard) -> Option<String> {
+    if let Some(told) = told_by_shape(heard) {
+        return Some(told);
+    }
+    let (setting, address) = heard.garbage.first()?;
+    Some(format!(
+        "received invalid frames {} times, first at {setting}, address {address}: the line may have another baud, format or \
+         protocol, or two drives the same address",
+        heard.garbage.len(),
+    ))
 }
 
 /// The setting with most invalid replies, and how many.
@@ -95,7 +142,28 @@ mod tests {
             bytes: 5,
             ..Heard::default()
         };
+        let late = Heard {
+            requests: 30,
+            bytes: 60,
+            start_lost: 4,
+            ..Heard::default()
+        };
+        let early = Heard {
+            requests: 30,
+            bytes: 60,
+            cut_echoes: 30,
+            garbage: vec![(at(9600), 1)],
+            ..Heard::default()
+        };
         for (heard, wanted) in [
+            (
+                late,
+                "4 replies came that are sound once their first bytes are put back: the beginning of replies is lost; ",
+            ),
+            (
+                early,
+                "30 of 30 requests came back as the adapter's own echo without their end",
+            ),
             (silent, "after 30 requests not one byte was heard; /dev/x; "),
             (echo, "30 of 30 requests came back as the adapter's own echo"),
             (

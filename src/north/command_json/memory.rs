@@ -4,24 +4,38 @@ use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 use std::time::{Duration, Instant};
 
-use super::super::outbox::Message;
-use super::super::request::Incoming;
-
 /// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
 const RECENT: usize = 1024;
 /// Least time for which a command with an `id` is remembered.
-pub(super) const REMEMBERED: Duration = Duration::from_secs(600);
+pub(in crate::north) const REMEMBERED: Duration = Duration::from_secs(600);
 /// Longest time, whatever the expiry of its message.
 const LONGEST: Duration = Duration::from_secs(86_400);
 /// Maximum number of commands with an `id` that are remembered.
 const MOST: usize = 1 << 18;
 
-/// The commands that were taken.
-#[derive(Debug, Default)]
-pub(super) struct Memory {
+/// A command, as far as its repetition is recognised by it.
+#[derive(Debug, Clone, Copy, Default)]
+pub(in crate::north) struct Taken<'t> {
+    /// Where it came in: its topic, or the user and the drive.
+    pub(in crate::north) topic: &'t str,
+    /// What it says.
+    pub(in crate::north) payload: &'t [u8],
+    /// Where its result goes: response topic and correlation data.
+    pub(in crate::north) answer_to: (Option<&'t str>, Option<&'t [u8]>),
+    /// The broker marks it as a repetition.
+    pub(in crate::north) dup: bool,
+    /// Packet id, which identifies that repetition.
+    pub(in crate::north) packet: u16,
+    /// Remaining life of its message, s.
+    pub(in crate::north) expiry: Option<u32>,
+}
+
+/// The commands that were taken, and their results `R`.
+#[derive(Debug)]
+pub(in crate::north) struct Memory<R> {
     hasher: RandomState,
     /// Oldest first.
-    recent: VecDeque<Recent>,
+    recent: VecDeque<Recent<R>>,
     /// By topic, `id` and payload.
     known: HashMap<u64, Known>,
     /// The same by the time until which they are remembered.
@@ -32,15 +46,28 @@ pub(super) struct Memory {
     taken: u64,
 }
 
+impl<R> Default for Memory<R> {
+    fn default() -> Memory<R> {
+        Memory {
+            hasher: RandomState::default(),
+            recent: VecDeque::new(),
+            known: HashMap::new(),
+            ends: BTreeMap::new(),
+            last_of: HashMap::new(),
+            taken: 0,
+        }
+    }
+}
+
 #[derive(Debug)]
-struct Recent {
+struct Recent<R> {
     number: u64,
     packet: u16,
     fingerprint: u64,
     stops: u64,
     answer_to: u64,
     /// `None` until it is finished.
-    result: Option<Message>,
+    result: Option<R>,
 }
 
 #[derive(Debug, Clone, Copy)]
@@ -55,7 +82,7 @@ struct Known {
 
 /// What is known of a message.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Fingerprint {
+pub(in crate::north) struct Fingerprint {
     /// Of everything but the packet id.
     whole: u64,
     /// Hash of topic and `id`, if it has one; and with the payload.
@@ -65,26 +92,20 @@ pub(super) struct Fingerprint {
 
 /// What a message repeats.
 #[derive(Debug, PartialEq)]
-pub(super) enum Repetition {
+pub(in crate::north) enum Repetition<R> {
     /// A command whose result is the same now.
-    Answered(Message),
+    Answered(R),
     /// A command whose result is still to come, to the same address.
     Pending,
     /// A command whose result does not answer this message, and why.
     Outdated(&'static str),
 }
 
-impl Memory {
-    /// The fingerprint of a message with this `id`.
-    pub(super) fn fingerprint(&self, incoming: &Incoming, id: Option<&str>) -> Fingerprint {
-        let Incoming {
-            topic,
-            payload,
-            response_topic,
-            correlation,
-            ..
-        } = incoming;
-        let answer_to = self.hasher.hash_one((response_topic, correlation));
+impl<R: Clone> Memory<R> {
+    /// The fingerprint of a command with this `id`.
+    pub(in crate::north) fn fingerprint(&self, taken: &Taken<'_>, id: Option<&str>) -> Fingerprint {
+        let Taken { topic, payload, .. } = taken;
+        let answer_to = self.hasher.hash_one(taken.answer_to);
         let identity = id.map(|id| self.hasher.hash_one((topic, id)));
         Fingerprint {
             whole: self.hasher.hash_one((topic, payload, answer_to)),
@@ -95,16 +116,15 @@ impl Memory {
 
     /// The command that a message repeats: one that the broker marks as repeated, or the same topic, payload and `id`.
     /// `stops` is the number of stops of the drive now.
-    pub(super) fn repeated(
+    pub(in crate::north) fn repeated(
         &mut self,
-        incoming: &Incoming,
+        taken: &Taken<'_>,
         print: Fingerprint,
         stops: u64,
         now: Instant,
-    ) -> Option<Repetition> {
+    ) -> Option<Repetition<R>> {
         self.forget(now);
-        let marked =
-            |known: &&Recent| incoming.dup && known.packet == incoming.packet && known.fingerprint == print.whole;
+        let marked = |known: &&Recent<R>| taken.dup && known.packet == taken.packet && known.fingerprint == print.whole;
         let by_id = print
             .identity
             .and_then(|(_, content)| self.known.get(&content).copied());
@@ -120,7 +140,7 @@ impl Memory {
         let known = by_id.or_else(by_mark)?;
         let recent = self.recent.iter().find(|recent| recent.number == known.number);
         let result = recent.map(|recent| &recent.result);
-        if result == Some(&None) && known.answer_to == print.answer_to {
+        if matches!(result, Some(None)) && known.answer_to == print.answer_to {
             return Some(Repetition::Pending);
         }
         if known.stops != stops {
@@ -139,7 +159,7 @@ impl Memory {
     }
 
     /// Whether another command with an `id` can be remembered.
-    pub(super) fn has_room(&mut self, now: Instant) -> bool {
+    pub(in crate::north) fn has_room(&mut self, now: Instant) -> bool {
         self.forget(now);
         self.known.len() < MOST
     }
@@ -155,7 +175,13 @@ impl Memory {
     }
 
     /// Remembers a command that is taken at `now`; returns its number.
-    pub(super) fn remember(&mut self, incoming: &Incoming, print: Fingerprint, stops: u64, now: Instant) -> u64 {
+    pub(in crate::north) fn remember(
+        &mut self,
+        taken: &Taken<'_>,
+        print: Fingerprint,
+        stops: u64,
+        now: Instant,
+    ) -> u64 {
         self.taken += 1;
         let number = self.taken;
         if self.recent.len() == RECENT {
@@ -163,14 +189,14 @@ impl Memory {
         }
         self.recent.push_back(Recent {
             number,
-            packet: incoming.packet,
+            packet: taken.packet,
             fingerprint: print.whole,
             stops,
             answer_to: print.answer_to,
             result: None,
         });
         if let Some((identity, content)) = print.identity {
-            let expiry = Duration::from_secs(incoming.expiry.unwrap_or_default().into());
+            let expiry = Duration::from_secs(taken.expiry.unwrap_or_default().into());
             let until = now + expiry.clamp(REMEMBERED, LONGEST);
             let known = Known {
                 number,
@@ -186,7 +212,7 @@ impl Memory {
     }
 
     /// Keeps the result of a command.
-    pub(super) fn finished(&mut self, number: u64, result: &Message) {
+    pub(in crate::north) fn finished(&mut self, number: u64, result: &R) {
         // Numbers ascend without gaps.
         let first = self.recent.front().map_or(0, |recent| recent.number);
         let place = number.checked_sub(first).and_then(|place| usize::try_from(place).ok());

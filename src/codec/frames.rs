@@ -6,20 +6,19 @@
 
 use std::time::{Duration, Instant};
 
-use crate::codec::n2::{self, Command};
-use crate::codec::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
+use super::n2::{self, Command};
+use super::{Decoded, LineFormat, Protocol, Reply, Request, RequestPdu, ascii, rtu};
 
-/// Silence behind an incomplete frame, on top of 3.5 characters, after which the rest is not expected any more: longer than a
-/// USB adapter holds bytes back.
-const HELD_BACK: Duration = Duration::from_millis(30);
+/// As long as a USB adapter holds bytes back, and longer.
+pub(crate) const HELD_BACK: Duration = Duration::from_millis(30);
 /// Bytes that are kept while no frame is found among them; no frame is longer.
 const MOST_BYTES: usize = 1024;
 /// So few characters before a reply are the glitch of a line that changes direction, and no request that was mangled.
-pub(super) const GLITCH: usize = 2;
+pub(crate) const GLITCH: usize = 2;
 
 /// What stands at the beginning of the bytes.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) enum Cut {
+pub(crate) enum Cut {
     /// A request of the other master; the PDU is `None` where the codec has none for it.
     Request {
         /// Who is asked; 0 is the broadcast.
@@ -40,12 +39,12 @@ pub(super) enum Cut {
 
 /// A piece of what was heard.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct Piece {
-    pub(super) cut: Cut,
-    pub(super) bytes: Vec<u8>,
+pub(crate) struct Piece {
+    pub(crate) cut: Cut,
+    pub(crate) bytes: Vec<u8>,
     /// Beginning of its first and end of its last character on the wire, as far as arrival shows it.
-    pub(super) began: Instant,
-    pub(super) ended: Instant,
+    pub(crate) began: Instant,
+    pub(crate) ended: Instant,
 }
 
 /// What the bytes at one place are.
@@ -58,20 +57,24 @@ enum Look {
 
 /// The bytes that are not cut yet, with their times.
 #[derive(Debug)]
-pub(super) struct Frames {
+pub(crate) struct Frames {
     protocol: Protocol,
     format: LineFormat,
     bytes: Vec<u8>,
     /// End of each character.
     times: Vec<Instant>,
     last: Option<Instant>,
+    held_back: Duration,
 }
 
 impl Frames {
-    pub(super) fn new(protocol: Protocol, format: LineFormat) -> Frames {
+    /// Nothing was heard yet. Behind an incomplete frame that falls silent for `held_back`, on top of 3.5 characters, the rest is
+    /// not expected any more.
+    pub(crate) fn new(protocol: Protocol, format: LineFormat, held_back: Duration) -> Frames {
         Frames {
             protocol,
             format,
+            held_back,
             bytes: Vec::new(),
             times: Vec::new(),
             last: None,
@@ -80,7 +83,7 @@ impl Frames {
 
     /// Bytes arrived at `now`: the last of them just then, the others as much earlier as the wire takes, but not before those
     /// that came before.
-    pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
+    pub(crate) fn add(&mut self, bytes: &[u8], now: Instant) {
         for (place, byte) in bytes.iter().enumerate() {
             let behind = self.format.chars(bytes.len() - 1 - place);
             let at = now.checked_sub(behind).unwrap_or(now);
@@ -91,14 +94,23 @@ impl Frames {
         }
     }
 
-    /// When the bytes that wait for more are given up.
-    pub(super) fn patience(&self) -> Option<Instant> {
+    /// When the bytes that wait for more are given up: whole frames that are no request the codec knows, sooner.
+    pub(crate) fn patience(&self) -> Option<Instant> {
         let last = self.last.filter(|_| !self.bytes.is_empty())?;
-        Some(last + self.format.silence_chars() + HELD_BACK)
+        let held_back = match self.protocol {
+            Protocol::ModbusRtu if rtu::open_frame(&self.bytes).is_some() => self.held_back.min(HELD_BACK),
+            _ => self.held_back,
+        };
+        Some(last + self.format.silence_chars() + held_back)
+    }
+
+    /// The bytes that are not cut yet.
+    pub(crate) fn rest(&self) -> &[u8] {
+        &self.bytes
     }
 
     /// The next piece, if one can be cut by `now`; `open` is the request whose reply may come.
-    pub(super) fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
+    pub(crate) fn next(&mut self, open: Option<&Request>, now: Instant) -> Option<Piece> {
         if self.bytes.is_empty() {
             return None;
         }
@@ -236,8 +248,7 @@ fn rtu_request(bytes: &[u8]) -> Look {
     let (Some(&address), Some(&function)) = (bytes.first(), bytes.get(1)) else {
         return Look::MayBecome(false);
     };
-    let known = matches!(function, 1..=6 | 8 | 15 | 16 | 22 | 23 | 43);
-    if address > 247 || !known {
+    if address > 247 || !rtu::is_known(function) {
         return Look::Nothing;
     }
     // Bytes that must agree with a count before them.
@@ -263,7 +274,7 @@ fn rtu_request(bytes: &[u8]) -> Look {
 
 /// Whether bytes that are neither request nor reply are whole frames all the same: of a function that the codec does not know,
 /// or an answer that belongs to nobody.
-pub(super) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
+pub(crate) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
     match protocol {
         Protocol::ModbusRtu => {
             let mut rest = bytes;
@@ -291,7 +302,7 @@ pub(super) fn are_sound(protocol: Protocol, bytes: &[u8]) -> bool {
 
 /// Whether so much garbage may be a request that was mangled and got no reply: as much as half of the shortest one, and not as much
 /// as that and the shortest reply.
-pub(super) fn may_be_request(protocol: Protocol, garbage: usize) -> bool {
+pub(crate) fn may_be_request(protocol: Protocol, garbage: usize) -> bool {
     let (request, reply) = match protocol {
         Protocol::ModbusRtu => (8, 5),
         Protocol::ModbusAscii => (17, 11),

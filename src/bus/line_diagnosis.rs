@@ -1,0 +1,209 @@
+//! Feeds the diagnosis of a line with its exchanges, and shows and tells what comes of it. No clock but the time of day of verdicts.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::line_state::Exchanged;
+use super::listener::Exchange as Overheard;
+use super::transaction::{Ended, MAY_BE_LATE};
+use crate::codec::{Reply, RequestPdu};
+use crate::diagnosis::figures::Sign;
+use crate::diagnosis::hold::{Change, Hold};
+use crate::diagnosis::{Cause, Counted, Diagnosis, End, Exchange, Figures, Finding, Line, Verdict, rules};
+use crate::process_image::BusImage;
+
+/// The diagnosis of one line.
+#[derive(Debug)]
+pub(super) struct LineDiagnosis {
+    image: Arc<BusImage>,
+    names: Vec<String>,
+    figures: Figures,
+    hold: Hold,
+    /// Silence before the request that is on the line.
+    gap: Duration,
+    /// When each verdict that is shown came.
+    since: Vec<(Cause, Option<usize>, SystemTime)>,
+}
+
+impl LineDiagnosis {
+    /// A line whose port is not open yet, with that silence before requests and that time for the first byte of a reply.
+    pub(super) fn new(
+        image: Arc<BusImage>,
+        silence: Duration,
+        response_timeout: Duration,
+        now: Instant,
+    ) -> LineDiagnosis {
+        let line = Line {
+            protocol: image.spec.protocol,
+            format: image.spec.format,
+            silence,
+            response_timeout,
+        };
+        LineDiagnosis {
+            names: image.drives.iter().map(|drive| drive.spec.name.clone()).collect(),
+            figures: Figures::new(line, image.drives.iter().map(|drive| drive.spec.address), now),
+            hold: Hold::default(),
+            gap: Duration::ZERO,
+            since: Vec::new(),
+            image,
+        }
+    }
+
+    /// The figures, to be told of the port, of drives that run and of bytes that nobody asked for.
+    pub(super) fn figures(&mut self) -> &mut Figures {
+        &mut self.figures
+    }
+
+    /// A request goes onto a line that was silent for so long.
+    pub(super) fn sending(&mut self, gap: Duration) {
+        self.gap = gap;
+    }
+
+    /// An exchange of the gateway is over.
+    pub(super) fn exchanged(&mut self, drive: usize, exchanged: &Exchanged, turnaround: Option<Duration>, at: Instant) {
+        let transaction = &exchanged.transaction;
+        // A drive may well ignore what a tool asks of it that no codec knows.
+        if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
+            return;
+        }
+        self.figures.exchange(&Exchange {
+            drive,
+            request: transaction.request(),
+            frame: transaction.frame(),
+            seen: transaction.seen(),
+            behind: if matches!(exchanged.ended, Ended::Reply(_)) {
+                transaction.rest()
+            } else {
+                &[]
+            },
+            foreign: transaction.foreign() > 0,
+            end: end(&exchanged.ended),
+            gap: self.gap,
+            began: exchanged.began,
+            at,
+            heard_at: exchanged.heard_at,
+            turnaround,
+        });
+    }
+
+    /// An exchange of another master is over.
+    pub(super) fn overheard(&mut self, drive: usize, exchange: &Overheard) {
+        let (Some(request), Some(ended)) = (&exchange.request, &exchange.ended) else {
+            return;
+        };
+        let answered = exchange
+            .replied
+            .filter(|_| matches!(ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_))));
+        self.figures.exchange(&Exchange {
+            drive,
+            request,
+            frame: &exchange.frame,
+            seen: &exchange.heard,
+            behind: &[],
+            foreign: false,
+            end: if exchange.doubt.is_some() {
+                End::Doubtful
+            } else {
+                end(ended)
+            },
+            gap: exchange.began.saturating_duration_since(exchange.quiet_since),
+            began: exchange.began,
+            at: exchange.at,
+            heard_at: exchange.at,
+            turnaround: answered.map(|replied| replied.saturating_duration_since(exchange.sent)),
+        });
+    }
+
+    /// Asks the rules when a step is over. What changed by it, in words.
+    pub(super) fn tick(&mut self, now: Instant) -> Vec<(Option<usize>, String)> {
+        if !self.figures.is_step_over(now) {
+            return Vec::new();
+        }
+        let changes = self.hold.take(rules::find(&self.figures, &self.names, now));
+        self.show();
+        self.figures.next_step(now);
+        let tell = |change: &Change| match change {
+            Change::Came(finding) => (finding.drive, told(finding)),
+            Change::Firmer(finding) => (finding.drive, format!("now {}", told(finding))),
+            Change::Went(finding) => (finding.drive, format!("no longer: {}", finding.cause.meaning())),
+        };
+        changes.iter().map(tell).collect()
+    }
+
+    fn show(&mut self) {
+        let now = SystemTime::now();
+        let shown: Vec<Finding> = self.hold.shown().cloned().collect();
+        let is = |finding: &Finding, (cause, drive, _): &(Cause, Option<usize>, SystemTime)| {
+            finding.cause == *cause && finding.drive == *drive
+        };
+        self.since.retain(|one| shown.iter().any(|finding| is(finding, one)));
+        let verdicts = shown.iter().map(|finding| {
+            let known = self
+                .since
+                .iter()
+                .find(|one| is(finding, one))
+                .map(|(_, _, since)| *since);
+            let since = known.unwrap_or(now);
+            if known.is_none() {
+                self.since.push((finding.cause, finding.drive, since));
+            }
+            Verdict {
+                verdict: finding.cause,
+                drive: finding.drive.and_then(|drive| self.names.get(drive)).cloned(),
+                certainty: finding.certainty,
+                meaning: finding.cause.meaning().to_string(),
+                evidence: finding.evidence.clone(),
+                remedy: finding.cause.remedy().to_string(),
+                since: humantime::format_rfc3339_millis(since).to_string(),
+            }
+        });
+        let verdicts = verdicts.collect();
+        let counted = self
+            .figures
+            .drives
+            .iter()
+            .zip(&self.names)
+            .map(|(drive, name)| Counted {
+                drive: name.clone(),
+                answered: drive.sum(Sign::Answered),
+                silent: drive.sum(Sign::Tried),
+                damaged: drive.sum(Sign::Damaged) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho),
+                stray_before: drive.sum(Sign::Led),
+                start_lost: drive.sum(Sign::StartLost),
+                late: drive.sum(Sign::Late),
+                second: drive.sum(Sign::Second),
+                slowest_ms: drive.slowest_ms(),
+            });
+        let drives = counted.collect();
+        self.image.diagnosis.store(Arc::new(Diagnosis {
+            at: Some(now),
+            verdicts,
+            wrong_address: self.figures.wrong_address(),
+            drives,
+        }));
+    }
+}
+
+fn end(ended: &Ended) -> End {
+    match ended {
+        Ended::Reply(_) => End::Answered,
+        Ended::Silent => End::Silent,
+        Ended::Corrupt(why) if *why == MAY_BE_LATE => End::Doubtful,
+        Ended::Corrupt(_) => End::Damaged,
+    }
+}
+
+fn told(finding: &Finding) -> String {
+    let Finding {
+        cause,
+        certainty,
+        evidence,
+        ..
+    } = finding;
+    format!(
+        "{} ({}): {evidence}; {}",
+        cause.meaning(),
+        certainty.name(),
+        cause.remedy()
+    )
+}

@@ -1,0 +1,220 @@
+//! Starts, stops, warnings and control places: which changes become events (each one, unless they come too often), and by whom.
+
+use std::time::{Duration, Instant, SystemTime};
+
+use super::{RECENT, Report};
+use crate::drive::{ModelPoint, Value};
+use crate::event::{Event, EventKind};
+
+/// Time from an order to the poll that shows the motor running, ramps and slow polls included.
+const STARTS_WITHIN: Duration = Duration::from_secs(30);
+/// The same until it shows it standing.
+const STOPS_WITHIN: Duration = Duration::from_secs(300);
+
+/// Points whose changes are events: what they are when the point comes and goes, in words.
+pub(super) const WATCHED: [(ModelPoint, [(EventKind, &str); 2]); 3] = [
+    (
+        ModelPoint::Running,
+        [(EventKind::Started, "has started"), (EventKind::Stopped, "has stopped")],
+    ),
+    (
+        ModelPoint::Warning,
+        [
+            (EventKind::Warning, "reports a warning"),
+            (EventKind::WarningEnd, "reports no warning any more"),
+        ],
+    ),
+    (
+        ModelPoint::Remote,
+        [
+            (EventKind::ControlPlace, "is controlled by the fieldbus"),
+            (EventKind::ControlPlace, "is no longer controlled by the fieldbus"),
+        ],
+    ),
+];
+
+/// Changes that are reported at once.
+const BURST: u32 = 10;
+/// Time after which one more is.
+const EVERY: Duration = Duration::from_secs(10);
+
+/// A bit of which changes are reported.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct Watched {
+    /// As last reported; `None` before the first read.
+    reported: Option<bool>,
+    /// As last read, and when it came to be so.
+    seen: Option<(bool, Option<Instant>)>,
+    /// Changes since the last report.
+    changes: u64,
+    /// Reports of late, and since when they are counted.
+    spent: Option<(u32, Instant)>,
+}
+
+/// A change to be reported.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Change {
+    /// What it is now.
+    pub(super) value: bool,
+    /// When it changed before, if it was seen to.
+    pub(super) before: Option<Instant>,
+    /// Changes before it that were not reported.
+    pub(super) left_out: u64,
+}
+
+impl Watched {
+    /// It was read. What holds at the first read is no change. A bit that changes too often is reported now and then, with what
+    /// was left out, and at last as it is.
+    pub(super) fn read(&mut self, value: bool, now: Instant) -> Option<Change> {
+        let Some((seen, before)) = self.seen else {
+            (self.seen, self.reported) = (Some((value, None)), Some(value));
+            return None;
+        };
+        if seen != value {
+            self.changes += 1;
+            self.seen = Some((value, Some(now)));
+        }
+        if self.reported == Some(value) || !self.may_report(now) {
+            return None;
+        }
+        self.reported = Some(value);
+        let changes = std::mem::take(&mut self.changes);
+        Some(Change {
+            value,
+            before: before.filter(|_| changes == 1),
+            left_out: changes.saturating_sub(1),
+        })
+    }
+
+    /// Whether it was set when it was read last.
+    fn is_set(&self) -> bool {
+        self.seen.is_some_and(|(value, _)| value)
+    }
+
+    fn may_report(&mut self, now: Instant) -> bool {
+        let (spent, since) = self.spent.unwrap_or((0, now));
+        let passed = now.saturating_duration_since(since);
+        let regained = u32::try_from(passed.as_nanos() / EVERY.as_nanos()).unwrap_or(u32::MAX);
+        let (spent, since) = match spent.saturating_sub(regained) {
+            0 => (0, now),
+            left => (left, since + EVERY * regained),
+        };
+        let may = spent < BURST;
+        self.spent = Some((spent + u32::from(may), since));
+        may
+    }
+}
+
+impl Report {
+    /// Starts, stops, warnings and control places that changed with the last poll. What holds at the first read is no
+    /// event; what changed while the drive was offline is one.
+    pub(super) fn look_at_state(&mut self, index: usize, now: Instant) {
+        let Some(drive) = self.drive(index) else { return };
+        let reading = drive.reading(now, RECENT);
+        for (place, (point, changes)) in WATCHED.into_iter().enumerate() {
+            let Some(Value::Bool(value)) = reading.model(point).good() else {
+                continue;
+            };
+            let watched = self.watched.get_mut(index).and_then(|watched| watched.get_mut(place));
+            let Some(change) = watched.and_then(|watched| watched.read(value, now)) else {
+                continue;
+            };
+            let [comes, goes] = changes;
+            let (kind, words) = if value { comes } else { goes };
+            let name = &drive.spec.name;
+            let by = (point == ModelPoint::Running).then(|| self.who(name, change, now));
+            let mut text = format!("drive {name} {words}");
+            match &by {
+                Some(Some(who)) => text += &format!(": ordered by {who}"),
+                Some(None) if reading.is_set(ModelPoint::Fault) => text += ": it has a fault",
+                Some(None) => text += ", by no order of this gateway: at the drive, by another master or by itself",
+                None => {}
+            }
+            if change.left_out > 0 {
+                text += &format!(
+                    " ({} changes before it are left out: they come too often)",
+                    change.left_out
+                );
+            }
+            self.publish(Event {
+                drive: Some(name.clone()),
+                by: by.flatten(),
+                ..Event::new(kind, SystemTime::now(), text)
+            });
+        }
+        let age = reading
+            .model(ModelPoint::Running)
+            .at
+            .map_or(Duration::ZERO, |at| now.saturating_duration_since(at));
+        let runs = self.watched.iter().any(|[running, ..]| running.is_set());
+        self.diagnosis.figures().set_running(runs, age);
+    }
+
+    /// Who ordered a motor to start or to stop that has done so: the last order to the drive, if it was that and nothing else
+    /// came of it before.
+    fn who(&self, drive: &str, change: Change, now: Instant) -> Option<String> {
+        let ordered = self.writes.audit().last_ordered(drive)?;
+        let within = if change.value { STARTS_WITHIN } else { STOPS_WITHIN };
+        let is_recent = now.saturating_duration_since(ordered.at) <= within;
+        let is_new = change.left_out == 0 && change.before.is_none_or(|before| ordered.at > before);
+        (ordered.run == change.value && is_recent && is_new).then_some(ordered.who)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const SECOND: Duration = Duration::from_secs(1);
+
+    #[test]
+    fn each_change_is_reported_once() {
+        let (mut bit, start) = (Watched::default(), Instant::now());
+        let mut reported = Vec::new();
+        for second in 0..100u32 {
+            // The first read is none.
+            let value = second / 20 % 2 == 0;
+            if let Some(change) = bit.read(value, start + SECOND * second) {
+                reported.push((second, change));
+            }
+        }
+        let seconds: Vec<u32> = reported.iter().map(|(second, _)| *second).collect();
+        assert_eq!(seconds, [20, 40, 60, 80]);
+        assert_eq!(reported[1].1.before, Some(start + 20 * SECOND));
+        assert!(reported.iter().all(|(_, change)| change.left_out == 0));
+    }
+
+    proptest! {
+        /// However it flaps: the count of events is bounded, none is lost without being counted, and the last one is true.
+        #[test]
+        fn a_bit_that_flaps_is_bounded_and_told_in_the_end(reads in prop::collection::vec((any::<bool>(), 0u64..3000), 1..2000)) {
+            let (mut bit, start) = (Watched::default(), Instant::now());
+            let (mut now, mut last, mut changes, mut reported, mut told) = (start, None, 0u64, 0u64, None);
+            for (value, pause) in reads {
+                now += Duration::from_millis(pause);
+                changes += u64::from(last.is_some_and(|last| last != value));
+                told = told.or(Some(value));
+                last = Some(value);
+                if let Some(change) = bit.read(value, now) {
+                    prop_assert_eq!(change.value, value);
+                    prop_assert!(told != Some(value), "one after the other");
+                    told = Some(value);
+                    reported += 1;
+                    changes -= 1 + change.left_out;
+                }
+            }
+            let most = u64::from(BURST) + (now - start).as_secs() / EVERY.as_secs() + 1;
+            prop_assert!(reported <= most, "{} of {}", reported, most);
+            // It stays as it is.
+            let last = last.unwrap();
+            if let Some(change) = bit.read(last, now + 2 * EVERY) {
+                told = Some(change.value);
+                changes -= 1 + change.left_out;
+            }
+            prop_assert_eq!(told, Some(last));
+            prop_assert!(changes % 2 == 0, "what is left goes there and back");
+        }
+    }
+}

@@ -1,0 +1,168 @@
+//! `drivegate diagnose`: what is wrong with a line.
+
+use std::fmt::Write;
+use std::process::ExitCode;
+
+use percent_encoding::{NON_ALPHANUMERIC, utf8_percent_encode};
+use serde::Deserialize;
+
+use super::client::{Gateway, get_json};
+use super::{EXIT_FAILED, printable, report};
+use crate::diagnosis::{Counted, Verdict};
+
+/// Says what is wrong with a line: each verdict with its evidence, how sure it is, and what to do.
+#[derive(Debug, clap::Args)]
+#[command(after_help = "Examples:
+  drivegate diagnose
+  drivegate diagnose line1 --url http://10.0.0.5:9488
+  drivegate diagnose --json
+
+Asks a running gateway, which watches its lines all the time: verdicts rest on the last minute, and a verdict needs half
+a minute to come and a minute to go. Exit code 0 whatever is found.")]
+pub(super) struct Args {
+    #[command(flatten)]
+    gateway: Gateway,
+    /// Name of the bus [default: all].
+    bus: Option<String>,
+    /// JSON instead of text.
+    #[arg(long)]
+    json: bool,
+}
+
+/// The diagnosis of a bus, as the gateway tells it.
+#[derive(Debug, Deserialize)]
+struct Diagnosis {
+    bus: String,
+    time: Option<String>,
+    verdicts: Vec<Verdict>,
+    drives: Vec<Counted>,
+}
+
+pub(super) fn run(args: &Args) -> ExitCode {
+    super::block_on(async {
+        match diagnose(args).await {
+            Ok(text) => report::print(&text),
+            Err(message) => {
+                report::error(&message);
+                ExitCode::from(EXIT_FAILED)
+            }
+        }
+    })
+}
+
+async fn diagnose(args: &Args) -> Result<String, String> {
+    let get = async |path: &str| get_json(&args.gateway, path).await.map_err(|error| error.to_string());
+    let names: Vec<String> = match &args.bus {
+        Some(name) => vec![name.clone()],
+        None => {
+            let buses = get("/api/v1/buses").await?;
+            let names = buses
+                .as_array()
+                .into_iter()
+                .flatten()
+                .filter_map(|bus| bus.get("name")?.as_str());
+            names.map(str::to_string).collect()
+        }
+    };
+    let mut all = Vec::new();
+    for name in names {
+        let name = utf8_percent_encode(&name, NON_ALPHANUMERIC);
+        all.push(get(&format!("/api/v1/buses/{name}/diagnosis")).await?);
+    }
+    if args.json {
+        return Ok(serde_json::to_string_pretty(&all).unwrap_or_default() + "\n");
+    }
+    let text = |value: serde_json::Value| {
+        let diagnosis: Diagnosis = serde_json::from_value(value)
+            .map_err(|error| format!("the reply is no diagnosis ({error}); the gateway; use the same version"))?;
+        Ok(text(&diagnosis))
+    };
+    all.into_iter()
+        .map(text)
+        .collect::<Result<Vec<String>, String>>()
+        .map(|texts| texts.join("\n"))
+}
+
+fn text(diagnosis: &Diagnosis) -> String {
+    let mut text = format!("{}:", printable::line(&diagnosis.bus));
+    text += match (&diagnosis.time, diagnosis.verdicts.as_slice()) {
+        (None, _) => " not looked at yet; ask again in some seconds\n",
+        (_, []) => " nothing wrong was recognised in the last minute\n",
+        _ => "\n",
+    };
+    for verdict in &diagnosis.verdicts {
+        let about = verdict
+            .drive
+            .as_deref()
+            .map_or(String::new(), |drive| format!(" {}", printable::line(drive)));
+        let (evidence, remedy) = (printable::line(&verdict.evidence), printable::line(&verdict.remedy));
+        // Writing to a String cannot fail.
+        let _ = write!(
+            text,
+            "\n  {}{about}: {} ({})\n      seen: {evidence}\n      do: {remedy}\n",
+            verdict.verdict.name(),
+            printable::line(&verdict.meaning),
+            verdict.certainty.name()
+        );
+    }
+    let bad = |one: &&Counted| one.silent + one.damaged + one.late + one.second + one.stray_before > 0;
+    let bad: Vec<&Counted> = diagnosis.drives.iter().filter(bad).collect();
+    if !bad.is_empty() {
+        text += "\n  in the last minute     answered  no reply  damaged  late  second  stray before  slowest\n";
+    }
+    for one in bad {
+        let _ = writeln!(
+            text,
+            "  {:<22} {:>8}  {:>8}  {:>7}  {:>4}  {:>6}  {:>12}  {:>4.1} ms",
+            printable::line(&one.drive),
+            one.answered,
+            one.silent,
+            one.damaged,
+            one.late,
+            one.second,
+            one.stray_before,
+            one.slowest_ms
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::diagnosis::{Cause, Certainty};
+
+    #[test]
+    fn a_verdict_is_told_with_evidence_and_remedy() {
+        let mut diagnosis = Diagnosis {
+            bus: "line1".to_string(),
+            time: None,
+            verdicts: Vec::new(),
+            drives: vec![Counted {
+                drive: "pump-1".to_string(),
+                ..Counted::default()
+            }],
+        };
+        assert_eq!(
+            text(&diagnosis),
+            "line1: not looked at yet; ask again in some seconds\n"
+        );
+        diagnosis.time = Some("2026-03-02T06:11:09.480Z".to_string());
+        assert_eq!(
+            text(&diagnosis),
+            "line1: nothing wrong was recognised in the last minute\n"
+        );
+        diagnosis.verdicts.push(Verdict {
+            verdict: Cause::OneDrive,
+            drive: Some("pump-1".to_string()),
+            certainty: Certainty::Likely,
+            meaning: "one is bad".to_string(),
+            evidence: "7 of 9".to_string(),
+            remedy: "look".to_string(),
+            since: String::new(),
+        });
+        diagnosis.drives[0].silent = 7;
+        let expected = "line1:\n\n  one_drive pump-1: one is bad (likely)\n      seen: 7 of 9\n      do: look\n\n  in the last minute";
+        assert!(text(&diagnosis).starts_with(expected), "{}", text(&diagnosis));
+    }
+}

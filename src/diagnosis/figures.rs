@@ -1,0 +1,568 @@
+//! What is counted: for each drive and for the line, in steps of the last minute. All of it is bounded, and an exchange that goes well
+//! costs a few additions.
+
+use std::time::{Duration, Instant};
+
+use super::STEP;
+use super::counters::{Contrast, FADE, InPhase, LATENCY, LONGEST_AGE, MAINS, Running, STEPS, Window, lock};
+use super::signature::{self, Shape};
+use crate::codec::describe::{self, Kind};
+use crate::codec::{LineFormat, Protocol, Request};
+
+/// Memory of a drive, at most; a line has about 1.5 KiB beside.
+pub const BYTES_PER_DRIVE: usize = 512;
+/// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
+const ABSENCE: u16 = 12;
+/// A reply within this time behind a request that got none may be a late one.
+const LATE: Duration = Duration::from_secs(5);
+/// The rest of a damaged reply may be on the line for so long.
+const LEFT_OVER: Duration = Duration::from_millis(50);
+/// Bytes between two exchanges that are kept until it is known whether they are a frame.
+const MOST_IDLE: usize = 300;
+/// Losses of the port that are remembered, and for how long.
+const LOSSES: usize = 8;
+const LOSSES_FOR: Duration = Duration::from_secs(600);
+
+/// How an exchange ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum End {
+    /// The drive answered, perhaps with an exception.
+    Answered,
+    /// No reply in time.
+    Silent,
+    /// A reply that cannot be believed.
+    Damaged,
+    /// A reply that may belong to another request: it says nothing about the line.
+    Doubtful,
+}
+
+/// One exchange.
+#[derive(Debug, Clone, Copy)]
+pub struct Exchange<'e> {
+    /// Place of the drive on the bus.
+    pub drive: usize,
+    /// What was asked.
+    pub request: &'e Request,
+    /// Its frame.
+    pub frame: &'e [u8],
+    /// All that came until the end.
+    pub seen: &'e [u8],
+    /// What of it stands behind the reply.
+    pub behind: &'e [u8],
+    /// Frames that answer nothing, or stray bytes, were among it.
+    pub foreign: bool,
+    /// How it ended.
+    pub end: End,
+    /// Silence before the request.
+    pub gap: Duration,
+    /// When the request began.
+    pub began: Instant,
+    /// When the exchange was over.
+    pub at: Instant,
+    /// When the last bytes came; no matter where none did.
+    pub heard_at: Instant,
+    /// Time until the reply began.
+    pub turnaround: Option<Duration>,
+}
+
+/// How the line is set up.
+#[derive(Debug, Clone, Copy)]
+pub struct Line {
+    /// Protocol.
+    pub protocol: Protocol,
+    /// Baud rate and character format.
+    pub format: LineFormat,
+    /// Silence before each request; on a line of another master the least that is usual.
+    pub silence: Duration,
+    /// Time for the first byte of a reply.
+    pub response_timeout: Duration,
+}
+
+/// What is counted of a drive in each step.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Sign {
+    /// Sound replies.
+    Answered,
+    /// Requests without a reply, of a drive that is there.
+    Silent,
+    /// Requests without a reply, all of them.
+    Tried,
+    /// Replies that are damaged anywhere.
+    Damaged,
+    /// Of those: longer than the reply could be.
+    Overlong,
+    /// Stray bytes directly before the reply.
+    Led,
+    /// Of those: zeros.
+    LedZero,
+    /// Replies without their beginning.
+    StartLost,
+    /// Requests that came back without their end.
+    CutEcho,
+    /// Stray bytes behind a reply, while nobody was to speak.
+    Idle,
+    /// Sound replies behind the one that was believed.
+    Second,
+    /// Sound replies after the time limit.
+    Late,
+    /// Replies that used more than half of the time limit.
+    Slow,
+    /// Exchanges that show whether the adapter hears itself.
+    EchoShown,
+    /// It does.
+    Echoed,
+}
+
+const SIGNS: usize = Sign::Echoed as usize + 1;
+
+/// What is counted of one drive.
+#[derive(Debug, Clone)]
+pub struct Drive {
+    /// Its address.
+    pub address: u8,
+    window: Window<SIGNS>,
+    /// Slowest beginning of a reply in each step, tenths of a millisecond.
+    slowest: Window<1>,
+    /// Requests without a reply in a row; those of them that followed a reply closely, and after a pause.
+    run: u16,
+    run_paused: [u16; 2],
+    silent_at: Option<Instant>,
+    mains: InPhase,
+}
+
+impl Drive {
+    fn add(&mut self, sign: Sign) {
+        self.window.add(sign as usize, 1);
+    }
+
+    /// In the last minute.
+    pub fn sum(&self, sign: Sign) -> u32 {
+        self.window.sum(sign as usize)
+    }
+
+    /// Steps of the last minute in which one of these was counted.
+    pub fn steps(&self, signs: &[Sign]) -> usize {
+        let has = |step: &&[u16; SIGNS]| {
+            signs
+                .iter()
+                .any(|sign| step.get(*sign as usize).is_some_and(|count| *count > 0))
+        };
+        self.window.steps.iter().filter(has).count()
+    }
+
+    /// Slowest beginning of a reply in the last minute, ms.
+    pub fn slowest_ms(&self) -> f64 {
+        f64::from(self.slowest.each(0).max().unwrap_or_default()) / 10.0
+    }
+
+    fn was_silent(&self, at: Instant) -> bool {
+        self.silent_at
+            .is_some_and(|silent| at.saturating_duration_since(silent) <= LATE)
+    }
+}
+
+/// What was counted on a line.
+#[derive(Debug, Clone)]
+pub struct Figures {
+    /// How the line is set up.
+    pub line: Line,
+    /// Its drives.
+    pub drives: Vec<Drive>,
+    /// Sound replies by the millisecond of their arrival, modulo the latency timer; requests after a pause likewise.
+    arrivals: Window<LATENCY>,
+    paced: Window<LATENCY>,
+    running: Running,
+    /// Close behind a reply, after a pause.
+    pub pause: Contrast,
+    /// Sound replies of an address that was not asked, by step.
+    wrong: Window<1>,
+    idle: Vec<u8>,
+    last: Option<(usize, End)>,
+    /// When the exchange before was over.
+    last_at: Instant,
+    epoch: Instant,
+    step_ends: Instant,
+    opened: Option<Instant>,
+    answered_since_opened: bool,
+    losses: [Option<Instant>; LOSSES],
+}
+
+impl Figures {
+    /// A line whose port is not open yet, with drives at these addresses.
+    pub fn new(line: Line, addresses: impl IntoIterator<Item = u8>, now: Instant) -> Figures {
+        let drive = |address| Drive {
+            address,
+            window: Window::new(),
+            slowest: Window::new(),
+            run: 0,
+            run_paused: [0; 2],
+            silent_at: None,
+            mains: InPhase::default(),
+        };
+        Figures {
+            line,
+            drives: addresses.into_iter().map(drive).collect(),
+            arrivals: Window::new(),
+            paced: Window::new(),
+            running: Running::default(),
+            pause: Contrast::default(),
+            wrong: Window::new(),
+            idle: Vec::new(),
+            last: None,
+            last_at: now,
+            epoch: now,
+            step_ends: now + STEP,
+            opened: None,
+            answered_since_opened: false,
+            losses: [None; LOSSES],
+        }
+    }
+
+    /// The port was opened.
+    pub fn port_opened(&mut self, now: Instant) {
+        self.opened = Some(now);
+        self.answered_since_opened = false;
+        (self.last, self.idle) = (None, Vec::new());
+        for drive in &mut self.drives {
+            (drive.run, drive.run_paused, drive.silent_at) = (0, [0; 2], None);
+        }
+    }
+
+    /// The port was lost.
+    pub fn port_lost(&mut self, now: Instant) {
+        if self.opened.take().is_some() {
+            self.losses.rotate_right(1);
+            self.losses[0] = Some(now);
+        }
+    }
+
+    /// Losses of the port lately.
+    pub fn losses(&self, now: Instant) -> usize {
+        let lately = |at: &&Instant| now.saturating_duration_since(**at) < LOSSES_FOR;
+        self.losses.iter().flatten().filter(lately).count()
+    }
+
+    /// How long the port has been open.
+    pub fn open_for(&self, now: Instant) -> Option<Duration> {
+        self.opened.map(|opened| now.saturating_duration_since(opened))
+    }
+
+    /// Whether any drive has answered since the port was opened.
+    pub fn answered_since_opened(&self) -> bool {
+        self.answered_since_opened
+    }
+
+    /// Whether any drive runs from now on, as read at some time in the last `age`.
+    pub fn set_running(&mut self, runs: bool, age: Duration) {
+        self.running.age = self.running.age.max(age).min(LONGEST_AGE);
+        self.running.change(runs);
+    }
+
+    /// Whether any drive runs.
+    pub fn runs(&self) -> bool {
+        self.running.runs
+    }
+
+    /// While all drives stand, while one runs.
+    pub fn while_running(&self) -> &Contrast {
+        &self.running.contrast
+    }
+
+    /// In the last minute, of all drives.
+    pub fn sum(&self, sign: Sign) -> u32 {
+        self.drives.iter().map(|drive| drive.sum(sign)).sum()
+    }
+
+    /// Sound replies of addresses that were not asked, in the last minute.
+    pub fn wrong_address(&self) -> u32 {
+        self.wrong.sum(0)
+    }
+
+    /// An exchange is over.
+    pub fn exchange(&mut self, exchange: &Exchange<'_>) {
+        self.settle_idle(exchange.began);
+        let protocol = self.line.protocol;
+        let answered = exchange.end == End::Answered;
+        let seen = signature::of(protocol, exchange.request, exchange.frame, exchange.seen, answered);
+        let condition = self.condition(exchange.gap);
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
+        if let Some(echoed) = seen.echoed {
+            drive.add(Sign::EchoShown);
+            if echoed {
+                drive.add(Sign::Echoed);
+            }
+        }
+        let excused = self.is_excused(exchange);
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
+        match exchange.end {
+            End::Damaged | End::Silent if excused => {
+                drive.add(Sign::Tried);
+                if exchange.end == End::Silent {
+                    drive.silent_at = Some(exchange.at);
+                }
+            }
+            End::Answered => self.answered(exchange, seen.shape),
+            End::Damaged => self.damaged(exchange, seen.shape),
+            End::Silent => {
+                drive.add(Sign::Tried);
+                drive.run = drive.run.saturating_add(1);
+                if let Some(count) = condition.and_then(|condition| drive.run_paused.get_mut(condition)) {
+                    *count = count.saturating_add(1);
+                }
+                drive.silent_at = Some(exchange.at);
+            }
+            End::Doubtful => {}
+        }
+        if let (Some(condition), End::Answered | End::Damaged, false) = (condition, exchange.end, excused) {
+            self.pause.add(condition, 1.0, 0.0);
+        }
+        if exchange.foreign && !matches!(seen.shape, Shape::Led(_)) {
+            let parts = describe::parts(protocol, exchange.request, exchange.frame, exchange.seen, answered);
+            for part in parts.into_iter().filter(|part| part.kind == Kind::Foreign) {
+                if part.range.end + exchange.behind.len() <= exchange.seen.len() {
+                    self.answer_of_another(exchange.seen.get(part.range).unwrap_or_default(), exchange.at);
+                }
+            }
+        }
+        self.last = Some((exchange.drive, exchange.end));
+        self.last_at = exchange.at;
+        if answered {
+            self.stray(exchange.behind);
+        }
+    }
+
+    /// Whether a failure may come of what was left on the line by an exchange with another drive that failed just before.
+    fn is_excused(&self, exchange: &Exchange<'_>) -> bool {
+        let just_before = exchange.began.saturating_duration_since(self.last_at) < LEFT_OVER;
+        exchange.end != End::Answered
+            && just_before
+            && self
+                .last
+                .is_some_and(|(drive, end)| drive != exchange.drive && end == End::Damaged)
+    }
+
+    fn condition(&self, gap: Duration) -> Option<usize> {
+        let silence = self.line.silence;
+        if gap <= silence.mul_f64(1.5) + Duration::from_millis(1) {
+            Some(0)
+        } else {
+            (gap >= silence * 4 && gap >= Duration::from_millis(20)).then_some(1)
+        }
+    }
+
+    fn answered(&mut self, exchange: &Exchange<'_>, shape: Shape) {
+        self.is_there(exchange.drive, exchange.at);
+        self.answered_since_opened = true;
+        self.running.add(1.0, 0.0, exchange.at);
+        self.arrivals.add(self.millisecond(exchange.at), 1);
+        let follows = self.last.is_some_and(|(_, end)| end == End::Answered);
+        if follows && exchange.gap >= self.line.silence + Duration::from_millis(4) {
+            self.paced.add(self.millisecond(exchange.began), 1);
+        }
+        let limit = self.line.response_timeout / 2;
+        let (middle, length) = self.middle(exchange);
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
+        drive.add(Sign::Answered);
+        if let Shape::Led(zero) = shape {
+            drive.add(Sign::Led);
+            if zero {
+                drive.add(Sign::LedZero);
+            }
+        }
+        if let Some(turnaround) = exchange.turnaround {
+            if turnaround > limit {
+                drive.add(Sign::Slow);
+            }
+            let tenths = u16::try_from(turnaround.as_micros() / 100).unwrap_or(u16::MAX);
+            drive.slowest.most(0, tenths);
+        }
+        drive.mains.look(middle, length, false);
+    }
+
+    fn damaged(&mut self, exchange: &Exchange<'_>, shape: Shape) {
+        self.is_there(exchange.drive, exchange.at);
+        let damage = self.damage_at(exchange);
+        let Some(drive) = self.drives.get_mut(exchange.drive) else {
+            return;
+        };
+        match shape {
+            Shape::CutEcho => drive.add(Sign::CutEcho),
+            Shape::StartLost => drive.add(Sign::StartLost),
+            Shape::Led(zero) => {
+                drive.add(Sign::Led);
+                if zero {
+                    drive.add(Sign::LedZero);
+                }
+            }
+            Shape::Overlong | Shape::Nothing | Shape::Sound | Shape::EndLost | Shape::Garbled => {
+                drive.add(Sign::Damaged);
+                if shape == Shape::Overlong {
+                    drive.add(Sign::Overlong);
+                }
+                if let Some(at) = damage {
+                    drive.mains.look(at, Duration::ZERO, true);
+                }
+                self.running.add(1.0, 1.0, exchange.at);
+            }
+        }
+    }
+
+    /// The drive is heard of: what it left unanswered before counts, unless it was absent.
+    fn is_there(&mut self, drive: usize, at: Instant) {
+        let Some(drive) = self.drives.get_mut(drive) else {
+            return;
+        };
+        let (run, paused) = (std::mem::take(&mut drive.run), std::mem::take(&mut drive.run_paused));
+        if run == 0 || run > ABSENCE {
+            return;
+        }
+        drive.window.add(Sign::Silent as usize, run);
+        drive.silent_at = drive
+            .silent_at
+            .filter(|silent| at.saturating_duration_since(*silent) <= LATE);
+        self.running.add(f32::from(run), f32::from(run), at);
+        for (condition, count) in paused.into_iter().enumerate() {
+            self.pause.add(condition, f32::from(count), f32::from(count));
+        }
+    }
+
+    /// The middle of a reply on the wire, and for how long it could have been hit where the place of damage is known.
+    fn middle(&self, exchange: &Exchange<'_>) -> (Instant, Duration) {
+        let length = self.line.format.chars(exchange.seen.len());
+        let middle = exchange.heard_at.checked_sub(length / 2).unwrap_or(exchange.at);
+        (
+            middle,
+            if self.line.protocol.is_text() {
+                length
+            } else {
+                Duration::ZERO
+            },
+        )
+    }
+
+    /// When a reply was damaged: in a text protocol a character may show it, else the middle is taken.
+    fn damage_at(&self, exchange: &Exchange<'_>) -> Option<Instant> {
+        if !self.line.protocol.is_text() {
+            return Some(self.middle(exchange).0);
+        }
+        let misfit = signature::misfit(self.line.protocol, exchange.seen)?;
+        exchange
+            .heard_at
+            .checked_sub(self.line.format.chars(exchange.seen.len() - misfit))
+    }
+
+    fn millisecond(&self, at: Instant) -> usize {
+        (at.saturating_duration_since(self.epoch).as_millis() % LATENCY as u128) as usize
+    }
+
+    /// Bytes came while nothing was asked for.
+    pub fn stray(&mut self, bytes: &[u8]) {
+        let room = MOST_IDLE.saturating_sub(self.idle.len());
+        self.idle.extend(bytes.iter().take(room));
+    }
+
+    /// What came since the last exchange is whole.
+    fn settle_idle(&mut self, now: Instant) {
+        if self.idle.is_empty() {
+            return;
+        }
+        let bytes = std::mem::take(&mut self.idle);
+        // What comes behind a damaged reply may be the rest of it.
+        if !self.answer_of_another(&bytes, now)
+            && let Some((drive, End::Answered)) = self.last
+            && let Some(drive) = self.drives.get_mut(drive)
+        {
+            drive.add(Sign::Idle);
+        }
+    }
+
+    /// A sound answer that was not believed, if it is one: a late one, a second one, or one of nobody who was asked.
+    fn answer_of_another(&mut self, bytes: &[u8], at: Instant) -> bool {
+        let Some(address) = signature::answer(self.line.protocol, bytes) else {
+            return false;
+        };
+        let asked = self.last.map(|(drive, _)| drive);
+        let drive = match address {
+            Some(address) => self.drives.iter().position(|drive| drive.address == address),
+            // A frame of N2 names nobody: it is late if anybody was silent lately.
+            None => {
+                let silent = self.drives.iter().enumerate().filter(|(_, drive)| drive.was_silent(at));
+                silent
+                    .max_by_key(|(_, drive)| drive.silent_at)
+                    .map(|(place, _)| place)
+                    .or(asked)
+            }
+        };
+        let is_second = drive.is_some() && self.last == drive.map(|drive| (drive, End::Answered));
+        match drive.and_then(|drive| self.drives.get_mut(drive)) {
+            Some(drive) if drive.was_silent(at) => drive.add(Sign::Late),
+            Some(drive) if is_second => drive.add(Sign::Second),
+            _ => self.wrong.add(0, 1),
+        }
+        true
+    }
+
+    /// Time went by: whether a step is over, so that the rules are to be asked.
+    pub fn is_step_over(&self, now: Instant) -> bool {
+        now >= self.step_ends
+    }
+
+    /// Begins the next step.
+    pub fn next_step(&mut self, now: Instant) {
+        let missed = now.saturating_duration_since(self.step_ends).as_secs() / STEP.as_secs();
+        for _ in 0..=missed.min(STEPS as u64) {
+            for drive in &mut self.drives {
+                drive.window.roll();
+                drive.slowest.roll();
+                drive.mains.sums.iter_mut().flatten().for_each(|sum| *sum *= FADE);
+            }
+            self.arrivals.roll();
+            self.paced.roll();
+            self.wrong.roll();
+            self.running.contrast.fade();
+            self.running.age = self.running.age.mul_f32(FADE);
+            self.pause.fade();
+        }
+        self.step_ends = now + STEP;
+    }
+
+    /// How closely arrivals keep to the steps of a latency timer, 0 to 1, and how many there were; requests after a pause likewise.
+    pub fn in_steps(&self) -> [(f64, u32); 2] {
+        [lock(&self.arrivals), lock(&self.paced)]
+    }
+
+    /// For each frequency of the mains: damaged replies that have one before, and how much closer in phase they are to it than
+    /// the sound replies of the same drive, -2 to 2.
+    pub fn in_phase(&self) -> [(f32, f32); MAINS.len()] {
+        let of = |place: usize| {
+            let sums = self.drives.iter().filter_map(|drive| drive.mains.sums.get(place));
+            let (mut count, mut closer) = (0.0, 0.0);
+            for &[bad, bad_cosines, good, good_cosines] in sums.filter(|[bad, _, good, _]| *bad >= 1.0 && *good >= 1.0)
+            {
+                // As certain as the smaller of the two.
+                let weight = bad.min(good);
+                count += weight;
+                closer += weight * (bad_cosines / bad - good_cosines / good);
+            }
+            (count, if count > 0.0 { closer / count } else { 0.0 })
+        };
+        std::array::from_fn(of)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_drive_takes_as_much_memory_as_is_stated() {
+        assert!(size_of::<Drive>() <= BYTES_PER_DRIVE, "{}", size_of::<Drive>());
+        assert!(size_of::<Figures>() + MOST_IDLE <= 1536, "{}", size_of::<Figures>());
+    }
+}

@@ -1,0 +1,173 @@
+//! A verdict comes when its rule holds for some time, and goes when it has not held for a minute.
+
+use super::{Cause, Certainty, Finding};
+
+/// Steps of 5 s after which a verdict that no longer holds goes.
+const GOES_AFTER: u32 = 12;
+/// Most verdicts of a line that are held at a time.
+const MOST: usize = 24;
+
+/// A finding that is held.
+#[derive(Debug, Clone, PartialEq)]
+struct Held {
+    finding: Finding,
+    /// Steps in which the rule held, less those in which it did not.
+    holds: u32,
+    /// Steps since it held last.
+    missing: u32,
+    shown: bool,
+}
+
+/// What changed.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Change {
+    /// It holds from now on.
+    Came(Finding),
+    /// It is more certain than it was.
+    Firmer(Finding),
+    /// It does not hold any more.
+    Went(Finding),
+}
+
+/// The findings that are held.
+#[derive(Debug, Clone, Default)]
+pub struct Hold {
+    held: Vec<Held>,
+}
+
+/// Steps for which a rule must hold, beside those in which it did not. Causes that only say that nothing else was recognised wait until it would have been.
+fn patience(cause: Cause) -> u32 {
+    match cause {
+        Cause::Noise | Cause::RequestEndLost => 5,
+        Cause::OneDrive | Cause::FromAddress => 3,
+        Cause::PortResets => 1,
+        _ => 2,
+    }
+}
+
+impl Hold {
+    /// Takes what the rules found in this step; what changed by it.
+    pub fn take(&mut self, found: Vec<Finding>) -> Vec<Change> {
+        let mut changes = Vec::new();
+        for held in &mut self.held {
+            held.missing += 1;
+        }
+        for finding in found {
+            self.found(finding, &mut changes);
+        }
+        for held in &mut self.held {
+            if held.missing > 0 {
+                held.holds = held.holds.saturating_sub(1);
+            }
+        }
+        self.held.retain(|held| {
+            let goes = held.missing >= GOES_AFTER || (!held.shown && held.holds == 0);
+            if goes && held.shown {
+                changes.push(Change::Went(held.finding.clone()));
+            }
+            !goes
+        });
+        changes
+    }
+
+    fn found(&mut self, finding: Finding, changes: &mut Vec<Change>) {
+        let same = |held: &&mut Held| held.finding.cause == finding.cause && held.finding.drive == finding.drive;
+        let Some(held) = self.held.iter_mut().find(same) else {
+            if self.held.len() < MOST {
+                let shown = patience(finding.cause) <= 1;
+                if shown {
+                    changes.push(Change::Came(finding.clone()));
+                }
+                self.held.push(Held {
+                    finding,
+                    holds: 1,
+                    missing: 0,
+                    shown,
+                });
+            }
+            return;
+        };
+        let before = held.finding.certainty;
+        // Less certain in one step than in another: it was seen.
+        let certainty = if held.shown {
+            before.max(finding.certainty)
+        } else {
+            finding.certainty
+        };
+        held.finding = Finding { certainty, ..finding };
+        (held.holds, held.missing) = (held.holds + 1, 0);
+        if !held.shown && held.holds >= patience(held.finding.cause) {
+            held.shown = true;
+            changes.push(Change::Came(held.finding.clone()));
+        } else if held.shown && certainty > before {
+            changes.push(Change::Firmer(held.finding.clone()));
+        }
+    }
+
+    /// What is shown, the surest first.
+    pub fn shown(&self) -> impl Iterator<Item = &Finding> {
+        let mut shown: Vec<&Finding> = self
+            .held
+            .iter()
+            .filter(|held| held.shown)
+            .map(|held| &held.finding)
+            .collect();
+        shown.sort_by_key(|finding| {
+            (
+                std::cmp::Reverse::<Certainty>(finding.certainty),
+                finding.cause,
+                finding.drive,
+            )
+        });
+        shown.into_iter()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn finding(cause: Cause, certainty: Certainty) -> Finding {
+        Finding {
+            cause,
+            drive: None,
+            certainty,
+            evidence: String::new(),
+        }
+    }
+
+    #[test]
+    fn a_verdict_comes_by_lasting_evidence_and_goes_without_it() {
+        let fits = || vec![finding(Cause::Bias, Certainty::Fits)];
+        let likely = || vec![finding(Cause::Bias, Certainty::Likely)];
+        let mut hold = Hold::default();
+        // Once is chance, also again and again.
+        for _ in 0..10 {
+            assert_eq!(hold.take(fits()), []);
+            assert_eq!(hold.take(Vec::new()), []);
+        }
+        assert_eq!(hold.take(fits()), []);
+        assert_eq!(hold.take(fits()), [Change::Came(finding(Cause::Bias, Certainty::Fits))]);
+        assert_eq!(
+            hold.take(likely()),
+            [Change::Firmer(finding(Cause::Bias, Certainty::Likely))]
+        );
+        assert_eq!(hold.take(fits()), [], "it does not become less certain");
+        for step in 1..GOES_AFTER {
+            assert_eq!(hold.take(Vec::new()), [], "{step}");
+            assert_eq!(hold.shown().count(), 1);
+        }
+        assert_eq!(
+            hold.take(Vec::new()),
+            [Change::Went(finding(Cause::Bias, Certainty::Likely))]
+        );
+        assert_eq!(hold.shown().count(), 0);
+    }
+
+    #[test]
+    fn what_only_fits_because_nothing_else_does_waits() {
+        let mut hold = Hold::default();
+        let steps = (1..).find(|_| !hold.take(vec![finding(Cause::Noise, Certainty::Likely)]).is_empty());
+        assert_eq!(steps, Some(5));
+    }
+}

@@ -1,0 +1,84 @@
+//! What is known of each drive of a line, and how much worse one is than the others.
+
+use super::Drive;
+use super::figures::Sign;
+
+/// Exchanges in the last minute from which on a drive is known.
+const KNOWN: u32 = 15;
+/// What is seen in fewer steps of 5 s is a passing disturbance.
+pub(super) const LASTING: usize = 3;
+/// What is seen less often in a minute is chance.
+pub(super) const FEW: u32 = 5;
+/// So many standard deviations are no chance.
+pub(super) const SIGNIFICANT: f64 = 5.0;
+/// A drive is good that would have failed so often if it were as bad as another: by chance it fails not once in 400 times.
+pub(super) const ENOUGH: f64 = 6.0;
+/// A drive is bad whose errors are so many times as frequent as those of the others.
+const TIMES: f64 = 5.0;
+
+/// What is known of one drive.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Known {
+    pub(super) place: usize,
+    pub(super) asked: u32,
+    pub(super) failed: u32,
+    pub(super) silent: u32,
+    pub(super) damaged: u32,
+    pub(super) lasting: bool,
+}
+
+impl Known {
+    pub(super) fn share(&self) -> f64 {
+        share(self.failed, self.asked)
+    }
+
+    pub(super) fn is_bad(&self) -> bool {
+        self.failed >= FEW && self.share() >= 0.02
+    }
+}
+
+pub(super) fn share(part: u32, of: u32) -> f64 {
+    f64::from(part) / f64::from(of.max(1))
+}
+
+pub(super) fn sums<'k>(drives: impl IntoIterator<Item = &'k Known>) -> (u32, u32) {
+    drives
+        .into_iter()
+        .fold((0, 0), |(failed, asked), one| (failed + one.failed, asked + one.asked))
+}
+
+/// Whether `failed` of `asked` are more than chance allows where `rate` is usual.
+pub(super) fn exceeds(failed: u32, asked: u32, rate: f64) -> bool {
+    let expected = f64::from(asked) * rate;
+    f64::from(failed) > expected + SIGNIFICANT * expected.max(1.0).sqrt()
+}
+
+/// Whether the first `count` of these, the worst first, are all bad, and much worse than the others.
+pub(super) fn stand_out(known: &[Known], count: usize) -> bool {
+    let Some((bad, good)) = known.split_at_checked(count) else {
+        return false;
+    };
+    let (failed, asked) = sums(good);
+    let usual = share(failed, asked).max(0.5 / f64::from(asked.max(1)));
+    let stands_out =
+        |one: &Known| one.is_bad() && one.share() >= TIMES * usual && exceeds(one.failed, one.asked, usual);
+    good.len() >= 2 && asked >= 60 && bad.iter().all(stands_out)
+}
+
+impl Known {
+    /// What is known of the drive at that place, if it was asked often enough.
+    pub(super) fn of(place: usize, drive: &Drive) -> Option<Known> {
+        let (silent, damaged) = (drive.sum(Sign::Silent), drive.sum(Sign::Damaged));
+        let others = drive.sum(Sign::Answered) + drive.sum(Sign::StartLost) + drive.sum(Sign::CutEcho);
+        let asked = others + silent + damaged;
+        // A bad drive is asked less and less often.
+        (asked >= KNOWN || silent + damaged >= FEW).then(|| Known {
+            place,
+            asked,
+            failed: silent + damaged,
+            silent,
+            damaged,
+            lasting: drive.steps(&[Sign::Silent, Sign::Damaged]) >= LASTING,
+        })
+    }
+}

@@ -1,0 +1,196 @@
+//! What is wrong with a line, from what is seen on it anyway: a few counters a drive and rules over them. Pure: exchanges and time are
+//! arguments.
+//!
+//! - [`signature`]: what the bytes of one exchange show: the echo, a stray byte before the reply, a reply without its beginning.
+//! - [`counters`]: the kinds of counters.
+//! - [`figures`]: what was counted in the last minute, for each drive and for the line. Bounded: see [`figures::BYTES_PER_DRIVE`].
+//! - `known`: what is known of each drive, and which stand out.
+//! - [`rules`]: one rule for each cause. A rule that compares drives says nothing until most of them were asked often enough.
+//! - [`hold`]: a verdict comes and goes only by lasting evidence.
+//! - [`words`]: how causes are told, and what to do.
+
+pub mod counters;
+pub mod figures;
+pub mod hold;
+mod known;
+pub mod rules;
+pub mod signature;
+pub mod words;
+
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+
+pub use figures::{Drive, End, Exchange, Figures, Line};
+
+/// What may be wrong with a line.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Cause {
+    /// No drive answers.
+    AllSilent,
+    /// One drive is bad, the others are good.
+    OneDrive,
+    /// All drives are bad from one address on.
+    FromAddress,
+    /// Two drives answer to one address.
+    AddressTwice,
+    /// Errors only while drives run.
+    WhileRunning,
+    /// Errors in phase with the mains.
+    Mains,
+    /// Stray bytes while nobody speaks.
+    Bias,
+    /// The beginning of replies is lost.
+    ReplyStartLost,
+    /// Requests do not arrive whole.
+    RequestEndLost,
+    /// The adapter hears its own request.
+    Echo,
+    /// A USB adapter delivers in steps of 16 ms.
+    LatencyTimer,
+    /// Requests that follow a reply closely are not heard.
+    SilenceTooShort,
+    /// The port was lost again and again.
+    PortResets,
+    /// Errors without a pattern.
+    Noise,
+}
+
+impl Cause {
+    /// All causes, in the order of the documentation.
+    pub const ALL: [Cause; 14] = [
+        Cause::AllSilent,
+        Cause::OneDrive,
+        Cause::FromAddress,
+        Cause::AddressTwice,
+        Cause::WhileRunning,
+        Cause::Mains,
+        Cause::Bias,
+        Cause::ReplyStartLost,
+        Cause::RequestEndLost,
+        Cause::Echo,
+        Cause::LatencyTimer,
+        Cause::SilenceTooShort,
+        Cause::PortResets,
+        Cause::Noise,
+    ];
+
+    /// The word in payloads and metrics.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Cause::AllSilent => "all_silent",
+            Cause::OneDrive => "one_drive",
+            Cause::FromAddress => "from_address",
+            Cause::AddressTwice => "address_twice",
+            Cause::WhileRunning => "while_running",
+            Cause::Mains => "mains",
+            Cause::Bias => "bias",
+            Cause::ReplyStartLost => "reply_start_lost",
+            Cause::RequestEndLost => "request_end_lost",
+            Cause::Echo => "echo",
+            Cause::LatencyTimer => "latency_timer",
+            Cause::SilenceTooShort => "silence_too_short",
+            Cause::PortResets => "port_resets",
+            Cause::Noise => "noise",
+        }
+    }
+}
+
+/// How far the evidence goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Serialize, serde::Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Certainty {
+    /// It would explain what is seen; other causes would, too.
+    Fits,
+    /// Other causes would show otherwise as a rule.
+    Likely,
+    /// It was seen itself.
+    Certain,
+}
+
+impl Certainty {
+    /// The word in payloads.
+    pub const fn name(self) -> &'static str {
+        match self {
+            Certainty::Fits => "fits",
+            Certainty::Likely => "likely",
+            Certainty::Certain => "certain",
+        }
+    }
+}
+
+/// What a rule found. Drives are named by their place on the bus.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Finding {
+    /// The cause.
+    pub cause: Cause,
+    /// The drive, where it is about one.
+    pub drive: Option<usize>,
+    /// How far the evidence goes.
+    pub certainty: Certainty,
+    /// The evidence, for people.
+    pub evidence: String,
+}
+
+/// A cause with its evidence, as it is shown.
+#[derive(Debug, Clone, PartialEq, Serialize, serde::Deserialize)]
+pub struct Verdict {
+    /// The cause.
+    pub verdict: Cause,
+    /// The drive, where it is about one.
+    #[serde(skip_serializing_if = "Option::is_none", default)]
+    pub drive: Option<String>,
+    /// How far the evidence goes.
+    pub certainty: Certainty,
+    /// What it means, in a few words.
+    pub meaning: String,
+    /// What shows it.
+    pub evidence: String,
+    /// What to do.
+    pub remedy: String,
+    /// Since when it holds, RFC 3339.
+    pub since: String,
+}
+
+/// The diagnosis of a line at one time.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Diagnosis {
+    /// When it was made; none before the first time.
+    pub at: Option<SystemTime>,
+    /// What holds, most telling first.
+    pub verdicts: Vec<Verdict>,
+    /// Sound replies of addresses that were not asked, in the last minute.
+    pub wrong_address: u32,
+    /// What was counted in the last minute, a line for each drive in the order of the file.
+    pub drives: Vec<Counted>,
+}
+
+/// What was counted of one drive in the last minute.
+#[derive(Debug, Clone, Default, PartialEq, Serialize, serde::Deserialize)]
+pub struct Counted {
+    /// Its name.
+    pub drive: String,
+    /// Exchanges whose reply was sound.
+    pub answered: u32,
+    /// Requests without a reply.
+    pub silent: u32,
+    /// Replies that could not be believed.
+    pub damaged: u32,
+    /// Of those, and of the sound ones: a stray byte before the reply.
+    pub stray_before: u32,
+    /// Of the damaged: the beginning was lost, the rest was sound.
+    pub start_lost: u32,
+    /// Replies after the time limit.
+    pub late: u32,
+    /// Further replies behind the one that was believed.
+    pub second: u32,
+    /// Slowest beginning of a reply, ms.
+    pub slowest_ms: f64,
+}
+
+/// How often the rules are asked.
+pub const STEP: Duration = Duration::from_secs(5);
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,586 @@
+//! One rule for each cause. What is counted is judged against chance, and a comparison between drives needs most of them.
+
+use std::time::{Duration, Instant};
+
+use super::counters::{Contrast, MAINS, STEPS};
+use super::figures::{Figures, Sign};
+use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, sums};
+use super::{Cause, Certainty, Finding};
+
+/// The same of what would be told of the whole line.
+const FEW_OF_LINE: u32 = 10;
+/// Share of exchanges below which a drive is good.
+const GOOD: f64 = 0.003;
+
+/// The rules, over the figures of one line.
+#[derive(Debug)]
+pub struct Rules<'f> {
+    figures: &'f Figures,
+    names: &'f [String],
+    now: Instant,
+    known: Vec<Known>,
+    /// So many failures of others come of drives that speak when others are asked.
+    disturbed: u32,
+    /// Drives that are neither known nor absent.
+    waiting: usize,
+    found: Vec<Finding>,
+}
+
+/// What holds at `now`, most telling first; `names` are those of the drives.
+pub fn find(figures: &Figures, names: &[String], now: Instant) -> Vec<Finding> {
+    let known: Vec<Known> = figures
+        .drives
+        .iter()
+        .enumerate()
+        .filter_map(|(place, drive)| Known::of(place, drive))
+        .collect();
+    let heard = [Sign::Answered, Sign::Damaged, Sign::StartLost, Sign::CutEcho, Sign::Led];
+    let is_absent = |drive: &&super::Drive| drive.steps(&heard) == 0 && drive.sum(Sign::Tried) > 1;
+    let absent = figures.drives.iter().filter(is_absent).count();
+    let mut rules = Rules {
+        waiting: figures.drives.len().saturating_sub(known.len() + absent),
+        disturbed: 0,
+        figures,
+        names,
+        now,
+        known,
+        found: Vec::new(),
+    };
+    rules.all();
+    rules.found
+}
+
+impl Rules<'_> {
+    fn all(&mut self) {
+        if self.all_silent() {
+            self.port_resets();
+            return;
+        }
+        self.address_twice();
+        self.while_running();
+        self.mains();
+        self.single_drives();
+        self.silence_too_short();
+        self.bias();
+        self.reply_start_lost();
+        self.request_end_lost();
+        self.echo();
+        self.latency_timer();
+        self.port_resets();
+        self.noise();
+    }
+
+    fn add(&mut self, cause: Cause, drive: Option<usize>, certainty: Certainty, evidence: String) {
+        self.found.push(Finding {
+            cause,
+            drive,
+            certainty,
+            evidence,
+        });
+    }
+
+    fn has(&self, cause: Cause) -> bool {
+        self.found.iter().any(|found| found.cause == cause)
+    }
+
+    fn is_told(&self, place: usize) -> bool {
+        self.found.iter().any(|found| found.drive == Some(place))
+    }
+
+    fn name(&self, place: usize) -> &str {
+        self.names.get(place).map_or("?", String::as_str)
+    }
+
+    fn names_of(&self, places: impl IntoIterator<Item = usize>) -> String {
+        let names: Vec<&str> = places.into_iter().map(|place| self.name(place)).collect();
+        match names.as_slice() {
+            [first, second, third, _, rest @ ..] => format!("{first}, {second}, {third} and {} more", rest.len() + 1),
+            few => few.join(", "),
+        }
+    }
+
+    fn sum(&self, place: usize, sign: Sign) -> u32 {
+        self.figures.drives.get(place).map_or(0, |drive| drive.sum(sign))
+    }
+
+    fn steps(&self, signs: &[Sign]) -> usize {
+        self.figures
+            .drives
+            .iter()
+            .map(|drive| drive.steps(signs))
+            .max()
+            .unwrap_or(0)
+    }
+
+    /// Exchanges of the known drives, and how many of them failed.
+    fn exchanges(&self) -> (u32, u32) {
+        sums(&self.known)
+    }
+
+    fn all_silent(&mut self) -> bool {
+        let figures = self.figures;
+        let open = figures.open_for(self.now).unwrap_or_default();
+        if open < Duration::from_secs(20) || figures.sum(Sign::Answered) > 0 {
+            return false;
+        }
+        let drives = figures.drives.len();
+        let (tried, damaged) = (
+            figures.sum(Sign::Tried),
+            figures.sum(Sign::Damaged) + figures.sum(Sign::Overlong),
+        );
+        let explained = figures.sum(Sign::StartLost) + figures.sum(Sign::CutEcho) + figures.sum(Sign::Led);
+        let each = figures
+            .drives
+            .iter()
+            .all(|drive| drive.sum(Sign::Tried) + drive.sum(Sign::Damaged) >= 2);
+        // A single drive that has answered is off; its event says so.
+        let is_one = drives < 2 && figures.answered_since_opened();
+        if !each || is_one || tried + damaged < 6 || explained > (tried + damaged) / 4 {
+            return false;
+        }
+        let heard = match (damaged, figures.sum(Sign::Echoed)) {
+            (0, 0) => "not one byte came back".to_string(),
+            (0, echoes) => {
+                format!("{echoes} came back as the adapter's own echo and nothing else, so the adapter sends")
+            }
+            (_, _) => format!(
+                "{damaged} replies came that are no valid frames: baud, format or protocol are likely to differ"
+            ),
+        };
+        let certainty = if figures.answered_since_opened() || drives < 3 {
+            Certainty::Fits
+        } else {
+            Certainty::Likely
+        };
+        let evidence = format!(
+            "{} requests to {drives} drives in the last minute were not answered; {heard}",
+            tried + damaged
+        );
+        self.add(Cause::AllSilent, None, certainty, evidence);
+        true
+    }
+
+    fn address_twice(&mut self) {
+        let seconds = self.figures.sum(Sign::Second) + self.figures.sum(Sign::Overlong);
+        for known in self.known.clone() {
+            let (second, overlong) = (
+                self.sum(known.place, Sign::Second),
+                self.sum(known.place, Sign::Overlong),
+            );
+            let shows = [Sign::Second, Sign::Overlong];
+            let lasts = self
+                .figures
+                .drives
+                .get(known.place)
+                .is_some_and(|drive| drive.steps(&shows) >= LASTING);
+            let of_others = seconds - second - overlong;
+            let enough = second >= FEW || (second + overlong >= FEW - 1 && overlong * 5 >= known.damaged * 3);
+            // A line that repeats everything is no second drive.
+            if !lasts
+                || !enough
+                || of_others * 5 > second + overlong
+                || self.known.len() < 2.min(self.figures.drives.len())
+            {
+                continue;
+            }
+            let certainty = if second >= FEW {
+                Certainty::Likely
+            } else {
+                Certainty::Fits
+            };
+            let name = self.name(known.place);
+            let evidence = format!(
+                "{second} times in the last minute a second sound reply came behind that of {name}, and {overlong} replies were \
+                 longer than asked for; {of_others} times with all other drives"
+            );
+            self.disturbed += second + overlong;
+            self.add(Cause::AddressTwice, Some(known.place), certainty, evidence);
+        }
+    }
+
+    /// Whether exchanges fail under the second condition and not under the first.
+    fn contrast(contrast: &Contrast) -> bool {
+        let [asked, others] = contrast.asked;
+        let [failed, of_others] = contrast.failed;
+        if asked < 100.0 || others < 40.0 || of_others < 10.0 {
+            return false;
+        }
+        let (usual, now) = ((failed / asked).max(0.5 / asked), of_others / others);
+        let expected = usual * others;
+        now > 0.01 && now > 5.0 * usual && of_others > expected + SIGNIFICANT as f32 * expected.max(1.0).sqrt()
+    }
+
+    fn while_running(&mut self) {
+        let running = *self.figures.while_running();
+        let (failed, _) = self.exchanges();
+        if !Self::contrast(&running) || failed < FEW || self.steps(&[Sign::Silent, Sign::Damaged]) < 2 {
+            return;
+        }
+        let [standing, runs] = running.failed.map(f32::round);
+        let [of_standing, of_runs] = running.asked.map(f32::round);
+        let evidence = format!(
+            "{runs} of {of_runs} exchanges failed lately while a drive ran, {standing} of {of_standing} while all stood"
+        );
+        let certainty = if runs >= 30.0 && of_standing >= 300.0 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::WhileRunning, None, certainty, evidence);
+    }
+
+    fn mains(&mut self) {
+        let phases = self.figures.in_phase();
+        let best = MAINS
+            .into_iter()
+            .zip(phases)
+            .max_by(|(_, a), (_, b)| a.1.total_cmp(&b.1));
+        let Some((hertz, (count, closer))) = best else { return };
+        // The difference of two means of cosines, each of which deviates by the root of one half over their number.
+        if count < 40.0 || closer < 0.25 || closer < SIGNIFICANT as f32 / count.sqrt() {
+            return;
+        }
+        let evidence = format!(
+            "{count:.0} damaged replies lately came at the same place of the {hertz:.0} Hz period, which the sound ones avoid"
+        );
+        let certainty = if closer > 0.5 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::Mains, None, certainty, evidence);
+    }
+
+    /// One drive, or all from one address on.
+    fn single_drives(&mut self) {
+        if self.has(Cause::WhileRunning) || self.has(Cause::Mains) || self.may_be_of_running() {
+            return;
+        }
+        self.answers_late();
+        let mut known: Vec<Known> = self
+            .known
+            .iter()
+            .filter(|one| !self.is_told(one.place))
+            .copied()
+            .collect();
+        if self.waiting * 10 > self.figures.drives.len() || known.len() < 3 || sums(&known).0 <= self.disturbed {
+            return;
+        }
+        known.sort_by(|a, b| b.share().total_cmp(&a.share()));
+        let Some(count) = (1..known.len() - 1).rev().find(|count| stand_out(&known, *count)) else {
+            return;
+        };
+        let (bad, good) = known.split_at(count);
+        // Whether it is one drive or several shows when all of them were bad for some time, and all others were asked so often that
+        // they would have failed by now, too.
+        let least = bad.iter().map(Known::share).fold(1.0, f64::min);
+        let is_good =
+            |one: &Known| f64::from(one.asked) * least >= ENOUGH && (one.failed < 2 || one.share() * 4.0 < least);
+        if !bad.iter().all(|one| one.lasting) || !good.iter().all(is_good) {
+            return;
+        }
+        let (failed, asked) = sums(good);
+        let mut bad = bad.to_vec();
+        let address = |one: &Known| self.figures.drives.get(one.place).map(|drive| drive.address);
+        bad.sort_by_key(address);
+        let is_tail = good.iter().map(address).max() < bad.first().map(address);
+        if bad.len() > 1 && is_tail {
+            self.bad_tail(&bad, (failed, asked));
+        } else if bad.len() * 2 < self.known.len() && bad.len() <= 3 {
+            bad.iter().for_each(|one| self.one_drive(one, (failed, asked)));
+        }
+    }
+
+    fn one_drive(&mut self, bad: &Known, (failed, asked): (u32, u32)) {
+        let slow = self.sum(bad.place, Sign::Slow);
+        let tail = if slow >= FEW && bad.silent > bad.damaged {
+            let slowest = self.figures.drives.get(bad.place).map_or(0.0, super::Drive::slowest_ms);
+            format!("; its replies begin after up to {slowest:.1} ms")
+        } else {
+            String::new()
+        };
+        let evidence = format!(
+            "{} of {} exchanges with {} failed in the last minute ({} without a reply, {} damaged), {failed} of {asked} with the \
+             others{tail}",
+            bad.failed,
+            bad.asked,
+            self.name(bad.place),
+            bad.silent,
+            bad.damaged
+        );
+        let certainty = if bad.failed >= 15 && share(failed, asked) < GOOD {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::OneDrive, Some(bad.place), certainty, evidence);
+    }
+
+    fn bad_tail(&mut self, bad: &[Known], (failed, asked): (u32, u32)) {
+        let (of_bad, asked_bad) = sums(bad);
+        let Some(first) = bad.first() else { return };
+        let address = self.figures.drives.get(first.place).map_or(0, |drive| drive.address);
+        let evidence = format!(
+            "{of_bad} of {asked_bad} exchanges with {} failed in the last minute, {failed} of {asked} with the drives below \
+             address {address}",
+            self.names_of(bad.iter().map(|one| one.place)),
+        );
+        let certainty = if bad.len() > 2 && share(failed, asked) < GOOD {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::FromAddress, None, certainty, evidence);
+    }
+
+    /// A drive whose replies come after the time limit was seen to do so, whatever the others do.
+    fn answers_late(&mut self) {
+        let late = self.figures.sum(Sign::Late);
+        for place in 0..self.figures.drives.len() {
+            let own = self.sum(place, Sign::Late);
+            let lasts = self
+                .figures
+                .drives
+                .get(place)
+                .is_some_and(|drive| drive.steps(&[Sign::Late]) >= LASTING);
+            if own < FEW || !lasts || self.is_told(place) || own * 2 <= late {
+                continue;
+            }
+            let limit = self.figures.line.response_timeout.as_millis();
+            let evidence = format!(
+                "{own} replies of {} came after the time limit of {limit} ms in the last minute, {} of the others",
+                self.name(place),
+                late - own
+            );
+            self.disturbed += own;
+            self.add(Cause::OneDrive, Some(place), Certainty::Likely, evidence);
+        }
+    }
+
+    fn silence_too_short(&mut self) {
+        let [close, paused] = [0, 1].map(|place: usize| {
+            let of = |counts: [f32; 2]| counts.get(place).copied().unwrap_or_default();
+            (of(self.figures.pause.failed), of(self.figures.pause.asked))
+        });
+        let turned = Contrast {
+            asked: [paused.1, close.1],
+            failed: [paused.0, close.0],
+        };
+        let silent = self.figures.sum(Sign::Silent);
+        let mut few = turned;
+        // Pauses are rare on a busy line, mostly those behind a request without a reply.
+        few.asked[0] = few.asked[0].max(if few.asked[0] >= 15.0 { 100.0 } else { 0.0 });
+        let rate = close.0 / close.1.max(1.0);
+        let chance = (1.0 - rate).max(0.0).powf(paused.1);
+        if !Self::contrast(&few) || paused.0 > 0.2 * rate * paused.1 || chance > 1e-4 || silent < FEW_OF_LINE {
+            return;
+        }
+        if self.figures.sum(Sign::Damaged) * 5 > silent || self.steps(&[Sign::Silent]) < LASTING {
+            return;
+        }
+        let places = self.known.iter().filter(|one| one.silent > 0).map(|one| one.place);
+        let evidence = format!(
+            "{:.0} of {:.0} requests that followed a reply closely got no reply ({}), {:.0} of {:.0} after a pause",
+            close.0,
+            close.1,
+            self.names_of(places),
+            paused.0,
+            paused.1
+        );
+        self.found
+            .retain(|found| !matches!(found.cause, Cause::OneDrive | Cause::FromAddress));
+        self.add(Cause::SilenceTooShort, None, Certainty::Likely, evidence);
+    }
+
+    fn bias(&mut self) {
+        let (led, zero, idle) = (
+            self.figures.sum(Sign::Led),
+            self.figures.sum(Sign::LedZero),
+            self.figures.sum(Sign::Idle),
+        );
+        let with = self
+            .figures
+            .drives
+            .iter()
+            .filter(|drive| drive.sum(Sign::Led) + drive.sum(Sign::Idle) > 0)
+            .count();
+        let answered = self.figures.sum(Sign::Answered) + led;
+        let lasts = self.steps(&[Sign::Led, Sign::Idle]) >= LASTING;
+        if !lasts || led + idle < FEW_OF_LINE || share(led + idle, answered) < 0.01 || with < 2.min(self.known.len()) {
+            return;
+        }
+        let evidence = format!(
+            "{led} of {answered} replies in the last minute had stray bytes before them ({zero} times only zeros), and {idle} times \
+             stray bytes came while nobody was to speak"
+        );
+        let certainty = if zero * 2 > led || (led > 0 && idle > 0) {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::Bias, None, certainty, evidence);
+    }
+
+    fn reply_start_lost(&mut self) {
+        let lost = self.figures.sum(Sign::StartLost);
+        let damaged = self.figures.sum(Sign::Damaged) + lost;
+        if lost < FEW || self.steps(&[Sign::StartLost]) < LASTING || share(lost, damaged) < 0.4 {
+            return;
+        }
+        let with = self
+            .figures
+            .drives
+            .iter()
+            .enumerate()
+            .filter(|(_, drive)| drive.sum(Sign::StartLost) > 0);
+        let evidence = format!(
+            "{lost} of {damaged} damaged replies in the last minute are sound once their first bytes are put back ({})",
+            self.names_of(with.map(|(place, _)| place))
+        );
+        let certainty = if lost >= 20 && share(lost, damaged) > 0.8 {
+            Certainty::Certain
+        } else {
+            Certainty::Likely
+        };
+        self.add(Cause::ReplyStartLost, None, certainty, evidence);
+    }
+
+    fn request_end_lost(&mut self) {
+        let cut = self.figures.sum(Sign::CutEcho);
+        if cut >= FEW && self.steps(&[Sign::CutEcho]) >= LASTING {
+            let evidence =
+                format!("{cut} requests in the last minute came back as an echo without their end, and got no reply");
+            self.add(Cause::RequestEndLost, None, Certainty::Certain, evidence);
+            return;
+        }
+        let rest = self.unexplained();
+        let (failed, asked) = sums(&rest);
+        let silent: u32 = rest.iter().map(|one| one.silent).sum();
+        if !self.is_of_line(&rest) || silent < FEW_OF_LINE || (failed - silent) * 5 > silent {
+            return;
+        }
+        let evidence = format!(
+            "{silent} of {asked} requests in the last minute got no reply, of all drives alike, and only {} replies were damaged",
+            failed - silent
+        );
+        self.add(Cause::RequestEndLost, None, Certainty::Fits, evidence);
+    }
+
+    fn echo(&mut self) {
+        let (echoed, shown) = (self.figures.sum(Sign::Echoed), self.figures.sum(Sign::EchoShown));
+        if echoed < 20 || share(echoed, shown) < 0.5 || self.steps(&[Sign::Echoed]) < LASTING {
+            return;
+        }
+        let evidence = format!("{echoed} of {shown} requests in the last minute came back before the reply");
+        self.add(Cause::Echo, None, Certainty::Certain, evidence);
+    }
+
+    fn latency_timer(&mut self) {
+        let [(lock, arrivals), (paced_lock, paced)] = self.figures.in_steps();
+        // A cadence of whole steps would look the same.
+        let by_cadence = paced * 5 >= arrivals && paced_lock > 0.5;
+        let enough = arrivals >= 100 && self.steps(&[Sign::Answered]) >= 2 * LASTING;
+        if lock < 0.85 || !enough || by_cadence {
+            return;
+        }
+        let evidence = format!(
+            "{arrivals} replies in the last minute arrived in steps of 16 ms ({:.0} % in step), whatever the drive and the length",
+            lock * 100.0
+        );
+        self.add(Cause::LatencyTimer, None, Certainty::Likely, evidence);
+    }
+
+    fn port_resets(&mut self) {
+        let losses = self.figures.losses(self.now);
+        if losses >= 3 {
+            let evidence = format!("the port was lost {losses} times within 10 minutes");
+            self.add(Cause::PortResets, None, Certainty::Certain, evidence);
+        }
+    }
+
+    /// Whether errors began about when a drive started, so that it is not known yet whether they are those of running drives.
+    fn may_be_of_running(&self) -> bool {
+        let Contrast { asked, failed } = *self.figures.while_running();
+        let (now, of) = self.exchanges();
+        let [usual, _] = failed;
+        let [standing, running] = asked;
+        self.figures.runs()
+            && standing >= 100.0
+            && running < 100.0
+            && f64::from(usual / standing) < 0.5 * share(now, of)
+    }
+
+    /// Known drives whose errors no verdict explains.
+    fn unexplained(&self) -> Vec<Known> {
+        if self.may_be_of_running() {
+            return Vec::new();
+        }
+        let of_line = [
+            Cause::WhileRunning,
+            Cause::Mains,
+            Cause::SilenceTooShort,
+            Cause::FromAddress,
+        ];
+        if of_line.iter().any(|cause| self.has(*cause)) {
+            return Vec::new();
+        }
+        let rest: Vec<Known> = self
+            .known
+            .iter()
+            .filter(|one| !self.is_told(one.place))
+            .copied()
+            .collect();
+        if sums(&rest).0 <= self.disturbed {
+            Vec::new()
+        } else {
+            rest
+        }
+    }
+
+    /// Whether errors are lasting, frequent, and of more than one drive: of half of those that should show some.
+    fn is_of_line(&self, rest: &[Known]) -> bool {
+        let (failed, asked) = sums(rest);
+        let rate = share(failed, asked);
+        let expected_some = |one: &&Known| f64::from(one.asked) * rate >= 3.0;
+        let (some, with) = (
+            rest.iter().filter(expected_some).count(),
+            rest.iter().filter(expected_some).filter(|one| one.failed > 0).count(),
+        );
+        let lasts = rest.iter().any(|one| one.lasting) || self.steps_of_line() >= LASTING;
+        let several = rest.iter().filter(|one| one.failed > 0).count() >= 2.min(rest.len());
+        let comparable = self.waiting * 5 <= self.figures.drives.len();
+        comparable && lasts && several && failed >= FEW_OF_LINE && rate >= 0.005 && with * 2 >= some
+    }
+
+    /// Steps, at most, in which any drive had errors.
+    fn steps_of_line(&self) -> usize {
+        let steps: usize = self
+            .figures
+            .drives
+            .iter()
+            .map(|drive| drive.steps(&[Sign::Silent, Sign::Damaged]))
+            .sum();
+        (steps / 2).min(STEPS)
+    }
+
+    fn noise(&mut self) {
+        let rest = self.unexplained();
+        let (_, asked) = sums(&rest);
+        let damaged: u32 = rest.iter().map(|one| one.damaged).sum();
+        let silent: u32 = rest.iter().map(|one| one.silent).sum();
+        if !self.is_of_line(&rest) || damaged < FEW_OF_LINE || damaged * 4 < silent {
+            return;
+        }
+        let with = rest.iter().filter(|one| one.failed > 0).map(|one| one.place);
+        let evidence = format!(
+            "{damaged} of {asked} replies in the last minute were damaged and {silent} requests got none, without a pattern ({})",
+            self.names_of(with)
+        );
+        let certainty = if rest.len() > 2 {
+            Certainty::Likely
+        } else {
+            Certainty::Fits
+        };
+        self.add(Cause::Noise, None, certainty, evidence);
+    }
+}

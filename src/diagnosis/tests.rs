@@ -1,0 +1,24 @@
+//! The page holds what the code says.
+
+use super::*;
+
+#[test]
+fn the_page_has_every_verdict() {
+    let page = include_str!("../../docs/diagnosis.md");
+    let rows: Vec<&str> = page.lines().filter(|line| line.starts_with("| `")).collect();
+    for (place, cause) in Cause::ALL.into_iter().enumerate() {
+        let row = format!("| `{}` | {} |", cause.name(), cause.meaning());
+        assert!(rows[place].starts_with(&row), "docs/diagnosis.md lacks {row}");
+        assert_eq!(serde_json::to_value(cause).unwrap(), cause.name());
+    }
+    for certainty in [Certainty::Fits, Certainty::Likely, Certainty::Certain] {
+        assert!(page.contains(&format!("`{}`: ", certainty.name())), "{certainty:?}");
+        assert_eq!(serde_json::to_value(certainty).unwrap(), certainty.name());
+    }
+    let counted = serde_json::to_value(Counted::default()).unwrap();
+    for field in counted.as_object().unwrap().keys() {
+        assert!(page.contains(&format!("`{field}`")), "docs/diagnosis.md lacks {field}");
+    }
+    let memory = format!("{} bytes for each drive", figures::BYTES_PER_DRIVE);
+    assert!(page.contains(&memory), "docs/diagnosis.md lacks {memory}");
+}

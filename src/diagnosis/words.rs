@@ -1,0 +1,80 @@
+//! How causes are told to people.
+
+use super::Cause;
+
+impl Cause {
+    /// What it means, in a few words.
+    pub const fn meaning(self) -> &'static str {
+        match self {
+            Cause::AllSilent => "no drive answers",
+            Cause::OneDrive => "one drive is badly connected or slow, the others are good",
+            Cause::FromAddress => "all drives are bad from one address on",
+            Cause::AddressTwice => "two drives answer to one address",
+            Cause::WhileRunning => "errors come only while drives run",
+            Cause::Mains => "errors come in step with the mains",
+            Cause::Bias => "stray bytes come while nobody speaks",
+            Cause::ReplyStartLost => "the beginning of replies is lost",
+            Cause::RequestEndLost => "requests do not arrive whole",
+            Cause::Echo => "the adapter hears its own requests",
+            Cause::LatencyTimer => "the adapter hands replies over in steps of 16 ms",
+            Cause::SilenceTooShort => "requests that follow a reply closely are not heard",
+            Cause::PortResets => "the adapter goes and comes back",
+            Cause::Noise => "errors without a pattern",
+        }
+    }
+
+    /// What to do.
+    pub const fn remedy(self) -> &'static str {
+        match self {
+            Cause::AllSilent => {
+                "check the supply of the drives, A and B (swap them), baud, format and protocol, and that the bus is enabled at \
+                 the drives; `drivegate scan` tries other settings"
+            }
+            Cause::OneDrive => {
+                "check the cable and terminals of this drive, that no other drive has its address, and its supply; where its \
+                 replies come late, raise response_timeout of the bus"
+            }
+            Cause::FromAddress => {
+                "check the cable and terminals before the first of these drives, if addresses follow the cable, and the \
+                 termination at both ends of the line"
+            }
+            Cause::AddressTwice => {
+                "switch this drive off: if its address still answers, give the other drive another one"
+            }
+            Cause::WhileRunning => {
+                "use shielded twisted pair, earth the shield as the drives' manual says, and keep it away from motor cables (30 cm \
+                 or more); earth the motor cables at both ends"
+            }
+            Cause::Mains => {
+                "look for a loop through earth: connect the reference conductor of the line, the shield as the drives' manual \
+                 says, and keep the line away from mains cables; an isolated adapter helps"
+            }
+            Cause::Bias => {
+                "bias the line at one place (pull-up at one conductor, pull-down at the other, often switches of the adapter), \
+                 terminate both ends, and connect the reference conductor"
+            }
+            Cause::ReplyStartLost => {
+                "the adapter turns from sending to receiving too late: use one that turns by itself, or with rs485 = \"kernel\" a \
+                 shorter delay after sending; at the drive, raise the delay before its reply"
+            }
+            Cause::RequestEndLost => {
+                "if the adapter is turned by RTS, it stops sending too early: lengthen the RTS delay or use an adapter that turns \
+                 by itself; else look for what disturbs the way to the drives"
+            }
+            Cause::Echo => {
+                "harmless, but it costs bytes and hides collisions: two-wire wiring of a four-wire adapter, switch its echo \
+                 suppression on"
+            }
+            Cause::LatencyTimer => "set the latency timer of the USB adapter to 1 ms: docs/performance.md, adapters",
+            Cause::SilenceTooShort => "set a longer silence of the bus, such as silence = \"10ms\"",
+            Cause::PortResets => {
+                "check the USB cable, plug and hub, and the supply of the adapter; an isolated adapter survives what drives \
+                 induce; the log has the reasons"
+            }
+            Cause::Noise => {
+                "check termination at both ends, the reference conductor, and shield and course of the cable; a lower baud rate \
+                 shows whether it is the cable"
+            }
+        }
+    }
+}

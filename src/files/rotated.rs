@@ -1,0 +1,156 @@
+//! A file of lines that only grows, until it becomes the first of the older ones beside it.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+
+use rustix::fs::{FlockOperation, flock};
+
+/// The current file; older ones have `.1`, `.2` and so on after its name.
+#[derive(Debug)]
+pub struct Rotated {
+    path: PathBuf,
+    /// Size of one file, bytes.
+    most: u64,
+    /// Files at most.
+    files: u64,
+    open: Option<Open>,
+}
+
+#[derive(Debug)]
+struct Open {
+    file: File,
+    bytes: u64,
+    /// Something is not on disk for sure.
+    unsynced: bool,
+}
+
+impl Rotated {
+    /// A file that shares `max_bytes` with those before it, `files` in all. Nothing is opened.
+    pub fn new(path: PathBuf, max_bytes: u64, files: u64) -> Rotated {
+        Rotated {
+            path,
+            most: max_bytes / files.max(1),
+            files,
+            open: None,
+        }
+    }
+
+    /// The current file.
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// An older file; the greater the number, the older it is.
+    pub fn older(&self, number: u64) -> PathBuf {
+        let mut name = self.path.clone().into_os_string();
+        name.push(format!(".{number}"));
+        name.into()
+    }
+
+    /// All files there can be, oldest first.
+    pub fn all(&self) -> Vec<PathBuf> {
+        let older = (1..self.files).rev().map(|number| self.older(number));
+        older.chain([self.path.clone()]).collect()
+    }
+
+    /// Whether the file is open.
+    pub fn is_open(&self) -> bool {
+        self.open.is_some()
+    }
+
+    /// Opens the file for this process alone, with its directory; its size in bytes.
+    ///
+    /// # Errors
+    /// It cannot be opened, or another process has it.
+    pub fn open(&mut self) -> io::Result<(&mut File, u64)> {
+        self.open = None;
+        if let Some(dir) = self.path.parent() {
+            fs::create_dir_all(dir)?;
+        }
+        let file = OpenOptions::new()
+            .read(true)
+            .append(true)
+            .create(true)
+            .mode(0o640)
+            .open(&self.path)?;
+        flock(&file, FlockOperation::NonBlockingLockExclusive)
+            .map_err(|_| io::Error::other("another process writes it; give each gateway its own"))?;
+        let bytes = file.metadata()?.len();
+        let open = self.open.insert(Open {
+            file,
+            bytes,
+            unsynced: false,
+        });
+        Ok((&mut open.file, bytes))
+    }
+
+    /// Closes the file; it is opened again when that is asked for.
+    pub fn close(&mut self) {
+        self.open = None;
+    }
+
+    /// Whether the file is too large for so many bytes more.
+    pub fn is_full(&self, more: usize) -> bool {
+        let bytes = self.open.as_ref().map_or(0, |open| open.bytes);
+        bytes > 0 && bytes + more as u64 > self.most
+    }
+
+    /// Appends bytes, whole or not at all.
+    ///
+    /// # Errors
+    /// They cannot be written, or the file is not open. What was written of them is removed, as far as that is possible.
+    pub fn append(&mut self, bytes: &[u8]) -> io::Result<()> {
+        let open = self.open.as_mut().ok_or_else(|| io::Error::other("it is not open"))?;
+        if let Err(error) = open.file.write_all(bytes) {
+            let _ = open.file.set_len(open.bytes);
+            return Err(error);
+        }
+        open.bytes += bytes.len() as u64;
+        open.unsynced = true;
+        Ok(())
+    }
+
+    /// What was appended survives a power failure.
+    ///
+    /// # Errors
+    /// The disk does not take it.
+    pub fn sync(&mut self) -> io::Result<()> {
+        if let Some(open) = self.open.as_mut().filter(|open| open.unsynced) {
+            open.file.sync_data()?;
+            open.unsynced = false;
+        }
+        Ok(())
+    }
+
+    /// Makes the current file the first of the older ones and removes the oldest; it is closed then.
+    ///
+    /// # Errors
+    /// A file cannot be renamed, or the current one not be brought to disk.
+    pub fn rotate(&mut self) -> io::Result<()> {
+        self.sync()?;
+        self.open = None;
+        for number in (1..self.files.saturating_sub(1)).rev() {
+            ignore_missing(fs::rename(self.older(number), self.older(number + 1)))?;
+        }
+        ignore_missing(fs::rename(&self.path, self.older(1)))
+    }
+
+    /// Whether the file that is open was moved, removed or replaced by another.
+    pub fn is_replaced(&self) -> bool {
+        let Some(open) = &self.open else { return false };
+        let same = |there: fs::Metadata| {
+            let own = open.file.metadata().ok()?;
+            Some((own.dev(), own.ino()) == (there.dev(), there.ino()))
+        };
+        fs::metadata(&self.path).ok().and_then(same) != Some(true)
+    }
+}
+
+fn ignore_missing(done: io::Result<()>) -> io::Result<()> {
+    match done {
+        Err(error) if error.kind() == io::ErrorKind::NotFound => Ok(()),
+        done => done,
+    }
+}

@@ -1,0 +1,106 @@
+//! Starts, run time and energy of a drive, as the gateway sees them. Pure: time is an argument.
+//!
+//! What nobody saw is not counted: while a drive is away, or its running bit is not good, no time passes and no start happens.
+
+use std::time::{Duration, Instant};
+
+use serde::{Deserialize, Serialize};
+
+use crate::drive::{ModelPoint, Value};
+use crate::process_image::Reading;
+
+/// What was counted of a drive since it was first seen.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Totals {
+    /// Starts: the running bit came while the gateway looked.
+    pub starts: u64,
+    /// Time that the motor was seen running, s.
+    pub running_seconds: f64,
+    /// The drive's own energy counter when it was last read, kWh.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub energy_kwh: Option<f64>,
+}
+
+impl Totals {
+    /// These, counted after `before`.
+    #[must_use]
+    pub fn after(self, before: Totals) -> Totals {
+        Totals {
+            starts: self.starts.saturating_add(before.starts),
+            running_seconds: self.running_seconds + before.running_seconds,
+            energy_kwh: self.energy_kwh.or(before.energy_kwh),
+        }
+    }
+
+    /// Whether they can have been counted.
+    pub fn is_sane(&self) -> bool {
+        let fine = |figure: f64| figure.is_finite() && figure >= 0.0;
+        fine(self.running_seconds) && self.energy_kwh.is_none_or(f64::is_finite)
+    }
+}
+
+/// Counts.
+#[derive(Debug, Default)]
+pub struct Counters {
+    totals: Totals,
+    /// Whether the motor ran when that was last read, as long as the drive was not away since.
+    ran: Option<(Instant, bool)>,
+}
+
+impl Counters {
+    /// Counts on from there.
+    pub fn from(totals: Totals) -> Counters {
+        Counters { totals, ran: None }
+    }
+
+    /// Adds what was counted before.
+    pub fn add(&mut self, before: Totals) {
+        self.totals = self.totals.after(before);
+    }
+
+    /// What was counted.
+    pub fn totals(&self) -> Totals {
+        self.totals
+    }
+
+    /// The drive was read, and reads as `reading` now; `known` is the drive as its image has it, which knows for how long a
+    /// value is good.
+    pub fn read(&mut self, reading: &Reading<'_>, known: &Reading<'_>) {
+        let profile = &reading.spec.profile;
+        if let Some(index) = profile.model_index(ModelPoint::Running) {
+            let sample = reading.sample(index);
+            if let (Some(running), Some(at)) = (sample.good(), sample.at) {
+                self.see(running.as_bool(), at, || known.good_for(index));
+            }
+        }
+        if let Some(energy) = reading.model(ModelPoint::Energy).good().map(Value::as_f64) {
+            self.totals.energy_kwh = Some(energy);
+        }
+    }
+
+    /// The running bit was read at `at`, and what was read before was good for so long.
+    fn see(&mut self, running: bool, at: Instant, good_for: impl Fn() -> Duration) {
+        if let Some((before, ran)) = self.ran {
+            let Some(passed) = at.checked_duration_since(before).filter(|passed| !passed.is_zero()) else {
+                return;
+            };
+            // The same reading at the same rate is the usual case.
+            if ran || running {
+                let seen = passed <= good_for();
+                if seen && ran {
+                    self.totals.running_seconds += passed.as_secs_f64();
+                }
+                if seen && running && !ran {
+                    self.totals.starts += 1;
+                }
+            }
+        }
+        self.ran = Some((at, running));
+    }
+
+    /// The drive was away: what it did meanwhile is not known.
+    pub fn interrupt(&mut self) {
+        self.ran = None;
+    }
+}

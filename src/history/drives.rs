@@ -1,0 +1,157 @@
+//! What is kept of the past of drives and buses: trends, counters, the last hour of each line. One writer, the recorder's
+//! thread; any number of readers, which hold up nobody but that thread.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+
+use super::Clock;
+use super::counters::{Counters, Totals};
+use super::line::LineHistory;
+use super::trend::DriveTrend;
+use crate::drive::Profile;
+use crate::process_image::{BusImage, DriveSpec, Reading, TapedRead};
+
+/// Drives without an entry in the configuration whose counters are kept, in case they return.
+const MOST_ABSENT: usize = 4096;
+
+/// The past of all drives and buses.
+#[derive(Debug, Default)]
+pub struct History {
+    known: Mutex<Known>,
+}
+
+#[derive(Debug, Default)]
+struct Known {
+    drives: BTreeMap<String, Arc<DriveHistory>>,
+    lines: BTreeMap<String, Arc<Mutex<LineHistory>>>,
+    /// Counters of drives that are not there.
+    absent: BTreeMap<String, Totals>,
+}
+
+/// The past of a drive.
+#[derive(Debug)]
+pub struct DriveHistory {
+    /// What it was made for: another drive of that name has other trends.
+    bus: String,
+    address: u8,
+    profile: Arc<Profile>,
+    trend: Mutex<DriveTrend>,
+    counters: Mutex<Counters>,
+}
+
+fn lock<T>(mutex: &Mutex<T>) -> MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+impl History {
+    /// The past of the drive of that name; none before its bus was started.
+    pub fn drive(&self, name: &str) -> Option<Arc<DriveHistory>> {
+        lock(&self.known).drives.get(name).cloned()
+    }
+
+    /// The last hour of the bus of that name; none before it was started.
+    pub fn line(&self, bus: &str) -> Option<Arc<Mutex<LineHistory>>> {
+        lock(&self.known).lines.get(bus).cloned()
+    }
+
+    /// What was counted of a drive.
+    pub fn totals(&self, drive: &str) -> Totals {
+        let known = lock(&self.known);
+        let counted = known.drives.get(drive).map(|drive| drive.totals());
+        counted.or_else(|| known.absent.get(drive).copied()).unwrap_or_default()
+    }
+
+    /// What was counted of all drives, also of those that are not there.
+    pub fn all_totals(&self) -> BTreeMap<String, Totals> {
+        let known = lock(&self.known);
+        let mut all = known.absent.clone();
+        all.extend(known.drives.iter().map(|(name, drive)| (name.clone(), drive.totals())));
+        all
+    }
+
+    /// Adds what was counted before, in earlier runs.
+    pub fn count_on(&self, totals: BTreeMap<String, Totals>) {
+        let known = &mut *lock(&self.known);
+        for (name, before) in totals {
+            match known.drives.get(&name) {
+                Some(drive) => lock(&drive.counters).add(before),
+                None => {
+                    let absent = known.absent.entry(name).or_default();
+                    *absent = absent.after(before);
+                }
+            }
+        }
+    }
+
+    /// The past of a drive, which it keeps over a reload: its counters for ever, its trends as long as bus, address and
+    /// profile are the same.
+    pub(super) fn of(&self, spec: &DriveSpec, clock: Clock) -> Arc<DriveHistory> {
+        let mut known = lock(&self.known);
+        let before = known.drives.get(&spec.name).cloned();
+        if let Some(same) = before.as_ref().filter(|before| before.is_of(spec)) {
+            return same.clone();
+        }
+        let counted = before.map(|before| before.totals());
+        let counted = counted.or_else(|| known.absent.remove(&spec.name));
+        let new = Arc::new(DriveHistory {
+            bus: spec.bus.clone(),
+            address: spec.address,
+            profile: spec.profile.clone(),
+            trend: Mutex::new(DriveTrend::new(&spec.profile, clock)),
+            counters: Mutex::new(Counters::from(counted.unwrap_or_default())),
+        });
+        known.drives.insert(spec.name.clone(), new.clone());
+        new
+    }
+
+    /// The last hour of a bus that is about to start.
+    pub(super) fn of_line(&self, bus: &BusImage, clock: Clock) -> Arc<Mutex<LineHistory>> {
+        let new = Arc::new(Mutex::new(LineHistory::new(bus, clock)));
+        lock(&self.known).lines.insert(bus.spec.name.clone(), new.clone());
+        new
+    }
+
+    /// Forgets all but these buses and their drives; of the others the counters are kept.
+    pub(super) fn keep_only(&self, buses: &[Arc<BusImage>]) {
+        let known = &mut *lock(&self.known);
+        known
+            .lines
+            .retain(|name, _| buses.iter().any(|bus| bus.spec.name == *name));
+        let drives = || buses.iter().flat_map(|bus| &bus.drives);
+        known.drives.retain(|name, drive| {
+            let is_there = drives().any(|image| image.spec.name == *name);
+            if !is_there && known.absent.len() < MOST_ABSENT {
+                known.absent.insert(name.clone(), drive.totals());
+            }
+            is_there
+        });
+    }
+}
+
+impl DriveHistory {
+    fn is_of(&self, spec: &DriveSpec) -> bool {
+        (&self.bus, self.address, &self.profile) == (&spec.bus, spec.address, &spec.profile)
+    }
+
+    /// Its trends.
+    pub fn trend(&self) -> MutexGuard<'_, DriveTrend> {
+        lock(&self.trend)
+    }
+
+    /// What was counted.
+    pub fn totals(&self) -> Totals {
+        lock(&self.counters).totals()
+    }
+
+    /// The drive was read, and reads as `reading` right after it; `known` is the drive as its image has it.
+    pub(super) fn read(&self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
+        self.trend().read(read, reading, known);
+        lock(&self.counters).read(reading, known);
+    }
+
+    /// The drive was away.
+    pub(super) fn interrupt(&self) {
+        self.trend().interrupt();
+        lock(&self.counters).interrupt();
+    }
+}

@@ -1,0 +1,334 @@
+//! Keeps events and counters on disk: a thread that hears every event and looks at the counters. Nobody waits for it: while the
+//! disk is slow, full or gone, events wait, those beyond are missing in the file, and everything else goes on.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::fs;
+use std::io::{self, ErrorKind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, channel};
+use std::time::{Duration, Instant, SystemTime};
+
+use serde::{Deserialize, Serialize};
+use tokio::sync::broadcast::error::TryRecvError;
+use tokio::sync::{broadcast, watch};
+
+use super::counters::Totals;
+use super::drives::History;
+use crate::event::{self, Event, Events};
+use crate::files::{self, Rotated};
+
+/// Events reach the disk within that time; a disk that failed is tried again at this interval.
+const TICK: Duration = Duration::from_secs(1);
+/// Counters reach it at this interval: what a power cut costs at most, with time for the write.
+const COUNTERS_EVERY: Duration = Duration::from_secs(45);
+/// Size of all files of events, bytes, and their number.
+pub(super) const EVENT_FILES: (u64, u64) = (4 << 20, 4);
+/// Events that wait for the disk.
+const WAITING: usize = 4096;
+/// Counters of drives in a file at most; more are none of ours.
+const MOST_DRIVES: usize = 16_384;
+/// Form of the file of counters.
+const VERSION: u32 = 1;
+
+const EVENTS: &str = "events.jsonl";
+const COUNTERS: &str = "counters.json";
+
+/// The file of counters.
+#[derive(Debug, Serialize, Deserialize)]
+struct CounterFile {
+    drivegate_counters: u32,
+    #[serde(default)]
+    time: String,
+    drives: BTreeMap<String, Totals>,
+}
+
+/// The thread, at work.
+#[derive(Debug)]
+pub struct Keeper {
+    dir: PathBuf,
+    end: Sender<()>,
+    ended: watch::Receiver<()>,
+}
+
+impl Keeper {
+    /// Keeps events and counters in that directory from now on. With `first`, the first of this run, events of earlier runs are
+    /// taken from there before it returns: to be called before anything happens.
+    ///
+    /// # Errors
+    /// The system gives no thread.
+    pub fn start(dir: &Path, first: bool, history: Arc<History>, events: &Events) -> io::Result<Keeper> {
+        let mut writer = Writer::new(dir, first, history, events.subscribe());
+        if first {
+            writer.remember(events);
+        }
+        let ((end, to_end), (running, ended)) = (channel(), watch::channel(()));
+        let thread = std::thread::Builder::new().name("history".to_string());
+        thread.spawn(move || {
+            writer.run(&to_end);
+            drop(running);
+        })?;
+        Ok(Keeper {
+            dir: dir.to_path_buf(),
+            end,
+            ended,
+        })
+    }
+
+    /// Where it keeps them.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Writes what there is, as far as the disk takes it, and ends the thread. A disk that hangs holds it up for good: wait with
+    /// a limit.
+    pub async fn stop(self) {
+        let Keeper { end, mut ended, .. } = self;
+        drop(end);
+        while ended.changed().await.is_ok() {}
+    }
+}
+
+#[derive(Debug)]
+struct Writer {
+    events: Rotated,
+    heard: broadcast::Receiver<Arc<Event>>,
+    waiting: VecDeque<Arc<Event>>,
+    /// Events that are missing in the file since it was last written.
+    lost: u64,
+    counters: PathBuf,
+    history: Arc<History>,
+    /// What earlier runs counted is in memory.
+    counted_on: bool,
+    /// What the file of counters has.
+    written: Option<BTreeMap<String, Totals>>,
+    /// Logged once, until a write succeeds.
+    failing: bool,
+}
+
+impl Writer {
+    fn new(dir: &Path, first: bool, history: Arc<History>, heard: broadcast::Receiver<Arc<Event>>) -> Writer {
+        Writer {
+            events: Rotated::new(dir.join(EVENTS), EVENT_FILES.0, EVENT_FILES.1),
+            heard,
+            waiting: VecDeque::new(),
+            lost: 0,
+            counters: dir.join(COUNTERS),
+            history,
+            counted_on: !first,
+            written: None,
+            failing: false,
+        }
+    }
+
+    fn run(mut self, ended: &Receiver<()>) {
+        let mut due = Instant::now() + COUNTERS_EVERY;
+        loop {
+            let end = ended.recv_timeout(TICK) != Err(RecvTimeoutError::Timeout);
+            let now = Instant::now();
+            let counters = end || now >= due;
+            if counters {
+                due = now + COUNTERS_EVERY;
+            }
+            let done = self.work(counters);
+            self.report(done, end);
+            if end {
+                return;
+            }
+        }
+    }
+
+    /// Takes what earlier runs left into memory.
+    fn remember(&mut self, events: &Events) {
+        let done = self.open();
+        if done.is_ok() {
+            events.remember(self.earlier());
+        }
+        self.report(done, false);
+    }
+
+    /// The events of earlier runs, oldest first.
+    fn earlier(&self) -> Vec<Event> {
+        let (mut earlier, mut wrong) = (Vec::new(), 0u64);
+        for path in self.events.all() {
+            let Ok(bytes) = fs::read(&path) else {
+                // Not all of them need be there.
+                continue;
+            };
+            for line in bytes.split(|byte| *byte == b'\n').filter(|line| !line.is_empty()) {
+                match event::from_line(line) {
+                    Ok(event) => earlier.push(event),
+                    Err(_) => wrong += 1,
+                }
+            }
+        }
+        if wrong > 0 {
+            tracing::warn!(
+                target: "drivegate::history",
+                "{wrong} lines of {} and the files before it are cut, or no events that this version knows; they are left there and \
+                 not shown", self.events.path().display()
+            );
+        }
+        earlier
+    }
+
+    /// Writes what waits, and the counters where they are due.
+    fn work(&mut self, counters: bool) -> io::Result<()> {
+        self.hear();
+        if self.events.is_replaced() {
+            self.events.close();
+        }
+        // Whoever has the events has the counters, too: another gateway with the same directory gets neither.
+        if !self.events.is_open() {
+            self.open()?;
+        }
+        while let Some(event) = self.waiting.front() {
+            let mut line = serde_json::to_vec(&**event).map_err(io::Error::other)?;
+            line.push(b'\n');
+            if self.events.is_full(line.len()) {
+                self.events.rotate()?;
+                self.open()?;
+            }
+            self.events.append(&line)?;
+            self.waiting.pop_front();
+        }
+        self.events.sync()?;
+        if counters { self.write_counters() } else { Ok(()) }
+    }
+
+    fn hear(&mut self) {
+        loop {
+            match self.heard.try_recv() {
+                Ok(event) if self.waiting.len() < WAITING => self.waiting.push_back(event),
+                Ok(_) => self.lost += 1,
+                Err(TryRecvError::Lagged(lost)) => self.lost += lost,
+                Err(TryRecvError::Empty | TryRecvError::Closed) => return,
+            }
+        }
+    }
+
+    /// Opens the file of events. At the first time in this run it takes in what was counted before.
+    fn open(&mut self) -> io::Result<()> {
+        let (file, bytes) = self.events.open()?;
+        let ended = bytes == 0 || ends_with_newline(file, bytes)?;
+        if !ended {
+            // A line that a power failure cut stays as it is, and no event is appended to it.
+            self.events.append(b"\n")?;
+        }
+        if !std::mem::replace(&mut self.counted_on, true) {
+            self.count_on();
+        }
+        Ok(())
+    }
+
+    fn count_on(&mut self) {
+        let path = &self.counters;
+        let found = match fs::read(path) {
+            Err(error) if error.kind() == ErrorKind::NotFound => return,
+            Err(error) => Err(error.to_string()),
+            Ok(bytes) => read_counters(&bytes),
+        };
+        match found {
+            Ok(totals) => self.history.count_on(totals),
+            Err(why) => {
+                let aside = kept_aside(path);
+                let kept = match fs::rename(path, &aside) {
+                    Ok(()) => format!("it is kept as {}", aside.display()),
+                    Err(error) => format!("it cannot be kept aside ({error})"),
+                };
+                tracing::error!(
+                    target: "drivegate::history",
+                    "cannot use the run hours and starts in {}: {why}; {kept}, and counting begins at 0; to count on from it, stop the \
+                     gateway, mend the file and give it its name back", path.display()
+                );
+            }
+        }
+    }
+
+    fn write_counters(&mut self) -> io::Result<()> {
+        let totals = self.history.all_totals();
+        if self.written.as_ref() == Some(&totals) {
+            return Ok(());
+        }
+        let file = CounterFile {
+            drivegate_counters: VERSION,
+            time: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
+            drives: totals,
+        };
+        let bytes = serde_json::to_vec_pretty(&file).map_err(io::Error::other)?;
+        files::replace(&self.counters, &bytes)?;
+        self.written = Some(file.drives);
+        Ok(())
+    }
+
+    /// Logs a failure once, and its end.
+    fn report(&mut self, done: io::Result<()>, end: bool) {
+        let path = self.events.path().display();
+        let waiting = self.waiting.len();
+        match done {
+            Ok(()) => {
+                let lost = std::mem::take(&mut self.lost);
+                if std::mem::take(&mut self.failing) || lost > 0 {
+                    tracing::warn!(
+                        target: "drivegate::history",
+                        "events and counters are written again; {lost} events are missing in {path}"
+                    );
+                }
+            }
+            Err(error) => {
+                if !std::mem::replace(&mut self.failing, true) {
+                    tracing::error!(
+                        target: "drivegate::history",
+                        "cannot keep events and counters in {path}: {error}; a restart forgets those from now on, everything else goes \
+                         on; check state_dir of [gateway] and the disk"
+                    );
+                }
+                self.events.close();
+                if end {
+                    tracing::error!(target: "drivegate::history", "{waiting} events are not written");
+                }
+            }
+        }
+    }
+}
+
+fn ends_with_newline(file: &fs::File, bytes: u64) -> io::Result<bool> {
+    use std::os::unix::fs::FileExt;
+    let mut last = [0];
+    file.read_exact_at(&mut last, bytes.saturating_sub(1))?;
+    Ok(last == *b"\n")
+}
+
+/// The counters of a file, or why they are none.
+fn read_counters(bytes: &[u8]) -> Result<BTreeMap<String, Totals>, String> {
+    #[derive(Deserialize)]
+    struct Version {
+        drivegate_counters: u32,
+    }
+    let Version {
+        drivegate_counters: version,
+    } = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+    if version != VERSION {
+        return Err(format!("it has version {version}, this gateway knows {VERSION}"));
+    }
+    let file: CounterFile = serde_json::from_slice(bytes).map_err(|error| error.to_string())?;
+    if file.drives.len() > MOST_DRIVES {
+        return Err(format!("it has {} drives, more than {MOST_DRIVES}", file.drives.len()));
+    }
+    match file.drives.iter().find(|(_, totals)| !totals.is_sane()) {
+        Some((drive, _)) => Err(format!("what it has of `{drive}` cannot have been counted")),
+        None => Ok(file.drives),
+    }
+}
+
+/// A name beside that path that is free.
+fn kept_aside(path: &Path) -> PathBuf {
+    let named = |ending: String| path.with_extension(ending);
+    let mut names = (1..1000).map(|number| named(format!("damaged-{number}")));
+    names
+        .find(|name| !name.exists())
+        .unwrap_or_else(|| named("damaged".to_string()))
+}
+
+#[cfg(test)]
+mod tests;

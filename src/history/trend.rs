@@ -1,0 +1,315 @@
+//! Trends in memory: the least, the greatest and the last value of a point in equal steps of time. Pure: time is an argument.
+//!
+//! Each value goes into every range, so the buckets of a coarse range hold the extremes of what was read, not of what a finer
+//! one kept of it. Times are monotonic; the time of day serves for labels only.
+
+use std::ops::RangeInclusive;
+use std::time::{Duration, Instant, SystemTime};
+
+use super::Clock;
+use super::buckets::Buckets;
+use crate::codec::Table;
+use crate::drive::{ModelPoint, Profile, Source};
+use crate::process_image::{Reading, TapedRead};
+
+/// A span of time and the steps it is kept in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Range {
+    /// How far back it reaches.
+    pub span: Duration,
+    /// Length of a bucket.
+    pub step: Duration,
+}
+
+impl Range {
+    const fn new(span: u64, step: u64) -> Range {
+        Range {
+            span: Duration::from_secs(span),
+            step: Duration::from_secs(step),
+        }
+    }
+
+    const fn buckets(self) -> usize {
+        (self.span.as_secs() / self.step.as_secs()) as usize
+    }
+}
+
+/// The ranges, finest first.
+pub const RANGES: [Range; 3] = [Range::new(600, 1), Range::new(3600, 5), Range::new(24 * 3600, 120)];
+
+/// Points of which a trend is kept, as far as a profile has them.
+pub const POINTS: [ModelPoint; 9] = [
+    ModelPoint::ActualSpeed,
+    ModelPoint::OutputFrequency,
+    ModelPoint::MotorSpeed,
+    ModelPoint::MotorCurrent,
+    ModelPoint::MotorTorque,
+    ModelPoint::MotorPower,
+    ModelPoint::MotorVoltage,
+    ModelPoint::DcLinkVoltage,
+    ModelPoint::HeatsinkTemperature,
+];
+
+/// Memory of the trend of a point, from its first value on, bytes.
+pub const POINT_BYTES: usize = {
+    let [fine, middle, coarse] = RANGES;
+    (fine.buckets() + middle.buckets() + coarse.buckets()) * size_of::<Bucket>()
+};
+
+/// Memory of the trends of a drive at most, bytes.
+pub fn bytes_of(profile: &Profile) -> usize {
+    points_of(profile).count() * POINT_BYTES
+}
+
+fn points_of(profile: &Profile) -> impl Iterator<Item = (ModelPoint, usize)> {
+    let index = |point: ModelPoint| Some((point, profile.model_index(point)?));
+    POINTS.into_iter().filter_map(index)
+}
+
+/// What the values of one step were; no numbers while there were none.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Bucket {
+    pub(super) min: f32,
+    pub(super) max: f32,
+    pub(super) last: f32,
+}
+
+impl Default for Bucket {
+    fn default() -> Bucket {
+        let [min, max, last] = [f32::NAN; 3];
+        Bucket { min, max, last }
+    }
+}
+
+impl Bucket {
+    pub(super) fn add(&mut self, value: f32) {
+        // `min` and `max` take the other one where one is no number.
+        self.min = self.min.min(value);
+        self.max = self.max.max(value);
+        self.last = value;
+    }
+
+    pub(super) fn is_empty(self) -> bool {
+        self.last.is_nan()
+    }
+}
+
+/// What the values of one step were.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// Its beginning, ms since 1970.
+    pub at: u64,
+    /// The least value.
+    pub min: f32,
+    /// The greatest value.
+    pub max: f32,
+    /// The last value.
+    pub last: f32,
+}
+
+/// A part of a trend.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Part {
+    /// Name of the point.
+    pub point: &'static str,
+    /// Its unit.
+    pub unit: &'static str,
+    /// Length of a step.
+    pub step: Duration,
+    /// Beginning of the first step.
+    pub from: SystemTime,
+    /// End of the last one.
+    pub to: SystemTime,
+    /// A step each, oldest first; `None` where nothing good was read.
+    pub steps: Vec<Option<Step>>,
+}
+
+/// Registers: a table and the addresses in it.
+type Registers = (Table, RangeInclusive<u16>);
+
+#[derive(Debug)]
+struct PointTrend {
+    point: ModelPoint,
+    /// Index in the profile.
+    index: usize,
+    /// Where its value is read from.
+    registers: Vec<Registers>,
+    /// It rests on points that are read elsewhere, too.
+    derived: bool,
+    /// `None` before the first value.
+    kept: Option<Kept>,
+}
+
+/// The values of a point.
+#[derive(Debug)]
+struct Kept {
+    ranges: [Buckets<Bucket>; RANGES.len()],
+    /// The last value and when it was read, as long as the drive was not away since.
+    last: Option<(Duration, f32)>,
+}
+
+/// The trends of a drive.
+#[derive(Debug)]
+pub struct DriveTrend {
+    /// Time that the numbers of the buckets are counted from.
+    epoch: Instant,
+    points: Vec<PointTrend>,
+}
+
+impl DriveTrend {
+    /// The trends of a drive of that profile, empty.
+    pub fn new(profile: &Profile, clock: Clock) -> DriveTrend {
+        let trend = |(point, index): (ModelPoint, usize)| PointTrend {
+            point,
+            index,
+            registers: registers_of(profile, index),
+            derived: profile.points.get(index).is_some_and(|point| point.raw().is_none()),
+            kept: None,
+        };
+        DriveTrend {
+            epoch: epoch(clock),
+            points: points_of(profile).map(trend).collect(),
+        }
+    }
+
+    /// Takes in the values that `read` shows, of a drive that reads as `reading` right after it. `known` is the drive as its
+    /// image has it: it knows whether a point that is made of others is good, since they may have been read before the drive
+    /// was away, and for how long a value is good. A value stands for the steps until the next one, as far as it is good so long.
+    pub fn read(&mut self, read: &TapedRead, reading: &Reading<'_>, known: &Reading<'_>) {
+        for point in &mut self.points {
+            if !point.registers.iter().any(|registers| shows(read, registers)) {
+                continue;
+            }
+            let sample = reading.sample(point.index);
+            // The words of a value may come in several reads: it is as old as the oldest.
+            let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
+                continue;
+            };
+            let is_known = !known.snapshot.link.is_online() || known.sample(point.index).good().is_some();
+            if !point.derived || is_known {
+                let since = read.at.saturating_duration_since(self.epoch);
+                let kept = point.kept.get_or_insert_with(Kept::new);
+                kept.add(since, value.as_f64() as f32, known.good_for(point.index));
+            }
+        }
+    }
+
+    /// The drive was away: no value from before stands for the time since.
+    pub fn interrupt(&mut self) {
+        for kept in self.points.iter_mut().filter_map(|point| point.kept.as_mut()) {
+            kept.last = None;
+        }
+    }
+
+    /// The points, and the memory of each in bytes.
+    pub fn points(&self) -> impl Iterator<Item = (ModelPoint, usize)> {
+        let bytes = |point: &PointTrend| point.kept.as_ref().map_or(0, |_| POINT_BYTES);
+        self.points.iter().map(move |point| (point.point, bytes(point)))
+    }
+
+    /// The trend of a point between two times, in the finest range that reaches back as far as `from`. What is older than the
+    /// longest range, or not yet, is left out. `None` where no trend of the point is kept.
+    pub fn part(&self, point: ModelPoint, from: Instant, to: Instant, clock: Clock) -> Option<Part> {
+        let trend = self.points.iter().find(|trend| trend.point == point)?;
+        let age = clock.now.saturating_duration_since(from);
+        let last = RANGES.len() - 1;
+        let chosen = RANGES.iter().position(|range| age <= range.span).unwrap_or(last);
+        let range = RANGES.get(chosen)?;
+        let number = |at: Instant| number(at.saturating_duration_since(self.epoch), range.step);
+        let now = number(clock.now);
+        let oldest = (now + 1).saturating_sub(range.buckets() as u64);
+        let (first, end) = (number(from).clamp(oldest, now), number(to).clamp(oldest, now));
+        // Steps that follow each other have times that follow each other, whatever the clock says meanwhile.
+        let at = clock.wall_at(self.epoch) + range.step * u32::try_from(first).unwrap_or(u32::MAX);
+        let from = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+        let from = (from.as_micros() as u64).div_ceil(1000);
+        let step = range.step.as_millis() as u64;
+        let buckets = trend.kept.as_ref().and_then(|kept| kept.ranges.get(chosen));
+        let steps = (first..=end).map(|number| {
+            let bucket = buckets?.get(number).filter(|bucket| !bucket.is_empty());
+            let Bucket { min, max, last } = bucket?;
+            let at = from + (number - first) * step;
+            Some(Step { at, min, max, last })
+        });
+        let wall = |millis: u64| SystemTime::UNIX_EPOCH + Duration::from_millis(millis);
+        Some(Part {
+            point: point.name(),
+            unit: point.unit(),
+            step: range.step,
+            from: wall(from),
+            to: wall(from + (end + 1).saturating_sub(first) * step),
+            steps: steps.collect(),
+        })
+    }
+}
+
+impl Kept {
+    fn new() -> Kept {
+        Kept {
+            ranges: RANGES.map(|range| Buckets::new(range.buckets())),
+            last: None,
+        }
+    }
+
+    /// A value was read `since` the beginning; the one before was good for `good_for`.
+    fn add(&mut self, since: Duration, value: f32, good_for: Duration) {
+        let before = self.last.filter(|(at, _)| since.saturating_sub(*at) <= good_for);
+        for (buckets, range) in self.ranges.iter_mut().zip(RANGES) {
+            let number = number(since, range.step);
+            let between = before.map(|(at, before)| (self::number(at, range.step), before));
+            if let Some((at, before)) = between.filter(|(at, _)| at + 1 < number) {
+                let first = at.max(number.saturating_sub(range.buckets() as u64)) + 1;
+                for between in first..number {
+                    if let Some(bucket) = buckets.at(between) {
+                        bucket.add(before);
+                    }
+                }
+            }
+            if let Some(bucket) = buckets.at(number) {
+                bucket.add(value);
+            }
+        }
+        self.last = Some((since, value));
+    }
+}
+
+/// Number of the bucket that a time since the beginning falls into.
+pub(super) fn number(since: Duration, step: Duration) -> u64 {
+    since.as_secs() / step.as_secs().max(1)
+}
+
+/// A time from which on the steps of all ranges begin at whole steps of the time of day: a longest step ago at most.
+pub(super) fn epoch(clock: Clock) -> Instant {
+    let [.., Range { step, .. }] = RANGES;
+    let since = clock.wall.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
+    let into = Duration::from_nanos((since.as_nanos() % step.as_nanos().max(1)) as u64);
+    // Shortly after the machine was started there may be no such instant.
+    clock.now.checked_sub(into).unwrap_or(clock.now)
+}
+
+fn shows(read: &TapedRead, (table, addresses): &Registers) -> bool {
+    let end = usize::from(read.start) + read.words.len();
+    let overlap = *addresses.end() >= read.start && usize::from(*addresses.start()) < end;
+    read.table == *table && overlap
+}
+
+/// Where the value of a point is read from, without the ends of a band.
+fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
+    let Some(point) = profile.points.get(index) else {
+        return Vec::new();
+    };
+    match &point.source {
+        Source::Raw(raw) => {
+            let last = raw.address.saturating_add(raw.form.items().saturating_sub(1));
+            vec![(raw.table, raw.address..=last)]
+        }
+        // A point rests on points before it only: the profile is refused otherwise.
+        Source::Derived(derived) => {
+            let sources = derived.sources().into_iter().filter(|source| *source != index);
+            sources.flat_map(|source| registers_of(profile, source)).collect()
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests;

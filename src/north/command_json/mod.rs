@@ -1,0 +1,13 @@
+//! Commands as JSON, as MQTT and HTTP have them: what a request means, whether it repeats an earlier one, and its result.
+
+mod memory;
+mod request;
+mod result;
+
+#[cfg(test)]
+pub(super) use self::memory::REMEMBERED;
+pub(super) use self::memory::{Memory, Repetition, Taken};
+#[cfg(test)]
+pub(super) use self::request::MAX_ID;
+pub(super) use self::request::{Id, MAX_PAYLOAD, Points, check_size, excerpt, find_id, order, resolve, unknown_drive};
+pub(super) use self::result::CommandResult;

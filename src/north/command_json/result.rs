@@ -1,0 +1,70 @@
+//! The result of a command as JSON.
+
+use std::time::{Duration, SystemTime};
+
+use serde::Serialize;
+
+use super::Id;
+use crate::command::{Answer, CONFIRMED, milliseconds, milliseconds_or_null};
+
+/// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
+#[derive(Debug, Clone, Serialize)]
+pub(in crate::north) struct CommandResult<'r> {
+    id: Option<&'r Id>,
+    drive: &'r str,
+    ok: bool,
+    result: &'static str,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    error: Option<ErrorObject>,
+    #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
+    latency: Duration,
+    /// From acceptance to the read that showed the effect.
+    #[serde(
+        rename = "confirmed_ms",
+        serialize_with = "milliseconds_or_null",
+        skip_serializing_if = "Option::is_none"
+    )]
+    confirmed: Option<Duration>,
+    #[serde(serialize_with = "crate::event::rfc3339")]
+    time: SystemTime,
+}
+
+#[derive(Debug, Clone, Serialize)]
+struct ErrorObject {
+    code: &'static str,
+    message: String,
+}
+
+impl<'r> CommandResult<'r> {
+    /// The result at `time` of the command with that `id`; `confirmed` is the time from its acceptance to the read that
+    /// showed its effect.
+    pub(in crate::north) fn new(
+        id: Option<&'r Id>,
+        drive: &'r str,
+        answer: &Answer,
+        confirmed: Option<Duration>,
+        time: SystemTime,
+    ) -> CommandResult<'r> {
+        let code = match confirmed {
+            Some(_) => CONFIRMED,
+            None => answer.outcome.code(),
+        };
+        let error = (!answer.outcome.is_ok()).then(|| answer.outcome.to_string());
+        CommandResult {
+            id,
+            drive,
+            ok: error.is_none(),
+            result: code,
+            error: error.map(|message| ErrorObject { code, message }),
+            latency: answer.latency,
+            confirmed,
+            time,
+        }
+    }
+
+    /// As it is sent.
+    pub(in crate::north) fn to_json(&self) -> Vec<u8> {
+        // Strings, numbers and previous JSON can always be serialized.
+        serde_json::to_vec(self).unwrap_or_default()
+    }
+}

@@ -1,0 +1,46 @@
+//! Reads the body of a request, within limits of size and time.
+
+use std::time::{Duration, Instant};
+
+use axum::Json;
+use axum::body::{Body, Bytes, to_bytes};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use tokio::time::timeout;
+
+use super::api::ErrorReply;
+use super::routes::Reached;
+
+/// Time limit for the body of a request, from its head on.
+const TIMEOUT: Duration = Duration::from_secs(5);
+
+/// The body of at most `most` bytes. Until it is complete the connection is not in use: it yields to others.
+///
+/// # Errors
+/// The reply to a body that is too long, incomplete or too slow.
+pub(super) async fn read(body: Body, reached: &Reached, most: usize) -> Result<Bytes, Response> {
+    let in_use = |in_use| {
+        if let Some(place) = &reached.place {
+            place.use_at(Instant::now(), in_use);
+        }
+    };
+    in_use(false);
+    let read = timeout(TIMEOUT, to_bytes(body, most)).await;
+    in_use(true);
+    let (status, error) = match read {
+        Ok(Ok(bytes)) => return Ok(bytes),
+        Ok(Err(_)) => (
+            StatusCode::PAYLOAD_TOO_LARGE,
+            format!("the body has more than {most} bytes, or is incomplete"),
+        ),
+        Err(_) => (
+            StatusCode::REQUEST_TIMEOUT,
+            format!("the body did not arrive within {} s", TIMEOUT.as_secs()),
+        ),
+    };
+    let error = ErrorReply {
+        error,
+        known: Vec::new(),
+    };
+    Err((status, Json(error)).into_response())
+}

@@ -1,0 +1,121 @@
+//! `GET /api/v1/events/log`: what happened, also before the last start.
+
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use axum::Json;
+use axum::extract::{RawQuery, State};
+use axum::http::StatusCode;
+use axum::response::{IntoResponse, Response};
+use serde::Serialize;
+
+use super::query::{self, QueryError};
+use super::routes::AppState;
+use crate::event::{Before, Event, EventKind, RecordingMade, Search};
+use crate::history::{Entry, Recordings};
+
+/// Events of a reply without `limit`, and at most.
+const LIMITS: (usize, usize) = (100, 1000);
+
+fn search(query: Option<&str>, now: SystemTime) -> Result<Search, QueryError> {
+    let known = &["kind", "drive", "bus", "text", "before", "limit"];
+    let [kind, drive, bus, text, before, limit] = query::parameters(query, known)?;
+    let mut kinds = Vec::new();
+    for name in kind
+        .iter()
+        .flat_map(|kinds| kinds.split(','))
+        .filter(|name| !name.is_empty())
+    {
+        let kind = EventKind::ALL.into_iter().find(|kind| kind.name() == name.trim());
+        kinds.push(kind.ok_or_else(|| QueryError::Value {
+            name: "kind",
+            value: name.to_string(),
+            expected: "it is the `event` of an event, such as `fault`; several are separated by commas",
+        })?);
+    }
+    let point = |text: String| match Before::event(&text) {
+        Some(event) => Ok(event),
+        None => query::time("before", &text, now).map(Before::Time),
+    };
+    let count = |text: String| match text.parse::<usize>() {
+        Ok(limit) if limit > 0 => Ok(limit.min(LIMITS.1)),
+        _ => Err(QueryError::Value {
+            name: "limit",
+            value: text,
+            expected: "a number from 1 to 1000",
+        }),
+    };
+    Ok(Search {
+        kinds,
+        drive,
+        bus,
+        text,
+        before: before.map(point).transpose()?,
+        limit: limit.map_or(Ok(LIMITS.0), count)?,
+    })
+}
+
+/// The events that match, newest first.
+pub(super) async fn log(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> Response {
+    let search = match search(query.as_deref(), SystemTime::now()) {
+        Ok(search) => search,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let _turn = app.turn().await;
+    let plant = app.plant.load();
+    let found = plant.events.search(&search);
+    let recorded = Recorded::new(&plant.recordings);
+    let shown: Vec<Shown<'_>> = found.iter().map(|event| recorded.show(event)).collect();
+    Json(shown).into_response()
+}
+
+/// An event, with the recording that shows it.
+#[derive(Debug, Serialize)]
+struct Shown<'e> {
+    #[serde(flatten)]
+    event: &'e Event,
+    /// Absent in events that have it themselves.
+    #[serde(rename = "recording", skip_serializing_if = "Option::is_none")]
+    shown_in: Option<RecordingMade>,
+}
+
+/// The recordings that there are, by the time that they cover.
+struct Recorded {
+    before: Duration,
+    after: Duration,
+    entries: Vec<(SystemTime, Arc<Entry>)>,
+}
+
+impl Recorded {
+    fn new(recordings: &Recordings) -> Recorded {
+        let (before, after) = recordings.span();
+        let timed = |entry: Arc<Entry>| Some((humantime::parse_rfc3339(&entry.time).ok()?, entry));
+        Recorded {
+            before,
+            after,
+            entries: recordings.list().into_iter().filter_map(timed).collect(),
+        }
+    }
+
+    /// The recording of its drive that covers the event; the one with the nearest trigger if several do.
+    fn show<'e>(&self, event: &'e Event) -> Shown<'e> {
+        let covers = |(at, entry): &&(SystemTime, Arc<Entry>)| {
+            let of_drive = event.drive.as_ref() == Some(&entry.drive);
+            of_drive && event.time + self.before >= *at && event.time <= *at + self.after
+        };
+        let apart = |(at, _): &&(SystemTime, Arc<Entry>)| match event.time.duration_since(*at) {
+            Ok(after) => after,
+            Err(before) => before.duration(),
+        };
+        let wanted = event.recording.is_none();
+        let nearest = self.entries.iter().filter(covers).min_by_key(apart).filter(|_| wanted);
+        Shown {
+            event,
+            shown_in: nearest.map(|(_, entry)| RecordingMade {
+                id: entry.id.clone(),
+                trigger: entry.trigger.name().into(),
+                summary: entry.summary.clone(),
+            }),
+        }
+    }
+}

@@ -1,0 +1,370 @@
+//! Commands and heartbeats over HTTP. The body of a command is that of the MQTT set topics, and so is its result.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use axum::Json;
+use axum::body::Body;
+use axum::extract::{Extension, Path, Request, State};
+use axum::http::{StatusCode, header, request};
+use axum::response::{IntoResponse, Response};
+use serde_json::{Value as Json_, json};
+use tokio::sync::{OwnedSemaphorePermit, watch};
+
+use super::super::api::ErrorReply;
+use super::super::body;
+use super::super::routes::{AppState, Reached, not_found};
+use super::{Operating, Operator};
+use crate::command::{Answer, Authority, Order, Origin, Outcome, Refusal, SourceKind};
+use crate::drive::ModelPoint;
+use crate::drive::model::Kind;
+use crate::north::command_json::{
+    self, CommandResult, Id, MAX_PAYLOAD, Memory, Repetition, Taken, excerpt, find_id, unknown_drive,
+};
+use crate::plant::{DriveHandle, Placed, Plant};
+use crate::process_image::Access;
+
+/// The reply to a command.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct CommandReply {
+    status: StatusCode,
+    body: Vec<u8>,
+}
+
+/// The reply to a command, which may be still to come, for everybody who repeats it.
+pub(super) type SharedReply = watch::Receiver<Option<CommandReply>>;
+
+/// A command that was understood, or not.
+enum Progress {
+    /// Its reply is known.
+    Known(CommandReply),
+    /// It repeats another one, whose reply is its own.
+    Repeated(SharedReply),
+    /// It is in the queue of the bus.
+    Placed(Waiting),
+}
+
+/// A command whose result is to come.
+struct Waiting {
+    placed: Placed,
+    id: Option<Id>,
+    drive: String,
+    /// For those who repeat it; none of a stop, which is always executed.
+    shared: Option<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit)>,
+}
+
+impl CommandReply {
+    fn new(
+        id: Option<&Id>,
+        drive: &str,
+        answer: &Answer,
+        confirmed: Option<Duration>,
+        time: SystemTime,
+    ) -> CommandReply {
+        CommandReply {
+            status: status(&answer.outcome),
+            body: CommandResult::new(id, drive, answer, confirmed, time).to_json(),
+        }
+    }
+}
+
+impl IntoResponse for CommandReply {
+    fn into_response(self) -> Response {
+        let json = [(header::CONTENT_TYPE, "application/json")];
+        (self.status, json, self.body).into_response()
+    }
+}
+
+/// The status of a result (`docs/operating.md`).
+fn status(outcome: &Outcome) -> StatusCode {
+    match outcome {
+        Outcome::Acknowledged(_) => StatusCode::OK,
+        Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
+        Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
+        Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
+        Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => StatusCode::CONFLICT,
+        Outcome::Exception(_) | Outcome::Garbled => StatusCode::BAD_GATEWAY,
+        Outcome::TimedOut | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
+        Outcome::Expired | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull | Outcome::ShuttingDown => {
+            StatusCode::SERVICE_UNAVAILABLE
+        }
+    }
+}
+
+/// `POST /api/v1/drives/{name}/commands`
+pub(in crate::north::http) async fn command(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    request: Request,
+) -> Response {
+    let (parts, body) = request.into_parts();
+    match commanded(&app, &reached, &name, &parts, body).await {
+        Ok(reply) => reply.into_response(),
+        Err(response) => response,
+    }
+}
+
+async fn commanded(
+    app: &AppState,
+    reached: &Reached,
+    name: &str,
+    parts: &request::Parts,
+    body: Body,
+) -> Result<CommandReply, Response> {
+    let (operating, cookies, address) = (&app.operating, app.cookies(reached), reached.peer.ip());
+    let operator = operating.commander(&parts.headers, &cookies, address).await;
+    let operator = operator.map_err(IntoResponse::into_response)?;
+    let payload = body::read(body, reached, MAX_PAYLOAD).await?;
+    let plant = app.plant.load_full();
+    let progress = operating.take(&plant, &operator, name, &payload, Instant::now(), SystemTime::now());
+    match progress {
+        Progress::Known(reply) => Ok(reply),
+        Progress::Repeated(reply) => shared(reply).await,
+        Progress::Placed(mut waiting) => match waiting.shared.take() {
+            None => Ok(waiting.finished().await),
+            // The result is kept for whoever repeats the command, also if this client has gone.
+            Some((sender, permit)) => {
+                let reply = sender.subscribe();
+                tokio::spawn(async move {
+                    let reply = waiting.finished().await;
+                    sender.send_replace(Some(reply));
+                    drop(permit);
+                });
+                shared(reply).await
+            }
+        },
+    }
+}
+
+/// Waits for a reply that several may wait for.
+async fn shared(mut reply: SharedReply) -> Result<CommandReply, Response> {
+    let known = reply
+        .wait_for(Option::is_some)
+        .await
+        .ok()
+        .and_then(|reply| reply.clone());
+    // Its task ends without a reply only when the process does.
+    known.ok_or_else(|| StatusCode::SERVICE_UNAVAILABLE.into_response())
+}
+
+impl Waiting {
+    async fn finished(mut self) -> CommandReply {
+        let answer = self.placed.answered().await;
+        let confirmed = self.placed.confirmed().await;
+        CommandReply::new(self.id.as_ref(), &self.drive, &answer, confirmed, SystemTime::now())
+    }
+}
+
+impl Operator {
+    /// As the audit shows it. All that a user does counts as one client.
+    fn origin(&self) -> Origin {
+        let client = format!("{} {}", SourceKind::Http.name(), self.user);
+        let who = format!("{} {}", self.user, self.address);
+        Origin::of(client.into(), SourceKind::Http, who).with_login(self.login.clone())
+    }
+}
+
+impl Operating {
+    /// Takes a command at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
+    /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
+    /// is always executed.
+    fn take(
+        &self,
+        plant: &Plant,
+        operator: &Operator,
+        name: &str,
+        payload: &[u8],
+        now: Instant,
+        time: SystemTime,
+    ) -> Progress {
+        let (id, origin) = (find_id(payload), operator.origin());
+        let reply = |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, None, time));
+        let Some(drive) = plant.drive(name) else {
+            let shown = excerpt(name.as_bytes());
+            let why = unknown_drive(name, plant);
+            let answer = plant.refuse_unknown(shown.trim_matches('`'), &excerpt(payload), why, origin, now);
+            return reply(&answer);
+        };
+        let profile = &drive.image.spec.profile;
+        let refuse = |refusal, origin| reply(&drive.refuse(&excerpt(payload), refusal, origin, now));
+        let (points, expiry) = match command_json::order(payload, profile) {
+            Ok(order) => order,
+            Err(refusal) => return refuse(refusal, origin),
+        };
+        let run = profile.model_index(ModelPoint::Run);
+        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
+        let shared = match stop {
+            true => None,
+            false => match self.remember(&drive, operator, payload, id.as_ref(), now) {
+                Ok(shared) => Some(shared),
+                Err(Known::Reply(reply)) => return Progress::Repeated(reply),
+                Err(Known::Refused(why)) => return refuse(Refusal::NotAllowed(why), origin),
+            },
+        };
+        let placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
+        Progress::Placed(Waiting {
+            placed,
+            drive: name.to_string(),
+            shared,
+            id,
+        })
+    }
+
+    /// Remembers a command that is no stop.
+    ///
+    /// # Errors
+    /// It is not to be executed.
+    fn remember(
+        &self,
+        drive: &DriveHandle,
+        operator: &Operator,
+        payload: &[u8],
+        id: Option<&Id>,
+        now: Instant,
+    ) -> Result<(watch::Sender<Option<CommandReply>>, OwnedSemaphorePermit), Known> {
+        let refused = |why: &str| Known::Refused(format!("{why}; nothing was written"));
+        let busy = || refused("too many commands wait for their results");
+        let permit = self.in_progress.clone().try_acquire_owned().map_err(|_| busy())?;
+        let (sender, reply) = watch::channel(None);
+        let Some(id) = id else {
+            return Ok((sender, permit));
+        };
+        let mut memory = self.memory.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+        let memory: &mut Memory<SharedReply> = &mut memory;
+        let topic = format!("{}/{}", operator.user, drive.image.spec.name);
+        let taken = Taken {
+            topic: &topic,
+            payload,
+            ..Taken::default()
+        };
+        let (print, stops) = (memory.fingerprint(&taken, Some(id.text())), drive.stops());
+        match memory.repeated(&taken, print, stops, now) {
+            None => {}
+            Some(Repetition::Answered(reply)) => return Err(Known::Reply(reply)),
+            // Replies are shared from the beginning, so none is pending.
+            Some(Repetition::Pending) => return Err(busy()),
+            Some(Repetition::Outdated(why)) => {
+                let why = format!("it repeats an earlier command, {why}; send it with another `id`");
+                return Err(Known::Refused(why));
+            }
+        }
+        if !memory.has_room(now) {
+            return Err(refused("too many commands with an `id` within ten minutes"));
+        }
+        let number = memory.remember(&taken, print, stops, now);
+        memory.finished(number, &reply);
+        Ok((sender, permit))
+    }
+}
+
+/// Why a command is not executed.
+enum Known {
+    /// It was, and this is its reply.
+    Reply(SharedReply),
+    Refused(String),
+}
+
+/// `GET /api/v1/drives/{name}/commands`: what can be commanded, and within which limits.
+pub(in crate::north::http) async fn commands_of(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    headers: header::HeaderMap,
+) -> Response {
+    let cookies = app.cookies(&reached);
+    let operator = match app.operating.operator(&headers, &cookies, reached.peer.ip()).await {
+        Ok(operator) => operator,
+        Err(denied) => return denied.into_response(),
+    };
+    match app.plant.load().drive(&name) {
+        Some(drive) => Json(description(&drive, &operator)).into_response(),
+        None => no_drive(&name, &app.plant.load()),
+    }
+}
+
+fn no_drive(name: &str, plant: &Plant) -> Response {
+    let known = plant.drives().map(|d| d.image.spec.name.clone());
+    not_found(format!("there is no drive `{name}`"), known.collect())
+}
+
+fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
+    let spec = &drive.image.spec;
+    let controlled = spec.access == Access::Control;
+    let writable = spec
+        .profile
+        .points
+        .iter()
+        .enumerate()
+        .filter(|(_, point)| controlled && point.write);
+    let points: Vec<Json_> = writable
+        .map(|(index, point)| {
+            let limits = spec.limits_of(index).map(std::ops::RangeInclusive::into_inner);
+            json!({
+                "name": point.name,
+                "kind": if point.kind() == Kind::Bool { "bool" } else { "number" },
+                "unit": point.unit,
+                "minimum": limits.map(|(low, _)| low).filter(|low| low.is_finite()),
+                "maximum": limits.map(|(_, high)| high).filter(|high| high.is_finite()),
+            })
+        })
+        .collect();
+    json!({
+        "drive": spec.name,
+        "points": points,
+        "lease_ms": spec.supervision.as_ref().map(|lease| u64::try_from(lease.timeout.as_millis()).unwrap_or(u64::MAX)),
+        "commanded_last": drive.commander().as_ref() == Some(&operator.login),
+    })
+}
+
+/// `POST /api/v1/drives/{name}/heartbeat`: renews the lease of a drive that this login commanded last.
+pub(in crate::north::http) async fn heartbeat(
+    State(app): State<Arc<AppState>>,
+    Extension(reached): Extension<Reached>,
+    Path(name): Path<String>,
+    headers: header::HeaderMap,
+) -> Response {
+    let cookies = app.cookies(&reached);
+    let operator = match app.operating.commander(&headers, &cookies, reached.peer.ip()).await {
+        Ok(operator) => operator,
+        Err(denied) => return denied.into_response(),
+    };
+    let plant = app.plant.load();
+    let Some(drive) = plant.drive(&name) else {
+        return no_drive(&name, &plant);
+    };
+    match renew(&drive, &operator, Instant::now()) {
+        Ok(()) => StatusCode::NO_CONTENT.into_response(),
+        Err(why) => {
+            let error = ErrorReply {
+                error: why.to_string(),
+                known: Vec::new(),
+            };
+            (StatusCode::CONFLICT, Json(error)).into_response()
+        }
+    }
+}
+
+/// Renews the lease of a drive, if the login commanded it last.
+///
+/// # Errors
+/// Why not.
+fn renew(drive: &DriveHandle, operator: &Operator, now: Instant) -> Result<(), &'static str> {
+    let spec = &drive.image.spec;
+    if spec.access != Access::Control {
+        return Err("the drive is only monitored; nothing was renewed");
+    }
+    if spec.supervision.is_none() {
+        return Err("the drive has no `supervision`, so there is no lease to renew");
+    }
+    match drive.commander() {
+        Some(login) if login == operator.login => {
+            drive.image.renew_lease(now);
+            Ok(())
+        }
+        _ => Err("this login was not the last to command the drive; nothing was renewed"),
+    }
+}
+
+#[cfg(test)]
+mod tests;

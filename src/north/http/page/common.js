@@ -1,0 +1,269 @@
+// What all views share: elements, figures, ages, and values with their quality. Texts reach the page as text nodes
+// only, never as markup.
+
+const OLDER_MS = 500;
+
+export const $ = (id) => document.getElementById(id);
+
+export function make(tag, className, ...children) {
+  const element = document.createElement(tag);
+  if (className) element.className = className;
+  element.append(...children);
+  return element;
+}
+
+/// An element of SVG.
+export function draw(tag, attributes = {}, ...children) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", tag);
+  for (const [name, value] of Object.entries(attributes)) element.setAttribute(name, value);
+  element.append(...children);
+  return element;
+}
+
+export function anchor(href, className, ...children) {
+  const element = make("a", className, ...children);
+  element.setAttribute("href", href);
+  return element;
+}
+
+/// A heading with an id of its own, and the section that it names.
+export function section(id, title, ...children) {
+  const heading = make("h2", "", title);
+  heading.id = `${id}-title`;
+  const element = make("section", "", heading, ...children);
+  element.setAttribute("aria-labelledby", heading.id);
+  return element;
+}
+
+// Updates only what changed, so that selections, focus and screen readers are not disturbed. What was set last is kept beside the
+// element: asking the document for it is most of what an update of a thousand rows would cost.
+export function text(element, value) {
+  if (element.lastText === value) return;
+  element.lastText = value;
+  element.textContent = value;
+}
+
+export function className(element, value) {
+  if (element.lastClass === value) return;
+  element.lastClass = value;
+  element.className = value;
+}
+
+export function hide(element, hidden) {
+  if (element.lastHidden === hidden) return;
+  element.lastHidden = hidden;
+  element.hidden = hidden;
+}
+
+function hint(element, value) {
+  if ((element.lastTitle ?? "") === value) return;
+  element.lastTitle = value;
+  element.title = value;
+}
+
+/// The width of a bar, a share of 0 to 1.
+export function fill(element, share) {
+  const width = `${Math.min(100, Math.abs(share) * 100).toFixed(1)}%`;
+  if (element.lastWidth === width) return;
+  element.lastWidth = width;
+  element.style.width = width;
+}
+
+export const words = (name) => name.replaceAll("_", " ");
+
+/// Links within the page.
+export const places = {
+  drive: (name) => `#/drive/${encodeURIComponent(name)}`,
+  line: (name) => `#/line/${encodeURIComponent(name)}`,
+  recording: (id) => `#/recording/${encodeURIComponent(id)}`,
+};
+
+const TITLES = { actual_speed: "Speed", output_frequency: "Frequency", motor_speed: "Motor", motor_current: "Current", motor_torque: "Torque",
+  motor_power: "Power", motor_voltage: "Voltage", dc_link_voltage: "DC link", heatsink_temperature: "Heatsink" };
+
+/// The heading of a point: short for those that are on every page.
+export const titleOf = (point) => TITLES[point] ?? words(point);
+
+const DECIMALS = { "Hz": 2, "%": 1, "A": 1, "V": 0, "rpm": 0, "°C": 0, "kWh": 0, "h": 0 };
+
+/// Digits after the point of a plot's figures.
+export const digitsOf = (unit) => DECIMALS[unit] ?? 0;
+
+export function figure(value, unit) {
+  if (value === true) return "yes";
+  if (value === false) return "no";
+  if (typeof value !== "number") return String(value);
+  const decimals = DECIMALS[unit];
+  if (decimals === undefined) return String(Math.round(value * 1000) / 1000);
+  return value.toFixed(decimals);
+}
+
+export function age(ms) {
+  if (ms === null || ms === undefined) return "never read";
+  if (ms < 1000) return `${Math.round(ms)} ms`;
+  if (ms < 60000) return `${(ms / 1000).toFixed(1)} s`;
+  if (ms < 3600000) return `${Math.floor(ms / 60000)} min`;
+  return `${Math.floor(ms / 3600000)} h`;
+}
+
+/// A duration in seconds, as hours and minutes.
+export function hours(seconds) {
+  if (seconds < 60) return `${Math.floor(seconds)} s`;
+  const minutes = Math.floor(seconds / 60);
+  return minutes < 60 ? `${minutes} min` : `${Math.floor(minutes / 60)} h ${minutes % 60} min`;
+}
+
+const two = (n) => String(n).padStart(2, "0");
+
+/// Time of day, with the date unless it is today's.
+export function clock(time) {
+  const today = new Date().toDateString() === time.toDateString();
+  const day = today ? "" : `${time.getFullYear()}-${two(time.getMonth() + 1)}-${two(time.getDate())} `;
+  return `${day}${two(time.getHours())}:${two(time.getMinutes())}:${two(time.getSeconds())}`;
+}
+
+export function stamp(time) {
+  const element = make("time", "", clock(time));
+  element.dateTime = time.toISOString();
+  return element;
+}
+
+/// Bytes, for people.
+export const size = (bytes) => (bytes < 1e6 ? `${Math.ceil(bytes / 1000)} kB` : `${(bytes / 1e6).toFixed(1)} MB`);
+
+// ---- States and qualities
+
+/// Colour and words of a state, and its rank in the list of drives.
+export const STATES = {
+  fault: ["red", "▲ fault", 0],
+  unknown: ["amber", "? unknown", 3],
+  offline: ["", "✕ offline", 3],
+  not_ready: ["amber", "◌ not ready", 3],
+  ready: ["blue", "● ready", 3],
+  running: ["green", "▶ running", 3],
+};
+
+export const stateOf = (drive) => drive.state || "unknown";
+
+const isGood = (point) => point !== undefined && point.quality === "good";
+
+export const isOn = (point) => isGood(point) && Boolean(point.value);
+
+export function badge(element, state) {
+  const [colour, word] = STATES[state] || ["", words(state)];
+  className(element, `badge ${colour}`);
+  text(element, word);
+}
+
+/// Code and text of the fault that is known for now; empty without one.
+export function faultOf(drive) {
+  const code = drive.points.fault_code;
+  if (!isOn(code)) return "";
+  return drive.fault_text === String(code.value) ? `fault ${code.value}` : `F${code.value} ${drive.fault_text}`;
+}
+
+/// What holds the drive, apart from the fault and being offline, which are told elsewhere.
+export function blockedOf(drive) {
+  return drive.blocked_by.filter((word) => word !== "fault" && word !== "offline").map(words).join(", ");
+}
+
+const QUALITY_TITLES = {
+  stale: (point) => `stale, ${age(point.age_ms)} old`,
+  bad: () => "bad: refused by the drive or never read",
+  contradicted: (point) => `read ${age(point.age_ms)} ago; a newer state says otherwise`,
+};
+
+const qualityOf = (point) => (!point ? "absent" : point.contradicted ? "contradicted" : point.quality);
+
+/// What is said beside a value about its age and quality.
+export function noteOf(point) {
+  const quality = qualityOf(point);
+  if (quality === "bad") return "bad";
+  const old = age(point.age_ms);
+  return { contradicted: `${old}, contradicted since`, good: old }[quality] ?? `stale, ${old}`;
+}
+
+/// A place for a value with its unit and, where it matters, its own age.
+export function valueCell(tag, name) {
+  const cell = { value: make("span", "value"), unit: make("span", "unit"), age: make("span", "sub age") };
+  cell.element = make(tag, name, cell.value, cell.unit, cell.age);
+  return cell;
+}
+
+/// `newest` is the age of the process data: a good value that is much older shows its own.
+export function showValue(cell, point, newest) {
+  const shown = Boolean(point) && point.value !== null;
+  const quality = qualityOf(point);
+  text(cell.value, shown ? (point.text ?? figure(point.value, point.unit)) : point ? "—" : "");
+  text(cell.unit, shown && point.unit && !point.text ? ` ${point.unit}` : "");
+  className(cell.value, `value ${quality === "good" ? "main" : quality}`);
+  hint(cell.value, point && QUALITY_TITLES[quality] ? QUALITY_TITLES[quality](point) : "");
+  if (newest === undefined) return;
+  const older = shown && point.age_ms !== null && (newest === null || point.age_ms > newest + OLDER_MS);
+  text(cell.age, older ? `${age(point.age_ms)} old` : "");
+}
+
+/// The share of the speed range, and the reference beside it. A value that is not good has no bar.
+export function speedBar() {
+  const bar = { fill: make("i"), reference: make("span", "sub") };
+  bar.element = make("span", "bar", bar.fill);
+  return bar;
+}
+
+export function showSpeed(bar, point, reference) {
+  hide(bar.element, !point);
+  const good = isGood(point) && !point.contradicted;
+  fill(bar.fill, good ? point.value / 100 : 0);
+  text(bar.reference, isGood(reference) ? `set ${figure(reference.value, reference.unit)} %` : "");
+}
+
+// ---- Lists
+
+/// Keeps one entry for each item, by name; an entry has an `element`.
+export function keyed(map, items, create, show) {
+  const names = new Set(items.map((item) => item.name));
+  for (const [name, entry] of map) {
+    if (names.has(name)) continue;
+    entry.element.remove();
+    map.delete(name);
+  }
+  for (const item of items) {
+    let entry = map.get(item.name);
+    if (!entry) map.set(item.name, (entry = create(item)));
+    show(entry, item);
+  }
+}
+
+/// Brings the children of `parent` into this order with few moves. The focus stays where it is.
+export function arrange(parent, wanted) {
+  const focused = document.activeElement;
+  let place = parent.firstElementChild;
+  let moved = false;
+  for (const element of wanted) {
+    if (element === place) {
+      place = place.nextElementSibling;
+    } else if (place && place.nextElementSibling === element) {
+      // What stood here belongs further down and is put there in its turn.
+      place = element.nextElementSibling;
+    } else {
+      parent.insertBefore(element, place);
+      moved = true;
+    }
+  }
+  if (moved && focused && focused !== document.activeElement && parent.contains(focused)) focused.focus({ preventScroll: true });
+}
+
+/// A table with headings, that can be scrolled by itself where it is wider than the page.
+export function table(caption, ...headings) {
+  const body = make("tbody");
+  const head = make("tr", "", ...headings.map((heading) => {
+    const cell = make("th", "", heading);
+    cell.scope = "col";
+    return cell;
+  }));
+  const element = make("div", "wide", make("table", "list", make("caption", "unseen", caption), make("thead", "", head), body));
+  element.tabIndex = 0;
+  element.setAttribute("role", "group");
+  element.setAttribute("aria-label", caption);
+  return { element, body };
+}

@@ -1,0 +1,262 @@
+// One drive: what it does and why, its trends, what the gateway counted, all its points, who commanded it, what happened, and how
+// well the line carries it.
+
+import {
+  age, anchor, badge, faultOf, figure, hide, hours, isOn, keyed, make, noteOf, places, section, showSpeed, showValue, size,
+  speedBar, stamp, stateOf, table, text, titleOf, valueCell, words,
+} from "./common.js";
+import { EVENT_COLOURS, eventList } from "./events.js";
+import { failures } from "./lines.js";
+import { minutes } from "./strips.js";
+import { trends } from "./trend.js";
+
+const SLOW_MS = 4000;
+const MAIN = ["actual_speed", "output_frequency", "motor_speed", "motor_current", "motor_torque", "motor_power", "dc_link_voltage",
+  "heatsink_temperature"];
+
+// The common model in groups; what a profile has beyond it follows by its kind.
+const GROUPS = [
+  ["State", ["ready", "running", "reversed", "fault", "warning", "at_reference", "zero_speed", "remote", "fault_code"]],
+  ["Process data", ["actual_speed", "output_frequency", "motor_speed", "motor_current", "motor_torque", "motor_power", "motor_voltage",
+    "dc_link_voltage", "heatsink_temperature"]],
+  ["Commands and references", ["run", "reverse", "fault_reset", "speed_reference", "frequency_reference"]],
+  ["Counters", ["energy", "operating_hours"]],
+];
+const OWN_BITS = "More states";
+const OWN = "More of this family";
+
+function groupOf(name, point) {
+  const group = GROUPS.find(([, names]) => names.includes(name));
+  if (group) return group[0];
+  return typeof point.value === "boolean" && !point.text ? OWN_BITS : OWN;
+}
+
+// ---- All points, grouped
+
+function pointList() {
+  const element = section("points", "Points");
+  const groups = new Map();
+  for (const name of [...GROUPS.map(([title]) => title), OWN_BITS, OWN]) {
+    const list = make("dl", "points");
+    const group = make("div", "group", make("h3", "", name), list);
+    groups.set(name, { group, list });
+    element.append(group);
+  }
+  const entries = new Map();
+  const create = ({ name, point }) => {
+    const entry = valueCell("dd", "");
+    entry.dd = entry.element;
+    entry.group = groupOf(name, point);
+    entry.element = make("div", "", make("dt", "", words(name)), entry.dd);
+    groups.get(entry.group).list.append(entry.element);
+    return entry;
+  };
+  return {
+    element,
+    show(points) {
+      // A reload may have given the drive another profile.
+      keyed(entries, Object.entries(points).map(([name, point]) => ({ name, point })), create, (entry, { name, point }) => {
+        const group = groupOf(name, point);
+        // A point that was never read has no kind yet.
+        if (group !== entry.group) groups.get((entry.group = group)).list.append(entry.element);
+        showValue(entry, point);
+        text(entry.age, noteOf(point));
+      });
+      for (const { group, list } of groups.values()) hide(group, list.childElementCount === 0);
+    },
+  };
+}
+
+// ---- What it does and why
+
+function causeText(cause) {
+  const since = cause.age_ms === null || cause.age_ms === undefined ? "" : ` (${age(cause.age_ms)} ago)`;
+  return [words(cause.cause), `${cause.evidence}${since}`, cause.remedy];
+}
+
+function whyPanel() {
+  const list = make("ul", "causes");
+  const element = section("why", "Why it does not run", list);
+  element.classList.add("panel", "why-panel");
+  return {
+    element,
+    show(causes) {
+      hide(element, causes.length === 0);
+      while (list.children.length > causes.length) list.lastChild.remove();
+      while (list.children.length < causes.length) list.append(make("li", "", make("b"), make("span", "evidence"), make("span", "remedy")));
+      causes.forEach((cause, place) => causeText(cause).forEach((part, at) => text(list.children[place].children[at], part)));
+    },
+  };
+}
+
+function figures() {
+  const element = make("dl", "figures");
+  const cells = MAIN.map((point) => {
+    const cell = { point, ...valueCell("dd", "") };
+    if (point === "actual_speed") {
+      cell.bar = speedBar();
+      cell.element.append(cell.bar.element, cell.bar.reference);
+    }
+    cell.box = make("div", "", make("dt", "", titleOf(point)), cell.element);
+    element.append(cell.box);
+    return cell;
+  });
+  return {
+    element,
+    show(drive) {
+      for (const cell of cells) {
+        const point = drive.points[cell.point];
+        hide(cell.box, !point);
+        showValue(cell, point, drive.age_ms);
+        if (cell.bar) showSpeed(cell.bar, point, drive.points.speed_reference);
+      }
+    },
+  };
+}
+
+function top(name) {
+  const parts = { badge: make("span", "badge"), warning: make("span", "tag amber", "! warning"), quality: make("span", "tag"), fault: make("p", "why"),
+    where: make("p", "where") };
+  parts.element = make("div", "top", make("p", "crumbs", anchor("#/", "", "Drives"), " › "), make("h1", "", name), parts.where, make("p", "state", parts.badge, " ", parts.warning, " ", parts.quality), parts.fault);
+  return parts;
+}
+
+function showTop(parts, drive) {
+  badge(parts.badge, stateOf(drive));
+  hide(parts.warning, !isOn(drive.points.warning));
+  const fault = faultOf(drive);
+  text(parts.fault, fault);
+  hide(parts.fault, !fault);
+  text(parts.quality, drive.age_ms === null ? "never read" : drive.quality === "good" ? `${age(drive.age_ms)} old` : `${drive.quality}, ${age(drive.age_ms)} old`);
+  const access = drive.access === "control" ? "may be commanded" : "is only read";
+  const line = anchor(places.line(drive.bus), "", drive.bus);
+  if (parts.known === JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access])) return;
+  parts.known = JSON.stringify([drive.bus, drive.address, drive.unit, drive.profile, access]);
+  parts.where.replaceChildren(line, ` · address ${drive.address} · Modbus TCP unit ${drive.unit} · ${drive.profile} · ${access}`);
+}
+
+// ---- What the gateway counted, and the line
+
+function factList(...titles) {
+  const values = new Map();
+  const element = make("dl", "facts");
+  for (const title of titles) {
+    const value = make("dd", "value");
+    values.set(title, value);
+    element.append(make("div", "", make("dt", "", title), value));
+  }
+  return { element, set: (title, value) => text(values.get(title), value) };
+}
+
+const counted = (value, unit) => (value === null || value === undefined ? "not known" : `${value}${unit}`);
+
+function showCounters(facts, drive) {
+  const { starts, running_seconds: running, energy_kwh: energy } = drive;
+  facts.set("Running", running === null || running === undefined ? "not known" : hours(running));
+  facts.set("Starts", counted(starts, ""));
+  facts.set("Energy", energy === null || energy === undefined ? "not known" : `${figure(energy, "kWh")} kWh`);
+}
+
+function showLine(facts, drive) {
+  const { ok, exception, timeout, corrupt } = drive.transactions;
+  const total = ok + exception + timeout + corrupt;
+  const share = total ? ` (${((100 * (timeout + corrupt)) / total).toFixed(2)} %)` : "";
+  facts.set("Online", `${drive.online ? "yes" : "no"}${drive.since ? `, since ${stamp(new Date(drive.since)).textContent}` : ""}`);
+  facts.set("Exchanges", String(total));
+  facts.set("Without a valid reply", `${timeout + corrupt}${share}`);
+  facts.set("Failures", failures(drive.transactions));
+  facts.set("Turnaround", drive.turnaround_ms === null ? "not known" : `${drive.turnaround_ms.toFixed(1)} ms`);
+}
+
+// ---- Commands, recordings
+
+function commandRow(record) {
+  const cells = [stamp(new Date(record.time)), record.command, words(record.source), record.client, `${words(record.result)}${record.count > 1 ? ` ×${record.count}` : ""}`,
+    `${record.latency_ms.toFixed(0)} ms`];
+  const row = make("tr", "", ...cells.map((cell) => make("td", "", cell)));
+  row.title = record.text;
+  return row;
+}
+
+function recordingRow(record) {
+  return make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.recording(record.id), "", words(record.trigger))),
+    make("td", "", record.summary), make("td", "n", size(record.bytes)));
+}
+
+/// A table that is filled anew only when what it shows has changed.
+function log(id, title, none, columns, row) {
+  const list = table(title, ...columns);
+  const note = make("p", "note", none);
+  let shown = null;
+  return {
+    element: section(id, title, list.element, note),
+    show(records) {
+      const state = JSON.stringify(records);
+      hide(list.element, records.length === 0);
+      hide(note, records.length > 0);
+      if (state === shown) return;
+      shown = state;
+      list.body.replaceChildren(...records.map(row));
+    },
+  };
+}
+
+// ---- The view
+
+export function open(root, { name }) {
+  const parts = {
+    top: top(name), figures: figures(), why: whyPanel(), trends: trends(name), points: pointList(), operate: make("div", "operate"),
+    counters: factList("Running", "Starts", "Energy"), line: factList("Online", "Exchanges", "Without a valid reply", "Failures", "Turnaround"),
+    commands: log("commands", "Commands", "No command to this drive is known.", ["Time", "Command", "By", "Client", "Result", "Took"], commandRow),
+    recordings: log("recordings", "Recordings", "There is no recording of this drive.", ["Time", "Trigger", "Summary", "Size"], recordingRow),
+    events: eventList(), strip: make("div", "strip-bars"),
+  };
+  parts.operate.dataset.operate = name;
+  const counters = section("counters", "Counted by the gateway", parts.counters.element);
+  const line = section("line", "Line", parts.line.element, make("p", "note", "Errors by minute, the last hour"), parts.strip);
+  const events = section("drive-events", "Events", parts.events.element, make("p", "note", anchor(`#/events?drive=${encodeURIComponent(name)}`, "", "All events of this drive")));
+  root.append(parts.top.element, parts.why.element, parts.operate, parts.figures.element, parts.trends.element,
+    make("div", "pair", counters, line), parts.points.element, parts.commands.element, make("div", "pair", events, parts.recordings.element));
+  window.Operate?.mount(parts.operate, name);
+  let slow = 0;
+
+  async function refreshSlow(load, drive) {
+    slow = performance.now() + SLOW_MS;
+    const named = `drive=${encodeURIComponent(name)}`;
+    const [events, commands, recordings, bus] = await Promise.all([
+      parts.events.load(load, { drive: name, limit: 20 }), load(`audit?${named}`), load("recordings"), load(`buses/${encodeURIComponent(drive.bus)}`),
+    ]);
+    parts.events.show(events);
+    // Starts and stops show in the curves.
+    const marked = events.filter((event) => ["red", "amber"].includes(EVENT_COLOURS[event.event]));
+    parts.marks = marked.map((event) => ({ t: Date.parse(event.time), colour: EVENT_COLOURS[event.event], text: event.text }));
+    parts.commands.show(commands.slice(-20).reverse());
+    parts.recordings.show(recordings.filter((record) => record.drive === name).slice(-20).reverse());
+    showMinutes(parts.strip, bus, name);
+  }
+
+  return {
+    title: name,
+    async refresh(load) {
+      const drive = await load(`drives/${encodeURIComponent(name)}`);
+      showTop(parts.top, drive);
+      parts.figures.show(drive);
+      parts.why.show(drive.why);
+      parts.points.show(drive.points);
+      showCounters(parts.counters, drive);
+      showLine(parts.line, drive);
+      window.Operate?.update(drive);
+      if (performance.now() >= slow) await refreshSlow(load, drive);
+      await parts.trends.refresh(load, parts.marks ?? []);
+      parts.trends.showNow(drive.points);
+    },
+  };
+}
+
+function showMinutes(place, bus, name) {
+  const own = bus.by_drive.find((item) => item.drive === name);
+  const state = JSON.stringify(own?.errors ?? null);
+  if (place.state === state) return;
+  place.state = state;
+  place.replaceChildren(own ? minutes(own.errors, "errors").svg : "");
+}

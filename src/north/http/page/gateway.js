@@ -1,0 +1,56 @@
+// Requests to the gateway, and whether it answers.
+
+import { $, className, clock, hide, text } from "./common.js";
+
+const LOST_MS = 3500;
+const FETCH_MS = 4000;
+
+/// The gateway answered that there is nothing of the kind, or that it cannot.
+export class Refused extends Error {
+  constructor(status, reply) {
+    super(reply.error || `status ${status}`);
+    this.status = status;
+    this.known = reply.known || [];
+  }
+}
+
+let lastGood = -Infinity;
+let lastGoodTime = null;
+let lost = null;
+
+/// JSON at `path`, below `api/v1/`. Throws `Refused` where the gateway answers that it has none.
+export async function load(path, limit = FETCH_MS) {
+  const reply = await fetch(`api/v1/${path}`, { headers: { Accept: "application/json" }, cache: "no-store", signal: AbortSignal.timeout(limit) });
+  if (reply.ok) return reply.json();
+  if (reply.status === 503) throw new Error(`${path}: 503`);
+  throw new Refused(reply.status, await reply.json().catch(() => ({})));
+}
+
+/// Everything on the page is of this moment.
+export function answered() {
+  lastGood = performance.now();
+  lastGoodTime = new Date();
+  show(false);
+}
+
+/// Looks whether the gateway was heard of lately; what is older is greyed.
+export function watch() {
+  if (performance.now() - lastGood > LOST_MS) show(true);
+}
+
+/// Forgets what was heard so far: a page that opens has some seconds for its first answer.
+export function begin() {
+  lastGood = performance.now();
+}
+
+function show(isLost) {
+  if (lost === isLost) return;
+  lost = isLost;
+  document.body.classList.toggle("lost", lost);
+  className($("link"), `pill ${lost ? "red" : "green"}`);
+  hide($("link"), false);
+  text($("link-text"), lost ? "Connection lost" : "Live");
+  const since = lastGoodTime ? `since ${clock(lastGoodTime)}` : "yet";
+  text($("banner"), lost ? `No connection to the gateway ${since}. What is shown below is old. Reconnecting…` : "");
+  hide($("banner"), !lost);
+}

@@ -1,0 +1,221 @@
+// Lines: load, cycles against their target, exchanges; errors of each drive over the last hour; how fast the drives answer.
+
+import { anchor, className, clock, fill, hide, keyed, make, places, section, stateOf, STATES, table, text, words } from "./common.js";
+import { Refused } from "./gateway.js";
+import { PlotGroup } from "./plot.js";
+import { histogram, strip } from "./strips.js";
+
+const RATE_MS = 5000;
+const DIAGNOSIS_MS = 10000;
+const FACTS = ["Line load", "Fast cycle", "Slow cycle", "Exchanges", "Errors", "Waiting", "Drives online"];
+/// Those of a line among others.
+export const FEW_FACTS = ["Line load", "Fast cycle", "Errors"];
+
+const short = (ms) => (ms >= 1000 ? `${(ms / 1000).toFixed(2).replace(/\.?0+$/, "")} s` : `${Number(ms.toPrecision(3))} ms`);
+
+function showCycle(element, cadence, up) {
+  const known = up && cadence.cycle_ms !== null;
+  const late = known && cadence.cycle_ms > 1.2 * cadence.aim_ms;
+  text(element, `${known ? short(cadence.cycle_ms) : "—"} (aim ${short(cadence.aim_ms)})${late ? " ! late" : ""}`);
+  className(element, late ? "value slow" : "value");
+}
+
+// Rate over the last seconds, from the counters.
+function rate(facts, bus) {
+  const now = performance.now();
+  facts.history = (facts.history || []).filter((past) => now - past.at < RATE_MS && past.count <= bus.transactions);
+  const oldest = facts.history[0];
+  facts.history.push({ at: now, count: bus.transactions });
+  if (!oldest || now === oldest.at) return `${bus.transactions} in total`;
+  return `${Math.round((1000 * (bus.transactions - oldest.count)) / (now - oldest.at))} /s`;
+}
+
+/// Figures of a line.
+function busFacts(titles = FACTS) {
+  const facts = { badge: make("span", "badge"), where: make("p", "where"), why: make("p", "why"), fill: make("i"), values: {} };
+  facts.list = make("dl");
+  for (const title of titles) {
+    facts.values[title] = make("dd", "value");
+    facts.list.append(make("div", "", make("dt", "", title), facts.values[title]));
+  }
+  facts.bar = make("span", "bar", facts.fill);
+  return facts;
+}
+
+function showFacts(facts, bus) {
+  const up = bus.state === "up";
+  text(facts.badge, up ? "● up" : bus.tried ? "✕ down" : "◌ opening");
+  className(facts.badge, `badge ${up ? "green" : bus.tried ? "red" : "amber"}`);
+  text(facts.where, `${bus.port} · ${bus.protocol} · ${bus.baud} ${bus.format}`);
+  text(facts.why, bus.reason || "");
+  hide(facts.why, !bus.reason);
+  const known = up && bus.load_ratio !== null;
+  fill(facts.fill, known ? bus.load_ratio : 0);
+  const set = (title, value) => facts.values[title] && text(facts.values[title], value);
+  set("Line load", known ? `${(bus.load_ratio * 100).toFixed(1)} %` : "—");
+  showCycle(facts.values["Fast cycle"], bus.fast, up);
+  if (facts.values["Slow cycle"]) showCycle(facts.values["Slow cycle"], bus.slow, up);
+  set("Exchanges", rate(facts, bus));
+  const errors = bus.transactions ? ` (${((100 * bus.errors) / bus.transactions).toFixed(2)} %)` : "";
+  set("Errors", `${bus.errors}${errors}`);
+  set("Waiting", String(bus.queue_depth));
+  set("Drives online", `${bus.online} of ${bus.drives}`);
+}
+
+/// A card for each line, with a heading of that level; the states of its drives in words. `address`: of the drives of a line; `titles`: its
+/// figures.
+export function busCards(level, address, titles) {
+  const cards = new Map();
+  const element = make("div", "cards");
+  const create = ({ name }) => {
+    const card = { facts: busFacts(titles), states: make("a", "states") };
+    card.states.setAttribute("href", address(name));
+    card.element = make("article", "card", make(level, "", anchor(places.line(name), "", name), card.facts.badge), card.facts.where, card.facts.why,
+      make("p", "tally", card.states), card.facts.bar, card.facts.list);
+    element.append(card.element);
+    return card;
+  };
+  return {
+    element,
+    show(buses, drives) {
+      const counts = new Map();
+      for (const drive of drives) {
+        const own = counts.get(drive.bus) ?? counts.set(drive.bus, new Map()).get(drive.bus);
+        own.set(stateOf(drive), (own.get(stateOf(drive)) ?? 0) + 1);
+      }
+      keyed(cards, buses, create, (card, bus) => {
+        showFacts(card.facts, bus);
+        const own = counts.get(bus.name) ?? new Map();
+        const told = Object.keys(STATES).filter((state) => own.has(state));
+        text(card.states, told.map((state) => `${STATES[state][1][0]} ${own.get(state)} ${words(state)}`).join(" · ") || "no drives");
+      });
+    },
+  };
+}
+
+/// All lines.
+export function open(root) {
+  const cards = busCards("h2", (bus) => `#/?bus=${encodeURIComponent(bus)}`);
+  root.append(make("h1", "", "Lines"), cards.element);
+  return {
+    title: "Lines",
+    async refresh(load) {
+      const [buses, drives] = await Promise.all([load("buses"), load("drives?points=")]);
+      cards.show(buses, drives);
+    },
+  };
+}
+
+// What the gateway has not or may not tell is left out.
+async function optional(reply) {
+  try {
+    return await reply;
+  } catch (error) {
+    if (error instanceof Refused) return null;
+    throw error;
+  }
+}
+
+/// What the gateway found wrong with the line, with what shows it and what to do.
+function diagnosisPanel() {
+  const list = make("ul", "causes");
+  const note = make("p", "note");
+  const element = section("diagnosis", "Diagnosis", list, note);
+  element.classList.add("panel", "why-panel");
+  const item = ({ verdict, drive, certainty, meaning, evidence, remedy }) => {
+    const about = drive ? [" ", anchor(places.drive(drive), "", drive)] : [];
+    return make("li", "", make("b", "", words(verdict), ...about), make("span", "evidence", `${meaning} (${certainty}): ${evidence}`), make("span", "remedy", remedy));
+  };
+  return {
+    element,
+    /// `null` where the gateway makes none.
+    show(found) {
+      hide(element, found === null);
+      const state = JSON.stringify(found?.verdicts ?? []);
+      text(note, found?.verdicts.length ? "" : found?.time ? "Nothing wrong is seen on this line." : "Not made yet.");
+      if (state === element.state) return;
+      element.state = state;
+      list.replaceChildren(...(found?.verdicts ?? []).map(item));
+    },
+  };
+}
+
+/// The row of a drive in the table of its line.
+function memberRow(body) {
+  return ({ name }) => {
+    const row = { state: make("td"), total: make("td", "n"), errors: make("td"), turnaround: make("td", "n") };
+    row.element = make("tr", "", make("td", "", anchor(places.drive(name), "", name)), row.state, row.total, row.errors, row.turnaround);
+    body.append(row.element);
+    return row;
+  };
+}
+
+function showMember(row, drive) {
+  const { ok, exception, timeout, corrupt } = drive.transactions;
+  text(row.state, STATES[stateOf(drive)]?.[1] ?? words(drive.state));
+  text(row.total, String(ok + exception + timeout + corrupt));
+  text(row.errors, failures(drive.transactions));
+  text(row.turnaround, drive.turnaround_ms === null ? "—" : `${drive.turnaround_ms.toFixed(1)} ms`);
+}
+
+/// The failed exchanges by what happened.
+export function failures({ timeout, corrupt, exception }) {
+  const told = [[timeout, "timeout"], [corrupt, "corrupt"], [exception, "exception"]].filter(([count]) => count > 0);
+  return told.map(([count, what]) => `${count} ${what}`).join(", ") || "none";
+}
+
+/// Load and fast cycle of the last hour, the cycle against what was aimed at.
+function lastHour() {
+  const group = new PlotGroup({ name: "Cursor of load and cycle", moment: (t) => clock(new Date(t)), label: (t) => clock(new Date(t)).slice(-8, -3) });
+  const load = group.add({ title: "Line load", unit: "%", digits: 1 });
+  const cycle = group.add({ title: "Fast cycle", unit: "ms", digits: 1 });
+  return {
+    element: group.element,
+    show({ hour, fast }) {
+      const step = hour.step_s * 1000;
+      const from = Date.parse(hour.from);
+      const samples = (steps, factor) => steps.map((figures, place) => figures && { t: from + (place + 0.5) * step, low: figures[0] * factor, high: figures[1] * factor, value: figures[2] * factor });
+      group.setRange(from, from + step * hour.load_ratio.length, step);
+      load.show(samples(hour.load_ratio, 100), { reach: 1.5 * step, includes: [0, 100] });
+      cycle.show(samples(hour.fast_cycle_ms, 1), { reach: 1.5 * step, aim: fast.aim_ms, includes: [0, 1.2 * fast.aim_ms] });
+      group.moved();
+    },
+  };
+}
+
+/// One line.
+export function openLine(root, { name }) {
+  const facts = busFacts();
+  const strips = make("div", "strips");
+  const answers = make("div", "histogram");
+  const drives = table("Drives of this line", "Drive", "State", "Exchanges", "Errors", "Turnaround");
+  const diagnosis = diagnosisPanel();
+  const unknown = make("p", "note");
+  const card = make("article", "card", make("p", "state", facts.badge), facts.where, facts.why, facts.bar, facts.list, unknown);
+  const hour = lastHour();
+  root.append(make("h1", "", `Line ${name}`), card, diagnosis.element, section("hour", "Load and cycle, the last hour", hour.element), section("errors", "Errors by drive, the last hour", strips),
+    section("turnaround", "How fast the drives answer", answers), section("members", "Drives", drives.element));
+  diagnosis.show(null);
+  let nextDiagnosis = 0;
+  const rows = new Map();
+  const create = memberRow(drives.body);
+  return {
+    title: `Line ${name}`,
+    async refresh(load) {
+      const path = `buses/${encodeURIComponent(name)}`;
+      const [bus, all] = await Promise.all([load(path), load("drives?points=")]);
+      showFacts(facts, bus);
+      hide(unknown, !bus.unknown_drives?.length);
+      text(unknown, `Answer on this line without an entry in the configuration: addresses ${(bus.unknown_drives ?? []).join(", ")}.`);
+      strip(strips, bus.by_drive);
+      histogram(answers, bus.turnaround);
+      hour.show(bus);
+      const members = all.filter((drive) => drive.bus === name);
+      keyed(rows, members, create, showMember);
+      if (performance.now() >= nextDiagnosis) {
+        nextDiagnosis = performance.now() + DIAGNOSIS_MS;
+        diagnosis.show(await optional(load(`${path}/diagnosis`)));
+      }
+    },
+  };
+}

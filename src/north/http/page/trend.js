@@ -1,0 +1,87 @@
+// Trends of a drive: what the gateway keeps in memory of its points, over 10 minutes, an hour or a day.
+
+import { anchor, clock, digitsOf, figure, hide, make, section, text, titleOf } from "./common.js";
+import { PlotGroup } from "./plot.js";
+
+const MINUTE = 60000;
+// Words, the time as the gateway takes it, and how often what it shows changes.
+const SPANS = [["10 min", "10min", 2000], ["1 h", "1h", 5000], ["24 h", "24h", 60000]];
+// The frequency takes the place of a speed that the family lacks.
+const SHOWN = [["actual_speed", "output_frequency"], ["motor_current"], ["motor_torque"], ["motor_power"], ["dc_link_voltage"], ["heatsink_temperature"]];
+
+/// Samples of the interface as a plot takes them: each in the middle of its step, `null` where there was no good value.
+export function samplesOf({ samples, step_s: step }) {
+  return samples.map((sample) => sample && { t: sample[0] + step * 500, low: sample[1], high: sample[2], value: sample[3] });
+}
+
+const nowOf = (point) => {
+  if (!point || point.value === null) return "—";
+  return point.quality === "good" && !point.contradicted ? `${figure(point.value, point.unit)} ${point.unit}` : "not good";
+};
+
+/// The trends of one drive; `marks` are its events.
+export function trends(drive) {
+  const chosen = { span: SPANS[0], points: null, next: 0 };
+  const plots = new Map();
+  const group = new PlotGroup({
+    name: "Cursor of the trends", moment: (t) => clock(new Date(t)),
+    label: (t, step) => clock(new Date(t)).slice(-8, step < MINUTE ? undefined : -3),
+  });
+  const buttons = SPANS.map((span) => {
+    const button = make("button", "chip", span[0]);
+    button.type = "button";
+    button.addEventListener("click", () => choose(span));
+    return button;
+  });
+  const files = make("p", "note files");
+  const note = make("p", "note", "Loading …");
+  const choices = make("div", "choices", ...buttons);
+  choices.setAttribute("role", "group");
+  choices.setAttribute("aria-label", "Time shown");
+  const element = section("trends", "Trends", choices, note, group.element, files);
+  const address = (points, span) => `drives/${encodeURIComponent(drive)}/trend?${points}${span ? `&from=${span[1]}` : ""}`;
+
+  function choose(span) {
+    chosen.span = span;
+    chosen.next = 0;
+    buttons.forEach((button, place) => button.setAttribute("aria-pressed", String(SPANS[place] === span)));
+    for (const plot of plots.values()) plot.show([]);
+  }
+
+  function create(points) {
+    const first = (names) => names.map((name) => points.find(({ point }) => point === name)).find(Boolean);
+    chosen.points = SHOWN.map(first).filter(Boolean);
+    for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit) }));
+  }
+
+  function linkFiles(span) {
+    const links = chosen.points.flatMap(({ point }) => [" ", anchor(`api/v1/${address(`point=${point}`, span)}&format=csv`, "", titleOf(point))]);
+    files.replaceChildren("As CSV: ", anchor(`api/v1/${address("", span)}&format=csv`, "", "all"), ...links);
+  }
+
+  choose(SPANS[0]);
+  return {
+    element,
+    /// What the plots say while their cursor rests.
+    showNow(points) {
+      for (const [name, plot] of plots) plot.now(nowOf(points[name]));
+    },
+    async refresh(load, marks) {
+      if (performance.now() < chosen.next) return;
+      const span = chosen.span;
+      if (!chosen.points) create((await load(address(""))).points);
+      // In one request, so that all have the same times; one alone comes without a list.
+      const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}`, span))].flat() : [];
+      if (span !== chosen.span) return;
+      chosen.next = performance.now() + span[2];
+      text(note, replies.length ? "" : "This family has none of the points that are kept.");
+      hide(note, replies.length > 0);
+      if (!replies.length) return;
+      const step = replies[0].step_s * 1000;
+      group.setRange(Date.parse(replies[0].from), Date.parse(replies[0].to), step);
+      for (const reply of replies) plots.get(reply.point).show(samplesOf(reply), { reach: 1.5 * step, marks });
+      group.moved();
+      linkFiles(span);
+    },
+  };
+}

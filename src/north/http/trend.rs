@@ -1,0 +1,236 @@
+//! `GET /api/v1/drives/{drive}/trend`: what the values of a drive were.
+
+use std::fmt::Write as _;
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use axum::Json;
+use axum::extract::{Path, RawQuery, State};
+use axum::http::{StatusCode, header};
+use axum::response::{IntoResponse, Response};
+use serde::{Serialize, Serializer};
+
+use super::query::{self, QueryError};
+use super::routes::{AppState, no_drive, not_found};
+use crate::drive::ModelPoint;
+use crate::history::trend::{DriveTrend, POINTS, Part, RANGES, Range, Step};
+use crate::history::{Clock, DriveHistory};
+
+/// Shown without `from`.
+const SHOWN: Duration = Duration::from_secs(600);
+
+/// What a client wants to see.
+#[derive(Debug, PartialEq)]
+struct Wanted {
+    /// None: only which points there are.
+    points: Vec<String>,
+    from: SystemTime,
+    to: SystemTime,
+    csv: bool,
+}
+
+impl Wanted {
+    fn of(query: Option<&str>, now: SystemTime) -> Result<Wanted, QueryError> {
+        let [point, from, to, format] = query::parameters(query, &["point", "from", "to", "format"])?;
+        let time = |name, value: Option<String>, otherwise| {
+            value.map_or(Ok(otherwise), |value| query::time(name, &value, now))
+        };
+        let to_text = to.clone().unwrap_or_default();
+        let to = time("to", to, now)?.min(now);
+        let from = time("from", from, to.checked_sub(SHOWN).unwrap_or(to))?;
+        // There is nothing older.
+        let [.., Range { span, .. }] = RANGES;
+        let from = now.checked_sub(span).map_or(from, |oldest| from.max(oldest));
+        if from > to {
+            return Err(QueryError::Value {
+                name: "to",
+                value: to_text,
+                expected: "it must be later than `from`, and `from` not in the future",
+            });
+        }
+        let csv = match format.as_deref() {
+            None | Some("json") => false,
+            Some("csv") => true,
+            Some(other) => {
+                return Err(QueryError::Value {
+                    name: "format",
+                    value: other.to_string(),
+                    expected: "it is `json` or `csv`",
+                });
+            }
+        };
+        let mut points: Vec<String> = Vec::new();
+        for point in point.iter().flat_map(|points| points.split(',')).map(str::trim) {
+            // Once each, so that a reply is bounded whatever is asked for.
+            if !point.is_empty() && points.iter().all(|known| known != point) {
+                points.push(point.to_string());
+            }
+        }
+        Ok(Wanted { points, from, to, csv })
+    }
+}
+
+/// The trends of one drive: without `point` which there are, with one of them an object, with several a list of these.
+pub(super) async fn trend(
+    State(app): State<Arc<AppState>>,
+    Path(name): Path<String>,
+    RawQuery(query): RawQuery,
+) -> Response {
+    let plant = app.plant.load();
+    let Some(drive) = plant.drive(&name) else {
+        return no_drive(&plant, &name);
+    };
+    let clock = Clock::read();
+    let wanted = match Wanted::of(query.as_deref(), clock.wall) {
+        Ok(wanted) => wanted,
+        Err(error) => return (StatusCode::BAD_REQUEST, Json(error.reply())).into_response(),
+    };
+    let _turn = app.turn().await;
+    let history = plant.history.drive(&name);
+    let profile = &drive.image.spec.profile;
+    let has = |point: &&ModelPoint| profile.model_index(**point).is_some();
+    let known: Vec<ModelPoint> = POINTS.iter().filter(has).copied().collect();
+    let mut points = Vec::new();
+    for name in &wanted.points {
+        let Some(point) = known.iter().find(|point| point.name() == name) else {
+            let known = known.iter().map(|point| point.name().to_string()).collect();
+            let drive = &drive.image.spec.name;
+            return not_found(format!("no trend of `{name}` is kept of drive `{drive}`"), known);
+        };
+        points.push(*point);
+    }
+    let every = points.is_empty() && wanted.csv;
+    let points = if every { &known } else { &points };
+    let [from, to] = [wanted.from, wanted.to].map(|at| clock.instant_at(at));
+    let part = |trend: &DriveTrend, point: &ModelPoint| trend.part(*point, from, to, clock);
+    let parts: Vec<Part> = match &history {
+        Some(history) => {
+            let trend = history.trend();
+            points.iter().filter_map(|point| part(&trend, point)).collect()
+        }
+        // Its bus is being started.
+        None => {
+            let nothing = DriveTrend::new(profile, clock);
+            points.iter().filter_map(|point| part(&nothing, point)).collect()
+        }
+    };
+    if wanted.csv {
+        let csv = [(header::CONTENT_TYPE, "text/csv; charset=utf-8")];
+        return (csv, text(&parts)).into_response();
+    }
+    match (&parts[..], &wanted.points[..]) {
+        (_, []) => Json(Kept::new(&name, history.as_deref(), &known)).into_response(),
+        ([part], [_]) => Json(Trend { drive: &name, part }).into_response(),
+        _ => {
+            let all: Vec<_> = parts.iter().map(|part| Trend { drive: &name, part }).collect();
+            Json(all).into_response()
+        }
+    }
+}
+
+/// Which trends there are.
+#[derive(Debug, Serialize)]
+struct Kept<'d> {
+    drive: &'d str,
+    ranges: Vec<KeptRange>,
+    points: Vec<KeptPoint>,
+}
+
+#[derive(Debug, Serialize)]
+struct KeptRange {
+    span_s: u64,
+    step_s: u64,
+}
+
+#[derive(Debug, Serialize)]
+struct KeptPoint {
+    point: &'static str,
+    unit: &'static str,
+    /// Memory it takes.
+    bytes: usize,
+}
+
+impl<'d> Kept<'d> {
+    fn new(drive: &'d str, history: Option<&DriveHistory>, known: &[ModelPoint]) -> Kept<'d> {
+        let bytes: Vec<_> = history.map_or_else(Vec::new, |history| history.trend().points().collect());
+        let of = |point: ModelPoint| bytes.iter().find(|(known, _)| *known == point).map_or(0, |(_, b)| *b);
+        let range = |range: Range| KeptRange {
+            span_s: range.span.as_secs(),
+            step_s: range.step.as_secs(),
+        };
+        let point = |point: &ModelPoint| KeptPoint {
+            point: point.name(),
+            unit: point.unit(),
+            bytes: of(*point),
+        };
+        Kept {
+            drive,
+            ranges: RANGES.into_iter().map(range).collect(),
+            points: known.iter().map(point).collect(),
+        }
+    }
+}
+
+/// The trend of one point.
+#[derive(Debug)]
+struct Trend<'p> {
+    drive: &'p str,
+    part: &'p Part,
+}
+
+impl Serialize for Trend<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        #[derive(Serialize)]
+        struct Shown<'p> {
+            drive: &'p str,
+            point: &'p str,
+            unit: &'p str,
+            step_s: u64,
+            #[serde(serialize_with = "crate::event::rfc3339")]
+            from: SystemTime,
+            #[serde(serialize_with = "crate::event::rfc3339")]
+            to: SystemTime,
+            samples: Vec<Option<(u64, f32, f32, f32)>>,
+        }
+        let part = self.part;
+        let sample = |step: &Option<Step>| step.map(|Step { at, min, max, last }| (at, min, max, last));
+        Shown {
+            drive: self.drive,
+            point: part.point,
+            unit: part.unit,
+            step_s: part.step.as_secs(),
+            from: part.from,
+            to: part.to,
+            samples: part.steps.iter().map(sample).collect(),
+        }
+        .serialize(serializer)
+    }
+}
+
+/// RFC 4180 with a header line: a line for each step, three columns for each point.
+fn text(parts: &[Part]) -> String {
+    let mut text = "time".to_string();
+    for part in parts {
+        for column in ["min", "max", "last"] {
+            // Writing to a string cannot fail.
+            let _ = write!(text, ",{} {column} [{}]", part.point, part.unit);
+        }
+    }
+    text.push_str("\r\n");
+    let Some(first) = parts.first() else { return text };
+    let mut at = first.from;
+    for number in 0..first.steps.len() {
+        let _ = write!(text, "{}", humantime::format_rfc3339_millis(at));
+        at += first.step;
+        for part in parts {
+            match part.steps.get(number).copied().flatten() {
+                Some(Step { min, max, last, .. }) => {
+                    let _ = write!(text, ",{min},{max},{last}");
+                }
+                None => text.push_str(",,,"),
+            }
+        }
+        text.push_str("\r\n");
+    }
+    text
+}

@@ -1,0 +1,264 @@
+//! The users who may command over HTTP: what a users file says, and whose password is right.
+//!
+//! Passwords are chosen by people, so the file holds Argon2id hashes: each guess costs time and memory.
+
+use std::fmt;
+use std::str::FromStr;
+
+use argon2::password_hash::{PasswordHash, PasswordHasher, PasswordVerifier, SaltString};
+use argon2::{Algorithm, Argon2, Params, Version};
+use ring::rand::{SecureRandom, SystemRandom};
+
+use super::tokens::{entries, is_name};
+
+/// Memory of a hash, KiB: 12 MiB are there on a small board too, once at a time.
+const MEMORY: u32 = 12 * 1024;
+/// Passes over it. With this memory, the least that OWASP recommends for Argon2id.
+const PASSES: u32 = 3;
+/// What the file may ask for at most: memory in KiB, passes and lanes. More would let a file stall the gateway.
+const MOST_COST: (u32, u32, u32) = (64 * 1024, 16, 4);
+/// Bytes of a salt.
+const SALT: usize = 16;
+/// Least number of characters of a password.
+pub const MIN_PASSWORD: usize = 10;
+/// Most bytes of a password.
+pub const MAX_PASSWORD: usize = 256;
+/// Most users of a file.
+const MOST: usize = 100;
+
+/// A line of the file. Displayed as that line.
+#[derive(Clone, PartialEq, Eq)]
+pub struct User {
+    /// Unique in the file.
+    pub name: String,
+    /// In the string format of password hashes, with salt and parameters.
+    hash: String,
+}
+
+/// Why a line is not a user, or a password cannot be one.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum UserError {
+    /// Not two words.
+    #[error("not `name hash`")]
+    Form,
+    /// A name of other characters, or a long one.
+    #[error("`{0}` is not a name of at most 64 letters, digits, `-`, `_` and `.`")]
+    Name(String),
+    /// A name that another line has.
+    #[error("there are two users named `{0}`")]
+    Repeated(String),
+    /// Not a hash of Argon2id, or one that is too expensive.
+    #[error("the hash is not one of Argon2id with at most 64 MiB, 16 passes and 4 lanes")]
+    Hash,
+    /// More lines than any plant needs.
+    #[error("there are more than {MOST} users")]
+    Many,
+    /// A password that is easily guessed, or no text.
+    #[error(
+        "a password has at least {MIN_PASSWORD} characters, at most {MAX_PASSWORD} bytes and no control characters"
+    )]
+    Password,
+    /// The system does not provide them.
+    #[error("the system has no random numbers")]
+    Random,
+}
+
+impl User {
+    /// A user with that password, whose hash has a new salt.
+    ///
+    /// # Errors
+    /// The name is not one, the password is too short or too long, or the system has no random numbers.
+    pub fn new(name: &str, password: &str) -> Result<User, UserError> {
+        let long_enough = password.chars().count() >= MIN_PASSWORD && password.len() <= MAX_PASSWORD;
+        if !long_enough || password.chars().any(char::is_control) {
+            return Err(UserError::Password);
+        }
+        let mut salt = [0; SALT];
+        SystemRandom::new().fill(&mut salt).map_err(|_| UserError::Random)?;
+        let salt = SaltString::encode_b64(&salt).map_err(|_| UserError::Hash)?;
+        let params = Params::new(MEMORY, PASSES, 1, None).map_err(|_| UserError::Hash)?;
+        let argon2 = Argon2::new(Algorithm::Argon2id, Version::V0x13, params);
+        let hash = argon2.hash_password(password.as_bytes(), &salt);
+        Ok(User {
+            name: checked_name(name)?,
+            hash: hash.map_err(|_| UserError::Hash)?.to_string(),
+        })
+    }
+
+    /// The hash, in which name and parameters of the function and the salt stand too.
+    pub(super) fn hash(&self) -> &str {
+        &self.hash
+    }
+}
+
+/// Whether this is the password behind that hash. Takes as long as the hash asks for, whatever the password.
+pub(super) fn is_password(hash: &str, password: &str) -> bool {
+    let Ok(hash) = PasswordHash::new(hash) else {
+        return false;
+    };
+    Argon2::default().verify_password(password.as_bytes(), &hash).is_ok()
+}
+
+/// Whether that is a hash that may be computed.
+fn is_affordable(hash: &str) -> bool {
+    let Ok(hash) = PasswordHash::new(hash) else {
+        return false;
+    };
+    let (memory, passes, lanes) = MOST_COST;
+    let fits = |p: Params| p.m_cost() <= memory && p.t_cost() <= passes && p.p_cost() <= lanes;
+    let complete = hash.salt.is_some() && hash.hash.is_some();
+    complete && hash.algorithm == Algorithm::Argon2id.ident() && Params::try_from(&hash).is_ok_and(fits)
+}
+
+impl fmt::Debug for User {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_tuple("User").field(&self.name).finish()
+    }
+}
+
+impl fmt::Display for User {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{} {}", self.name, self.hash)
+    }
+}
+
+impl FromStr for User {
+    type Err = UserError;
+
+    fn from_str(line: &str) -> Result<User, UserError> {
+        let mut words = line.split_whitespace();
+        let (Some(name), Some(hash), None) = (words.next(), words.next(), words.next()) else {
+            return Err(UserError::Form);
+        };
+        match is_affordable(hash) {
+            true => Ok(User {
+                name: checked_name(name)?,
+                hash: hash.to_string(),
+            }),
+            false => Err(UserError::Hash),
+        }
+    }
+}
+
+fn checked_name(name: &str) -> Result<String, UserError> {
+    match is_name(name) {
+        true => Ok(name.to_string()),
+        false => Err(UserError::Name(name.chars().take(64).collect())),
+    }
+}
+
+/// The users of a file.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Users(Vec<User>);
+
+impl Users {
+    /// Reads the text of a file: a user a line; empty lines and lines that begin with `#` are ignored.
+    ///
+    /// # Errors
+    /// The first bad line, counted from 1, and why.
+    pub fn parse(text: &str) -> Result<Users, (usize, UserError)> {
+        let mut users: Vec<User> = Vec::new();
+        for (line, text) in entries(text) {
+            let user: User = text.parse().map_err(|error| (line, error))?;
+            if users.iter().any(|other| other.name == user.name) {
+                return Err((line, UserError::Repeated(user.name)));
+            }
+            if users.len() >= MOST {
+                return Err((line, UserError::Many));
+            }
+            users.push(user);
+        }
+        Ok(Users(users))
+    }
+
+    /// All of them, in the order of the file.
+    pub fn list(&self) -> &[User] {
+        &self.0
+    }
+
+    /// The user of that name.
+    pub(super) fn find(&self, name: &str) -> Option<&User> {
+        self.0.iter().find(|user| user.name == name)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    /// The test vector of the reference implementation: Argon2id, 64 MiB, 2 passes, "password", "somesalt".
+    const FOREIGN: &str = "$argon2id$v=19$m=65536,t=2,p=1$c29tZXNhbHQ$CTFhFdXPJO1aFaMaO6Mm5c8y7cJHAph8ArZWb2GRPPc";
+
+    #[test]
+    fn the_hash_is_that_of_other_programs() {
+        let users = Users::parse(&format!("# users\n\nalice {FOREIGN}\r\n")).unwrap();
+        let alice = users.find("alice").unwrap();
+        assert!(is_password(alice.hash(), "password"));
+        assert!(!is_password(alice.hash(), "Password") && !is_password(alice.hash(), ""));
+    }
+
+    #[test]
+    fn a_new_user_is_found_again_and_the_file_has_no_password() {
+        let one = User::new("alice", "correct horse").unwrap();
+        let two = User::new("bob", "correct horse").unwrap();
+        assert_ne!(one.hash(), two.hash(), "each has a salt of its own");
+        let text = format!("{one}\n{two}\n");
+        assert!(!text.contains("horse") && text.contains("$argon2id$v=19$m=12288,t=3,p=1$"));
+        assert!(!format!("{one:?}").contains("argon2"), "hashes do not get into logs");
+        let users = Users::parse(&text).unwrap();
+        assert!(is_password(users.find("bob").unwrap().hash(), "correct horse"));
+        assert!(!is_password(users.find("bob").unwrap().hash(), "correct horse "));
+        assert!(users.find("carol").is_none());
+        for (name, password, error) in [
+            ("alice", "too short", UserError::Password),
+            ("alice", "ten\ncharacters", UserError::Password),
+            ("alice", &*"x".repeat(MAX_PASSWORD + 1), UserError::Password),
+            ("a b", "correct horse", UserError::Name("a b".to_string())),
+        ] {
+            assert_eq!(User::new(name, password), Err(error), "{name} {password}");
+        }
+    }
+
+    #[test]
+    fn bad_lines() {
+        let with = |parameters: &str| FOREIGN.replace("m=65536,t=2,p=1", parameters);
+        for (text, line, error) in [
+            ("alice".to_string(), 1, UserError::Form),
+            (format!("alice {FOREIGN} x"), 1, UserError::Form),
+            (format!("#\na/b {FOREIGN}"), 2, UserError::Name("a/b".to_string())),
+            (format!("alice {}", &FOREIGN[1..]), 1, UserError::Hash),
+            (
+                format!("alice {}", FOREIGN.replace("argon2id", "argon2i")),
+                1,
+                UserError::Hash,
+            ),
+            (
+                format!("alice {}", FOREIGN.rsplit_once('$').unwrap().0),
+                1,
+                UserError::Hash,
+            ),
+            (format!("alice {}", with("m=65537,t=2,p=1")), 1, UserError::Hash),
+            (format!("alice {}", with("m=4294967295,t=2,p=1")), 1, UserError::Hash),
+            (format!("alice {}", with("m=64,t=17,p=1")), 1, UserError::Hash),
+            (format!("alice {}", with("m=64,t=1,p=5")), 1, UserError::Hash),
+            ("alice password".to_string(), 1, UserError::Hash),
+            (
+                format!("alice {FOREIGN}\nalice {FOREIGN}"),
+                2,
+                UserError::Repeated("alice".to_string()),
+            ),
+        ] {
+            assert_eq!(Users::parse(&text), Err((line, error)), "{text}");
+        }
+        let many: String = (0..=MOST).map(|i| format!("u{i} {FOREIGN}\n")).collect();
+        assert_eq!(Users::parse(&many), Err((MOST + 1, UserError::Many)));
+    }
+
+    proptest! {
+        #[test]
+        fn any_text(text in "\\PC{0,200}") {
+            let _ = Users::parse(&text);
+        }
+    }
+}

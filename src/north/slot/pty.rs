@@ -1,0 +1,141 @@
+//! The pseudo-terminal of a slot: a serial port that an old program opens.
+
+use std::fs::File;
+use std::future::poll_fn;
+use std::io;
+use std::os::fd::AsFd;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use tokio::io::AsyncReadExt;
+use tokio::net::unix::pipe;
+use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
+
+use super::dialogue::Dialogue;
+use super::terms::{Terms, Tool};
+use crate::line::Pty;
+
+/// Pause before a pseudo-terminal that could not be opened is tried again.
+const AGAIN: Duration = Duration::from_secs(5);
+/// After that time without a byte the program may have been killed: what the last close of a serial port does is done.
+const RESTS: Duration = Duration::from_secs(2);
+
+/// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot does without, says so
+/// once for each reason, and tries again.
+pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: CancellationToken) {
+    let bus = terms.slot.bus.clone();
+    let mut told = String::new();
+    loop {
+        let why = match open(&path) {
+            Ok(pty) => {
+                tracing::info!(%bus, path = %path.display(), "tool slot: open");
+                told.clear();
+                let tool = Tool::new(terms.clone(), &path.display().to_string(), "pty");
+                match Port::new(pty, Arc::new(tool)) {
+                    Ok(port) => match cancel.run_until_cancelled(port.serve()).await {
+                        None => return,
+                        Some(error) => error,
+                    },
+                    Err(error) => error,
+                }
+            }
+            Err(error) => error,
+        };
+        let why = why.to_string();
+        if why != told {
+            tracing::warn!(%bus, "tool slot: no pseudo-terminal: {why}; trying again every {} s", AGAIN.as_secs());
+            told = why;
+        }
+        if cancel.run_until_cancelled(tokio::time::sleep(AGAIN)).await.is_none() {
+            return;
+        }
+    }
+}
+
+fn open(path: &Path) -> io::Result<Pty> {
+    let pty = Pty::open(Some(path))?;
+    pty.share()?;
+    Ok(pty)
+}
+
+struct Port {
+    pty: Pty,
+    /// The same end of the pseudo-terminal. To the runtime it is a pipe: something that can be read now and then.
+    reader: pipe::Receiver,
+    dialogue: Dialogue,
+    /// When bytes came or went last; `None` once the port rests.
+    used: Option<Instant>,
+}
+
+impl Port {
+    fn new(pty: Pty, tool: Arc<Tool>) -> io::Result<Port> {
+        let same = File::from(pty.as_fd().try_clone_to_owned()?);
+        Ok(Port {
+            reader: pipe::Receiver::from_file_unchecked(same)?,
+            pty,
+            dialogue: Dialogue::new(tool),
+            used: None,
+        })
+    }
+
+    /// Serves until the system reports an error.
+    async fn serve(mut self) -> io::Error {
+        loop {
+            if let Err(error) = self.turn().await {
+                return error;
+            }
+        }
+    }
+
+    async fn turn(&mut self) -> io::Result<()> {
+        let wake_at = self.dialogue.wake_at().map(Instant::from_std);
+        let rests_at = self.used.map(|at| at + RESTS).filter(|_| !self.dialogue.is_waiting());
+        let timer = [wake_at, rests_at].into_iter().flatten().min();
+        let dialogue = &mut self.dialogue;
+        let mut buffer = [0; 1024];
+        let asked = tokio::select! {
+            biased;
+            () = poll_fn(|cx| dialogue.poll(cx, std::time::Instant::now())) => false,
+            count = self.reader.read(&mut buffer) => {
+                let bytes = count.map(|count| buffer.get(..count).unwrap_or_default())?;
+                self.used = Some(Instant::now());
+                self.dialogue.received(bytes, std::time::Instant::now())
+            }
+            () = sleep_until(timer) => {
+                if rests_at.is_some_and(|at| at <= Instant::now()) {
+                    self.used = None;
+                    self.pty.settle();
+                }
+                self.dialogue.on_time(std::time::Instant::now())
+            }
+        };
+        if asked {
+            // What was answered to an earlier request and not read is no answer to this one.
+            self.pty.discard_unread();
+        }
+        self.write();
+        Ok(())
+    }
+
+    /// A serial port does not wait for whoever does not read: what finds no room is lost.
+    fn write(&mut self) {
+        let answer = std::mem::take(&mut self.dialogue.output);
+        if answer.is_empty() {
+            return;
+        }
+        self.used = Some(Instant::now());
+        let written = self.pty.write(&answer).unwrap_or(0);
+        if written < answer.len() {
+            self.pty.discard_unread();
+        }
+    }
+}
+
+async fn sleep_until(at: Option<Instant>) {
+    match at {
+        Some(at) => tokio::time::sleep_until(at).await,
+        None => std::future::pending().await,
+    }
+}

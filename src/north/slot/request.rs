@@ -1,0 +1,139 @@
+//! What a frame of a tool asks for: a read, a write, or something that may write. Pure.
+
+use crate::codec::n2::{self, Command};
+use crate::codec::{Exception, Protocol, RequestPdu, ascii, rtu};
+
+/// Diagnostics (function 8) that only read: the echo, the diagnostic register and the counters. The others restart or silence
+/// the drive, or clear what it has counted.
+const READING_DIAGNOSTICS: [u16; 10] = [0, 2, 11, 12, 13, 14, 15, 16, 17, 18];
+
+/// A sound frame of a tool.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) struct ToolRequest {
+    /// Who is asked; 0 is the broadcast, except on N2.
+    pub(super) address: u8,
+    /// The function code; 0 on N2.
+    pub(super) function: u8,
+    pub(super) meaning: Meaning,
+}
+
+/// What a tool asks for.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(super) enum Meaning {
+    /// Reads and nothing else.
+    Read(RequestPdu),
+    /// Writes registers, coils or an object.
+    Write(RequestPdu),
+    /// May write, and cannot be checked.
+    Unchecked(RequestPdu),
+    /// Nothing that a drive could do: what it is refused with.
+    Faulty(Refused),
+}
+
+/// Why a tool is refused.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Refused {
+    /// A Modbus exception.
+    Exception(Exception),
+    /// An N2 error code.
+    Nak(u8),
+}
+
+impl ToolRequest {
+    /// The request in a whole frame; `None` where the frame is not sound: nobody answers that.
+    pub(super) fn of(protocol: Protocol, frame: &[u8]) -> Option<ToolRequest> {
+        let (address, pdu) = match protocol {
+            Protocol::ModbusRtu => rtu::open_frame(frame).map(|(address, pdu)| (address, pdu.to_vec()))?,
+            Protocol::ModbusAscii => ascii::open_frame(frame)?,
+            Protocol::N2 => return of_n2(frame),
+        };
+        let function = *pdu.first()?;
+        let sound = address <= 247 && (1..0x80).contains(&function);
+        sound.then(|| ToolRequest {
+            address,
+            function,
+            meaning: meaning(pdu),
+        })
+    }
+
+    /// Whether everybody on the line is asked, and nobody answers.
+    pub(super) fn is_broadcast(&self, protocol: Protocol) -> bool {
+        self.address == 0 && protocol != Protocol::N2
+    }
+
+    /// The frame of a refusal.
+    pub(super) fn refusal(&self, protocol: Protocol, why: Refused) -> Vec<u8> {
+        let mut frame = Vec::with_capacity(12);
+        match why {
+            Refused::Nak(code) => n2::Answer::Nak(code).encode(&mut frame),
+            Refused::Exception(code) if protocol == Protocol::N2 => nak(code).encode(&mut frame),
+            Refused::Exception(code) => {
+                let pdu = [self.function | 0x80, code.0];
+                protocol.encode_frame(self.address, &pdu, &mut frame);
+            }
+        }
+        frame
+    }
+}
+
+/// The N2 error code for what a Modbus client is refused with.
+fn nak(code: Exception) -> n2::Answer {
+    n2::Answer::Nak(match code {
+        Exception::VALUE => n2::command::DATA,
+        _ => n2::command::TYPE,
+    })
+}
+
+fn meaning(pdu: Vec<u8>) -> Meaning {
+    use RequestPdu::{
+        DeviceIdentification, Diagnostics, MaskWrite, Read, ReadWrite, WriteCoil, WriteCoils, WriteRegister,
+        WriteRegisters,
+    };
+    let known = pdu.first().is_some_and(|function| rtu::is_known(*function));
+    match RequestPdu::decode(&pdu) {
+        Ok(pdu @ (Read { .. } | DeviceIdentification { .. })) => Meaning::Read(pdu),
+        Ok(pdu @ Diagnostics { subfunction, .. }) if READING_DIAGNOSTICS.contains(&subfunction) => Meaning::Read(pdu),
+        Ok(pdu @ (WriteCoil { .. } | WriteRegister { .. } | WriteCoils { .. } | WriteRegisters { .. })) => {
+            Meaning::Write(pdu)
+        }
+        // What they write depends on the drive, or goes with a read: no limit could be kept. No supported family has them.
+        Ok(MaskWrite { .. } | ReadWrite { .. }) => Meaning::Faulty(Refused::Exception(Exception::FUNCTION)),
+        Ok(pdu) => Meaning::Unchecked(pdu),
+        // Of function 43 only the device identification is known.
+        Err(code) if known && !matches!(pdu.as_slice(), [43, mei, ..] if *mei != 14) => {
+            Meaning::Faulty(Refused::Exception(code))
+        }
+        Err(_) => Meaning::Unchecked(RequestPdu::Other(pdu)),
+    }
+}
+
+fn of_n2(frame: &[u8]) -> Option<ToolRequest> {
+    let (address, heard) = Command::decode(frame)?;
+    let command = match heard {
+        Ok(command) => command,
+        // A drive stays silent to what was mangled on the way, and the tool asks again.
+        Err(n2::command::CHECKSUM) => return None,
+        Err(code) => return Some(n2_request(address, Meaning::Faulty(Refused::Nak(code)))),
+    };
+    // From the address to the checksum.
+    let lead = frame.iter().rposition(|byte| *byte == b'>')?;
+    let digits = frame.get(lead + 3..frame.len().checked_sub(3)?)?.to_vec();
+    let pdu = n2::pdu_of(&command);
+    let meaning = match (&command, pdu) {
+        (Command::Identify | Command::Poll { .. } | Command::Read { .. }, Some(pdu)) => Meaning::Read(pdu),
+        (Command::Read { .. } | Command::Status | Command::ReadMemory, None) => {
+            Meaning::Read(RequestPdu::Other(digits))
+        }
+        (Command::Override { .. }, Some(pdu)) => Meaning::Write(pdu),
+        _ => Meaning::Unchecked(RequestPdu::Other(digits)),
+    };
+    Some(n2_request(address, meaning))
+}
+
+fn n2_request(address: u8, meaning: Meaning) -> ToolRequest {
+    ToolRequest {
+        address,
+        function: 0,
+        meaning,
+    }
+}

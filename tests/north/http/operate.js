@@ -1,0 +1,188 @@
+"use strict";
+// Operates a drive from the status page in Chromium, as a person does: by what is seen and by the keyboard.
+// Arguments: the URL of the gateway, the script of axe-core, and what to do.
+const assert = require("node:assert");
+const { spawn } = require("node:child_process");
+const fs = require("node:fs");
+const os = require("node:os");
+const path = require("node:path");
+
+const [url, axe, what] = process.argv.slice(2);
+const PATIENCE_MS = 200000;
+
+// The browser's own protocol over two pipes.
+class Browser {
+  constructor() {
+    this.profile = fs.mkdtempSync(path.join(os.tmpdir(), "operate-"));
+    const options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
+      "--disable-component-update", "--disable-sync", `--user-data-dir=${this.profile}`, "--remote-debugging-pipe", "about:blank"];
+    this.process = spawn("chromium", options, { stdio: ["ignore", "ignore", "ignore", "pipe", "pipe"] });
+    this.waiting = new Map();
+    this.number = 0;
+    this.messages = [];
+    let rest = "";
+    this.process.stdio[4].on("data", (data) => {
+      const texts = (rest + data).split("\0");
+      rest = texts.pop();
+      for (const message of texts.map((text) => JSON.parse(text))) {
+        const waiting = this.waiting.get(message.id);
+        if (waiting) (message.error ? waiting.reject(new Error(JSON.stringify(message.error))) : waiting.resolve(message.result));
+        else if (message.method === "Log.entryAdded" || message.method === "Runtime.exceptionThrown") this.messages.push(JSON.stringify(message.params));
+      }
+    });
+  }
+
+  call(method, params = {}) {
+    const id = ++this.number;
+    this.process.stdio[3].write(JSON.stringify({ id, method, params, sessionId: this.session }) + "\0");
+    return new Promise((resolve, reject) => this.waiting.set(id, { resolve, reject }));
+  }
+
+  async open(address) {
+    const { targetId } = await this.call("Target.createTarget", { url: "about:blank" });
+    this.session = (await this.call("Target.attachToTarget", { targetId, flatten: true })).sessionId;
+    for (const domain of ["Page", "Runtime", "Log"]) await this.call(`${domain}.enable`);
+    await this.call("Page.navigate", { url: address });
+  }
+
+  async run(expression) {
+    const { result, exceptionDetails } = await this.call("Runtime.evaluate", { expression, awaitPromise: true, returnByValue: true });
+    if (exceptionDetails) throw new Error(`${expression}: ${JSON.stringify(exceptionDetails)}`);
+    return result.value;
+  }
+
+  async until(about, expression) {
+    const end = Date.now() + PATIENCE_MS;
+    for (;;) {
+      const value = await this.run(`(() => { try { return ${expression}; } catch { return false; } })()`);
+      if (value) return value;
+      if (Date.now() > end) throw new Error(`never came: ${about}\n${this.messages.join("\n")}\n${await this.run("document.body.innerText")}`);
+      await new Promise((done) => setTimeout(done, 50));
+    }
+  }
+
+  async key(key, text) {
+    const code = { Tab: 9, Enter: 13 }[key];
+    const event = { key, code: key, windowsVirtualKeyCode: code, text };
+    await this.call("Input.dispatchKeyEvent", { type: text ? "keyDown" : "rawKeyDown", ...event });
+    await this.call("Input.dispatchKeyEvent", { type: "keyUp", ...event });
+  }
+
+  write(text) {
+    return this.call("Input.insertText", { text });
+  }
+
+  // Goes on with the tabulator until the element has the focus.
+  async tabTo(selector) {
+    for (let pressed = 0; pressed < 200; pressed += 1) {
+      if (await this.run(`document.activeElement?.matches(${JSON.stringify(selector)}) ?? false`)) return;
+      await this.key("Tab");
+    }
+    throw new Error(`the keyboard does not reach ${selector}`);
+  }
+
+  async press(selector) {
+    await this.tabTo(selector);
+    await this.key("Enter", "\r");
+  }
+
+  async close() {
+    this.process.kill();
+    await new Promise((done) => this.process.on("exit", done));
+    fs.rmSync(this.profile, { recursive: true, force: true, maxRetries: 20, retryDelay: 100 });
+  }
+}
+
+const seen = (selector) => `document.querySelector(${JSON.stringify(selector)})?.checkVisibility()`;
+const result = (words) => `document.querySelector(".operate .operate-result").textContent.includes(${JSON.stringify(words)})`;
+const stopButton = "button[aria-label='Stop pump-1']";
+
+async function accessible(browser, state) {
+  await browser.run(fs.readFileSync(axe, "utf8"));
+  const violations = await browser.run("axe.run(document, { resultTypes: ['violations'] }).then((r) => JSON.stringify(r.violations.map((v) => [v.id, v.nodes.map((n) => n.html)])))");
+  assert.strictEqual(violations, "[]", state);
+}
+
+async function logIn(browser, password) {
+  await browser.until("the login", seen("#login input[name=user]"));
+  await browser.tabTo("#login input[name=user]");
+  await browser.write("alice");
+  await browser.tabTo("#login input[name=password]");
+  await browser.write(password);
+  await browser.key("Enter", "\r");
+}
+
+async function operate(browser) {
+  await browser.until("the drives", "document.body.innerText.includes('pump-1')");
+  assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press before the login");
+  await accessible(browser, "before the login");
+  await logIn(browser, "wrong horse!");
+  await browser.until("a refusal", "document.querySelector('#login .operate-result').textContent.includes('wrong user or password')");
+  await browser.run("document.querySelector('#login input[name=user]').value = ''");
+  await logIn(browser, "correct horse");
+  await browser.until("the login is shown", "document.querySelector('.login-known').innerText.includes('alice')");
+  await browser.until("the stop button", seen(stopButton));
+  assert.strictEqual(await browser.run("document.querySelectorAll('.operate-stop').length"), 1, "fan-2 is only monitored");
+  await browser.until("the limits", "document.querySelector('.operate-reference').innerText.includes('from 0 to 80 %')");
+  await accessible(browser, "after the login");
+  // A reference outside the limits is not sent, one inside is.
+  await browser.tabTo(".operate input");
+  await browser.write("90");
+  await browser.key("Enter", "\r");
+  await browser.until("the limits are told", result("nothing was sent"));
+  await browser.run("document.querySelector('.operate input').value = ''");
+  await browser.write("50");
+  await browser.key("Enter", "\r");
+  await browser.until("the reference", result("Reference 50 %: confirmed"));
+  // Start asks first, and the stop can be pressed while it asks.
+  await browser.press("button[aria-label='Start pump-1']");
+  await browser.until("the question", seen(".operate-confirm"));
+  assert.ok(await browser.run(seen(stopButton)));
+  await accessible(browser, "while it asks");
+  await browser.press("button[aria-label='Cancel: do not start pump-1']");
+  assert.ok(await browser.run(result("Reference 50 %")), "nothing was sent");
+  await browser.press("button[aria-label='Start pump-1']");
+  await browser.press("button[aria-label='Start now: pump-1']");
+  await browser.until("the start", result("Start: confirmed"));
+  await browser.until("it runs", "document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  // The lease of 2 s is renewed while the person is active.
+  for (let turn = 0; turn < 12; turn += 1) {
+    await browser.key("Tab");
+    await new Promise((done) => setTimeout(done, 500));
+  }
+  assert.ok(await browser.run("document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')"), "its lease was renewed");
+  await browser.until("who supervises", "document.querySelector('.operate-lease').textContent.includes('Supervised by this page')");
+  await browser.press(stopButton);
+  await browser.until("the stop", result("Stop: "));
+  await browser.until("it stands", "!document.querySelector('.row:has(.operate-stop) .badge').textContent.includes('running')");
+  await browser.press("#login .login-known button");
+  await browser.until("the logout", seen("#login input[name=user]"));
+  assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0, "nothing to press after the logout");
+}
+
+// A drive that runs is stopped in a page whose session ended: the page says what happened.
+async function ended(browser) {
+  await logIn(browser, "correct horse");
+  await browser.until("the stop button", seen(stopButton));
+  process.stdout.write("logged in\n");
+  await new Promise((done) => process.stdin.once("data", done));
+  await browser.press(stopButton);
+  await browser.until("the end", "document.querySelector('#login .operate-result').textContent.includes('The session has ended')");
+  assert.strictEqual(await browser.run("document.querySelectorAll('.operate button').length"), 0);
+}
+
+(async () => {
+  const browser = new Browser();
+  try {
+    await browser.open(url);
+    await { operate, ended }[what](browser);
+    const complaints = browser.messages.filter((text) => !/status of (401|403|409|422)/.test(text));
+    assert.deepStrictEqual(complaints, [], "the browser complains of nothing");
+  } finally {
+    await browser.close();
+  }
+  process.exit(0);
+})().catch((error) => {
+  console.error(error);
+  process.exit(1);
+});

@@ -1,0 +1,197 @@
+//! A drive operated from the status page: the real gateway, a simulated drive, a real browser.
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::PathBuf;
+use std::process::{Command, Stdio};
+
+use crate::support::process::{Running, api, drivegate, get, until};
+use crate::support::site::{HTTP, LINE1, Site, controlled, drive};
+use crate::support::tools::{root, run, tool};
+
+const COMMANDS: &str = "commands = true\nusers_file = \"users\"\n";
+
+/// A gateway with commands, of a drive whose lease is short, and one that is monitored.
+fn site() -> Site {
+    let keys = "limits = { speed_reference = [0.0, 80.0] }\nsupervision = { timeout = \"2s\", action = \"stop\" }";
+    let drives = [controlled("pump-1", 1, keys), drive("fan-2", 2, "")].concat();
+    let site = Site::of(&[LINE1, &drives, HTTP, COMMANDS]);
+    user(&site, &["add"], "alice", "correct horse\n");
+    site
+}
+
+/// `drivegate user`, with that on standard input.
+fn user(site: &Site, action: &[&str], name: &str, input: &str) -> String {
+    let file = site.path("users");
+    let arguments = [&["user"], action, &["--file", &file, name]].concat();
+    let mut child = drivegate(&arguments)
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    child.stdin.take().unwrap().write_all(input.as_bytes()).unwrap();
+    let output = child.wait_with_output().unwrap();
+    assert!(output.status.success(), "{output:?}");
+    String::from_utf8(output.stdout).unwrap()
+}
+
+fn axe() -> PathBuf {
+    let script = root().join(".tools/node/node_modules/axe-core/axe.min.js");
+    assert!(
+        script.exists(),
+        "{} is missing; run tests/tools/install.sh",
+        script.display()
+    );
+    script
+}
+
+fn arguments(site: &Site, what: &str) -> [String; 4] {
+    [
+        root().join("tests/north/http/operate.js").display().to_string(),
+        format!("http://localhost:{}/", site.http),
+        axe().display().to_string(),
+        what.to_string(),
+    ]
+}
+
+fn audit(site: &Site) -> String {
+    get(site.http, "/api/v1/audit").expect("an answer").1
+}
+
+fn state(site: &Site) -> String {
+    api(site.http, "pump-1")["state"].to_string()
+}
+
+#[test]
+fn a_drive_is_operated_from_the_page_by_the_keyboard() {
+    let site = site();
+    let _line = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let _gateway = site.run_ready();
+    let arguments = arguments(&site, "operate");
+    let browser = run(&tool("node"), &arguments.each_ref().map(String::as_str));
+    assert!(browser.status.success(), "{}", String::from_utf8_lossy(&browser.stderr));
+    let audit: serde_json::Value = serde_json::from_str(&audit(&site)).unwrap();
+    let of = |record: &serde_json::Value| {
+        assert_eq!(
+            (&record["source"], &record["drive"]),
+            (&"http".into(), &"pump-1".into())
+        );
+        assert!(record["client"].as_str().unwrap().starts_with("alice "), "{record}");
+        record["command"].as_str().unwrap().to_string()
+    };
+    let commands: Vec<String> = audit.as_array().unwrap().iter().map(of).collect();
+    assert_eq!(
+        commands,
+        ["speed_reference=50", "run=true", "run=false"],
+        "these, and no more"
+    );
+}
+
+/// A user is removed while its page is open, and the lease of the drive that it started runs out.
+#[test]
+fn a_removed_user_stops_nothing_and_the_lease_does() {
+    let site = site();
+    let _line = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let gateway = site.run_ready();
+    let mut browser = Command::new(tool("node"))
+        .args(arguments(&site, "ended"))
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut printed = BufReader::new(browser.stdout.take().unwrap());
+    let mut line = String::new();
+    printed.read_line(&mut line).unwrap();
+    assert_eq!(line, "logged in\n");
+    let curl = |body: &str| {
+        let url = format!("http://localhost:{}/api/v1/drives/pump-1/commands", site.http);
+        let ran = run(&tool("curl"), &["-sS", "-u", "alice:correct horse", "-d", body, &url]);
+        String::from_utf8(ran.stdout).unwrap()
+    };
+    assert!(curl("{\"run\": true, \"speed_reference\": 40}").contains("\"ok\":true"));
+    assert!(user(&site, &["remove"], "alice", "").contains("was removed"));
+    gateway.signal("HUP");
+    until("alice is out", || {
+        curl("{\"speed_reference\": 40}")
+            .contains("wrong user or password")
+            .then_some(())
+    });
+    browser.stdin.take().unwrap().write_all(b"\n").unwrap();
+    assert!(browser.wait().unwrap().success());
+    until("the lease runs out", || (state(&site) == "\"ready\"").then_some(()));
+    let audit = audit(&site);
+    assert!(audit.contains("\"supervision\""), "{audit}");
+}
+
+/// What `check` says of commands that cannot be.
+#[test]
+fn commands_need_users_and_a_private_way() {
+    let site = site();
+    let check = || {
+        let output = run(
+            env!("CARGO_BIN_EXE_drivegate").as_ref(),
+            &["check", "--config", &site.config()],
+        );
+        (
+            output.status.code(),
+            String::from_utf8([output.stdout, output.stderr].concat()).unwrap(),
+        )
+    };
+    let (code, said) = check();
+    assert_eq!(code, Some(0), "{said}");
+    for (from, to, wanted) in [
+        ("users_file = \"users\"\n", "", "there is no `users_file`"),
+        ("127.0.0.1", "0.0.0.0", "passwords in clear text"),
+        ("\"users\"", "\"nowhere\"", "nowhere"),
+    ] {
+        let before = site.change(from, to);
+        let (code, said) = check();
+        assert_eq!(code, Some(78), "{said}");
+        assert!(
+            said.contains(wanted) && said.contains("drivegate.conf:"),
+            "{wanted}: {said}"
+        );
+        site.write("drivegate.conf", &before);
+    }
+    let mut gateway = Running::drivegate(&["run", "--config", &site.config()]);
+    gateway.until_printed("drivegate runs");
+    assert!(gateway.runs());
+}
+
+/// A reload that starts a bus anew keeps who commanded its drives last, as it keeps their leases.
+#[test]
+fn a_bus_that_starts_anew_knows_who_commanded_last() {
+    let site = site();
+    let _line = site.simulate(&["--addresses", "1-2", "--baud", "38400"]);
+    let gateway = site.run_ready();
+    let post = |what: &str, body: &str| {
+        let url = format!("http://localhost:{}/api/v1/drives/pump-1/{what}", site.http);
+        let login = "alice:correct horse";
+        let ran = run(
+            &tool("curl"),
+            &[
+                "-sS",
+                "-o",
+                "/dev/null",
+                "-w",
+                "%{http_code}",
+                "-u",
+                login,
+                "-d",
+                body,
+                &url,
+            ],
+        );
+        String::from_utf8(ran.stdout).unwrap()
+    };
+    assert_eq!(post("heartbeat", ""), "409");
+    assert_eq!(post("commands", "{\"speed_reference\": 20}"), "200");
+    assert_eq!(post("heartbeat", ""), "204");
+    site.change("response_timeout = \"2s\"", "response_timeout = \"1900ms\"");
+    gateway.signal("HUP");
+    gateway.until_printed("configuration reloaded");
+    assert!(
+        gateway.output().matches("starting the bus").count() >= 2,
+        "the bus starts anew"
+    );
+    assert_eq!(post("heartbeat", ""), "204");
+}

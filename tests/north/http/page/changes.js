@@ -1,0 +1,201 @@
+"use strict";
+// What the page shows when the plant changes under it. Drives a real browser against a gateway that says what the test wants.
+const assert = require("node:assert");
+const { Browser } = require("./browser.js");
+const { FakeGateway, bus, drive, point } = require("./fake_gateway.js");
+
+const shown = (selector) => [...document.querySelectorAll(selector)].filter((element) => element.checkVisibility()).map((element) => element.textContent);
+const NASTY = "<img src=x onerror=window.hacked=1>";
+
+async function rowsFollowTheirDrives(gateway, page) {
+  const warned = { warning: point(true) };
+  gateway.drives = [drive("pump-10"), drive("pump-2"), drive("fan-1", { points: warned }), drive("mixer-1", { state: "fault", fault_text: NASTY, points: { fault_code: point(7) } })];
+  await page.open(gateway.url);
+  await page.until(() => document.querySelectorAll(".rows .row").length === 4);
+  assert.deepEqual(await page.eval(shown, ".rows .name a"), ["mixer-1", "fan-1", "pump-2", "pump-10"], "faults, warnings, then names");
+  assert.match((await page.eval(shown, ".row.fault .why"))[0], /F7 <img src=x/);
+
+  // The focus stays on its drive when the order changes.
+  await page.eval(() => document.querySelector('.rows a[href="#/drive/pump-10"]').focus());
+  gateway.drives[0] = drive("pump-10", { state: "fault", points: { fault_code: point(1) }, fault_text: "overcurrent" });
+  await page.until(() => document.querySelector(".rows a").textContent === "mixer-1" && document.querySelectorAll(".rows .fault").length === 2);
+  assert.deepEqual(await page.eval(shown, ".rows .name a"), ["mixer-1", "pump-10", "fan-1", "pump-2"]);
+  assert.equal(await page.eval(() => document.activeElement.textContent), "pump-10");
+  assert.match(await page.eval(() => document.querySelector('.view > [role="status"]').textContent), /pump-10: F1 overcurrent/, "a new fault is announced");
+
+  const speeds = { output_frequency: point(0, { unit: "Hz" }), motor_speed: point(1290, { unit: "rpm", age_ms: 900, contradicted: true }),
+    motor_current: point(3.2, { unit: "A", quality: "stale", age_ms: 5000 }), motor_torque: point(null, { unit: "%", quality: "bad", age_ms: null }) };
+  gateway.drives = [drive("pump-2", { points: speeds, blocked_by: ["interlocked", "fault"] })];
+  await page.until(() => document.querySelectorAll(".rows .row").length === 1);
+  const cells = await page.eval(() => [...document.querySelectorAll(".rows .n .value")].map((value) => [value.className, value.textContent, value.title]));
+  assert.deepEqual(cells.slice(1, 5), [["value main", "0.00", ""], ["value contradicted", "1290", "read 900 ms ago; a newer state says otherwise"],
+    ["value stale", "3.2", "stale, 5.0 s old"], ["value bad", "—", "bad: refused by the drive or never read"]]);
+  assert.deepEqual(await page.eval(shown, ".rows .blocked"), ["interlocked"]);
+}
+
+async function listIsFiltered(gateway, page) {
+  gateway.drives = ["a", "b", "c"].map((name, at) => drive(`pump-${name}`, { state: at ? "running" : "offline", bus: at === 2 ? "line2" : "line1" }));
+  gateway.buses = [bus("line1"), bus("line2")];
+  await page.until(() => document.querySelectorAll(".rows .row").length === 3);
+  await page.eval(() => document.getElementById("filter").focus());
+  await page.type("PUMP running");
+  await page.until(() => document.querySelector(".filter [role=status]").textContent === "2 of 3 drives");
+  assert.deepEqual(await page.eval(shown, ".rows .name a"), ["pump-b", "pump-c"]);
+  await page.send("Page.reload");
+  await page.until(() => document.getElementById("filter")?.value === "PUMP running" && document.querySelectorAll(".rows .row").length === 3);
+  assert.deepEqual(await page.eval(shown, ".rows .name a"), ["pump-b", "pump-c"], "the filter is in the address");
+  await page.eval(() => [...document.querySelectorAll(".tally a")].find((link) => link.getAttribute("href").includes("line2")).click());
+  await page.until(() => document.querySelector(".filter .chip")?.textContent.startsWith("line line2"));
+  await page.until(() => document.querySelectorAll(".rows .row:not([hidden])").length === 1);
+  assert.deepEqual(await page.eval(shown, ".rows .name a"), ["pump-c"]);
+  gateway.buses = [bus("line1")];
+}
+
+async function driveHasALinkOfItsOwn(gateway, page) {
+  const odd = "pump 1/ä";
+  const cause = { cause: "interlocked", evidence: "interlocked is on", age_ms: 140, remedy: "close it" };
+  const before = { hand_auto: point(false, { text: "hand" }), old_point: point(7), output_frequency: point(25, { unit: "Hz", age_ms: 40 }) };
+  gateway.drives = [drive(odd, { points: before, why: [cause], blocked_by: ["interlocked"] }), drive("pump-2")];
+  gateway.trends = { motor_current: { unit: "A", samples: [[1, 2, 1.5], [1, 3, 2], null, null, null, [4, 4, 4]] } };
+  gateway.events = [{ id: 2, boot: 1, time: "2026-03-02T07:40:12.118Z", event: "fault", bus: "line1", drive: odd, text: NASTY, recording: { id: "x" } }];
+  await page.open(`${gateway.url}#/`);
+  await page.until(() => document.querySelectorAll(".rows .row").length === 2);
+  await page.eval(() => document.querySelector(".rows a").click());
+  await page.until(() => document.querySelector(".points"));
+  const address = await page.eval("location.hash");
+  assert.equal(address, "#/drive/pump%201%2F%C3%A4");
+  assert.equal(await page.eval(() => document.activeElement.tagName), "H1", "the heading of a new view has the focus");
+  await page.until(() => document.querySelector('.points div') && document.querySelector(".curve"));
+  const text = await page.eval("document.querySelector('.view').textContent");
+  for (const wanted of [/hand autohand10 ms/, /old point7/, /Interlocked|interlocked/, /interlocked is on \(140 ms ago\)close it/, /2 h 1 min/, /Starts3/, /not known/]) assert.match(text, wanted);
+  assert.deepEqual(await page.eval(() => [...document.querySelectorAll(".curve")].map((path) => path.getAttribute("d").split("M").length - 1)), [2], "a gap is a gap");
+  assert.ok(await page.eval(() => document.querySelector('[data-operate]').dataset.operate === "pump 1/ä"));
+
+  // A reload of the configuration gave the drive another profile.
+  gateway.drives[0] = drive(odd, { points: { hand_auto: point(true, { text: "auto" }), new_point: point(8) } });
+  await page.until(() => document.querySelector(".view").textContent.includes("new point8"));
+  const after = await page.eval("document.querySelector('.view').textContent");
+  assert.match(after, /hand autoauto/);
+  assert.doesNotMatch(after, /old point/, "a point of the profile that was replaced");
+  assert.equal(await page.eval(() => document.querySelector(".why-panel").checkVisibility()), false);
+
+  await page.send("Page.reload");
+  await page.until(() => document.querySelector("h1")?.textContent === "pump 1/ä" && document.querySelector('.points div'));
+  await page.eval("history.back()");
+  await page.until(() => document.querySelector("h1").textContent === "Drives" && document.querySelectorAll(".rows .row").length === 2);
+  await page.eval("history.forward()");
+  await page.until(() => document.querySelector('.points div'));
+  gateway.drives = [drive("pump-2")];
+  await page.until(() => [...document.querySelectorAll(".problem")].some((problem) => problem.checkVisibility() && problem.textContent.includes("Known: pump-2.")));
+  assert.deepEqual(await page.eval(shown, ".view dd"), [], "nothing of a drive that is gone");
+  page.problems = page.problems.filter((problem) => !problem.includes("404"));
+}
+
+async function cursorIsMovedByKeys(gateway, page) {
+  gateway.drives = [drive("pump-2", { points: { motor_current: point(4, { unit: "A" }) } })];
+  await page.open(`${gateway.url}#/drive/pump-2`);
+  await page.until(() => document.querySelector("h1").textContent === "pump-2" && document.querySelector(".curve"));
+  const said = () => [document.querySelector(".cursor").getAttribute("aria-valuetext"), document.querySelector(".plot .reading").textContent];
+  await page.until(() => document.querySelector(".plot .reading").textContent === "4.0 A");
+  await page.eval(() => document.querySelector(".cursor").focus());
+  await page.press("Home");
+  const [value, reading] = await page.eval(said);
+  assert.match(value, /^\d\d:\d\d:\d\d: Current (1\.5 A|no value)$/);
+  assert.match(reading, /1\.5 A|no value/);
+  await page.press("ArrowRight");
+  await page.press("ArrowRight");
+  assert.match((await page.eval(said))[1], /2\.0 A|1\.5 A/);
+  await page.press("End");
+  assert.deepEqual(await page.eval(said), ["now: Current 4.0 A", "4.0 A"]);
+}
+
+async function connectionIsLostAndFound(gateway, page) {
+  await page.open(`${gateway.url}#/`);
+  await page.until(() => document.querySelector(".rows .row"));
+  gateway.silent = true;
+  await page.until(() => document.body.classList.contains("lost"));
+  const seen = await page.eval(() => [document.getElementById("link-text").textContent, document.getElementById("banner").textContent, getComputedStyle(document.getElementById("live")).filter,
+    getComputedStyle(document.querySelector(".rows .value")).textDecorationLine]);
+  assert.equal(seen[0], "Connection lost");
+  assert.match(seen[1], /^No connection to the gateway since .*\. What is shown below is old/);
+  assert.deepEqual(seen.slice(2), ["grayscale(1)", "line-through"]);
+  gateway.silent = false;
+  await page.until(() => !document.body.classList.contains("lost"));
+  assert.equal(await page.eval(() => document.getElementById("banner").checkVisibility()), false);
+
+  // A page that comes back from the background shows nothing old as good, not even until its first answer.
+  await page.eval(() => Object.defineProperty(document, "hidden", { configurable: true, get: () => window.away === true }));
+  await page.eval(() => {
+    window.away = true;
+    document.dispatchEvent(new Event("visibilitychange"));
+  });
+  await new Promise((resolve) => setTimeout(resolve, 4500));
+  gateway.silent = true;
+  const lost = await page.eval(() => {
+    window.away = false;
+    document.dispatchEvent(new Event("visibilitychange"));
+    return document.body.classList.contains("lost");
+  });
+  assert.ok(lost);
+  gateway.silent = false;
+  await page.until(() => !document.body.classList.contains("lost"));
+}
+
+async function eventsAreSearched(gateway, page) {
+  gateway.events = Array.from({ length: 150 }, (_, at) => ({ id: 150 - at, boot: 1, time: "2026-03-02T07:40:12.118Z", event: at % 50 ? "started" : "fault", bus: "line1", drive: "pump-2", text: `event ${150 - at}` }));
+  gateway.events[0].recording = { id: "20260302T074012.118Z-pump-2" };
+  await page.open(`${gateway.url}#/events`);
+  await page.until(() => document.querySelectorAll(".events li").length === 100);
+  assert.equal(await page.eval(() => document.querySelector(".events li a[href^='#/recording']").getAttribute("href")), "#/recording/20260302T074012.118Z-pump-2");
+  await page.eval(() => [...document.querySelectorAll(".pages button")].find((button) => button.textContent === "Older").click());
+  await page.until(() => document.querySelectorAll(".events li").length === 50);
+  await page.eval(() => {
+    const select = document.getElementById("event-kind");
+    select.value = "fault";
+    select.dispatchEvent(new Event("input"));
+  });
+  await page.until(() => document.querySelectorAll(".events li").length === 3);
+  assert.equal(await page.eval("location.hash"), "#/events?kind=fault");
+}
+
+async function linesTellTheirDiagnosis(gateway, page) {
+  const seen = () => document.querySelector("#diagnosis-title")?.checkVisibility() && document.querySelector("#diagnosis-title").parentElement.textContent;
+  await page.open(`${gateway.url}#/line/line1`);
+  await page.until(() => document.querySelector(".strip .count")?.textContent === "4 errors");
+  assert.deepEqual(await page.eval(shown, ".histogram dt"), ["1 ms to 2 ms", "2 ms to 5 ms"]);
+  assert.match(await page.eval(() => document.querySelector(".minutes").getAttribute("aria-label")), /errors of pump-2: 4 in the last hour, most this minute: 4/);
+  assert.ok(!(await page.eval(seen)), "a gateway that makes no diagnosis");
+  page.problems = page.problems.filter((problem) => !problem.includes("diagnosis"));
+  const verdict = { verdict: "one_drive", drive: "pump-2", certainty: "likely", meaning: "one drive is bad", evidence: NASTY, remedy: "look at its plug", since: "2026-03-02T07:40:12Z" };
+  gateway.diagnosis = { bus: "line1", time: "2026-03-02T07:40:12Z", verdicts: [verdict], drives: [] };
+  await page.open(`${gateway.url}#/lines`);
+  await page.until(() => document.querySelector(".card"));
+  await page.open(`${gateway.url}#/line/line1`);
+  await page.until(seen);
+  assert.equal(await page.eval(seen), `Diagnosisone drive pump-2one drive is bad (likely): ${NASTY}look at its plug`);
+}
+
+async function main() {
+  const gateway = new FakeGateway();
+  gateway.url = await gateway.start();
+  const browser = new Browser();
+  const page = await browser.page();
+  for (const step of [rowsFollowTheirDrives, listIsFiltered, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis]) {
+    try {
+      await step(gateway, page);
+    } catch (error) {
+      throw new Error(`${step.name}: ${error.stack}`);
+    }
+    // Requests that were cut off are what the step is about.
+    const problems = page.problems.filter((problem) => !/net::ERR_|cannot read the gateway/.test(problem));
+    assert.deepEqual(problems, [], step.name);
+    assert.equal(await page.eval("window.hacked"), undefined, `${step.name}: a text became markup`);
+  }
+  await browser.close();
+  await gateway.stop();
+}
+
+main().catch((error) => {
+  console.error(error);
+  process.exit(1);
+});

@@ -1,0 +1,98 @@
+"use strict";
+// A gateway that says what a test wants: the files of the page, and replies that the test changes while the page looks on.
+const fs = require("node:fs");
+const http = require("node:http");
+const path = require("node:path");
+
+const FILES = path.join(__dirname, "../../../../src/north/http/page");
+const TYPES = { ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml" };
+const POLICY = /SECURITY_POLICY: &str = "((?:[^"\\]|\\\s)*)"/.exec(fs.readFileSync(path.join(FILES, "mod.rs"), "utf8"))[1].replace(/\\\s+/g, "");
+
+const point = (value, more = {}) => ({ value, quality: "good", unit: "", age_ms: 10, time: "2026-03-02T07:40:12.118Z", ...more });
+
+function drive(name, more = {}) {
+  return { name, bus: "line1", address: 1, unit: 1, profile: "p", access: "monitor", state: "ready", quality: "good", online: true, age_ms: 10,
+    fault_text: "", blocked_by: [], why: [], turnaround_ms: 1.9, transactions: { ok: 10, exception: 0, timeout: 0, corrupt: 0 }, starts: 3,
+    running_seconds: 7260, energy_kwh: null, points: {}, ...more };
+}
+
+function bus(name, more = {}) {
+  return { name, port: "/dev/ttyUSB0", protocol: "modbus-rtu", baud: 9600, format: "8N1", state: "up", tried: true, drives: 1, online: 1, load_ratio: 0.5,
+    fast: { aim_ms: 100, cycle_ms: 100, rounds: 9 }, slow: { aim_ms: 1000, cycle_ms: 1000, rounds: 1 }, transactions: 10, errors: 0, queue_depth: 0, ...more };
+}
+
+const ended = (count) => new Date(Date.now() - count * 1000).toISOString();
+
+class FakeGateway {
+  constructor() {
+    Object.assign(this, { drives: [], buses: [bus("line1")], events: [], recordings: {}, audit: [], trends: {}, diagnosis: null, asked: [] });
+    this.server = http.createServer((request, response) => this.answer(request, response));
+  }
+
+  start() {
+    return new Promise((resolve) => this.server.listen(0, "127.0.0.1", () => resolve(`http://127.0.0.1:${this.server.address().port}/`)));
+  }
+
+  stop() {
+    this.server.closeAllConnections();
+    return new Promise((resolve) => this.server.close(resolve));
+  }
+
+  answer(request, response) {
+    const url = new URL(request.url, "http://localhost");
+    this.asked.push(request.url);
+    if (this.silent) return;
+    if (url.pathname === "/") return this.file(response, "index.html", "text/html");
+    if (url.pathname.startsWith("/assets/")) return this.file(response, path.basename(url.pathname), TYPES[path.extname(url.pathname)]);
+    const reply = this.reply(url);
+    const found = reply !== undefined;
+    response.writeHead(found ? 200 : 404, { "content-type": "application/json" });
+    response.end(JSON.stringify(found ? reply : { error: `there is nothing at ${url.pathname}`, known: this.drives.map(({ name }) => name) }));
+  }
+
+  file(response, name, type) {
+    const text = fs.readFileSync(path.join(FILES, name), "utf8").replace(/\{\{gateway\}\}/g, "test").replace(/\{\{\w+\}\}/g, "");
+    response.writeHead(200, { "content-type": `${type}; charset=utf-8`, "content-security-policy": POLICY });
+    response.end(text);
+  }
+
+  reply(url) {
+    const [kind, name, part] = url.pathname.replace("/api/v1/", "").split("/").map(decodeURIComponent);
+    const one = this.drives.find((drive) => drive.name === name);
+    if (kind === "drives" && part === "trend") return one && this.trend(one, url.searchParams.get("point"));
+    if (kind === "drives") return name ? one : this.drives;
+    if (kind === "buses" && part === "diagnosis") return this.diagnosis ?? undefined;
+    if (kind === "buses") return name ? this.line(name) : this.buses;
+    if (kind === "events") return this.search(url.searchParams);
+    if (kind === "recordings") return name ? this.recordings[name] : Object.values(this.recordings).map((recording) => recording.entry);
+    if (kind === "audit") return this.audit;
+    return undefined;
+  }
+
+  search(wanted) {
+    const matches = (event) => ["drive", "bus"].every((name) => !wanted.get(name) || event[name] === wanted.get(name)) &&
+      (!wanted.get("kind") || event.event === wanted.get("kind")) && (!wanted.get("text") || event.text.includes(wanted.get("text"))) &&
+      (!wanted.get("before") || event.id < Number(wanted.get("before").split("-")[1]));
+    return this.events.filter(matches).slice(0, Number(wanted.get("limit")));
+  }
+
+  trend({ name }, points) {
+    if (!points) return { drive: name, ranges: [], points: Object.keys(this.trends).map((point) => ({ point, unit: this.trends[point].unit })) };
+    const replies = points.split(",").map((point) => {
+      const { unit, samples } = this.trends[point];
+      return { drive: name, point, unit, step_s: 1, from: ended(samples.length), to: ended(0), samples: samples.map((value, at) => value && [Date.now() - (samples.length - at) * 1000, ...value]) };
+    });
+    return replies.length === 1 ? replies[0] : replies;
+  }
+
+  line(name) {
+    const found = this.buses.find((bus) => bus.name === name);
+    const members = this.drives.filter((drive) => drive.bus === name);
+    const none = Array(60).fill(null);
+    return found && { ...found, turnaround: { le_ms: [1, 2, 5, null], counts: [0, 7, 3, 0], count: 10, sum_ms: 20 },
+      hour: { from: ended(3600), step_s: 60, load_ratio: none, fast_cycle_ms: none },
+      by_drive: members.map(({ name }) => ({ drive: name, address: 1, errors: [...none.slice(1), 4] })) };
+  }
+}
+
+module.exports = { FakeGateway, drive, point, bus };
