@@ -1,4 +1,4 @@
-//! Parameters of a family as data: which there are, what they are called, and what must be known before one is written.
+//! Parameters of a family as data: which there are, and what they are called.
 
 use super::profile::Profile;
 use crate::codec::{Protocol, Table};
@@ -12,8 +12,6 @@ pub struct ParameterList {
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
     pub identification: Vec<usize>,
-    /// What is written to save the parameters in EEPROM: a holding register and its value.
-    pub save: Option<(u16, u16)>,
 }
 
 /// Addresses at which a drive may have parameters.
@@ -76,18 +74,6 @@ pub struct Parameter {
     pub address: u16,
     /// What it is called, and its unit.
     pub label: Label,
-    /// Range in the unit, where the manual states one.
-    pub range: Option<(f64, f64)>,
-    /// Not restored unless it is named: address, baud, passwords, control place and the like.
-    pub only_by_name: bool,
-    /// Written in PRGM mode only.
-    pub program_mode: bool,
-    /// Not saved in EEPROM.
-    pub not_saved: bool,
-    /// Part of the nameplate: a restore to a drive that differs here is refused.
-    pub nameplate: bool,
-    /// A limit of others: written before them.
-    pub limit: bool,
 }
 
 /// What a parameter is called, and what its counts mean.

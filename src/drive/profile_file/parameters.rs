@@ -1,15 +1,11 @@
 //! `[parameters]`: which parameters a family has.
 //!
-//! `list`: rows `id, address, name, unit, scale, range, flags`; `spans`: `"id 100 1998"` or `"group 100 9898"`;
-//! `identification`: names of points; `save`: `"0x0900 0"`.
+//! `list`: rows `id, address, name, unit, scale`; `spans`: `"id 100 1998"` or `"group 100 9898"`; `identification`: names of points.
 
 use super::super::parameters::{Label, Numbering, Parameter, ParameterList, Span};
 use super::super::profile::Point;
 use super::place::parse_address;
 use crate::document::Reader;
-
-/// The flags of a row.
-const FLAGS: [&str; 5] = ["only-by-name", "program-mode", "not-saved", "nameplate", "limit"];
 
 pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
     let Some(table) = reader.table("parameters") else {
@@ -23,7 +19,7 @@ pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
             Err(why) => table.problem(
                 "list",
                 format!("`{row}`: {why}"),
-                "write \"id, address, name, unit, scale, range, flags\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1, 1..180, limit\"",
+                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"",
             ),
         }
     }
@@ -70,16 +66,6 @@ pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
         identification: identification.collect(),
         named,
         spans,
-        save: table.parsed("save", |text| {
-            let pair = text.split_once(' ');
-            let pair = pair.and_then(|(address, value)| parse_address(address).zip(parse_address(value)));
-            pair.ok_or_else(|| {
-                crate::document::Finding::new(
-                    format!("`{text}` is not a register and its value"),
-                    "write for example \"0x0900 0\"",
-                )
-            })
-        }),
     };
     table.finish();
     list
@@ -98,31 +84,12 @@ fn read_span(text: &str) -> Option<Span> {
 
 fn read_row(row: &str) -> Result<Parameter, String> {
     let fields: Vec<&str> = row.split(',').map(str::trim).collect();
-    let [id, address, name, unit, scale, rest @ ..] = fields.as_slice() else {
-        return Err("too few fields".to_string());
-    };
-    let (range, flags) = match rest {
-        [] => ("", ""),
-        [range] => (*range, ""),
-        [range, flags] => (*range, *flags),
-        _ => return Err("too many fields".to_string()),
+    let [id, address, name, unit, scale] = fields.as_slice() else {
+        return Err(format!("{} fields in place of 5", fields.len()));
     };
     if id.is_empty() || id.contains(['#', '=']) {
         return Err("the id is empty or has # or = in it".to_string());
     }
-    let flags: Vec<&str> = flags.split_whitespace().collect();
-    if let Some(unknown) = flags.iter().find(|flag| !FLAGS.contains(flag)) {
-        return Err(format!("unknown flag `{unknown}`; known: {}", FLAGS.join(", ")));
-    }
-    let has = |flag: &str| flags.contains(&flag);
-    let range = match range.split_once("..") {
-        None if range.is_empty() => None,
-        None => return Err(format!("`{range}` is not a range")),
-        Some((low, high)) => {
-            let pair = low.parse::<f64>().ok().zip(high.parse::<f64>().ok());
-            Some(pair.ok_or_else(|| format!("`{range}` is not a range"))?)
-        }
-    };
     let scale: f64 = scale.parse().map_err(|_| format!("`{scale}` is not a scale"))?;
     Ok(Parameter {
         id: id.to_string(),
@@ -132,11 +99,5 @@ fn read_row(row: &str) -> Result<Parameter, String> {
             unit: unit.to_string(),
             scale,
         },
-        range,
-        only_by_name: has("only-by-name"),
-        program_mode: has("program-mode"),
-        not_saved: has("not-saved"),
-        nameplate: has("nameplate"),
-        limit: has("limit"),
     })
 }
