@@ -309,6 +309,7 @@ async fn what_is_not_good_has_no_sample() {
     };
     let known = [
         "drivegate_supervision_actions_total",
+        "drivegate_parameters_changed_total",
         "drivegate_drive_up",
         "drivegate_drive_state",
         "drivegate_drive_transactions_total",
