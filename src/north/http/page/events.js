@@ -10,7 +10,8 @@ export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", wa
 // All that the gateway knows; it refuses to search for others.
 const KINDS = [
   "fault", "fault_end", "warning", "warning_end", "online", "offline", "started", "stopped", "control_place", "supervision", "unsupervised",
-  "refused_command", "not_confirmed", "restarted", "unlike_profile", "foreign_command", "recording", "bus_up", "bus_down", "reload_refused",
+  "refused_command", "not_confirmed", "restarted", "unlike_profile", "foreign_command", "recording", "bus_up", "bus_down", "diagnosis",
+  "reload_refused",
 ];
 const PAGE = 100;
 
