@@ -556,7 +556,7 @@ fn a_simulation_tells_the_bus_whose_port_it_cannot_be() {
     let ran = run(&["simulate", "--config", &path]);
     assert_eq!(ran.code, Some(1), "{}", ran.err);
     let wanted = format!(
-        "error: cannot simulate bus `line1` at its `port` in {path}: {} exists and is not a symbolic link; ",
+        "error: cannot simulate bus `line1` at its `port` in {path}: {} exists and is not a symbolic link to a pseudo-terminal; ",
         occupied.display()
     );
     assert!(ran.err.contains(&wanted), "{}", ran.err);

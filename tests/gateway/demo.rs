@@ -102,6 +102,24 @@ fn pasted(line: &str) -> Output {
     shell.output().unwrap()
 }
 
+/// Examples that read from a gateway at its usual ports, or need none; without the programs that only arrange what is printed.
+fn examples_of_the_pages() -> Vec<String> {
+    let pages = ["http", "history", "modbus-tcp", "profiles", "diagnosis", "operating"]
+        .map(|page| root().join(format!("docs/{page}.md")));
+    let text = pages.map(|page| std::fs::read_to_string(page).unwrap()).concat();
+    let reads = |line: &&str| {
+        ["curl -s ", "mbpoll -m tcp ", "drivegate profiles"]
+            .iter()
+            .any(|begin| line.starts_with(begin))
+            && !line.contains("curl -N")
+    };
+    let lines = text.lines().map(|line| line.trim_start_matches("$ ")).filter(reads);
+    let lines = lines.map(|line| line.split(" | ").next().unwrap().to_string());
+    let lines: Vec<String> = lines.collect();
+    assert!(lines.len() >= 10, "{lines:#?}");
+    lines
+}
+
 #[test]
 fn every_line_that_it_prints_can_be_pasted_whole() {
     let folder = tempfile::tempdir().unwrap();
@@ -115,6 +133,22 @@ fn every_line_that_it_prints_can_be_pasted_whole() {
         .filter_map(|line| line.strip_prefix("  ").filter(|rest| !rest.starts_with(' ')))
         .collect();
     assert!(lines.len() > 15, "{printed}");
+    // The examples of the pages, which name the usual ports, work on the demo, too.
+    let modbus = port(&printed, "mbpoll -m tcp -p ");
+    for line in examples_of_the_pages() {
+        let line = match line.strip_prefix("drivegate ") {
+            Some(rest) => format!("{} {rest}", env!("CARGO_BIN_EXE_drivegate")),
+            None => line,
+        };
+        let line = line
+            .replace("127.0.0.1:9488", &format!("127.0.0.1:{http}"))
+            .replace("-p 1502", &format!("-p {modbus}"));
+        let output = pasted(&line);
+        assert!(
+            output.status.success() && !output.stdout.is_empty(),
+            "{line}: {output:?}"
+        );
+    }
     for line in &lines {
         until(line, || {
             let output = pasted(line);

@@ -258,29 +258,65 @@ fn every_fault_of_the_world_fits_the_core_and_is_listed() {
     }
 }
 
+/// The lines of all examples for a shell, a command that goes over several lines as one.
+fn examples() -> Vec<(PathBuf, String)> {
+    let mut examples = Vec::new();
+    for document in documents() {
+        let text = read(&document);
+        let pieces = text.split("\\\n").map(|piece| piece.trim_start_matches(' '));
+        let text = pieces.collect::<String>();
+        let shell = blocks(&text, "sh").join("\n");
+        let console = blocks(&text, "console").join("\n");
+        let typed = console.lines().filter_map(|line| line.strip_prefix("$ "));
+        let lines = shell.lines().chain(typed);
+        examples.extend(lines.map(|line| (document.clone(), line.to_string())));
+    }
+    examples
+}
+
 /// What is pasted whole must be a command: a description stands behind `#` or on a line of its own.
 #[test]
 fn examples_can_be_pasted_whole() {
-    let mut wrong = Vec::new();
-    let mut seen = 0;
-    for document in documents() {
-        let text = read(&document);
-        let shell = blocks(&text, "sh")
-            .into_iter()
-            .map(|block| block.lines().map(String::from).collect());
-        let console = blocks(&text, "console").into_iter().map(|block| {
-            let commands = block.lines().filter_map(|line| line.strip_prefix("$ "));
-            commands.map(String::from).collect()
-        });
-        let lines: Vec<Vec<String>> = shell.chain(console).collect();
-        for line in lines.concat() {
-            seen += 1;
-            if has_trailing_prose(&line) {
-                wrong.push(format!("{}: {line}", document.display()));
-            }
+    let examples = examples();
+    let wrong: Vec<_> = examples.iter().filter(|(_, line)| has_trailing_prose(line)).collect();
+    assert!(examples.len() > 100, "{}", examples.len());
+    assert!(wrong.is_empty(), "{wrong:#?}");
+}
+
+/// The words of a command of this program in a line for a shell; of `docker run IMAGE drivegate` those behind it.
+fn own_words(line: &str) -> Option<Vec<String>> {
+    let (mut words, mut quote) = (vec![String::new()], None);
+    for c in line.chars() {
+        let last = words.last_mut()?;
+        match (quote, c) {
+            (Some(open), _) if open == c => quote = None,
+            (None, '\'' | '"') => quote = Some(c),
+            (None, '|' | '>' | '#' | ';' | '&') if last.is_empty() => break,
+            (None, ' ') => words.push(String::new()),
+            _ => last.push(c),
         }
     }
-    assert!(seen > 100, "{seen}");
+    words.retain(|word| !word.is_empty());
+    let is_prefix = |word: &String| word == "sudo" || word.starts_with('-') || word.contains('=');
+    let begins = words.iter().position(|word| !is_prefix(word))?;
+    words
+        .get(begins)?
+        .ends_with("drivegate")
+        .then(|| words.split_off(begins))
+}
+
+#[test]
+fn the_options_of_all_examples_exist() {
+    let (mut wrong, mut seen) = (Vec::new(), 0);
+    for (document, line) in examples() {
+        let Some(words) = own_words(&line) else { continue };
+        seen += 1;
+        match drivegate::cli::command_line().try_get_matches_from(&words) {
+            Err(error) if error.use_stderr() => wrong.push(format!("{}: {line}: {error}", document.display())),
+            _ => {}
+        }
+    }
+    assert!(seen > 40, "{seen}");
     assert!(wrong.is_empty(), "{wrong:#?}");
 }
 

@@ -12,7 +12,11 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// The metrics of the public contract; dashboards and alerts of users hang on these names.
-const METRICS: [&str; 46] = [
+const METRICS: [&str; 50] = [
+    "drivegate_drive_starts_total",
+    "drivegate_drive_running_seconds_total",
+    "drivegate_line_diagnosis",
+    "drivegate_slot_requests_total",
     "drivegate_drive_blocked",
     "drivegate_drive_fault_info",
     "drivegate_drive_unsupervised",

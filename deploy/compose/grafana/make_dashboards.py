@@ -148,7 +148,7 @@ def timeline(title, description, expression, legend, texts, height=6, links=()):
 def table(title, description, expression, shown, width=12, link=None, unit="short"):
     """The series of a query as rows; `shown` names its labels in the order of the columns, and `Value`."""
     order = {name: place for place, name in enumerate(shown)}
-    hidden = ["Time", "__name__", "job", "gateway", "commit", "instance", "bus", "drive", "text", "reason", "Value"]
+    hidden = ["Time", "__name__", "job", "gateway", "commit", "instance", "bus", "drive", "text", "reason", "verdict", "Value"]
     organize = {
         "id": "organize",
         "options": {
@@ -314,11 +314,19 @@ def line():
         up("drivegate_bus_up", BUS, OF_BUS, "Port", "Whether the port is open.", 6),
         load(6),
         up("drivegate_drive_up", BUS, OF_DRIVE, "Drives", "Whether each drive is online.", 12, [TO_DRIVE]),
+        table(
+            "Diagnosis",
+            "What is wrong with the line; `drivegate diagnose` has the evidence and what to do.",
+            f"drivegate_line_diagnosis{{{BUS}}} == 1",
+            ["instance", "bus", "drive", "verdict"],
+            width=24,
+        ),
         row("The line"),
         graph("Load", "Share of time the line is in use.", "percentunit", query(f"drivegate_bus_load_ratio{{{BUS}}}", OF_BUS)),
         graph("Cycle", "Time from the start of one cycle of a poll class to the start of the next: median, 95th and 99th percentile.", "s", *quantiles("drivegate_bus_cycle_seconds", "instance, bus, class", BUS, OF_BUS + " {{class}}")),
         graph("Transaction", "Time of one transaction: request, turnaround, reply.", "s", *quantiles("drivegate_bus_transaction_seconds", "instance, bus", BUS, OF_BUS)),
         graph("Waiting commands", "Commands and forwarded reads waiting for the line.", "none", query(f"drivegate_bus_queue_depth{{{BUS}}}", OF_BUS)),
+        graph("Tool slots", "Requests of vendors' programs by outcome.", "ops", query(rate("drivegate_slot_requests_total", "instance, bus, outcome", BUS), OF_BUS + " {{outcome}}")),
         graph("Transactions by outcome", "Check the line if there are outcomes other than ok.", "ops", query(rate("drivegate_drive_transactions_total", "instance, bus, outcome", BUS), OF_BUS + " {{outcome}}")),
         row("The drives on it"),
         graph(
@@ -356,6 +364,8 @@ def drive():
         of_drive("DC link voltage", "", "volt", "dc_link_voltage_volts"),
         of_drive("Heatsink temperature", "", "celsius", "heatsink_temperature_celsius"),
         row("Counters and faults"),
+        graph("Starts in an hour", "Starts that the gateway saw; many wear out contactors and motors.", "none", query(f"increase(drivegate_drive_starts_total{{{DRIVE}}}[1h])", OF_DRIVE)),
+        graph("Running time", "Time that the gateway saw the motor running, kept over restarts.", "s", query(f"drivegate_drive_running_seconds_total{{{DRIVE}}}", OF_DRIVE)),
         of_drive("Energy", "Energy counter of the drive.", "kwatth", "energy_kilowatthours"),
         of_drive("Operating hours", "Operating hours counter of the drive.", "h", "operating_hours"),
         of_drive("Fault code", "0: no fault.", "none", "fault_code"),

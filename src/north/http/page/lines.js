@@ -135,6 +135,7 @@ function diagnosisPanel() {
       text(note, found?.verdicts.length ? "" : found?.time ? "Nothing wrong is seen on this line." : "Not made yet.");
       if (state === element.state) return;
       element.state = state;
+      element.classList.toggle("quiet", !found?.verdicts.length);
       list.replaceChildren(...(found?.verdicts ?? []).map(item));
     },
   };
