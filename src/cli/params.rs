@@ -225,7 +225,7 @@ fn list(config: &Path, drive: Option<&str>) -> Result<ExitCode, ExitCode> {
     let store = store(config)?;
     let kept = store.list().map_err(|error| {
         failed(&format!(
-            "cannot read the readings: {error}; {}; use sudo",
+            "cannot read the readings: {error}; {}; make it a directory that you may read, or use sudo",
             store.dir().display()
         ))
     })?;
@@ -265,7 +265,7 @@ fn show(config: &Path, of: &str, names: Option<&Path>) -> Result<ExitCode, ExitC
             let store = store(config)?;
             let last = store
                 .latest(of)
-                .map_err(|why| failed(&format!("{why}; remove that file")))?;
+                .map_err(|why| failed(&format!("{why}; mend or remove that")))?;
             last.ok_or_else(|| {
                 failed(&format!(
                     "no reading of `{of}` is kept; {}; read it by `drivegate params read {of}`",

@@ -54,14 +54,18 @@ pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how
 async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     let name = drive.image.spec.name.clone();
     let store = vault.store();
-    let last = latest(store.clone(), name.clone()).await;
+    // What the disk did not take is known all the same.
+    let last = match vault.last(&name) {
+        None => latest(store.clone(), name.clone()).await.map(Arc::new),
+        last => last,
+    };
     let names = vault.names(&drive.image.spec.profile.name);
     let begun = Instant::now();
     let result = read(
         &vault,
         &drive,
         origin,
-        last.as_ref().filter(|_| !how.afresh),
+        last.as_deref().filter(|_| !how.afresh),
         (how.pace, &names),
     )
     .await;
@@ -74,10 +78,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
             keep(store, file.clone()).await;
         }
     }
-    vault.update(&name, |job| {
-        (job.waits, job.remaining) = (None, None);
-        job.result = Some(result.map(Arc::new));
-    });
+    vault.end(&name, result);
 }
 
 async fn read(

@@ -27,6 +27,8 @@ pub struct Status {
 struct State {
     numbered: u64,
     readings: BTreeMap<String, Status>,
+    /// The last reading of each drive since the gateway started, whether the disk took it or not.
+    last: BTreeMap<String, Arc<ParameterFile>>,
     changed: BTreeMap<(String, String), u64>,
     names: BTreeMap<String, Arc<Names>>,
     store: Option<Store>,
@@ -76,6 +78,11 @@ impl Vault {
         self.lock().readings.get(drive).cloned()
     }
 
+    /// The last reading of that drive that succeeded since the gateway started.
+    pub fn last(&self, drive: &str) -> Option<Arc<ParameterFile>> {
+        self.lock().last.get(drive).cloned()
+    }
+
     /// Whether a reading goes on.
     pub fn is_reading(&self, drive: &str) -> bool {
         self.lock()
@@ -104,6 +111,19 @@ impl Vault {
         };
         state.readings.insert(drive.to_string(), begun);
         Ok(number)
+    }
+
+    /// The reading of that drive is over.
+    pub fn end(&self, drive: &str, result: Result<ParameterFile, String>) {
+        let mut state = self.lock();
+        let result = result.map(Arc::new);
+        if let Ok(file) = &result {
+            state.last.insert(drive.to_string(), file.clone());
+        }
+        if let Some(reading) = state.readings.get_mut(drive) {
+            (reading.waits, reading.remaining) = (None, None);
+            reading.result = Some(result);
+        }
     }
 
     /// Something is new of the reading of that drive.

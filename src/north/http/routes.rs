@@ -290,9 +290,9 @@ async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> R
         return not_found(format!("there is no drive `{name}`"), known.collect());
     }
     let status = plant.parameters.status(&name);
-    let last = match status.as_ref().and_then(|status| status.result.clone()) {
-        Some(Ok(file)) => Some(file),
-        _ => match stored_params(&app, &plant, &name).await {
+    let last = match plant.parameters.last(&name) {
+        Some(file) => Some(file),
+        None => match stored_params(&app, &plant, &name).await {
             Ok(file) => file.map(Arc::new),
             Err(response) => return response,
         },

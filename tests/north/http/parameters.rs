@@ -71,17 +71,20 @@ async fn the_last_reading_and_the_present_one_are_served() {
     let present = json!({"done": 30, "total": 90, "remaining_s": 2.0, "waits": "the drive is offline"});
     assert_eq!((&goes_on["reading"], &goes_on["last"]), (&present, &last));
 
-    vault.update("pump-1", |job| job.result = Some(Err("the bus is gone".to_string())));
+    vault.end("pump-1", Err("the bus is gone".to_string()));
     let failed = json_of(&server).await;
     assert_eq!(failed["error"], "the bus is gone");
     assert_eq!((&failed["reading"], &failed["last"]), (&Value::Null, &last));
 
     let mut newer = file.clone();
     newer.time = "2026-03-02T08:00:00Z".to_string();
-    vault.update("pump-1", |job| job.result = Some(Ok(Arc::new(newer))));
+    vault.end("pump-1", Ok(newer));
     let done = json_of(&server).await;
     assert_eq!(done["last"]["time"], "2026-03-02T08:00:00Z");
     assert_eq!(done["error"], Value::Null);
+    // While the next one goes on it stays, though the disk has an older one.
+    vault.begin("pump-1").unwrap();
+    assert_eq!(json_of(&server).await["last"]["time"], "2026-03-02T08:00:00Z");
 }
 
 #[tokio::test]
