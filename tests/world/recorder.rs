@@ -1,5 +1,6 @@
 //! The recorder beside a bus in virtual time: what a storm of faults costs the line, and that a recording has what was on it.
 
+use std::sync::Arc;
 use std::time::{Duration, SystemTime};
 
 use drivegate::codec::{Protocol, RequestPdu, Table};
@@ -66,11 +67,11 @@ fn thirty_two_drives_that_trip_at_once_cost_the_line_the_reads_of_their_faults_o
     // The same line with and without a recorder.
     let storm = |recorded: bool| {
         let mut rig = Rig::of(&line("vacon-nx", Protocol::ModbusRtu, 38_400, 32));
-        let mut recorder = recorded.then(|| Recorder::new(options()));
+        let mut recorder = recorded.then(|| Recorder::new(options(), Arc::default()));
         let now = clock(&rig);
         recorder
             .iter_mut()
-            .for_each(|r| drop(r.adopt(std::slice::from_ref(&rig.bus.handle.image), now)));
+            .for_each(|r| drop(r.adopt(std::slice::from_ref(&rig.bus.handle.image), SECOND, now)));
         run(&mut rig, recorder.as_mut(), 40 * SECOND);
         let before = rig.requests().len();
         run(&mut rig, recorder.as_mut(), 20 * SECOND);
@@ -113,9 +114,9 @@ fn thirty_two_drives_that_trip_at_once_cost_the_line_the_reads_of_their_faults_o
 #[test]
 fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
     let mut rig = Rig::of(&line("vacon-nx", Protocol::ModbusRtu, 115_200, 1));
-    let mut recorder = Recorder::new(options());
+    let mut recorder = Recorder::new(options(), Arc::default());
     let now = clock(&rig);
-    recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), now);
+    recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), SECOND, now);
     run(&mut rig, Some(&mut recorder), 5 * SECOND);
     // It accelerates, which takes ever more current, and trips on the way.
     rig.set(1, &[("speed_reference", 100.0), ("run", 1.0)]);
@@ -166,9 +167,9 @@ fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
 #[test]
 fn a_stop_waits_for_no_read_of_a_fault() {
     let mut rig = Rig::of(&line("vacon-cx", Protocol::ModbusRtu, 19_200, 8));
-    let mut recorder = Recorder::new(options());
+    let mut recorder = Recorder::new(options(), Arc::default());
     let now = clock(&rig);
-    recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), now);
+    recorder.adopt(std::slice::from_ref(&rig.bus.handle.image), SECOND, now);
     run(&mut rig, Some(&mut recorder), 20 * SECOND);
     (2..=8).for_each(|address| rig.with_drive(address, |drive, _| drive.trip(1)));
     rig.until("the faults", 10 * SECOND, |rig| {
