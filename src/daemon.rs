@@ -21,7 +21,9 @@ use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
+use crate::north::parameters::keep_reading;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
+use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
 use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
 
@@ -64,6 +66,10 @@ pub struct Daemon {
     slots: ServerSlot<slot::Server>,
     local: ServerSlot<local::Local>,
     recordings: Arc<Recordings>,
+    /// Readings of parameters.
+    vault: Arc<Vault>,
+    /// Reads parameters every so often.
+    reader: Option<tokio::task::JoinHandle<()>>,
     history: Arc<History>,
     recorder: Option<RecorderTask>,
     /// Keeps events and counters on disk.
@@ -99,6 +105,7 @@ impl Daemon {
         let settings = file_limit::fit(settings);
         let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
+        let vault = Arc::new(Vault::default());
         let history = Arc::new(History::default());
         let plant = Plant {
             gateway: settings.gateway.clone(),
@@ -107,6 +114,7 @@ impl Daemon {
             events: events.clone(),
             writes: writes.clone(),
             recordings: recordings.clone(),
+            parameters: vault.clone(),
             history: history.clone(),
         };
         let shared: SharedPlant = Arc::new(ArcSwap::from_pointee(plant));
@@ -123,6 +131,8 @@ impl Daemon {
             slots: ServerSlot::default(),
             local: ServerSlot::default(),
             recordings,
+            vault,
+            reader: None,
             history,
             recorder: None,
             keeper: None,
@@ -137,6 +147,7 @@ impl Daemon {
         daemon.apply_mqtt(&settings).await?;
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
+        daemon.apply_params(&settings);
         daemon.replace_buses(&settings, prepared).await;
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -198,6 +209,7 @@ impl Daemon {
         self.replace_buses(&settings, prepared).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
+        self.apply_params(&settings);
         self.apply_audit(&settings).await;
         self.apply_keeper(&settings).await;
         let changes = changes::between(&self.settings, &settings);
@@ -267,6 +279,7 @@ impl Daemon {
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
+            parameters: self.vault.clone(),
             history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
@@ -311,6 +324,21 @@ impl Daemon {
         let started = RecorderTask::start(options, recordings, history, self.events.clone(), &self.writes);
         self.recorder = Some(started.map_err(StartError::Recorder)?);
         Ok(())
+    }
+
+    /// Reads parameters every so often, where that is configured.
+    fn apply_params(&mut self, settings: &Settings) {
+        let params = &settings.params;
+        self.vault
+            .configure(Some(Store::new(params.dir.clone())), params.names.clone());
+        if self.reader.is_some() && self.settings.params.every == params.every {
+            return;
+        }
+        if let Some(reader) = self.reader.take() {
+            reader.abort();
+        }
+        let every = params.every;
+        self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
@@ -435,6 +463,9 @@ impl Daemon {
         })
         .await;
         self.reporter.abort();
+        if let Some(reader) = &self.reader {
+            reader.abort();
+        }
         // What is held back, whenever it would be due.
         self.plant
             .load()

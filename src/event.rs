@@ -67,13 +67,15 @@ pub enum EventKind {
     ReloadRefused,
     /// The other master of a line commands a drive.
     ForeignCommand,
+    /// Parameters changed that the gateway did not write.
+    ParametersChanged,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 21] = [
+    pub const ALL: [EventKind; 22] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -94,6 +96,7 @@ impl EventKind {
         EventKind::Recording,
         EventKind::ReloadRefused,
         EventKind::ForeignCommand,
+        EventKind::ParametersChanged,
         EventKind::Diagnosis,
     ];
 
@@ -120,7 +123,8 @@ impl EventKind {
             | EventKind::RefusedCommand
             | EventKind::BusUp
             | EventKind::Recording
-            | EventKind::ForeignCommand => false,
+            | EventKind::ForeignCommand
+            | EventKind::ParametersChanged => false,
         }
     }
 
@@ -147,6 +151,7 @@ impl EventKind {
             EventKind::Recording => "recording",
             EventKind::ReloadRefused => "reload_refused",
             EventKind::ForeignCommand => "foreign_command",
+            EventKind::ParametersChanged => "parameters_changed",
             EventKind::Diagnosis => "diagnosis",
         }
     }
@@ -435,6 +440,7 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
                 | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                ParametersChanged => false,
                 Diagnosis => true,
             };
             assert_eq!(kind as usize, place);

@@ -10,15 +10,16 @@ use std::time::{Duration, Instant};
 use arc_swap::ArcSwap;
 use tokio::sync::oneshot;
 
-use crate::codec::{Table, describe};
+use crate::codec::{RequestPdu, Table, describe};
 use crate::command::{
-    self, Answer, Authority, Change, Command, CommandQueue, Order, Origin, Outcome, Refusal, Ticket, Urgency,
-    WriteStats,
+    self, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Order, Origin, Outcome, Pace, Refusal,
+    Ticket, Urgency, WriteStats,
 };
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Value};
-use crate::event::{Events, RefusedCommand};
+use crate::event::{Event, Events, RefusedCommand};
 use crate::history::{History, Recordings};
+use crate::parameters::Vault;
 use crate::process_image::{BusImage, DriveImage, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
@@ -52,6 +53,8 @@ pub struct Plant {
     pub writes: Arc<WriteStats>,
     /// What the recorder has kept.
     pub recordings: Arc<Recordings>,
+    /// Readings of parameters.
+    pub parameters: Arc<Vault>,
     /// The past of the drives.
     pub history: Arc<History>,
 }
@@ -267,6 +270,50 @@ impl DriveHandle {
             }
         }
         placed
+    }
+
+    /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. What came of
+    /// it; a read on a line that another master owns is refused.
+    pub async fn read_in_background(
+        &self,
+        pdu: RequestPdu,
+        pace: Pace,
+        origin: Origin,
+        expiry: Duration,
+        now: Instant,
+    ) -> Outcome {
+        let reading = self.reading(now);
+        let order = match command::admit(Order::Read(pdu), &reading, Authority::ReadOnly) {
+            Ok(admitted) => admitted.order,
+            Err(refusal) => return Outcome::Refused(refusal),
+        };
+        let Order::Read(pdu) = order else {
+            return Outcome::Expired;
+        };
+        if !self.bus_up() {
+            return Outcome::BusDown;
+        }
+        if !reading.snapshot.link.is_online() {
+            return Outcome::Offline;
+        }
+        let name = &self.image.spec.name;
+        let (ticket, answer) = Ticket::new(origin, name, String::new(), false, now, self.writes.clone());
+        let request = BackgroundRequest {
+            drive: self.index,
+            pdu,
+            pace,
+            expires: now + expiry,
+            ticket,
+            passed_on: None,
+        };
+        self.bus.queue.submit_background(request, now);
+        // A ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        answer.await.map_or(Outcome::ShuttingDown, |answer| answer.outcome)
+    }
+
+    /// Publishes what happened to the drive.
+    pub fn publish(&self, event: Event) {
+        self.events.publish(event);
     }
 
     /// Refuses a command before it became an order; audited, counted and published like any other refusal.

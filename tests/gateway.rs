@@ -22,6 +22,7 @@ mod gateway {
     mod local_socket;
     mod messages;
     mod operators;
+    mod parameters;
     mod recordings;
     mod reload;
     mod replay;

@@ -156,6 +156,7 @@ async fn drivegate() -> Result<(), Box<dyn Error>> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     };
     let poll = move || {

@@ -16,6 +16,7 @@ static SERVER: LazyLock<Offline> = LazyLock::new(|| {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     };
     Offline::new(Arc::new(ArcSwap::from_pointee(plant))).expect("a server")

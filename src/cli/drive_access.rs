@@ -5,6 +5,7 @@
 
 mod direct;
 mod gateway;
+mod parameters;
 
 use std::path::Path;
 use std::process::ExitCode;
@@ -17,7 +18,7 @@ use crate::north::local::protocol::{Expected, Outcome, Request};
 use crate::process_image::DriveSpec;
 
 /// The drive that a command is about.
-#[derive(Debug)]
+#[derive(Debug, Clone)]
 pub(super) struct Target {
     pub(super) settings: Settings,
     pub(super) bus: BusSettings,

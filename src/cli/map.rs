@@ -146,6 +146,7 @@ fn plant(settings: &Settings) -> io::Result<Plant> {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     })
 }

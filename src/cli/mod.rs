@@ -20,6 +20,7 @@ mod loading;
 mod local_client;
 mod log;
 mod map;
+mod params;
 mod printable;
 mod profiles;
 mod read;
@@ -111,6 +112,7 @@ commands! {
     Diagnose => diagnose,
     Record => record,
     Recordings => recordings,
+    Params => params,
     Watch => watch,
     Trace => trace,
     Replay => replay,

@@ -56,13 +56,15 @@ pub enum SourceKind {
     CommandLine,
     /// The other master of a line on which the gateway only listens.
     OtherMaster,
+    /// What the gateway does every so often. It reads only.
+    Schedule,
     /// A tool at a slot of the bus.
     Slot,
 }
 
 impl SourceKind {
     /// All kinds.
-    pub const ALL: [SourceKind; 10] = [
+    pub const ALL: [SourceKind; 11] = [
         SourceKind::ModbusTcp,
         SourceKind::Mqtt,
         SourceKind::Sparkplug,
@@ -72,6 +74,7 @@ impl SourceKind {
         SourceKind::LocalSocket,
         SourceKind::CommandLine,
         SourceKind::OtherMaster,
+        SourceKind::Schedule,
         SourceKind::Slot,
     ];
 
@@ -87,13 +90,17 @@ impl SourceKind {
             SourceKind::LocalSocket => "local_socket",
             SourceKind::CommandLine => "command_line",
             SourceKind::OtherMaster => "other_master",
+            SourceKind::Schedule => "schedule",
             SourceKind::Slot => "slot",
         }
     }
 
     /// Whether a client commands; the gateway itself is none.
     pub fn is_client(self) -> bool {
-        !matches!(self, SourceKind::Supervision | SourceKind::Shutdown)
+        !matches!(
+            self,
+            SourceKind::Supervision | SourceKind::Shutdown | SourceKind::Schedule
+        )
     }
 }
 

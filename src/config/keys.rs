@@ -177,6 +177,8 @@ keys! {
         audit: Present = Own { schema: AuditTable::schema, range: "[audit]" }, or "not written";
         /// What the recorder keeps.
         recordings: Present = Own { schema: Recordings::schema, range: "[recordings]" }, or "the defaults";
+        /// When parameters are read by themselves, and what they are called.
+        params: Present = Own { schema: Params::schema, range: "[params]" }, or "only when asked";
         /// What is logged.
         log: Present = Own { schema: Log::schema, range: "[log]" }, or "the defaults";
     }
@@ -189,8 +191,8 @@ keys! {
         /// running gateway](commissioning.md#through-the-gateway); `""`: none. If it cannot be opened, a warning is logged and
         /// the gateway runs without it.
         socket: PathBuf = PATH, or "`drivegate.sock` in the runtime directory";
-        /// Directory of what the gateway keeps: [recordings](recordings.md), [events, run hours and starts](history.md), and the
-        /// [audit file](commands.md#the-audit-file).
+        /// Directory of what the gateway keeps: [recordings](recordings.md), [events, run hours and starts](history.md),
+        /// [parameters](parameters.md), and the [audit file](commands.md#the-audit-file).
         state_dir: PathBuf = PATH, or "the state directory of the systemd unit, else `/var/lib/drivegate`";
         /// Directories with custom [profiles](profiles.md), `*.toml`; a file with the name of a built-in profile
         /// replaces it.
@@ -605,6 +607,16 @@ keys! {
         max_count: usize = Number(0..=100_000, None), default 200;
         /// Whether a warning of a drive makes a recording, too.
         warnings: bool = Flag, default false;
+    }
+
+    /// When [parameters](parameters.md) are read by themselves, and what they are called.
+    PARAMS: Params {
+        /// How often all parameters of every drive are read, one drive of a bus after the other; absent: only when asked. Readings are
+        /// kept in `params` of the `state_dir`; what changed without the gateway is an event.
+        every: Duration = Time(Duration::from_secs(60)..=Duration::from_secs(366 * 86_400)), or "never";
+        /// Lists of names, units and scales of your own, [CSV](parameters.md#names-of-your-own); `vacon-cx.csv` is for the drives of
+        /// profile `vacon-cx`.
+        names: Vec<PathBuf> = List { parse: values::path, empty: None, range: "files" }, or "none";
     }
 
     /// What is logged.

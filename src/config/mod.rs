@@ -15,6 +15,7 @@ mod modbus_tcp;
 mod mqtt;
 mod named_files;
 mod north;
+mod params;
 mod raw_writes;
 mod recordings;
 mod shutdown;
@@ -29,6 +30,7 @@ pub(crate) use drive::{addresses, unknown_profile};
 pub(crate) use keys::schema;
 pub(crate) use log::parse_level;
 pub(crate) use named_files::{FileKind, NamedFile, named_files};
+pub use params::ParamsSettings;
 
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -62,6 +64,8 @@ pub struct Settings {
     pub keeps_history: bool,
     /// What the recorder keeps.
     pub recordings: RecorderOptions,
+    /// How parameters are read and kept.
+    pub params: ParamsSettings,
     /// Directories of the user's profiles.
     pub profile_dirs: Vec<PathBuf>,
     /// Built-in profiles and the user's.
@@ -246,6 +250,8 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .map(|table| log::read_audit(&table, &state_dir));
     let recordings = ROOT.recordings.table(reader);
     let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
+    let params = ROOT.params.table(reader);
+    let params = params.map(|table| params::read(&table, base, &state_dir, &profiles));
     let log = ROOT.log.table(reader).map(|table| log::read(&table));
     reader.finish();
 
@@ -256,6 +262,7 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
     Some(Settings {
         gateway: name?,
         socket,
+        params: params.unwrap_or_else(|| ParamsSettings::below(&state_dir)),
         state_dir,
         keeps_history: true,
         recordings: recordings?,

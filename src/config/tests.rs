@@ -50,6 +50,7 @@ tokens_file = "DIR/tokens"
 certificate = "DIR/gateway.crt"
 key = "DIR/gateway.key"
 [audit]
+[params]
 [log]
 [[bus.drive.trigger]]
 point = "motor_current"

@@ -10,6 +10,7 @@ pub(super) fn between(before: &Settings, after: &Settings) -> Vec<String> {
         ("stale_after", before.stale_after == after.stale_after),
         ("the local socket", before.socket == after.socket),
         ("what the recorder keeps", before.recordings == after.recordings),
+        ("how parameters are read", before.params == after.params),
         ("the log level", before.log.level == after.log.level),
     ];
     let sections = [

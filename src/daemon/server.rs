@@ -398,6 +398,7 @@ mod tests {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            parameters: Default::default(),
             history: Default::default(),
         };
         (Arc::new(arc_swap::ArcSwap::from_pointee(plant)), Arc::default())

@@ -5,6 +5,7 @@ pub(crate) mod derive;
 mod families_tests;
 pub(crate) mod identify;
 pub mod model;
+pub mod parameters;
 pub(crate) mod plan;
 pub mod profile;
 mod profile_file;

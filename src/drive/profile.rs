@@ -10,6 +10,7 @@ use std::time::Duration;
 
 use super::derive::Derived;
 use super::model::{Kind, ModelPoint, Value};
+use super::parameters::ParameterList;
 use crate::codec::{N2Options, Protocol, RequestPdu, Table};
 use crate::document::Node;
 
@@ -56,6 +57,8 @@ pub struct Profile {
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
     pub on_fault: Vec<usize>,
+    /// Its parameters.
+    pub parameters: ParameterList,
     /// Texts of fault codes.
     pub faults: BTreeMap<u16, FaultText>,
     /// Index of each model point in `points`.

@@ -12,6 +12,7 @@ mod log_throttle;
 pub mod metrics;
 pub mod modbus_tcp;
 pub mod mqtt;
+pub mod parameters;
 mod pem;
 mod readiness;
 mod refusals;

@@ -163,6 +163,8 @@ pub struct DriveImage {
     heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
     unsupervised: AtomicBool,
+    /// Values of parameters that the gateway wrote since they were read last, and when, by address.
+    written: Mutex<BTreeMap<u16, (u16, Instant)>>,
 }
 
 impl DriveImage {
@@ -184,7 +186,29 @@ impl DriveImage {
             heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
+            written: Mutex::default(),
         }
+    }
+
+    /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
+    pub(crate) fn note_written(&self, items: &[(u16, u16)], now: Instant) {
+        let parameters = &self.spec.profile.parameters;
+        let is_parameter = |address: u16| parameters.id(address).is_some();
+        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        let parameters = items.iter().filter(|(address, _)| is_parameter(*address));
+        written.extend(parameters.map(|(address, value)| (*address, (*value, now))));
+    }
+
+    /// The value that the gateway wrote to that parameter since the parameters were read last, and when.
+    pub fn written(&self, address: u16) -> Option<(u16, Instant)> {
+        let written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.get(&address).copied()
+    }
+
+    /// The parameters were read, from `begun` on: what was written before that is in what was read.
+    pub fn forget_written(&self, begun: Instant) {
+        let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
+        written.retain(|_, (_, at)| *at >= begun);
     }
 
     /// Process data is not stale before that age: the line cannot renew it faster.

@@ -126,7 +126,8 @@ fn the_tests_of_the_threat_model_exist() {
 
 fn is_profile(block: &str) -> bool {
     let named = block.contains("\nbase = ") || block.contains("\nprotocols = ");
-    named && !block.contains("[mqtt]") || block.starts_with("[n2]")
+    let part = block.starts_with("[n2]") || block.starts_with("[parameters]");
+    named && !block.contains("[mqtt]") || part
 }
 
 #[test]
@@ -137,8 +138,10 @@ fn every_profile_that_is_shown_is_sound() {
     assert!(shown.len() >= 5);
     for (i, mut block) in shown.into_iter().enumerate() {
         // A block that shows one section stands in a profile.
-        if block.starts_with("[n2]") {
-            block = format!("name = \"n2-{i}\"\nbase = \"vacon-nx-n2\"\n{block}");
+        for (section, base) in [("[n2]", "vacon-nx-n2"), ("[parameters]", "teco-7300pa")] {
+            if block.starts_with(section) {
+                block = format!("name = \"part-{i}\"\nbase = \"{base}\"\n{block}");
+            }
         }
         fs::write(dir.path().join(format!("{i}.toml")), block).unwrap();
     }

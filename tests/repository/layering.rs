@@ -9,7 +9,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 /// The rooms from the bottom of the house to its door.
-const ROOMS: [&str; 18] = [
+const ROOMS: [&str; 19] = [
     "document",
     "files",
     "codec",
@@ -19,6 +19,7 @@ const ROOMS: [&str; 18] = [
     "process_image",
     "command",
     "history",
+    "parameters",
     "plant",
     "line",
     "bus",

@@ -534,6 +534,7 @@ fn whatever_clients_try_nothing_goes_out_for_an_hour() {
         events: scene.events.clone(),
         writes: scene.writes.clone(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     };
     let profile = scene.handle.image.drives[0].spec.profile.clone();

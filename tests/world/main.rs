@@ -28,6 +28,7 @@ mod matrix;
 mod n2;
 mod one_bus;
 mod orders;
+mod parameters;
 mod prediction;
 mod recorder;
 mod rig;

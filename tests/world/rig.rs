@@ -101,6 +101,7 @@ impl Rig {
             events,
             writes,
             recordings: Default::default(),
+            parameters: Default::default(),
             history: Default::default(),
         };
         Rig { bus, now, plant }
@@ -170,6 +171,7 @@ impl Rig {
             events: self.plant.events.clone(),
             writes: self.plant.writes.clone(),
             recordings: Default::default(),
+            parameters: Default::default(),
             history: Default::default(),
         }))
     }

@@ -8,7 +8,7 @@ use crate::bus::news::News;
 use crate::bus::schedule::Admission;
 use crate::bus::transaction::Ended;
 use crate::codec::rtu::LONGEST;
-use crate::codec::{Exception, Reply, RequestPdu};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Urgency, written};
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
@@ -298,6 +298,10 @@ impl Master {
             }
         }
         if let Some((table, items)) = written(&turn.pdu) {
+            let image = self.bus.image.drives.get(turn.drive);
+            if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
+                image.note_written(&items, now);
+            }
             let covers = |read: &PlannedRead| items.iter().any(|(address, _)| read.covers(table, *address));
             self.schedule.refresh(turn.drive, covers, now);
         }

@@ -9,7 +9,7 @@ use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
-use crate::codec::{Exception, Reply, RequestPdu};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, written};
 use crate::drive::{PlannedRead, Point, Raw};
 
@@ -284,6 +284,11 @@ impl Master {
                 }
                 return;
             }
+        }
+        if let Some((Table::Holding, items)) = written(&step.pdu)
+            && !matches!(reply, Reply::Exception(_))
+        {
+            image.note_written(&items, now);
         }
         let outcome = drive.answered(slot, step, reply);
         if let Some(outcome) = outcome {

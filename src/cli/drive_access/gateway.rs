@@ -59,9 +59,12 @@ pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Out
 
 fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
     let remedy = match request {
-        Request::Read(_) | Request::Why(_) | Request::Record(_) | Request::Reload(_) | Request::Health(_) => {
-            "try again"
-        }
+        Request::Read(_)
+        | Request::Why(_)
+        | Request::Record(_)
+        | Request::Params(_)
+        | Request::Reload(_)
+        | Request::Health(_) => "try again",
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };
     format!("the gateway did not answer: {error}; {}; {remedy}", path.display())
@@ -70,6 +73,9 @@ fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
 fn refused(path: &Path, code: FailureCode, message: &str) -> String {
     let remedy = match code {
         FailureCode::Busy => "try again",
+        FailureCode::NoParameters => {
+            "parameters can be read of drives whose profile lists them, on lines that the gateway owns"
+        }
         FailureCode::NotRecorded => "set max_count of [recordings] above 0 and reload",
         FailureCode::OtherConfiguration | FailureCode::UnknownDrive | FailureCode::UnknownPoint => {
             "the gateway there runs with another configuration: reload it, or name its file by --config"

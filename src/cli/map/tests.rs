@@ -34,6 +34,7 @@ fn plant() -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     }
 }

@@ -130,6 +130,7 @@ mod tests {
             events: Default::default(),
             writes: Default::default(),
             recordings: Default::default(),
+            parameters: Default::default(),
             history: Default::default(),
         };
         assert_eq!(status(&plant, None), "0 of 0 buses up, 0 of 0 drives online");

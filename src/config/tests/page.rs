@@ -23,6 +23,7 @@ fn with_tables(page: &str) -> String {
         ("[http]", "Http"),
         ("[audit]", "AuditTable"),
         ("[recordings]", "Recordings"),
+        ("[params]", "Params"),
         ("[log]", "Log"),
     ];
     let mut page = page.to_string();

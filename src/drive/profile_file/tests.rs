@@ -467,6 +467,7 @@ fn the_page_names_every_key() {
         ("\n### `[speed_reference]`\n", "speed_reference."),
         ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[n2]`\n", "n2."),
+        ("\n### `[parameters]`\n", "parameters."),
         ("\n### `[[range]]`\n", "range[]."),
         ("\n### `[[point]]`\n", "point[]."),
     ] {

@@ -13,6 +13,7 @@ mod line;
 mod offline;
 mod operating;
 mod page;
+mod params;
 mod query;
 mod routes;
 mod streams;

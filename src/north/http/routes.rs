@@ -18,11 +18,13 @@ use tokio_util::sync::CancellationToken;
 
 use super::access::{Access, AccessError};
 use super::operating::{self, Cookies, Operating};
+use super::params::Parameters;
 use super::{Coverage, MAX_LISTENERS, MAX_LISTENERS_PER_ADDRESS, api, event_log, line, page, query, streams, trend};
 use crate::history::export;
 use crate::north::connection_limit::{ConnectionLimit, Limits, Place};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{NorthStats, metrics, readiness};
+use crate::parameters::ParameterFile;
 use crate::plant::{Plant, SharedPlant};
 
 /// What all handlers share.
@@ -99,6 +101,7 @@ pub(super) fn router(
         .route("/readyz", get(ready))
         .route("/api/v1/drives", get(drives))
         .route("/api/v1/drives/{name}", get(drive))
+        .route("/api/v1/drives/{name}/params", get(params))
         .route("/api/v1/drives/{name}/trend", get(trend::trend))
         .route("/api/v1/buses", get(buses))
         .route("/api/v1/buses/{name}", get(line::bus))
@@ -277,6 +280,43 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
         }
         None => no_drive(&plant, &name),
     }
+}
+
+/// The last reading of the parameters of a drive, and the one that goes on.
+async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
+    let plant = app.plant.load_full();
+    if plant.drive(&name).is_none() {
+        let known = plant.drives().map(|d| d.image.spec.name.clone());
+        return not_found(format!("there is no drive `{name}`"), known.collect());
+    }
+    let status = plant.parameters.status(&name);
+    let last = match plant.parameters.last(&name) {
+        Some(file) => Some(file),
+        None => match stored_params(&app, &plant, &name).await {
+            Ok(file) => file.map(Arc::new),
+            Err(response) => return response,
+        },
+    };
+    Json(Parameters::new(&name, last.as_deref(), status.as_ref())).into_response()
+}
+
+/// The last reading on disk.
+async fn stored_params(app: &AppState, plant: &Plant, name: &str) -> Result<Option<ParameterFile>, Response> {
+    let Some(store) = plant.parameters.store() else {
+        return Ok(None);
+    };
+    let unavailable = || StatusCode::SERVICE_UNAVAILABLE.into_response();
+    let _permit = app.files.acquire().await.map_err(|_| unavailable())?;
+    let name = name.to_string();
+    let read = tokio::task::spawn_blocking(move || store.latest(&name)).await;
+    read.map_err(|_| unavailable())?.map_err(|error| {
+        let known = Vec::new();
+        (
+            StatusCode::INTERNAL_SERVER_ERROR,
+            Json(api::ErrorReply { error, known }),
+        )
+            .into_response()
+    })
 }
 
 async fn buses(State(app): State<Arc<AppState>>) -> Response {

@@ -6,15 +6,16 @@ use std::time::{Duration, Instant};
 use serde_json::Value as Json;
 
 use super::protocol::{
-    Expected, Failure, FailureCode, Outcome, PointValue, ReadOutcome, ReadRequest, RecordOutcome, RecordRequest,
-    Request, Setting, WhyRequest, Word, WriteOutcome, WriteRequest, port_of,
+    Expected, Failure, FailureCode, Outcome, ParamsOutcome, ParamsRequest, PointValue, ReadOutcome, ReadRequest,
+    RecordOutcome, RecordRequest, Request, Setting, WhyRequest, Word, WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Refusal};
+use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refusal};
 use crate::document::nearest;
 use crate::drive::why::Explanation;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::command_json::resolve;
+use crate::north::parameters::{How, begin_reading};
 use crate::plant::{DriveHandle, Plant};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
@@ -30,6 +31,7 @@ pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
         Request::Why(request) => why(request, plant).map(Outcome::Why),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
+        Request::Params(request) => params(request, plant, origin).map(Outcome::Params),
         Request::Reload(_) | Request::Health(_) => {
             let message = "this is no request to a drive";
             Err(Failure::new(FailureCode::BadRequest, message))
@@ -301,6 +303,22 @@ async fn record(request: &RecordRequest, plant: &Plant, origin: &Origin) -> Resu
         }),
         Err(why) => Err(Failure::new(FailureCode::NotRecorded, why.to_string())),
     }
+}
+
+fn params(request: &ParamsRequest, plant: &Plant, origin: Origin) -> Result<ParamsOutcome, Failure> {
+    let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
+    let vault = &plant.parameters;
+    let fail = |why: String| Failure::new(FailureCode::NoParameters, why);
+    if request.begin {
+        let how = How {
+            afresh: request.afresh,
+            pace: if request.brisk { Pace::Brisk } else { Pace::Slow },
+        };
+        begin_reading(vault, drive, origin, how).map_err(fail)?;
+    }
+    let status = vault.status(&request.drive);
+    let status = status.ok_or_else(|| fail(format!("the parameters of `{}` were not read yet", request.drive)))?;
+    Ok(ParamsOutcome::new(&status))
 }
 
 /// The point and its value: as over MQTT, and the text of an enumeration too.

@@ -8,6 +8,8 @@
 //! {"v":1,"gateway":"plant","why":{"runs":false,"causes":[{"cause":"interlocked","evidence":"…","age_ms":12,"remedy":"…"}],"not_told":[]}}
 //! {"v":1,"record":{"drive":"pump-1"}}
 //! {"v":1,"gateway":"plant","record":{"id":"20260302T074012.118Z-pump-1","after_s":10.0}}
+//! {"v":1,"params":{"drive":"pump-1","begin":true}}
+//! {"v":1,"gateway":"plant","params":{"number":3,"done":120,"total":1899,"remaining_s":8.5}}
 //! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
 //! {"v":1,"gateway":"plant","reload":{"errors":[],"warnings":[],"changes":["changed: MQTT"]}}
 //! {"v":1,"health":{}}
@@ -24,6 +26,7 @@ use serde_json::Value as Json;
 use crate::command::{Answer, CONFIRMED};
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
+use crate::parameters::Status;
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -45,6 +48,8 @@ pub enum Request {
     Why(WhyRequest),
     /// A recording of one drive.
     Record(RecordRequest),
+    /// The parameters of one drive.
+    Params(ParamsRequest),
     /// The gateway reads its configuration anew.
     Reload(OfGateway),
     /// Whether the gateway is ready.
@@ -80,6 +85,26 @@ pub struct RecordRequest {
     /// Which configuration the client has in mind; absent: whatever the gateway runs with.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub expect: Option<Expected>,
+}
+
+/// The parameters of one drive: begin to read them, or say how far that is.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ParamsRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
+    /// A reading begins, unless one goes on.
+    #[serde(default)]
+    pub begin: bool,
+    /// The drive is asked for every address, whatever earlier readings found.
+    #[serde(default)]
+    pub afresh: bool,
+    /// It may take 18 % of a busy line in place of 1.5 %.
+    #[serde(default)]
+    pub brisk: bool,
 }
 
 /// Points of one drive.
@@ -179,6 +204,8 @@ pub enum Outcome {
     Why(Explanation),
     /// A recording goes on.
     Record(RecordOutcome),
+    /// A reading of parameters goes on, or is over.
+    Params(ParamsOutcome),
     /// The configuration was read anew.
     Reload(ReloadOutcome),
     /// The gateway is ready, or not.
@@ -224,6 +251,48 @@ pub struct RecordOutcome {
     pub id: String,
     /// Time until it is complete, s.
     pub after_s: f64,
+}
+
+/// A reading of parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct ParamsOutcome {
+    /// Its number.
+    pub number: u64,
+    /// Addresses that were asked.
+    pub done: usize,
+    /// Addresses to ask in all.
+    pub total: usize,
+    /// Time that it will still take, s, by what it took so far.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub remaining_s: Option<f64>,
+    /// Why it waits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waits: Option<String>,
+    /// The file, once it is over.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub file: Option<String>,
+    /// Why it failed.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub error: Option<String>,
+}
+
+impl ParamsOutcome {
+    pub(super) fn new(status: &Status) -> ParamsOutcome {
+        let (file, error) = match &status.result {
+            None => (None, None),
+            Some(Ok(file)) => (Some(file.text()), None),
+            Some(Err(why)) => (None, Some(why.clone())),
+        };
+        ParamsOutcome {
+            number: status.number,
+            done: status.progress.0,
+            total: status.progress.1,
+            remaining_s: status.remaining.map(|time| time.as_secs_f64()),
+            waits: status.waits.clone(),
+            file,
+            error,
+        }
+    }
 }
 
 /// The points that were asked for.
@@ -375,6 +444,8 @@ pub enum FailureCode {
     UnknownPoint,
     /// Nothing is recorded.
     NotRecorded,
+    /// The parameters of that drive cannot be read.
+    NoParameters,
     /// The client's port is none of this gateway's.
     OtherGateway,
     /// The gateway stops.

@@ -74,6 +74,7 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Fa
     buses(&plant.buses, &mut all);
     writes(plant, &mut all);
     recordings(plant, &mut all);
+    parameters(plant, &mut all);
     north(stats, &mut all);
     reload(stats, &mut all);
     all.push(build(plant));
@@ -328,6 +329,21 @@ fn recordings(plant: &Plant, all: &mut Vec<Family>) {
         made.add(vec![("trigger", kind.name().to_string())], SeriesValue::Count(count));
     }
     all.push(made);
+}
+
+fn parameters(plant: &Plant, all: &mut Vec<Family>) {
+    let mut changed = Family::new(
+        Kind::Counter,
+        "drivegate_parameters_changed_total",
+        "Parameters of the drive that changed from one reading to the next and that the gateway did not write.",
+    );
+    let counts = plant.parameters.changed();
+    for drive in plant.drives() {
+        let key = (drive.image.spec.bus.clone(), drive.image.spec.name.clone());
+        let count = counts.get(&key).copied().unwrap_or_default();
+        changed.add(vec![("bus", key.0), ("drive", key.1)], SeriesValue::Count(count));
+    }
+    all.push(changed);
 }
 
 fn north(stats: &NorthStats, all: &mut Vec<Family>) {

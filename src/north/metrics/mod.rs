@@ -195,6 +195,7 @@ mod tests {
             events: Events::default(),
             writes: Arc::new(WriteStats::default()),
             recordings: Default::default(),
+            parameters: Default::default(),
             history: Default::default(),
         }
     }

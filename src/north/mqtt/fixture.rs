@@ -40,6 +40,7 @@ pub(in crate::north) fn plant(drives: &[&str]) -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     }
 }

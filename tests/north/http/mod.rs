@@ -10,5 +10,6 @@ mod limits;
 mod metrics;
 mod operate;
 mod page;
+mod parameters;
 mod plant;
 mod streams;

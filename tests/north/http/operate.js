@@ -89,7 +89,15 @@ class Browser {
   async close() {
     this.process.kill();
     await new Promise((done) => this.process.on("exit", done));
-    fs.rmSync(this.profile, { recursive: true, force: true, maxRetries: 20, retryDelay: 100 });
+    // Children of the browser write for a moment longer.
+    for (let left = 100; fs.existsSync(this.profile); left -= 1) {
+      try {
+        fs.rmSync(this.profile, { recursive: true, force: true });
+      } catch (error) {
+        if (left === 0) throw error;
+        await new Promise((done) => setTimeout(done, 100));
+      }
+    }
   }
 }
 

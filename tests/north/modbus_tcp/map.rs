@@ -70,6 +70,7 @@ fn plant(settings: &Settings) -> Plant {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     }
 }

@@ -47,6 +47,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         events: Default::default(),
         writes: Default::default(),
         recordings: Default::default(),
+        parameters: Default::default(),
         history: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());

@@ -1,0 +1,64 @@
+//! `[params]`: when parameters are read, and what they are called.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::keys::PARAMS;
+use super::values;
+use crate::document::{self, Reader};
+use crate::drive::profile::Profiles;
+use crate::parameters::Names;
+
+/// How parameters are read and kept.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ParamsSettings {
+    /// Where readings are kept.
+    pub dir: PathBuf,
+    /// How often all parameters are read; none: when asked only.
+    pub every: Option<Duration>,
+    /// Names that go before those of the profiles, by profile.
+    pub names: BTreeMap<String, Arc<Names>>,
+}
+
+impl ParamsSettings {
+    /// Readings below that state directory, and nothing else.
+    pub(super) fn below(state_dir: &Path) -> ParamsSettings {
+        ParamsSettings {
+            dir: state_dir.join("params"),
+            ..ParamsSettings::default()
+        }
+    }
+}
+
+pub(super) fn read(reader: &Reader<'_>, base: &Path, state_dir: &Path, profiles: &Profiles) -> ParamsSettings {
+    let mut settings = ParamsSettings::below(state_dir);
+    settings.every = PARAMS.every.read(reader);
+    for file in PARAMS.names.get(reader) {
+        let path = values::resolved(base, file);
+        match read_names(&path, profiles) {
+            Ok((profile, names)) => drop(settings.names.insert(profile, Arc::new(names))),
+            Err(what) => reader.problem(PARAMS.names.name, what, "correct the list, or leave it out"),
+        }
+    }
+    reader.finish();
+    settings
+}
+
+/// A list of names, and the profile that it is for.
+fn read_names(path: &Path, profiles: &Profiles) -> Result<(String, Names), String> {
+    let shown = path.display();
+    let profile = path
+        .file_stem()
+        .map(|stem| stem.to_string_lossy().into_owned())
+        .unwrap_or_default();
+    if profiles.get(&profile).is_none() {
+        let known: Vec<&str> = profiles.names().collect();
+        let known = known.join(", ");
+        return Err(format!("{shown} is not named after a profile; known profiles: {known}"));
+    }
+    let text = document::read_file(path).map_err(|problem| problem.to_string())?;
+    let names = Names::parse(&text).map_err(|why| format!("{shown}: {why}"))?;
+    Ok((profile, names))
+}

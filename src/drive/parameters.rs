@@ -1,0 +1,243 @@
+//! Parameters of a family as data: which there are, and what they are called.
+
+use super::profile::Profile;
+use crate::codec::{Protocol, Table};
+
+/// The parameters of a family.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct ParameterList {
+    /// Those that are known by name, by ascending address.
+    pub named: Vec<Parameter>,
+    /// Where others may lie; which of them a drive has, it is asked.
+    pub spans: Vec<Span>,
+    /// Points that identify the drive in a file: indices in the profile.
+    pub identification: Vec<usize>,
+}
+
+/// Addresses at which a drive may have parameters.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Span {
+    /// First PDU address of a holding register.
+    pub first: u16,
+    /// Last PDU address.
+    pub last: u16,
+    /// How they are numbered.
+    pub numbering: Numbering,
+}
+
+/// How a family numbers its parameters.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Numbering {
+    /// ID = PDU address + 1.
+    Id,
+    /// `group.number` = 100 group + number - 1, numbers 1 to 99; group 0 at 9900.
+    Group,
+}
+
+impl Numbering {
+    /// The name of the parameter at an address; none where none can be.
+    pub fn id(self, address: u16) -> Option<String> {
+        match self {
+            Numbering::Id => Some((u32::from(address) + 1).to_string()),
+            Numbering::Group => {
+                let (block, number) = (address / 100, address % 100 + 1);
+                let group = if block == 99 { 0 } else { block };
+                (number <= 99).then(|| format!("{group}.{number}"))
+            }
+        }
+    }
+
+    /// The address of the parameter of that name.
+    pub fn address(self, id: &str) -> Option<u16> {
+        match self {
+            Numbering::Id => id.parse::<u16>().ok()?.checked_sub(1),
+            Numbering::Group => {
+                let (group, number) = id.split_once('.')?;
+                let (group, number): (u16, u16) = (group.parse().ok()?, number.parse().ok()?);
+                let block = match group {
+                    0 => 99,
+                    1..=98 => group,
+                    _ => return None,
+                };
+                (1..=99).contains(&number).then(|| 100 * block + number - 1)
+            }
+        }
+    }
+}
+
+/// One parameter that is known by name.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Parameter {
+    /// As the family calls it: `Cn-02`, `102`, `1.2`, `AO 3`.
+    pub id: String,
+    /// PDU address of its (first) holding register.
+    pub address: u16,
+    /// What it is called, and its unit.
+    pub label: Label,
+}
+
+/// What a parameter is called, and what its counts mean.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Label {
+    /// Name; empty where none is known.
+    pub name: String,
+    /// Unit of the value; empty for codes.
+    pub unit: String,
+    /// Value of one count; 0 where none is known.
+    pub scale: f64,
+}
+
+impl Label {
+    /// The value in its unit; nothing where the value of a count is not known.
+    pub fn value(&self, raw: RawValue) -> String {
+        let number = match raw {
+            RawValue::Float(bits) => return with_unit(&f32::from_bits(bits).to_string(), &self.unit),
+            RawValue::Word(word) => f64::from(word),
+        };
+        if self.scale <= 0.0 {
+            return String::new();
+        }
+        let decimals = (0..6).find(|n| {
+            let scaled = self.scale * 10f64.powi(*n);
+            (scaled - scaled.round()).abs() < 1e-6
+        });
+        let decimals = usize::try_from(decimals.unwrap_or(6)).unwrap_or_default();
+        with_unit(&format!("{:.decimals$}", number * self.scale), &self.unit)
+    }
+}
+
+fn with_unit(number: &str, unit: &str) -> String {
+    match unit {
+        "" => number.to_string(),
+        unit => format!("{number} {unit}"),
+    }
+}
+
+/// The value of a parameter as the drive gives it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub enum RawValue {
+    /// One register.
+    Word(u16),
+    /// The bits of an analog output of N2.
+    Float(u32),
+}
+
+impl RawValue {
+    /// From the words of a read.
+    pub fn of_words(words: &[u16]) -> Option<RawValue> {
+        match words {
+            [word] => Some(RawValue::Word(*word)),
+            [high, low] => Some(RawValue::Float(u32::from(*high) << 16 | u32::from(*low))),
+            _ => None,
+        }
+    }
+
+    /// As a number: counts of a register, or the value of an object.
+    pub fn number(self) -> f64 {
+        match self {
+            RawValue::Word(word) => f64::from(word),
+            RawValue::Float(bits) => f64::from(f32::from_bits(bits)),
+        }
+    }
+}
+
+impl Profile {
+    /// Whether a parameter of the family takes two registers, as an object of N2 does.
+    pub fn parameter_words(&self) -> u16 {
+        if self.protocols.contains(&Protocol::N2) { 2 } else { 1 }
+    }
+
+    /// Most parameters in one read at `address`, and whether the read may cover addresses without one.
+    pub(crate) fn parameter_read(&self, address: u16) -> (u16, bool) {
+        let range = self.range(Table::Holding, address);
+        range.map_or((1, false), |range| {
+            ((range.read / self.parameter_words()).max(1), range.holes)
+        })
+    }
+
+    /// The last address that may be read together with `address`.
+    pub(crate) fn parameter_range_end(&self, address: u16) -> u16 {
+        self.range(Table::Holding, address)
+            .map_or(address, |range| *range.addresses.end())
+    }
+}
+
+impl ParameterList {
+    /// Whether the family has parameters that can be read.
+    pub fn is_empty(&self) -> bool {
+        self.named.is_empty() && self.spans.is_empty()
+    }
+
+    /// The parameter at an address, if it is known by name.
+    pub fn at(&self, address: u16) -> Option<&Parameter> {
+        let index = self.named.binary_search_by_key(&address, |parameter| parameter.address);
+        index.ok().and_then(|index| self.named.get(index))
+    }
+
+    /// What the parameter at an address is called in files.
+    pub fn id(&self, address: u16) -> Option<String> {
+        if let Some(parameter) = self.at(address) {
+            return Some(parameter.id.clone());
+        }
+        let span = self
+            .spans
+            .iter()
+            .find(|span| (span.first..=span.last).contains(&address));
+        span.and_then(|span| span.numbering.id(address))
+    }
+
+    /// The address of the parameter of that name.
+    pub fn address(&self, id: &str) -> Option<u16> {
+        if let Some(parameter) = self.named.iter().find(|parameter| parameter.id == id) {
+            return Some(parameter.address);
+        }
+        self.spans.iter().find_map(|span| {
+            let address = span.numbering.address(id)?;
+            (span.first..=span.last).contains(&address).then_some(address)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn numbers_and_addresses_of_the_manuals() {
+        assert_eq!(
+            (Numbering::Id.id(101), Numbering::Id.address("102")),
+            (Some("102".to_string()), Some(101))
+        );
+        let group = Numbering::Group;
+        for (id, address) in [
+            ("1.2", 101),
+            ("3.2", 301),
+            ("0.1", 9900),
+            ("98.99", 9898),
+            ("0.99", 9998),
+        ] {
+            assert_eq!(
+                (group.address(id), group.id(address).as_deref()),
+                (Some(address), Some(id))
+            );
+        }
+        assert_eq!(
+            (group.id(199), group.address("1.100"), group.address("99.1")),
+            (None, None, None)
+        );
+    }
+
+    #[test]
+    fn values_have_the_decimals_of_their_scale() {
+        let label = |scale| Label {
+            unit: "Hz".to_string(),
+            scale,
+            ..Label::default()
+        };
+        assert_eq!(label(0.01).value(RawValue::Word(5000)), "50.00 Hz");
+        assert_eq!(label(1.0).value(RawValue::Word(7)), "7 Hz");
+        assert_eq!(label(0.25).value(RawValue::Word(3)), "0.75 Hz");
+        assert_eq!(label(0.0).value(RawValue::Word(3)), "");
+        assert_eq!(label(1.0).value(RawValue::Float(12.5f32.to_bits())), "12.5 Hz");
+    }
+}

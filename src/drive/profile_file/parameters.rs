@@ -1,0 +1,103 @@
+//! `[parameters]`: which parameters a family has.
+//!
+//! `list`: rows `id, address, name, unit, scale`; `spans`: `"id 100 1998"` or `"group 100 9898"`; `identification`: names of points.
+
+use super::super::parameters::{Label, Numbering, Parameter, ParameterList, Span};
+use super::super::profile::Point;
+use super::place::parse_address;
+use crate::document::Reader;
+
+pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
+    let Some(table) = reader.table("parameters") else {
+        return ParameterList::default();
+    };
+    let rows: Vec<String> = table.or("list", Vec::new());
+    let mut named = Vec::with_capacity(rows.len());
+    for row in &rows {
+        match read_row(row) {
+            Ok(parameter) => named.push(parameter),
+            Err(why) => table.problem(
+                "list",
+                format!("`{row}`: {why}"),
+                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"",
+            ),
+        }
+    }
+    named.sort_by_key(|parameter| parameter.address);
+    if let Some(twice) = named
+        .windows(2)
+        .find(|pair| matches!(pair, [a, b] if a.address == b.address))
+    {
+        let id = twice.first().map_or("", |parameter| parameter.id.as_str());
+        table.problem(
+            "list",
+            format!("the address of `{id}` is listed twice"),
+            "list each parameter once",
+        );
+    }
+    let texts: Vec<String> = table.or("spans", Vec::new());
+    let spans = texts.iter().filter_map(|text| {
+        let span = read_span(text);
+        if span.is_none() {
+            table.problem(
+                "spans",
+                format!("`{text}` is not a span"),
+                "write for example \"id 100 1998\"",
+            );
+        }
+        span
+    });
+    let spans = spans.collect();
+    let names: Vec<String> = table.or("identification", Vec::new());
+    let identification = names.iter().filter_map(|name| {
+        let index = points
+            .iter()
+            .position(|point| point.name == *name && point.raw().is_some());
+        if index.is_none() {
+            table.problem(
+                "identification",
+                format!("there is no point `{name}` with an address of its own"),
+                "name points of the profile",
+            );
+        }
+        index
+    });
+    let list = ParameterList {
+        identification: identification.collect(),
+        named,
+        spans,
+    };
+    table.finish();
+    list
+}
+
+fn read_span(text: &str) -> Option<Span> {
+    let mut words = text.split(' ');
+    let numbering = match words.next()? {
+        "id" => Numbering::Id,
+        "group" => Numbering::Group,
+        _ => return None,
+    };
+    let (first, last) = (parse_address(words.next()?)?, parse_address(words.next()?)?);
+    (first <= last && words.next().is_none()).then_some(Span { first, last, numbering })
+}
+
+fn read_row(row: &str) -> Result<Parameter, String> {
+    let fields: Vec<&str> = row.split(',').map(str::trim).collect();
+    let [id, address, name, unit, scale] = fields.as_slice() else {
+        return Err(format!("{} fields in place of 5", fields.len()));
+    };
+    if id.is_empty() || id.contains(['#', '=']) {
+        return Err("the id is empty or has # or = in it".to_string());
+    }
+    let scale: f64 = scale.parse().map_err(|_| format!("`{scale}` is not a scale"))?;
+    Ok(Parameter {
+        id: id.to_string(),
+        address: parse_address(address).ok_or_else(|| format!("`{address}` is not an address"))?,
+        label: Label {
+            name: name.to_string(),
+            unit: unit.to_string(),
+            scale,
+        },
+    })
+}

@@ -1,0 +1,269 @@
+//! Parameters of drives read by background exchanges: on demand of a client, and every so often.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+use std::time::{Duration, Instant, SystemTime};
+
+use crate::command::{Origin, Pace, SourceKind};
+use crate::drive::parameters::RawValue;
+use crate::event::{Event, EventKind};
+use crate::parameters::{Difference, Names, Next, ParameterFile, Reading, Store, Vault, differences};
+use crate::plant::{DriveHandle, SharedPlant};
+use crate::process_image::Access;
+
+/// A request waits no longer than that for its turn; then it is asked anew.
+const EXPIRY: Duration = Duration::from_secs(60);
+/// A drive that does not answer for that long ends its reading.
+const AWAY: Duration = Duration::from_secs(3600);
+/// Changes that an event names.
+const NAMED_CHANGES: usize = 5;
+
+/// How a drive is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct How {
+    /// The drive is asked for every address, whatever earlier readings found.
+    pub afresh: bool,
+    /// How much of a busy line that takes.
+    pub pace: Pace,
+}
+
+/// Begins to read a drive, unless that goes on already; the number of the reading.
+///
+/// # Errors
+/// Why it cannot be read.
+pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) -> Result<u64, String> {
+    let spec = &drive.image.spec;
+    if spec.profile.parameters.is_empty() {
+        return Err(format!(
+            "profile `{}` has no parameters that can be read",
+            spec.profile.name
+        ));
+    }
+    if spec.access == Access::Listen {
+        return Err(format!("bus `{}` only listens: nothing is asked on it", spec.bus));
+    }
+    match vault.begin(&spec.name) {
+        Err(number) => Ok(number),
+        Ok(number) => {
+            tokio::spawn(run(vault.clone(), drive, origin, how));
+            Ok(number)
+        }
+    }
+}
+
+async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
+    let name = drive.image.spec.name.clone();
+    let store = vault.store();
+    // What the disk did not take is known all the same.
+    let last = match vault.last(&name) {
+        None => latest(store.clone(), name.clone()).await.map(Arc::new),
+        last => last,
+    };
+    let names = vault.names(&drive.image.spec.profile.name);
+    let begun = Instant::now();
+    let result = read(
+        &vault,
+        &drive,
+        origin,
+        last.as_deref().filter(|_| !how.afresh),
+        (how.pace, &names),
+    )
+    .await;
+    if let Ok(file) = &result {
+        if let Some(last) = &last {
+            compare(&vault, &drive, last, file, begun);
+        }
+        drive.image.forget_written(begun);
+        if let Some(store) = store {
+            keep(store, file.clone()).await;
+        }
+    }
+    vault.end(&name, result);
+}
+
+async fn read(
+    vault: &Vault,
+    drive: &DriveHandle,
+    origin: Origin,
+    last: Option<&ParameterFile>,
+    (pace, names): (Pace, &Names),
+) -> Result<ParameterFile, String> {
+    let spec = &drive.image.spec;
+    let known = last.filter(|last| last.family == spec.profile.name);
+    let known = known
+        .map(|last| Reading::addresses_of(&spec.profile, last))
+        .unwrap_or_default();
+    let mut reading = Reading::new(spec.profile.clone(), known);
+    let begun = Instant::now();
+    let (mut paused, mut away_since): (Duration, Option<Instant>) = (Duration::ZERO, None);
+    while let Some(pdu) = reading.request() {
+        let now = Instant::now();
+        let outcome = drive.read_in_background(pdu, pace, origin.clone(), EXPIRY, now).await;
+        match reading.answered(&outcome) {
+            Next::Go => away_since = None,
+            Next::Failed(why) => return Err(why),
+            Next::Pause(pause, why) => {
+                let since = *away_since.get_or_insert(now);
+                if since.elapsed() > AWAY {
+                    return Err(format!("{why}, for {} minutes", AWAY.as_secs() / 60));
+                }
+                vault.update(&spec.name, |job| job.waits = Some(why));
+                tokio::time::sleep(pause).await;
+                paused += now.elapsed();
+                continue;
+            }
+        }
+        let worked = begun.elapsed().saturating_sub(paused);
+        vault.update(&spec.name, |job| {
+            job.progress = reading.progress();
+            job.remaining = remaining(job.progress, worked);
+            job.waits = None;
+        });
+    }
+    let time = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
+    Ok(reading.file(&spec.name, &identification(drive), &time, names))
+}
+
+/// Tells what changed since the last reading, what the gateway wrote itself apart.
+fn compare(vault: &Vault, drive: &DriveHandle, last: &ParameterFile, file: &ParameterFile, begun: Instant) {
+    let spec = &drive.image.spec;
+    if last.family != file.family {
+        return;
+    }
+    let changes: Vec<Difference> = differences(last, file)
+        .into_iter()
+        .filter(|change| change.before.is_some() && change.after.is_some())
+        .filter(|change| {
+            let address = spec.profile.parameters.address(change.id.name());
+            match address.and_then(|address| drive.image.written(address)) {
+                // It is not known whether it was read before that or after; the next reading tells.
+                Some((_, at)) if at >= begun => false,
+                Some((own, _)) => change.after != Some(RawValue::Word(own)),
+                None => true,
+            }
+        })
+        .collect();
+    if changes.is_empty() {
+        return;
+    }
+    vault.count_changed(&spec.bus, &spec.name, changes.len() as u64);
+    let text = told(&spec.name, &last.time, &changes);
+    drive.publish(Event {
+        bus: spec.bus.clone(),
+        drive: Some(spec.name.clone()),
+        ..Event::new(EventKind::ParametersChanged, SystemTime::now(), text)
+    });
+}
+
+/// The text of an event.
+fn told(drive: &str, since: &str, changes: &[Difference]) -> String {
+    let named: Vec<String> = changes.iter().take(NAMED_CHANGES).map(Difference::line).collect();
+    let more = match changes.len().saturating_sub(NAMED_CHANGES) {
+        0 => String::new(),
+        more => format!(" and {more} more"),
+    };
+    format!(
+        "parameters of {drive} changed since {since}: {}{more}",
+        named.join(", ")
+    )
+}
+
+/// By what it took so far.
+fn remaining((done, all): (usize, usize), worked: Duration) -> Option<Duration> {
+    let left = u32::try_from(all.checked_sub(done)?).ok()?;
+    let done = u32::try_from(done).ok().filter(|done| *done > 0)?;
+    Some(worked.checked_div(done)?.saturating_mul(left))
+}
+
+/// What the drive says of itself, by the points that its profile names for that.
+fn identification(drive: &DriveHandle) -> String {
+    let reading = drive.reading(Instant::now());
+    let profile = &drive.image.spec.profile;
+    let points = profile.parameters.identification.iter();
+    let parts: Vec<String> = points
+        .filter_map(|index| {
+            let name = &profile.points.get(*index)?.name;
+            Some(match reading.sample(*index).good() {
+                Some(value) => format!("{name} {value}"),
+                None => format!("{name} not known"),
+            })
+        })
+        .collect();
+    if parts.is_empty() {
+        "none".to_string()
+    } else {
+        parts.join(", ")
+    }
+}
+
+async fn latest(store: Option<Store>, drive: String) -> Option<ParameterFile> {
+    let store = store?;
+    let read = tokio::task::spawn_blocking(move || store.latest(&drive)).await.ok()?;
+    read.unwrap_or_else(|why| {
+        tracing::warn!("the last reading of parameters is left out: {why}");
+        None
+    })
+}
+
+async fn keep(store: Store, file: ParameterFile) {
+    let dir = store.dir().display().to_string();
+    let kept = tokio::task::spawn_blocking(move || store.keep(&file)).await;
+    if let Ok(Err(error)) = kept {
+        tracing::warn!("a reading of parameters cannot be kept in {dir}: {error}; free space or mend its permissions");
+    }
+}
+
+/// A reading that failed is tried again after that time.
+const AGAIN: Duration = Duration::from_secs(600);
+/// How often it is looked which drives are due.
+const LOOK: Duration = Duration::from_secs(10);
+
+/// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.
+pub async fn keep_reading(plant: SharedPlant, every: Duration) {
+    let mut begun: BTreeMap<String, SystemTime> = BTreeMap::new();
+    loop {
+        let plant_now = plant.load_full();
+        let vault = plant_now.parameters.clone();
+        for bus in &plant_now.buses {
+            let of_bus: Vec<DriveHandle> = plant_now
+                .drives()
+                .filter(|drive| drive.image.spec.bus == bus.image.spec.name)
+                .filter(|drive| !drive.image.spec.profile.parameters.is_empty())
+                .filter(|drive| drive.image.spec.access != Access::Listen)
+                .collect();
+            if of_bus.iter().any(|drive| vault.is_reading(&drive.image.spec.name)) {
+                continue;
+            }
+            for drive in of_bus {
+                let name = drive.image.spec.name.clone();
+                let online = drive.image.snapshot().link.is_online();
+                if !begun.contains_key(&name) {
+                    let last = latest(vault.store(), name.clone()).await;
+                    begun.extend(read_at(last.as_ref()).map(|at| (name.clone(), at)));
+                }
+                let failed = matches!(vault.status(&name).and_then(|status| status.result), Some(Err(_)));
+                let pause = if failed { every.min(AGAIN) } else { every };
+                // A clock that was set back leaves the next reading to the time it has lost.
+                let is_due = |at: &SystemTime| at.elapsed().is_ok_and(|age| age >= pause);
+                let is_due = begun.get(&name).is_none_or(is_due);
+                if is_due && online {
+                    let origin = Origin::new(SourceKind::Schedule, "every");
+                    begun.insert(name, SystemTime::now());
+                    // It has parameters, and its line is the gateway's.
+                    let how = How {
+                        afresh: false,
+                        pace: Pace::Slow,
+                    };
+                    let _ = begin_reading(&vault, drive, origin, how);
+                    break;
+                }
+            }
+        }
+        tokio::time::sleep(LOOK.min(every)).await;
+    }
+}
+
+/// When a reading was made.
+fn read_at(file: Option<&ParameterFile>) -> Option<SystemTime> {
+    humantime::parse_rfc3339(&file?.time).ok()
+}

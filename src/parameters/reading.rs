@@ -1,0 +1,283 @@
+//! A reading of all parameters of a drive: what is asked next, and what an answer means. Pure.
+//!
+//! A family names its parameters, or says where they may lie; then the drive is asked for each address, and what it refuses
+//! with 02 is not there. What an earlier reading found is asked for alone, until one of those is refused: the drive has another
+//! application then, and is asked for everything.
+
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::Duration;
+
+use super::file::{Entry, Id, ParameterFile};
+use super::names::Names;
+use crate::codec::{Exception, RequestPdu, Table};
+use crate::command::Outcome;
+use crate::drive::Profile;
+use crate::drive::parameters::{Label, Numbering, RawValue};
+
+/// Tries of a request that is not answered.
+const TRIES: u32 = 4;
+/// Tries of a request to a drive that is busy.
+const BUSY_TRIES: u32 = 20;
+/// Pause before a busy drive is asked again.
+const BUSY_PAUSE: Duration = Duration::from_millis(200);
+/// Pause before a drive is asked again that is away.
+const AWAY_PAUSE: Duration = Duration::from_secs(1);
+
+/// What comes after an answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Next {
+    /// The next request.
+    Go,
+    /// The next request after that time, for the reason given.
+    Pause(Duration, String),
+    /// It cannot go on.
+    Failed(String),
+}
+
+#[derive(Debug, Clone, Copy)]
+struct Block {
+    start: u16,
+    /// Parameters in it.
+    count: u16,
+    tries: u32,
+}
+
+/// A reading that goes on.
+#[derive(Debug)]
+pub struct Reading {
+    profile: Arc<Profile>,
+    todo: VecDeque<Block>,
+    found: BTreeMap<u16, Result<RawValue, String>>,
+    /// What an earlier reading found; empty once the drive is asked for everything.
+    known: BTreeSet<u16>,
+    total: usize,
+}
+
+impl Reading {
+    /// Of a drive of that family; `known` are the addresses that an earlier reading found.
+    pub fn new(profile: Arc<Profile>, known: BTreeSet<u16>) -> Reading {
+        let mut reading = Reading {
+            profile,
+            todo: VecDeque::new(),
+            found: BTreeMap::new(),
+            known,
+            total: 0,
+        };
+        let first: BTreeSet<u16> = match reading.known.is_empty() {
+            true => reading.everywhere(),
+            false => reading.known.clone(),
+        };
+        reading.ask(&first);
+        reading
+    }
+
+    /// The addresses of a file of the same family.
+    pub fn addresses_of(profile: &Profile, file: &ParameterFile) -> BTreeSet<u16> {
+        let ids = file.values.keys();
+        ids.filter_map(|id| profile.parameters.address(id.name())).collect()
+    }
+
+    /// Every address that may have a parameter.
+    fn everywhere(&self) -> BTreeSet<u16> {
+        let list = &self.profile.parameters;
+        let spans = list.spans.iter().flat_map(|span| {
+            let numbered = |address: &u16| span.numbering != Numbering::Group || span.numbering.id(*address).is_some();
+            (span.first..=span.last).filter(numbered)
+        });
+        let named = list.named.iter().map(|parameter| parameter.address);
+        named.chain(spans).collect()
+    }
+
+    /// Plans the reads of these addresses: neighbours together, as far as the drive allows.
+    fn ask(&mut self, addresses: &BTreeSet<u16>) {
+        let words = self.profile.parameter_words();
+        self.total = addresses.len();
+        self.found.clear();
+        self.todo.clear();
+        let mut block: Option<Block> = None;
+        for &address in addresses {
+            let joined = block.and_then(|block| {
+                let (most, holes) = self.profile.parameter_read(block.start);
+                let count = address.checked_sub(block.start)? / words + 1;
+                let next = holes || count == block.count + 1;
+                let fits = count <= most && address <= self.profile.parameter_range_end(block.start);
+                (next && fits).then_some(Block { count, ..block })
+            });
+            if joined.is_none() {
+                self.todo.extend(block);
+            }
+            block = joined.or(Some(Block {
+                start: address,
+                count: 1,
+                tries: 0,
+            }));
+        }
+        self.todo.extend(block);
+    }
+
+    /// The request to send; nothing when everything was asked.
+    pub fn request(&self) -> Option<RequestPdu> {
+        let block = self.todo.front()?;
+        Some(RequestPdu::Read {
+            table: Table::Holding,
+            start: block.start,
+            count: block.count * self.profile.parameter_words(),
+        })
+    }
+
+    /// Addresses that were asked, and all.
+    pub fn progress(&self) -> (usize, usize) {
+        let open: usize = self.todo.iter().map(|block| usize::from(block.count)).sum();
+        (self.total.saturating_sub(open), self.total)
+    }
+
+    /// The request that [`Reading::request`] gave ended so.
+    pub fn answered(&mut self, outcome: &Outcome) -> Next {
+        let Some(mut block) = self.todo.pop_front() else {
+            return Next::Go;
+        };
+        let words = self.profile.parameter_words();
+        match outcome {
+            Outcome::Acknowledged(reply) => {
+                let values = reply.words().unwrap_or_default();
+                if values.len() != usize::from(block.count * words) {
+                    return Next::Failed("the reply has another length than what was asked for".to_string());
+                }
+                let addresses = (block.start..).step_by(usize::from(words));
+                for (address, words) in addresses.zip(values.chunks(usize::from(words))) {
+                    self.take(address, words);
+                }
+                Next::Go
+            }
+            Outcome::Exception(Exception::ADDRESS | Exception::VALUE) if block.count > 1 => {
+                self.split(block);
+                Next::Go
+            }
+            Outcome::Exception(Exception::ADDRESS) => self.absent(block.start),
+            Outcome::Exception(Exception::BUSY) if block.tries < BUSY_TRIES => {
+                block.tries += 1;
+                self.todo.push_front(block);
+                Next::Pause(BUSY_PAUSE, "the drive is busy".to_string())
+            }
+            Outcome::TimedOut | Outcome::Garbled if block.tries < TRIES => {
+                block.tries += 1;
+                self.todo.push_front(block);
+                Next::Go
+            }
+            Outcome::Exception(_) | Outcome::TimedOut | Outcome::Garbled if block.count > 1 => {
+                self.split(block);
+                Next::Go
+            }
+            Outcome::Exception(_) => {
+                self.found.insert(block.start, Err(outcome.to_string()));
+                Next::Go
+            }
+            Outcome::TimedOut | Outcome::Garbled => {
+                self.found
+                    .insert(block.start, Err("the drive did not answer to be believed".to_string()));
+                Next::Go
+            }
+            Outcome::Refused(refusal) => Next::Failed(refusal.to_string()),
+            Outcome::ShuttingDown => Next::Failed("the gateway stops, or its bus starts anew".to_string()),
+            Outcome::Expired => {
+                self.todo.push_front(block);
+                Next::Go
+            }
+            away => {
+                self.todo.push_front(block);
+                let why = match away {
+                    Outcome::Offline => "the drive does not answer".to_string(),
+                    Outcome::BusDown => "the bus is down".to_string(),
+                    other => other.to_string(),
+                };
+                Next::Pause(AWAY_PAUSE, why)
+            }
+        }
+    }
+
+    fn take(&mut self, address: u16, words: &[u16]) {
+        // What lies in the hole of a block is no parameter.
+        if self.profile.parameters.id(address).is_none() {
+            return;
+        }
+        let value = match RawValue::of_words(words) {
+            Some(RawValue::Float(bits)) if !f32::from_bits(bits).is_finite() => {
+                Err("the object does not hold a number".to_string())
+            }
+            Some(value) => Ok(value),
+            None => Err("the reply has another length than what was asked for".to_string()),
+        };
+        self.found.insert(address, value);
+    }
+
+    /// One by one: which of them is it?
+    fn split(&mut self, block: Block) {
+        let words = self.profile.parameter_words();
+        for place in (0..block.count).rev() {
+            let start = block.start + place * words;
+            if self.profile.parameters.id(start).is_some() {
+                self.todo.push_front(Block {
+                    start,
+                    count: 1,
+                    tries: 0,
+                });
+            }
+        }
+    }
+
+    /// There is none at that address. One that was there has gone: everything is asked.
+    fn absent(&mut self, address: u16) -> Next {
+        if self.known.contains(&address) {
+            self.known.clear();
+            let all = self.everywhere();
+            self.ask(&all);
+        }
+        Next::Go
+    }
+
+    /// What was found, as a file; `names` go before those of the family.
+    pub fn file(&self, drive: &str, identification: &str, time: &str, names: &Names) -> ParameterFile {
+        let list = &self.profile.parameters;
+        let values = self.found.iter().filter_map(|(address, value)| {
+            let id = Id::new(&list.id(*address)?);
+            let label = names
+                .get(&id)
+                .or_else(|| list.at(*address).map(|parameter| &parameter.label));
+            let note = label.map_or(String::new(), |label| note(label, value.as_ref().ok().copied()));
+            let value = value.clone();
+            Some((id, Entry { value, note }))
+        });
+        ParameterFile {
+            drive: drive.to_string(),
+            family: self.profile.name.clone(),
+            identification: identification.to_string(),
+            time: time.to_string(),
+            values: values.collect(),
+        }
+    }
+}
+
+/// What people read: the value in its unit, and the name.
+fn note(label: &Label, value: Option<RawValue>) -> String {
+    let shown = value.map_or(String::new(), |value| label.value(value));
+    match (shown.as_str(), label.name.as_str()) {
+        ("", name) => name.to_string(),
+        (shown, "") => shown.to_string(),
+        (shown, name) => format!("{shown}, {name}"),
+    }
+}
+
+impl ParameterFile {
+    /// The file with what people read made anew, by the user's names and then those of the family.
+    #[must_use]
+    pub fn named(mut self, profile: &Profile, names: &Names) -> ParameterFile {
+        for (id, entry) in &mut self.values {
+            let own = || Some(&profile.parameters.at(profile.parameters.address(id.name())?)?.label);
+            if let Some(label) = names.get(id).or_else(own) {
+                entry.note = note(label, entry.value.as_ref().ok().copied());
+            }
+        }
+        self
+    }
+}

@@ -1,0 +1,187 @@
+//! Readings kept on disk: `DIR/DRIVE/20260302T074012Z.params`.
+
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+
+use super::file::{MOST_BYTES, ParameterFile};
+use crate::files;
+
+/// Readings kept of one drive.
+const KEPT: usize = 100;
+/// The end of the name of a file.
+const EXTENSION: &str = "params";
+
+/// A directory of readings.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Store {
+    dir: PathBuf,
+}
+
+/// A reading on disk.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Kept {
+    /// Name of the drive.
+    pub drive: String,
+    /// Its file.
+    pub path: PathBuf,
+}
+
+impl Store {
+    /// That directory, which need not exist.
+    pub fn new(dir: PathBuf) -> Store {
+        Store { dir }
+    }
+
+    /// The directory.
+    pub fn dir(&self) -> &Path {
+        &self.dir
+    }
+
+    /// Keeps a reading. Of readings in a row with the same values the first and the last are kept, of all a hundred.
+    ///
+    /// # Errors
+    /// When the disk refuses it.
+    pub fn keep(&self, file: &ParameterFile) -> io::Result<PathBuf> {
+        let dir = self.dir.join(&file.drive);
+        let name: String = file.time.chars().filter(|c| c.is_ascii_alphanumeric()).collect();
+        let path = dir.join(format!("{name}.{EXTENSION}"));
+        files::replace(&path, file.text().as_bytes())?;
+        let mut kept = self.of(&file.drive)?;
+        let checksum = file.checksum();
+        let same = |path: &PathBuf| read(path).is_ok_and(|other| other.checksum() == checksum);
+        if let [.., before, last, _] = kept.as_slice()
+            && same(before)
+            && same(last)
+        {
+            fs::remove_file(last)?;
+        }
+        kept = self.of(&file.drive)?;
+        let too_many = kept.len().saturating_sub(KEPT);
+        for old in kept.iter().take(too_many) {
+            fs::remove_file(old)?;
+        }
+        Ok(path)
+    }
+
+    /// The readings of a drive, oldest first.
+    fn of(&self, drive: &str) -> io::Result<Vec<PathBuf>> {
+        let entries = match fs::read_dir(self.dir.join(drive)) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let paths = entries.map(|entry| entry.map(|entry| entry.path()));
+        let mut paths: Vec<PathBuf> = paths.collect::<io::Result<_>>()?;
+        paths.retain(|path| path.extension().is_some_and(|end| end == EXTENSION));
+        paths.sort();
+        Ok(paths)
+    }
+
+    /// The last reading of a drive.
+    ///
+    /// # Errors
+    /// When it cannot be read; which file, and why.
+    pub fn latest(&self, drive: &str) -> Result<Option<ParameterFile>, String> {
+        let all = self
+            .of(drive)
+            .map_err(|error| format!("cannot read {}: {error}", self.dir.join(drive).display()))?;
+        all.last().map(|path| read(path)).transpose()
+    }
+
+    /// All readings, drive by drive, the oldest first.
+    ///
+    /// # Errors
+    /// When the directory cannot be read.
+    pub fn list(&self) -> io::Result<Vec<Kept>> {
+        let entries = match fs::read_dir(&self.dir) {
+            Err(error) if error.kind() == io::ErrorKind::NotFound => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let mut drives: Vec<String> = Vec::new();
+        for entry in entries {
+            let entry = entry?;
+            if entry.file_type()?.is_dir() {
+                drives.extend(entry.file_name().into_string());
+            }
+        }
+        drives.sort();
+        let mut all = Vec::new();
+        for drive in drives {
+            let paths = self.of(&drive)?;
+            all.extend(paths.into_iter().map(|path| Kept {
+                drive: drive.clone(),
+                path,
+            }));
+        }
+        Ok(all)
+    }
+}
+
+/// Reads a file of parameters.
+///
+/// # Errors
+/// Which file, and what is wrong with it.
+pub fn read(path: &Path) -> Result<ParameterFile, String> {
+    let shown = path.display();
+    let mut text = String::new();
+    let opened = File::open(path).map_err(|error| format!("cannot open {shown}: {error}"))?;
+    let taken = opened.take(MOST_BYTES + 1).read_to_string(&mut text);
+    taken.map_err(|error| format!("cannot read {shown}: {error}"))?;
+    if text.len() as u64 > MOST_BYTES {
+        return Err(format!(
+            "{shown} is larger than {MOST_BYTES} bytes: no parameter file is"
+        ));
+    }
+    ParameterFile::parse(&text).map_err(|error| format!("{shown}: {error}"))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::file::{Entry, Id};
+    use super::*;
+    use crate::drive::parameters::RawValue;
+
+    fn file(minute: u32, value: u16) -> ParameterFile {
+        let entry = Entry {
+            value: Ok(RawValue::Word(value)),
+            note: String::new(),
+        };
+        ParameterFile {
+            drive: "pump-1".to_string(),
+            family: "vacon-nx".to_string(),
+            time: format!("2026-03-02T{:02}:{:02}:12Z", minute / 60, minute % 60),
+            values: [(Id::new("102"), entry)].into(),
+            ..ParameterFile::default()
+        }
+    }
+
+    #[test]
+    fn the_first_and_the_last_of_readings_alike_are_kept_and_a_hundred_in_all() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::new(folder.path().join("params"));
+        assert_eq!((store.list().unwrap(), store.latest("pump-1")), (Vec::new(), Ok(None)));
+        for (minute, value) in [(1, 7), (2, 7), (3, 7), (4, 8), (5, 7)] {
+            store.keep(&file(minute, value)).unwrap();
+        }
+        let times: Vec<String> = store
+            .of("pump-1")
+            .unwrap()
+            .iter()
+            .map(|path| read(path).unwrap().time)
+            .collect();
+        let minutes: Vec<&str> = times.iter().map(|time| &time[14..16]).collect();
+        assert_eq!(minutes, ["01", "03", "04", "05"]);
+        assert_eq!(store.latest("pump-1").unwrap().unwrap(), file(5, 7));
+        for minute in 10..200 {
+            store.keep(&file(minute, minute as u16)).unwrap();
+        }
+        assert_eq!(store.list().unwrap().len(), KEPT);
+        std::fs::write(folder.path().join("params/pump-1/99999999.params"), "x").unwrap();
+        assert!(
+            store
+                .latest("pump-1")
+                .unwrap_err()
+                .contains("99999999.params: it is no parameter file")
+        );
+    }
+}
