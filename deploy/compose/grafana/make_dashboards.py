@@ -369,6 +369,7 @@ def drive():
         of_drive("Energy", "Energy counter of the drive.", "kwatth", "energy_kilowatthours"),
         of_drive("Operating hours", "Operating hours counter of the drive.", "h", "operating_hours"),
         of_drive("Fault code", "0: no fault.", "none", "fault_code"),
+        graph("Parameters that changed", "From one reading to the next, not by this gateway.", "none", query(f"drivegate_parameters_changed_total{{{DRIVE}}}", OF_DRIVE)),
         graph("Warning", "1 while the drive has a warning.", "none", query(f"drivegate_drive_warning{{{DRIVE}}}", OF_DRIVE)),
         row("Communication"),
         graph("Transactions", "By outcome.", "ops", query(rate("drivegate_drive_transactions_total", "instance, bus, drive, outcome", DRIVE), OF_DRIVE + " {{outcome}}"), links=[TO_LINE]),
