@@ -45,7 +45,7 @@
 //! - Writes that nobody ordered: none at start, at reconnect or at reload. What the gateway writes of itself are the
 //!   lease action and the stop at shutdown, and both only where they are configured.
 //! - Values without quality, and old values served as good ones.
-//! - A database, a user interface that writes, and plug-ins: profiles are declarative.
+//! - A database, and plug-ins: profiles are declarative.
 //! - The async runtime on the way of the line: 3.5 characters are shorter than its timer's step.
 //!
 //! `docs/architecture.md` follows one exchange, one command and one value through the files, says which file a change belongs
