@@ -206,7 +206,7 @@ fn the_two_commands_of_the_readme_exist() {
 }
 
 #[test]
-fn the_commands_of_the_readme_exist() {
+fn the_commands_of_the_readme_are_those_that_exist() {
     let readme = read(&root().join("README.md"));
     let rows = readme.lines().filter_map(|line| line.strip_prefix("| `drivegate "));
     let commands: Vec<&str> = rows
@@ -216,6 +216,13 @@ fn the_commands_of_the_readme_exist() {
     for command in commands {
         let help = run_well(Path::new(DRIVEGATE), &[command, "--help"]);
         assert!(help.contains(&format!("Usage: drivegate {command}")), "{help}");
+    }
+    for command in drivegate::cli::command_line().get_subcommands() {
+        let name = command.get_name();
+        let is_named = ["`drivegate ", "· `"]
+            .iter()
+            .any(|before| readme.contains(&format!("{before}{name}")));
+        assert!(is_named, "README.md lacks `drivegate {name}`");
     }
 }
 
