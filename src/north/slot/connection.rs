@@ -87,12 +87,13 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
             .into_iter()
             .flatten()
             .min();
+        let reads = self.dialogue.reads();
         let dialogue = &mut self.dialogue;
         tokio::select! {
             biased;
             () = place.closing().cancelled() => return Err(place.close_reason().map_or(End::Stopping, End::Closed)),
             () = poll_fn(|cx| dialogue.poll(cx, std::time::Instant::now())) => {}
-            count = self.stream.read(&mut buffer) => match count? {
+            count = self.stream.read(&mut buffer), if reads => match count? {
                 0 => return Err(End::Tool),
                 count => self.take(buffer.get(..count).unwrap_or_default()),
             },

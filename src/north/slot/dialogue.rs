@@ -16,6 +16,8 @@ use crate::north::SlotOutcome;
 
 /// A tool is answered within this time from the end of its request, or not at all.
 pub(super) const ANSWER_WITHIN: Duration = Duration::from_secs(1);
+/// Time that a byte of a tool takes at least: no line of 460,800 baud brings more, so a tool that floods costs little.
+const BYTE_TIME: Duration = Duration::from_micros(20);
 /// A tool that asks again before it is answered gets no more than one request to the bus in this time, stops apart.
 const IMPATIENT: Duration = Duration::from_millis(20);
 
@@ -47,6 +49,8 @@ pub(super) struct Dialogue {
     held: Option<Held>,
     /// When the last request was given to the bus.
     asked: Option<Instant>,
+    /// When more of the tool is read, while that is not now.
+    reads_at: Option<Instant>,
     /// What the tool is answered.
     pub(super) output: Vec<u8>,
 }
@@ -59,6 +63,7 @@ impl Dialogue {
             pending: None,
             held: None,
             asked: None,
+            reads_at: None,
             output: Vec::new(),
         }
     }
@@ -76,12 +81,20 @@ impl Dialogue {
     /// Bytes of the tool came in at `now`. Requests that it makes are in the queue of the bus when this returns, or held until
     /// [`Dialogue::wake_at`]. Whether there were any.
     pub(super) fn received(&mut self, bytes: &[u8], now: Instant) -> bool {
+        let count = u32::try_from(bytes.len()).unwrap_or(u32::MAX);
+        self.reads_at = now.checked_add(BYTE_TIME.saturating_mul(count));
         self.framing.add(bytes, now);
         self.on_time(now)
     }
 
+    /// Whether more of the tool is read now; if not, from [`Dialogue::wake_at`] on.
+    pub(super) fn reads(&self) -> bool {
+        self.reads_at.is_none()
+    }
+
     /// Time went by. Whether the tool made a request by that.
     pub(super) fn on_time(&mut self, now: Instant) -> bool {
+        self.reads_at = self.reads_at.filter(|at| *at > now);
         let mut any = false;
         while let Some(said) = self.framing.next(now) {
             match said {
@@ -107,7 +120,10 @@ impl Dialogue {
     pub(super) fn wake_at(&self) -> Option<Instant> {
         let pending = self.pending.as_ref().map(|pending| pending.deadline);
         let held = self.held.as_ref().map(|held| held.until);
-        [pending, held, self.framing.patience()].into_iter().flatten().min()
+        [pending, held, self.framing.patience(), self.reads_at]
+            .into_iter()
+            .flatten()
+            .min()
     }
 
     /// The tool is not there any more.

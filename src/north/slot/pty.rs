@@ -93,12 +93,13 @@ impl Port {
         let wake_at = self.dialogue.wake_at().map(Instant::from_std);
         let rests_at = self.used.map(|at| at + RESTS).filter(|_| !self.dialogue.is_waiting());
         let timer = [wake_at, rests_at].into_iter().flatten().min();
+        let reads = self.dialogue.reads();
         let dialogue = &mut self.dialogue;
         let mut buffer = [0; 1024];
         let asked = tokio::select! {
             biased;
             () = poll_fn(|cx| dialogue.poll(cx, std::time::Instant::now())) => false,
-            count = self.reader.read(&mut buffer) => {
+            count = self.reader.read(&mut buffer), if reads => {
                 let bytes = count.map(|count| buffer.get(..count).unwrap_or_default())?;
                 self.used = Some(Instant::now());
                 self.dialogue.received(bytes, std::time::Instant::now())
