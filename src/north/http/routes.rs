@@ -286,8 +286,7 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
 async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
     let plant = app.plant.load_full();
     if plant.drive(&name).is_none() {
-        let known = plant.drives().map(|d| d.image.spec.name.clone());
-        return not_found(format!("there is no drive `{name}`"), known.collect());
+        return no_drive(&plant, &name);
     }
     let status = plant.parameters.status(&name);
     let last = match plant.parameters.last(&name) {

@@ -13,7 +13,7 @@ use tokio::sync::{OwnedSemaphorePermit, watch};
 
 use super::super::api::ErrorReply;
 use super::super::body;
-use super::super::routes::{AppState, Reached, not_found};
+use super::super::routes::{AppState, Reached, no_drive};
 use super::{Operating, Operator};
 use crate::command::{Answer, Authority, Order, Origin, Outcome, Refusal, SourceKind};
 use crate::drive::ModelPoint;
@@ -279,13 +279,8 @@ pub(in crate::north::http) async fn commands_of(
     };
     match app.plant.load().drive(&name) {
         Some(drive) => Json(description(&drive, &operator)).into_response(),
-        None => no_drive(&name, &app.plant.load()),
+        None => no_drive(&app.plant.load(), &name),
     }
-}
-
-fn no_drive(name: &str, plant: &Plant) -> Response {
-    let known = plant.drives().map(|d| d.image.spec.name.clone());
-    not_found(format!("there is no drive `{name}`"), known.collect())
 }
 
 fn description(drive: &DriveHandle, operator: &Operator) -> Json_ {
@@ -331,7 +326,7 @@ pub(in crate::north::http) async fn heartbeat(
     };
     let plant = app.plant.load();
     let Some(drive) = plant.drive(&name) else {
-        return no_drive(&name, &plant);
+        return no_drive(&plant, &name);
     };
     match renew(&drive, &operator, Instant::now()) {
         Ok(()) => StatusCode::NO_CONTENT.into_response(),
