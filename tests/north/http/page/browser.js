@@ -103,7 +103,10 @@ class Page {
   async until(code, ...args) {
     const end = Date.now() + PATIENCE_MS;
     for (;;) {
-      const found = await this.eval(code, ...args);
+      // A page that is just being replaced by another can answer nothing.
+      const found = await this.eval(code, ...args).catch((error) => {
+        if (!/context/.test(error.message)) throw error;
+      });
       if (found) return found;
       if (Date.now() > end) throw new Error(`waited for ${code} ${JSON.stringify(args)} in\n${await this.eval("document.body.innerText")}\n${this.problems.join("\n")}`);
       await new Promise((resolve) => setTimeout(resolve, 50));

@@ -12,11 +12,11 @@ const MOST_GROWTH = 1.5;
 const updates = () => performance.getEntriesByType("resource").filter((entry) => entry.name.includes("/api/v1/drives")).length;
 
 /// Time of scripts, and of style and layout, for an update, and the intervals between frames meanwhile, ms.
-async function cost(browser, url) {
+async function cost(browser, url, drives) {
   const page = await browser.page({ calm: false });
   await page.open(`${url}#/`);
-  await page.until(() => document.querySelectorAll(".rows .row").length > 0 && performance.getEntriesByType("resource").filter((entry) => entry.name.includes("/api/v1/drives")).length > 2);
-  const drives = await page.eval(() => document.querySelectorAll(".rows .row").length);
+  await page.until((drives) => document.querySelectorAll(".rows .row").length >= drives && performance.getEntriesByType("resource").filter((entry) => entry.name.includes("/api/v1/drives")).length > 2, drives);
+  assert.equal(await page.eval(() => document.querySelectorAll(".rows .row").length), drives);
   await page.eval(() => {
     window.frames = [];
     let last = performance.now();
@@ -57,7 +57,7 @@ async function costOf(browser, count) {
   };
   change();
   const timer = setInterval(change, 900);
-  const result = await cost(browser, await gateway.start());
+  const result = await cost(browser, await gateway.start(), count);
   clearInterval(timer);
   await gateway.stop();
   return result;
@@ -72,7 +72,6 @@ async function main() {
   }
   const growth = many.script / few.script / (many.drives / few.drives);
   console.log(`scripts: ${growth.toFixed(2)} x linear`);
-  assert.deepEqual([few.drives, many.drives], [100, 1000]);
   assert.ok(growth <= MOST_GROWTH, `scripts take ${growth.toFixed(2)} x linear`);
 }
 
