@@ -3,9 +3,10 @@
 use std::time::Duration;
 
 use super::RecorderOptions;
+use super::packed_ring::{packed_frame, packed_read};
 use crate::drive::plan::WireTime;
 use crate::drive::{Plan, PlannedRead, PollClass};
-use crate::process_image::{BusSpec, DriveSpec, TapedFrame, TapedRead};
+use crate::process_image::{BusSpec, DriveSpec};
 
 /// Bytes of events and commands of a drive.
 pub const NOTES: usize = 64 << 10;
@@ -56,11 +57,11 @@ impl Budget {
             let bytes: f64 = reads.map(|read| rounds(read.class) * size(read) as f64).sum();
             (bytes * RESERVE) as usize
         };
-        let sample = |read: &PlannedRead| TapedRead::size_of(usize::from(read.count));
+        let sample = |read: &PlannedRead| packed_read(usize::from(read.count));
         let frames = |read: &PlannedRead| {
             let pdu = read.pdu();
             let (asked, answered) = (bus.protocol.request_chars(&pdu), bus.protocol.reply_chars(&pdu));
-            TapedFrame::size_of(asked) + TapedFrame::size_of(answered)
+            packed_frame(asked) + packed_frame(answered)
         };
         let line: usize = plans.iter().map(|plan| of(plan, &frames)).sum();
         Budget {

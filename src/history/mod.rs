@@ -23,6 +23,7 @@ pub mod drives;
 pub mod export;
 mod keeper;
 pub mod line;
+mod packed_ring;
 pub mod pcapng;
 pub mod recorder;
 pub mod recording;

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use super::budget::Budget;
 use super::drives::{DriveHistory, History};
 use super::line::LineHistory;
+use super::packed_ring::PackedRing;
 use super::ring::{Ring, Timed};
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
@@ -69,26 +70,6 @@ impl Timed for Note {
     }
 }
 
-impl Timed for TapedRead {
-    fn at(&self) -> Instant {
-        self.at
-    }
-
-    fn size(&self) -> usize {
-        TapedRead::size(self)
-    }
-}
-
-impl Timed for TapedFrame {
-    fn at(&self) -> Instant {
-        self.at
-    }
-
-    fn size(&self) -> usize {
-        TapedFrame::size(self)
-    }
-}
-
 /// A drive as its samples tell, with the reads that only a fault asks for.
 pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
     let Plan { mut reads, on_fault } = Plan::of(&spec.profile);
@@ -145,7 +126,7 @@ struct DriveRing {
     history: Arc<DriveHistory>,
     /// Whether it answered when it was last looked at, and since when.
     link: Link,
-    samples: Ring<TapedRead>,
+    samples: PackedRing<TapedRead>,
     notes: Ring<Note>,
     /// What was known before the oldest sample, and what is known now.
     base: Arc<Snapshot>,
@@ -169,7 +150,7 @@ struct LineRing {
     bus: Arc<BusImage>,
     last_hour: Arc<Mutex<LineHistory>>,
     drives: Vec<DriveRing>,
-    frames: Ring<TapedFrame>,
+    frames: PackedRing<TapedFrame>,
     errors: LineErrors,
     lost: u64,
 }
@@ -281,7 +262,7 @@ impl LineRing {
                 image: image.clone(),
                 history: history.of(&image.spec, clock),
                 link: image.snapshot().link,
-                samples: Ring::new(*samples, window),
+                samples: PackedRing::new(*samples, window),
                 notes: Ring::new(budget.notes, window),
                 now: base.clone(),
                 base,
@@ -292,7 +273,7 @@ impl LineRing {
         };
         LineRing {
             drives: bus.drives.iter().zip(&budget.samples).map(ring).collect(),
-            frames: Ring::new(budget.frames, window),
+            frames: PackedRing::new(budget.frames, window),
             errors: LineErrors::default(),
             lost: 0,
             last_hour: history.of_line(bus, clock),
@@ -319,7 +300,7 @@ impl LineRing {
                     let failed = frame.drive.filter(|_| frame.verdict.is_error());
                     let burst = failed.filter(|drive| self.answers(*drive));
                     let burst = burst.and_then(|drive| self.errors.note(frame.at, drive));
-                    self.frames.push(frame, drop);
+                    self.frames.push(&frame, drop);
                     if let Some((drive, trigger)) = burst
                         && let Some(drive) = self.drives.get_mut(drive)
                     {
@@ -356,9 +337,9 @@ impl LineRing {
                 more,
                 span: (from, to),
                 base: ring.base.clone(),
-                samples: ring.samples.iter().filter(|sample| sample.at <= to).cloned().collect(),
+                samples: ring.samples.iter().filter(|sample| sample.at <= to).collect(),
                 notes: ring.notes.iter().filter(|note| within(note.at)).cloned().collect(),
-                frames: self.frames.iter().filter(|frame| within(frame.at)).cloned().collect(),
+                frames: self.frames.iter().filter(|frame| within(frame.at)).collect(),
                 lost: self.lost,
             });
         }
@@ -392,7 +373,7 @@ impl DriveRing {
             return None;
         }
         let base = &mut self.base;
-        self.samples.push(read, |gone| {
+        self.samples.push(&read, |gone| {
             Arc::make_mut(base).store(gone.table, gone.start, &gone.words, gone.at);
         });
         self.watch.look(&reading, at, options.warnings)
@@ -406,7 +387,7 @@ impl DriveRing {
             return Some(pending.id.clone());
         }
         // A drive that was never there is not lost.
-        if trigger.kind == TriggerKind::Lost && self.samples.iter().next().is_none() {
+        if trigger.kind == TriggerKind::Lost && self.samples.is_empty() {
             return None;
         }
         let pause = trigger.kind.pause();

@@ -185,12 +185,13 @@ impl DriveTrend {
             let Some(value) = sample.good().filter(|_| sample.at == Some(read.at)) else {
                 continue;
             };
-            let is_known = !known.snapshot.link.is_online() || known.sample(point.index).good().is_some();
-            if !point.derived || is_known {
-                let since = read.at.saturating_duration_since(self.epoch);
-                let kept = point.kept.get_or_insert_with(Kept::new);
-                kept.add(since, value.as_f64() as f32, known.good_for(point.index));
+            let is_known = || !known.snapshot.link.is_online() || known.sample(point.index).good().is_some();
+            if point.derived && !is_known() {
+                continue;
             }
+            let since = read.at.saturating_duration_since(self.epoch);
+            let kept = point.kept.get_or_insert_with(Kept::new);
+            kept.add(since, value.as_f64() as f32, known.good_for(point.index));
         }
     }
 

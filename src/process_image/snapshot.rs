@@ -200,16 +200,16 @@ impl Snapshot {
     }
 
     fn each(&mut self, table: Table, start: u16, count: usize, mut change: impl FnMut(&mut Cell, usize)) {
-        for offset in 0..count {
-            let Some(address) = u16::try_from(offset).ok().and_then(|o| start.checked_add(o)) else {
-                return;
-            };
-            for span in &mut self.spans {
-                if let Some(place) = span.offset(table, address)
-                    && let Some(cell) = Arc::make_mut(span).cells.get_mut(place)
-                {
-                    change(cell, offset);
-                }
+        let start = usize::from(start);
+        for span in self.spans.iter_mut().filter(|span| span.table == table) {
+            let first = usize::from(span.start);
+            let (from, to) = (first.max(start), (first + span.cells.len()).min(start + count));
+            if from >= to {
+                continue;
+            }
+            let cells = Arc::make_mut(span).cells.get_mut(from - first..to - first);
+            for (place, cell) in cells.into_iter().flatten().enumerate() {
+                change(cell, from - start + place);
             }
         }
     }

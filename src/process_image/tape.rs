@@ -32,6 +32,16 @@ pub enum Verdict {
 }
 
 impl Verdict {
+    /// All.
+    pub const ALL: [Verdict; 6] = [
+        Verdict::Sent,
+        Verdict::Ok,
+        Verdict::Exception,
+        Verdict::Timeout,
+        Verdict::Corrupt,
+        Verdict::Foreign,
+    ];
+
     /// Whether the exchange failed.
     pub fn is_error(self) -> bool {
         matches!(self, Verdict::Timeout | Verdict::Corrupt)
@@ -87,26 +97,16 @@ impl Taped {
 const SHARED: usize = 16;
 
 impl TapedRead {
-    /// Bytes of memory that a read of so many words takes.
-    pub const fn size_of(words: usize) -> usize {
-        size_of::<TapedRead>() + SHARED + 2 * words
-    }
-
     /// Bytes of memory it takes.
     pub fn size(&self) -> usize {
-        TapedRead::size_of(self.words.len())
+        size_of::<TapedRead>() + SHARED + 2 * self.words.len()
     }
 }
 
 impl TapedFrame {
-    /// Bytes of memory that a frame of so many bytes takes.
-    pub const fn size_of(bytes: usize) -> usize {
-        size_of::<TapedFrame>() + SHARED + bytes
-    }
-
     /// Bytes of memory it takes.
     pub fn size(&self) -> usize {
-        TapedFrame::size_of(self.bytes.len())
+        size_of::<TapedFrame>() + SHARED + self.bytes.len()
     }
 }
 

@@ -346,7 +346,7 @@ fn memory_is_bounded_by_the_budget_and_enough_for_every_poll() {
     let spec = rig.bus.drives[0].spec.clone();
     let budget = budget::Budget::of(&rig.bus.spec, &[spec], &options());
     // 41 s at 10 ms, with a quarter in reserve, and the slow reads.
-    let read = TapedRead::size_of(11);
+    let read = packed_ring::packed_read(11);
     assert!(
         (4100 * read..4100 * read * 3 / 2).contains(&budget.samples[0]),
         "{budget:?}"

@@ -1,0 +1,273 @@
+//! A ring of entries packed into bytes, bounded by bytes and by age: a line of 10 ms has thousands of entries, each of them
+//! smaller than the allocations that it would take by itself.
+
+use std::collections::VecDeque;
+use std::marker::PhantomData;
+use std::time::{Duration, Instant};
+
+use crate::codec::Table;
+use crate::process_image::{TapedFrame, TapedRead, Verdict};
+
+/// Bytes in front of each entry: its length, and its time.
+const HEAD: usize = 4 + 8;
+/// The memory grows by this part of what it may be.
+const STEPS: usize = 16;
+/// The place of no drive.
+const NO_DRIVE: u32 = u32::MAX;
+
+/// Something with a time that can be packed into bytes.
+pub(super) trait Packed: Sized {
+    /// When it was.
+    fn at(&self) -> Instant;
+    /// Appends all but the time.
+    fn pack(&self, bytes: &mut Vec<u8>);
+    /// From what [`Packed::pack`] appended.
+    fn unpack(at: Instant, bytes: &[u8]) -> Option<Self>;
+}
+
+/// Bytes of memory that a read of so many words takes.
+pub(super) const fn packed_read(words: usize) -> usize {
+    HEAD + 3 + 2 * words
+}
+
+/// Bytes of memory that a frame of so many bytes takes.
+pub(super) const fn packed_frame(bytes: usize) -> usize {
+    HEAD + 5 + bytes
+}
+
+impl Packed for TapedRead {
+    fn at(&self) -> Instant {
+        self.at
+    }
+
+    fn pack(&self, bytes: &mut Vec<u8>) {
+        bytes.push(self.table.read_function());
+        bytes.extend(self.start.to_le_bytes());
+        bytes.extend(self.words.iter().flat_map(|word| word.to_le_bytes()));
+    }
+
+    fn unpack(at: Instant, bytes: &[u8]) -> Option<TapedRead> {
+        let ([function, low, high], words) = bytes.split_first_chunk()?;
+        let tables = [Table::Coil, Table::DiscreteInput, Table::Input, Table::Holding];
+        let (words, _) = words.as_chunks();
+        Some(TapedRead {
+            at,
+            table: tables.into_iter().find(|table| table.read_function() == *function)?,
+            start: u16::from_le_bytes([*low, *high]),
+            words: words.iter().map(|word| u16::from_le_bytes(*word)).collect(),
+        })
+    }
+}
+
+impl Packed for TapedFrame {
+    fn at(&self) -> Instant {
+        self.at
+    }
+
+    fn pack(&self, bytes: &mut Vec<u8>) {
+        let drive = self.drive.and_then(|drive| u32::try_from(drive).ok());
+        let verdict = Verdict::ALL.iter().position(|verdict| *verdict == self.verdict);
+        bytes.extend(drive.unwrap_or(NO_DRIVE).to_le_bytes());
+        bytes.push(verdict.and_then(|place| u8::try_from(place).ok()).unwrap_or(u8::MAX));
+        bytes.extend_from_slice(&self.bytes);
+    }
+
+    fn unpack(at: Instant, bytes: &[u8]) -> Option<TapedFrame> {
+        let (drive, rest) = bytes.split_first_chunk()?;
+        let (verdict, bytes) = rest.split_first()?;
+        let drive = u32::from_le_bytes(*drive);
+        Some(TapedFrame {
+            at,
+            drive: usize::try_from(drive).ok().filter(|_| drive != NO_DRIVE),
+            verdict: *Verdict::ALL.get(usize::from(*verdict))?,
+            bytes: bytes.into(),
+        })
+    }
+}
+
+/// The newest entries, oldest first.
+#[derive(Debug)]
+pub(super) struct PackedRing<T> {
+    /// The time of the very first entry, by which all are counted.
+    start: Option<Instant>,
+    bytes: VecDeque<u8>,
+    most_bytes: usize,
+    window: Duration,
+    /// The entry that is packed; kept for its memory.
+    entry: Vec<u8>,
+    of: PhantomData<T>,
+}
+
+impl<T: Packed> PackedRing<T> {
+    /// A ring of that many bytes, and of entries that are not older than `window`.
+    pub(super) fn new(most_bytes: usize, window: Duration) -> PackedRing<T> {
+        PackedRing {
+            start: None,
+            bytes: VecDeque::new(),
+            most_bytes,
+            window,
+            entry: Vec::new(),
+            of: PhantomData,
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.bytes.is_empty()
+    }
+
+    /// Adds an entry, the newest; `gone` gets those that have to go for it.
+    pub(super) fn push(&mut self, entry: &T, mut gone: impl FnMut(T)) {
+        let now = entry.at();
+        let start = *self.start.get_or_insert(now);
+        self.entry.clear();
+        entry.pack(&mut self.entry);
+        let Ok(length) = u32::try_from(self.entry.len()) else {
+            return;
+        };
+        let size = HEAD + self.entry.len();
+        while let Some((oldest, at)) = self.head(0, start) {
+            let is_old = now.saturating_duration_since(at) > self.window;
+            if !is_old && self.bytes.len() + size <= self.most_bytes {
+                break;
+            }
+            if let Some(entry) = self.unpack(0, oldest, at) {
+                gone(entry);
+            }
+            self.bytes.drain(..(HEAD + oldest).min(self.bytes.len()));
+        }
+        if self.bytes.capacity() - self.bytes.len() < size {
+            self.bytes.reserve_exact(size.max(self.most_bytes / STEPS));
+        }
+        self.bytes.extend(length.to_le_bytes());
+        self.bytes.extend(nanoseconds(start, now).to_le_bytes());
+        self.bytes.extend(&self.entry);
+    }
+
+    /// Oldest first.
+    pub(super) fn iter(&self) -> impl Iterator<Item = T> {
+        let mut place = 0;
+        std::iter::from_fn(move || {
+            let (length, at) = self.head(place, self.start?)?;
+            let entry = self.unpack(place, length, at);
+            place += HEAD + length;
+            entry
+        })
+    }
+
+    /// Length and time of the entry there.
+    fn head(&self, place: usize, start: Instant) -> Option<(usize, Instant)> {
+        let mut head = [0; HEAD];
+        if self.bytes.len() < place + HEAD {
+            return None;
+        }
+        head.iter_mut()
+            .zip(self.bytes.range(place..))
+            .for_each(|(to, from)| *to = *from);
+        let (length, time) = head.split_first_chunk()?;
+        let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
+        let at = instant(start, i64::from_le_bytes(*time.first_chunk()?));
+        (self.bytes.len() >= place + HEAD + length).then_some((length, at))
+    }
+
+    fn unpack(&self, place: usize, length: usize, at: Instant) -> Option<T> {
+        let first = place + HEAD;
+        let bytes: Vec<u8> = self.bytes.range(first..first + length).copied().collect();
+        T::unpack(at, &bytes)
+    }
+}
+
+/// From `start` to `at`, which may be before it.
+fn nanoseconds(start: Instant, at: Instant) -> i64 {
+    let count = |duration: Duration| i64::try_from(duration.as_nanos()).unwrap_or(i64::MAX);
+    match at.checked_duration_since(start) {
+        Some(after) => count(after),
+        None => -count(start.saturating_duration_since(at)),
+    }
+}
+
+fn instant(start: Instant, nanoseconds: i64) -> Instant {
+    let apart = Duration::from_nanos(nanoseconds.unsigned_abs());
+    let at = match nanoseconds < 0 {
+        true => start.checked_sub(apart),
+        false => start.checked_add(apart),
+    };
+    at.unwrap_or(start)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn read(at: Instant, words: &[u16]) -> TapedRead {
+        TapedRead {
+            at,
+            table: Table::Input,
+            start: 2100,
+            words: words.into(),
+        }
+    }
+
+    #[test]
+    fn what_is_old_or_too_much_goes_oldest_first() {
+        let start = Instant::now();
+        let at = |second| start + Duration::from_secs(second);
+        let mut ring = PackedRing::new(11 * packed_read(2), Duration::from_secs(10));
+        let mut gone = Vec::new();
+        for second in 0..20 {
+            ring.push(&read(at(second), &[1, second as u16]), |entry| {
+                gone.push(entry.words[1])
+            });
+        }
+        assert_eq!((ring.iter().count(), gone.len()), (11, 9), "by age");
+        assert_eq!(gone, (0..9).collect::<Vec<u16>>());
+        let most = (11 * packed_read(2) - packed_read(0)) / 2;
+        ring.push(&read(at(20), &vec![7; most]), drop);
+        assert_eq!(
+            ring.iter().map(|entry| entry.at).collect::<Vec<_>>(),
+            [at(20)],
+            "by bytes"
+        );
+        ring.push(&read(at(20), &vec![7; 9999]), drop);
+        assert_eq!(
+            ring.iter().next().map(|entry| entry.words.len()),
+            Some(9999),
+            "the newest always stays"
+        );
+    }
+
+    #[test]
+    fn memory_grows_with_what_is_in_it_and_no_further() {
+        let mut ring = PackedRing::new(1 << 20, Duration::from_secs(3600));
+        let start = Instant::now();
+        ring.push(&read(start, &[0; 11]), drop);
+        assert!(ring.bytes.capacity() <= (1 << 20) / STEPS + 64);
+        for count in 0..100_000 {
+            ring.push(&read(start + Duration::from_millis(count), &[0; 11]), drop);
+        }
+        let most = (1 << 20) + (1 << 20) / STEPS + 64;
+        assert!(ring.bytes.capacity() <= most, "{}", ring.bytes.capacity());
+        assert_eq!(ring.iter().count(), (1 << 20) / packed_read(11));
+    }
+
+    proptest! {
+        #[test]
+        fn everything_comes_back_as_it_was(
+            frames in proptest::collection::vec((any::<Option<u16>>(), 0..Verdict::ALL.len(), any::<Vec<u8>>(), -1000..1000i64), 0..50)
+        ) {
+            let start = Instant::now() + Duration::from_secs(3600);
+            let frames: Vec<TapedFrame> = frames.into_iter().map(|(drive, verdict, bytes, at)| TapedFrame {
+                at: instant(start, at * 1_000_003),
+                drive: drive.map(usize::from),
+                verdict: Verdict::ALL[verdict],
+                bytes: bytes.into(),
+            }).collect();
+            let mut ring = PackedRing::new(1 << 20, Duration::from_secs(10));
+            frames.iter().for_each(|frame| ring.push(frame, |_| unreachable!("all fit")));
+            prop_assert_eq!(ring.iter().collect::<Vec<_>>(), frames.clone());
+            let size: usize = frames.iter().map(|frame| packed_frame(frame.bytes.len())).sum();
+            prop_assert_eq!(ring.bytes.len(), size);
+        }
+    }
+}
