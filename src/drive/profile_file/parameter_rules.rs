@@ -10,9 +10,15 @@ use super::place::parse_address;
 use crate::codec::Table;
 use crate::document::{Reader, nearest};
 
-/// Reads the rules of `table`; the parameters that they name are those of `list`.
-pub(super) fn read(table: &Reader<'_>, list: &ParameterList, points: &[Point], ranges: &[AddressRange]) -> WriteRules {
-    let rules = Rules { table, list };
+/// Reads the rules of `table`; the parameters that they name are those of `list`, in what comes from a base also those of `bases`.
+pub(super) fn read(
+    table: &Reader<'_>,
+    list: &ParameterList,
+    bases: &[&ParameterList],
+    points: &[Point],
+    ranges: &[AddressRange],
+) -> WriteRules {
+    let rules = Rules { table, list, bases };
     WriteRules {
         only_by_name: rules.only_by_name(),
         nameplate: rules.addresses("nameplate"),
@@ -20,15 +26,22 @@ pub(super) fn read(table: &Reader<'_>, list: &ParameterList, points: &[Point], r
         volatile: rules.addresses("volatile"),
         limits: rules.limits(),
         save: read_save(table, ranges),
-        lock: read_lock(table, list, points),
+        lock: read_lock(table, &rules, points),
         note: table.or("note", String::new()),
     }
+}
+
+/// Whether the key is that of the base.
+fn is_inherited(table: &Reader<'_>, key: &str) -> bool {
+    table.place_of(key).env.is_some()
 }
 
 /// A table whose keys name parameters.
 struct Rules<'a, 'd> {
     table: &'a Reader<'d>,
     list: &'a ParameterList,
+    /// Those of the base, of its base, and so on.
+    bases: &'a [&'a ParameterList],
 }
 
 impl Rules<'_, '_> {
@@ -68,7 +81,12 @@ impl Rules<'_, '_> {
 
     fn address(&self, key: &str, id: &str) -> Option<u16> {
         let id = id.trim();
-        let address = self.list.address(id);
+        let of_bases = || {
+            // A profile with a list of its own keeps what the base says of the addresses.
+            let bases = self.bases.iter().filter(|_| is_inherited(self.table, key));
+            bases.filter_map(|base| base.address(id)).next()
+        };
+        let address = self.list.address(id).or_else(of_bases);
         if address.is_none() {
             let named = self.list.named.iter().map(|parameter| parameter.id.as_str());
             let near = nearest(id, named).map(|near| format!("did you mean `{near}`?"));
@@ -97,9 +115,11 @@ impl Rules<'_, '_> {
                     .map(|parameter| (&parameter.label.unit, parameter.label.scale))
             };
             if label(limit.upper) != label(limit.lower) {
-                let what = format!("the parameters of `{row}` differ in unit or scale");
-                self.table
-                    .problem(KEY, what, "limit parameters whose counts can be compared");
+                if !is_inherited(self.table, KEY) {
+                    let what = format!("the parameters of `{row}` differ in unit or scale");
+                    self.table
+                        .problem(KEY, what, "limit parameters whose counts can be compared");
+                }
                 return None;
             }
             Some(limit)
@@ -146,17 +166,23 @@ fn read_save(table: &Reader<'_>, ranges: &[AddressRange]) -> Option<(u16, u16)> 
         .iter()
         .find(|range| range.table == Table::Holding && range.addresses.contains(&address));
     if range.is_none_or(|range| range.write == 0) {
-        let what = format!("holding {address} cannot be written");
-        table.problem("save", what, "name a register that lies in a [[range]] with `write`");
+        if !is_inherited(table, "save") {
+            let what = format!("holding {address} cannot be written");
+            table.problem("save", what, "name a register that lies in a [[range]] with `write`");
+        }
         return None;
     }
     Some((address, value))
 }
 
 /// `[parameters.lock]`: parameters that the drive takes in one mode only.
-fn read_lock(parent: &Reader<'_>, list: &ParameterList, points: &[Point]) -> Option<Lock> {
+fn read_lock(parent: &Reader<'_>, rules: &Rules<'_, '_>, points: &[Point]) -> Option<Lock> {
     let table = parent.table("lock")?;
-    let of = Rules { table: &table, list }.addresses("of");
+    let rules = Rules {
+        table: &table,
+        ..*rules
+    };
+    let of = rules.addresses("of");
     if of.is_empty() {
         table.problem(
             "of",
@@ -175,7 +201,9 @@ fn read_lock(parent: &Reader<'_>, list: &ParameterList, points: &[Point]) -> Opt
         let near = nearest(&name, states.map(|point| point.name.as_str()));
         let near = near.map(|near| format!("did you mean `{near}`?"));
         let remedy = near.unwrap_or_else(|| "name a point of the profile that is true or false".to_string());
-        table.problem("while", format!("there is no state `{name}`"), remedy);
+        if !is_inherited(&table, "while") {
+            table.problem("while", format!("there is no state `{name}`"), remedy);
+        }
         return None;
     };
     Some(Lock {
@@ -252,6 +280,32 @@ list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, O
         );
         assert_eq!(profile.parameters.at(50).unwrap().range, Some(0.0..=50.0));
         assert_eq!(read("").unwrap().parameters.rules, Default::default());
+    }
+
+    #[test]
+    fn rules_of_the_base_hold_for_what_is_left_of_it() {
+        let keys = "name = \"p\"\nbase = \"teco-7300pa\"\n[parameters]\nlist = [\"Cn-14, 0x020D, Upper, %, 1\", \
+                    \"Cn-15, 0x020E, Lower, %, 0.1\", \"Sn-23, 0x0117, Address, , 1\"]\n";
+        let profile = Profile::parse("p.toml", keys, false).unwrap();
+        let rules = &profile.parameters.rules;
+        assert_eq!(rules.held_back(0x0117), Some("station address"));
+        assert_eq!(rules.held_back(0x0105), Some("source of run command and reference"));
+        assert_eq!(rules.lock.as_ref().map(|lock| lock.of.len()), Some(3));
+        assert_eq!(
+            (rules.limits.len(), rules.ratings.len(), rules.save),
+            (6, 3, Some((0x0900, 0)))
+        );
+        let keys = keys.replace("[parameters]", "remove = [\"ready\"]\n[parameters]");
+        let profile = Profile::parse("p.toml", &keys, false).unwrap();
+        assert_eq!(profile.parameters.rules.lock, None);
+        let own = format!("{keys}ratings = [\"Cn-09\"]\n");
+        let found = Profile::parse("p.toml", &own, false).unwrap_err();
+        assert_eq!(found.len(), 1, "{found:?}");
+        assert!(
+            found[0].to_string().contains("p.toml:6, parameters.ratings"),
+            "{}",
+            found[0]
+        );
     }
 
     #[test]

@@ -11,7 +11,12 @@ use super::parameter_rules;
 use super::place::parse_address;
 use crate::document::Reader;
 
-pub(super) fn read(reader: &Reader<'_>, points: &[Point], ranges: &[AddressRange]) -> ParameterList {
+pub(super) fn read(
+    reader: &Reader<'_>,
+    bases: &[&ParameterList],
+    points: &[Point],
+    ranges: &[AddressRange],
+) -> ParameterList {
     let Some(table) = reader.table("parameters") else {
         return ParameterList::default();
     };
@@ -72,7 +77,7 @@ pub(super) fn read(reader: &Reader<'_>, points: &[Point], ranges: &[AddressRange
         spans,
         rules: WriteRules::default(),
     };
-    list.rules = parameter_rules::read(&table, &list, points, ranges);
+    list.rules = parameter_rules::read(&table, &list, bases, points, ranges);
     table.finish();
     list
 }
