@@ -5,6 +5,7 @@ mod base;
 mod derived;
 mod identify;
 mod n2;
+mod parameter_rules;
 mod parameters;
 mod place;
 mod points;
@@ -14,10 +15,11 @@ mod reference;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
-use std::sync::LazyLock;
+use std::sync::{Arc, LazyLock};
 use std::time::Duration;
 
 use super::model::ModelPoint;
+use super::parameters::ParameterList;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Node, Problem, Reader};
@@ -38,6 +40,9 @@ const BUILT_IN: [(&str, &str); 8] = [
     ("vacon-nx-n2.toml", include_str!("../../../profiles/vacon-nx-n2.toml")),
     ("vacon-nx.toml", include_str!("../../../profiles/vacon-nx.toml")),
 ];
+
+/// Bases of bases that are followed; no sound set of files has so many.
+const MOST_BASES: usize = 16;
 
 impl Profiles {
     /// The profiles that are part of the program.
@@ -228,6 +233,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         .iter()
         .map(|m| points.iter().position(|p| p.model == Some(*m)))
         .collect();
+    let bases = parameters_of_bases(base.as_deref(), known);
     let profile = Profile {
         name: name.clone().unwrap_or_default(),
         title: reader.or("title", String::new()),
@@ -246,7 +252,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
         on_fault: read_on_fault(reader, &points),
-        parameters: parameters::read(reader, &points),
+        parameters: parameters::read(reader, &bases, &points, &ranges),
         ranges,
         points,
         faults,
@@ -256,6 +262,18 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
     };
     reader.finish();
     name.map(|_| profile)
+}
+
+/// The parameters of the base, of its base, and so on.
+fn parameters_of_bases<'k>(base: Option<&str>, known: &'k Profiles) -> Vec<&'k ParameterList> {
+    let first = base.and_then(|base| known.get(base));
+    let next = |profile: &&'k Arc<Profile>| {
+        // One that has replaced its own base is the last that is known.
+        let base = profile.base.as_deref().filter(|base| *base != profile.name)?;
+        known.get(base)
+    };
+    let all = std::iter::successors(first, next).take(MOST_BASES);
+    all.map(|profile| &profile.parameters).collect()
 }
 
 /// `on_fault`: points that are read at once when a fault comes up; of a derived one, those that it is made of.
