@@ -5,6 +5,7 @@
 mod difference;
 mod file;
 mod names;
+mod plan;
 mod reading;
 mod store;
 mod vault;
@@ -12,6 +13,7 @@ mod vault;
 pub use difference::{Difference, differences};
 pub use file::{Entry, FileError, Id, ParameterFile};
 pub use names::Names;
+pub use plan::{Handling, Need, ParameterWrite, Plan, Risk, Wishes, plan};
 pub use reading::{Next, Reading};
 pub use store::{Kept, Store, read};
 pub use vault::{Status, Vault};

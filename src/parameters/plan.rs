@@ -1,0 +1,104 @@
+//! What a restore would write to a drive, in which order, and why it may not. Pure.
+
+use super::file::{Id, ParameterFile};
+use crate::drive::Profile;
+use crate::drive::parameters::RawValue;
+
+/// One parameter to write.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ParameterWrite {
+    /// Which.
+    pub id: Id,
+    /// PDU address of its (first) holding register.
+    pub address: u16,
+    /// What the drive holds now.
+    pub from: RawValue,
+    /// What it shall hold.
+    pub to: RawValue,
+    /// For people: `102 Maximum frequency: 50.00 Hz → 100.00 Hz`.
+    pub line: String,
+    /// The drive does not keep it without power.
+    pub volatile: bool,
+}
+
+/// What must hold before the drive takes some of the writes.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Need {
+    /// Point of the profile (index) that shows it.
+    pub point: usize,
+    /// What the point must read.
+    pub value: bool,
+    /// Exception code by which the drive refuses a write otherwise.
+    pub exception: Option<u8>,
+    /// What to do: `switch the operator to PRGM`.
+    pub remedy: String,
+}
+
+/// How the drive takes and keeps parameters, from the profile.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Handling {
+    /// What must hold before the first write; nothing where none of the writes needs it.
+    pub needs: Option<Need>,
+    /// Register written once at the end so that the drive keeps the values: (PDU address, value).
+    pub save: Option<(u16, u16)>,
+}
+
+/// What a restore does.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Plan {
+    /// The writes, in an order in which every step keeps the limits of the drive.
+    pub writes: Vec<ParameterWrite>,
+    /// How the drive takes and keeps them.
+    pub handling: Handling,
+    /// Parameters that differ and are left out, and why.
+    pub left_out: Vec<(Id, String)>,
+    /// What people should know: parameters that only one side has, were not read, are not kept.
+    pub notes: Vec<String>,
+}
+
+/// What the user named singly, and whether he accepts the risks.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Wishes {
+    /// These alone; also those that are never restored otherwise. Empty: all.
+    pub only: Vec<Id>,
+    /// What can be forced is a risk, not a refusal.
+    pub force: bool,
+}
+
+/// A reason against the restore that the user overrode: for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Risk(pub String);
+
+/// What would be written so that the drive, which holds `present`, comes to hold `wanted`.
+///
+/// # Errors
+/// Every reason why it may not be done, each saying what differs and what to do.
+pub fn plan(
+    profile: &Profile,
+    wanted: &ParameterFile,
+    present: &ParameterFile,
+    wishes: &Wishes,
+) -> Result<(Plan, Vec<Risk>), Vec<String>> {
+    let _ = (wanted, present, wishes);
+    Err(vec![format!(
+        "the parameters of `{}` cannot be restored yet",
+        profile.name
+    )])
+}
+
+impl Plan {
+    /// The plan that takes back the first `done` writes: the former values, the last write first.
+    #[must_use]
+    pub fn back(&self, done: usize) -> Plan {
+        let writes = self.writes.iter().take(done).rev().map(|write| ParameterWrite {
+            from: write.to,
+            to: write.from,
+            ..write.clone()
+        });
+        Plan {
+            writes: writes.collect(),
+            handling: self.handling.clone(),
+            ..Plan::default()
+        }
+    }
+}
