@@ -122,7 +122,10 @@ impl CommandRun {
             Order::Parameter(_) => parameter.is_none().then(|| running_unknown(profile)),
         };
         let actions = match order {
-            Order::Parameter(_) => parameter.map(|run| Action::Parameter(Box::new(run))).into_iter().collect(),
+            Order::Parameter(_) => parameter
+                .map(|run| Action::Parameter(Box::new(run)))
+                .into_iter()
+                .collect(),
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),

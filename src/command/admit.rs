@@ -7,7 +7,7 @@ use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::model::Kind;
 use crate::drive::profile::AddressRange;
 use crate::drive::{ModelPoint, Point, Source, Value};
-use crate::process_image::{Access, DriveSpec, ParamsAccess, Reading};
+use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 
 /// An order that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]
@@ -69,7 +69,11 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
 
 /// While parameters are restored, or are half restored, only stops get through.
 fn not_held(drive: &Reading<'_>, admitted: Admitted) -> Result<Admitted, Refusal> {
-    match drive.hold.why().filter(|_| admitted.urgency != Urgency::Stop) {
+    match drive
+        .hold
+        .and_then(Hold::why)
+        .filter(|_| admitted.urgency != Urgency::Stop)
+    {
         Some(why) => Err(Refusal::NotAllowed(why.to_string())),
         None => Ok(admitted),
     }
@@ -79,7 +83,7 @@ fn not_held(drive: &Reading<'_>, admitted: Admitted) -> Result<Admitted, Refusal
 fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal> {
     let (spec, id) = (drive.spec, &order.id);
     may_restore(spec).map_err(Refusal::NotAllowed)?;
-    if drive.hold.why().is_none() {
+    if drive.hold.and_then(Hold::why).is_none() {
         return Err(Refusal::NotAllowed(format!(
             "parameter {id} of `{}` is written by a restore only; nothing was written",
             spec.name

@@ -282,7 +282,7 @@ impl DriveImage {
         let snapshot = self.snapshot();
         Reading {
             spec: &self.spec,
-            hold: &self.hold,
+            hold: Some(&self.hold),
             snapshot,
             now,
             stale_after: stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed))),

@@ -165,7 +165,10 @@ impl ParameterRun {
     fn heard_running(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
         let words = reply.words().unwrap_or_default();
         // A reply that does not say so is no motor that stands.
-        let stands = self.running.decode(&words, self.kind).is_some_and(|runs| !runs.as_bool());
+        let stands = self
+            .running
+            .decode(&words, self.kind)
+            .is_some_and(|runs| !runs.as_bool());
         if stands {
             return self.go(Stage::Write);
         }

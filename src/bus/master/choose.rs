@@ -138,13 +138,21 @@ impl Master {
             ..
         } = self;
         let is_checked = |drive: &mut DriveState| drive.run(slot).is_some_and(CommandRun::is_checked);
-        let (drive, state) = drives.iter_mut().enumerate().find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
+        let (drive, state) = drives
+            .iter_mut()
+            .enumerate()
+            .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
         let image = bus.image.drives.get(drive)?;
         match state.wanted(image, n2_late, now) {
             Wanted::Step(Urgency::Command, step)
                 if step.pdu.is_write() && sessions.before(drive, Some(slot), now).is_none() =>
             {
-                Some(Ready { drive, slot, rank, step })
+                Some(Ready {
+                    drive,
+                    slot,
+                    rank,
+                    step,
+                })
             }
             _ => None,
         }
