@@ -1,7 +1,13 @@
 //! Parameters of a family as data: which there are, and what they are called.
 
+mod rules;
+
+use std::ops::RangeInclusive;
+
 use super::profile::Profile;
 use crate::codec::{Protocol, Table};
+
+pub use rules::{Addresses, Limit, Lock, WriteRules, has};
 
 /// The parameters of a family.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -12,6 +18,8 @@ pub struct ParameterList {
     pub spans: Vec<Span>,
     /// Points that identify the drive in a file: indices in the profile.
     pub identification: Vec<usize>,
+    /// What holds when they are written back.
+    pub rules: WriteRules,
 }
 
 /// Addresses at which a drive may have parameters.
@@ -74,6 +82,26 @@ pub struct Parameter {
     pub address: u16,
     /// What it is called, and its unit.
     pub label: Label,
+    /// What the drive takes, in its unit; counts where the value of a count is not known. None where no manual says.
+    pub range: Option<RangeInclusive<f64>>,
+}
+
+/// A difference to the end of a range that floating point explains.
+const TOLERANCE: f64 = 1e-6;
+
+impl Parameter {
+    /// Whether the drive takes the value, as far as its family says.
+    pub fn takes(&self, raw: RawValue) -> bool {
+        let scale = match raw {
+            RawValue::Word(_) if self.label.scale > 0.0 => self.label.scale,
+            RawValue::Word(_) | RawValue::Float(_) => 1.0,
+        };
+        let value = raw.number() * scale;
+        self.range.as_ref().is_none_or(|range| {
+            let slack = TOLERANCE * value.abs().max(1.0);
+            (range.start() - slack..=range.end() + slack).contains(&value)
+        })
+    }
 }
 
 /// What a parameter is called, and what its counts mean.
@@ -162,7 +190,13 @@ impl RawValue {
 }
 
 impl Profile {
-    /// Whether a parameter of the family takes two registers, as an object of N2 does.
+    /// Whether the parameter at that address can be written.
+    pub(crate) fn parameter_is_writable(&self, address: u16) -> bool {
+        let range = self.range(Table::Holding, address);
+        range.is_some_and(|range| range.write >= self.parameter_words())
+    }
+
+    /// Registers of a parameter: two where it is an object of N2.
     pub fn parameter_words(&self) -> u16 {
         if self.protocols.contains(&Protocol::N2) { 2 } else { 1 }
     }
@@ -245,6 +279,32 @@ mod tests {
             (group.id(199), group.address("1.100"), group.address("99.1")),
             (None, None, None)
         );
+    }
+
+    #[test]
+    fn ranges_are_in_the_unit() {
+        let mut parameter = Parameter {
+            id: "Bn-13".to_string(),
+            address: 0x050C,
+            label: Label {
+                scale: 0.01,
+                ..Label::default()
+            },
+            range: Some(0.01..=10.0),
+        };
+        let takes = |parameter: &Parameter, words: [u16; 4]| words.map(|word| parameter.takes(RawValue::Word(word)));
+        assert_eq!(takes(&parameter, [0, 1, 1000, 1001]), [false, true, true, false]);
+        let floats = [0.009f32, 0.01, 10.0, 10.01];
+        let taken = floats.map(|value| parameter.takes(RawValue::Float(value.to_bits())));
+        assert_eq!(taken, [false, true, true, false]);
+        parameter.label.scale = 0.0;
+        assert_eq!(
+            takes(&parameter, [0, 1, 10, 11]),
+            [false, true, true, false],
+            "in counts"
+        );
+        parameter.range = None;
+        assert_eq!(takes(&parameter, [0, 1, 1000, 65_535]), [true; 4]);
     }
 
     #[test]

@@ -5,6 +5,7 @@ mod base;
 mod derived;
 mod identify;
 mod n2;
+mod parameter_rules;
 mod parameters;
 mod place;
 mod points;
@@ -246,7 +247,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         identify: identify::read(reader),
         simulator: reader.optional("simulator"),
         on_fault: read_on_fault(reader, &points),
-        parameters: parameters::read(reader, &points),
+        parameters: parameters::read(reader, &points, &ranges),
         ranges,
         points,
         faults,

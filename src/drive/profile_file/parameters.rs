@@ -1,13 +1,17 @@
 //! `[parameters]`: which parameters a family has.
 //!
-//! `list`: rows `id, address, name, unit, scale`; `spans`: `"id 100 1998"` or `"group 100 9898"`; `identification`: names of points.
+//! `list`: rows `id, address, name, unit, scale` and perhaps `, least, greatest`; `spans`: `"id 100 1998"` or `"group 100 9898"`;
+//! `identification`: names of points. The other keys are read in `parameter_rules`.
 
-use super::super::parameters::{Label, Numbering, Parameter, ParameterList, Span};
-use super::super::profile::Point;
+use std::ops::RangeInclusive;
+
+use super::super::parameters::{Label, Numbering, Parameter, ParameterList, Span, WriteRules};
+use super::super::profile::{AddressRange, Point};
+use super::parameter_rules;
 use super::place::parse_address;
 use crate::document::Reader;
 
-pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
+pub(super) fn read(reader: &Reader<'_>, points: &[Point], ranges: &[AddressRange]) -> ParameterList {
     let Some(table) = reader.table("parameters") else {
         return ParameterList::default();
     };
@@ -19,7 +23,7 @@ pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
             Err(why) => table.problem(
                 "list",
                 format!("`{row}`: {why}"),
-                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"",
+                "write \"id, address, name, unit, scale\", such as \"Cn-02, 0x0201, Max. output frequency, Hz, 0.1\"; behind it, where they are known, \"least, greatest\" in the unit",
             ),
         }
     }
@@ -62,11 +66,13 @@ pub(super) fn read(reader: &Reader<'_>, points: &[Point]) -> ParameterList {
         }
         index
     });
-    let list = ParameterList {
+    let mut list = ParameterList {
         identification: identification.collect(),
         named,
         spans,
+        rules: WriteRules::default(),
     };
+    list.rules = parameter_rules::read(&table, &list, points, ranges);
     table.finish();
     list
 }
@@ -84,8 +90,13 @@ fn read_span(text: &str) -> Option<Span> {
 
 fn read_row(row: &str) -> Result<Parameter, String> {
     let fields: Vec<&str> = row.split(',').map(str::trim).collect();
-    let [id, address, name, unit, scale] = fields.as_slice() else {
-        return Err(format!("{} fields in place of 5", fields.len()));
+    let (id, address, name, unit, scale, range) = match fields.as_slice() {
+        [id, address, name, unit, scale] => (id, address, name, unit, scale, None),
+        [id, address, name, unit, scale, least, greatest] => {
+            let range = read_range(least, greatest)?;
+            (id, address, name, unit, scale, Some(range))
+        }
+        _ => return Err(format!("{} fields in place of 5 or 7", fields.len())),
     };
     if id.is_empty() || id.contains(['#', '=']) {
         return Err("the id is empty or has # or = in it".to_string());
@@ -99,5 +110,14 @@ fn read_row(row: &str) -> Result<Parameter, String> {
             unit: unit.to_string(),
             scale,
         },
+        range,
     })
+}
+
+fn read_range(least: &str, greatest: &str) -> Result<RangeInclusive<f64>, String> {
+    let number = |text: &str| text.parse().ok().filter(|value: &f64| value.is_finite());
+    match (number(least), number(greatest)) {
+        (Some(least), Some(greatest)) if least <= greatest => Ok(least..=greatest),
+        _ => Err(format!("`{least}` to `{greatest}` is not a range")),
+    }
 }

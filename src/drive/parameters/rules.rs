@@ -1,0 +1,67 @@
+//! What a family says about writing its parameters back: what is left alone, in which order, how the drive keeps them.
+
+use std::ops::RangeInclusive;
+
+/// PDU addresses of parameters.
+pub type Addresses = Vec<RangeInclusive<u16>>;
+
+/// Rules for writing parameters back; the default knows nothing and leaves nothing out.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct WriteRules {
+    /// Written only if the user names the parameter; and why.
+    pub only_by_name: Vec<(RangeInclusive<u16>, String)>,
+    /// Ratings of the drive itself: drives of one kind have the same. Written only if the user names the parameter.
+    pub nameplate: Addresses,
+    /// Ratings of what is connected to the drive: supply and motor.
+    pub ratings: Addresses,
+    /// Not kept without power, whatever is saved.
+    pub volatile: Addresses,
+    /// Parameters that bound one another.
+    pub limits: Vec<Limit>,
+    /// The write after which the drive keeps the parameters without power: PDU address and value. Without it every write
+    /// is kept at once, as far as the family says anything.
+    pub save: Option<(u16, u16)>,
+    /// Parameters that the drive takes in one mode only.
+    pub lock: Option<Lock>,
+    /// What people should know before they write; empty if nothing.
+    pub note: String,
+}
+
+/// Two parameters of one scale of which one is never above the other.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Limit {
+    /// PDU address of the one that is not below the other.
+    pub upper: u16,
+    /// PDU address of the one that is not above it.
+    pub lower: u16,
+}
+
+/// Parameters that the drive takes in one mode only.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lock {
+    /// Which.
+    pub of: Addresses,
+    /// Point (index in the profile) that is true only while the drive refuses them. While it is false the drive may still
+    /// refuse them.
+    pub point: usize,
+    /// Exception code of the refusal; N2 codes with 0x80 added. None where no manual says.
+    pub exception: Option<u8>,
+    /// What to do.
+    pub remedy: String,
+}
+
+/// Whether one of the ranges has that address.
+pub fn has(addresses: &[RangeInclusive<u16>], address: u16) -> bool {
+    addresses.iter().any(|range| range.contains(&address))
+}
+
+impl WriteRules {
+    /// Why the parameter is written only if the user names it; nothing where it is written like the others.
+    pub fn held_back(&self, address: u16) -> Option<&str> {
+        if has(&self.nameplate, address) {
+            return Some("it describes the drive itself");
+        }
+        let row = self.only_by_name.iter().find(|(range, _)| range.contains(&address));
+        row.map(|(_, why)| why.as_str())
+    }
+}
