@@ -9,6 +9,8 @@ use super::teco::{TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu};
 use std::time::Duration;
 
+pub use super::teco::Mode;
+
 /// Missed actions of an autopilot that lie longer back are passed over.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
 
