@@ -4,8 +4,8 @@ use crate::codec::{RequestPdu, Table};
 use crate::drive::parameters::RawValue;
 
 /// One parameter to set. The bus asks the drive for its value and whether its motor runs, writes, and reads the value back; nothing else
-/// goes on the line between the answer that the motor stands and the write. A drive that has the value already is not written:
-/// what it keeps wears its memory.
+/// goes on the line between the answer that the motor stands and the write. A drive that has the value already is not written,
+/// since what it keeps wears its memory: the reply is then that of the read.
 #[derive(Debug, Clone, PartialEq)]
 pub struct ParameterOrder {
     /// What the family calls it.

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use super::journal::{Journal, Phase};
 use super::plan::ParameterWrite;
-use crate::codec::Exception;
+use crate::codec::{Exception, Reply};
 use crate::command::{Outcome, ParameterOrder, Refusal};
 use crate::drive::parameters::RawValue;
 
@@ -21,6 +21,8 @@ const BUSY_PAUSE: Duration = Duration::from_millis(200);
 const PAUSE: Duration = Duration::from_secs(1);
 /// How often the journal is told how far the restore is.
 const NOTED: Duration = Duration::from_secs(1);
+/// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved anew.
+const MOST_SAVES: u32 = 3;
 
 /// What is done next.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,8 +61,8 @@ pub enum End {
 
 #[derive(Debug, Clone, PartialEq)]
 enum State {
-    /// The journal must be written.
-    Recording,
+    /// The journal must be written, before the parameter at that place has its turn.
+    Recording(usize),
     /// The parameter at that place has its turn; behind the last one the save.
     Setting(usize),
     /// It is over, but for the journal.
@@ -77,6 +79,9 @@ pub struct Restoration {
     state: State,
     /// Something may have been written.
     touched: bool,
+    /// Something was written that is not saved.
+    wrote: bool,
+    saves: u32,
     /// Since when it cannot go on.
     waits_since: Option<Instant>,
     noted: Instant,
@@ -109,8 +114,10 @@ impl Restoration {
         Restoration {
             journal,
             writes,
-            state: State::Recording,
+            state: State::Recording(0),
             touched,
+            wrote: true,
+            saves: 0,
             waits_since: None,
             noted: now,
         }
@@ -119,7 +126,7 @@ impl Restoration {
     /// What is done next.
     pub fn wanted(&self) -> Wanted {
         match &self.state {
-            State::Recording => Wanted::Record,
+            State::Recording(_) => Wanted::Record,
             State::Setting(place) => match self.writes.get(*place) {
                 Some(write) => Wanted::Set(ParameterOrder {
                     id: write.id.name().to_string(),
@@ -164,8 +171,12 @@ impl Restoration {
     pub fn recorded(&mut self, result: Result<(), String>, now: Instant) {
         self.noted = now;
         match result {
-            Ok(()) if self.journal.done >= self.writes.len() && !self.saves() => self.finish(),
-            Ok(()) => self.state = State::Setting(self.journal.done),
+            Ok(()) => match self.state {
+                State::Recording(place) if place < self.writes.len() || self.saves() => {
+                    self.state = State::Setting(place)
+                }
+                _ => self.finish(),
+            },
             Err(why) => self.give_up(format!("the journal cannot be written: {why}")),
         }
     }
@@ -191,10 +202,9 @@ impl Restoration {
             self.touched = true;
         }
         match outcome {
-            Outcome::Acknowledged(_) => {
+            Outcome::Acknowledged(reply) => {
                 self.waits_since = None;
-                self.advance(now);
-                Then::Go
+                self.advance(*reply == Reply::Written, now)
             }
             Outcome::NotTaken(_) => self.stop(outcome.to_string()),
             Outcome::Refused(Refusal::MotorRuns(_)) => self.wait_for_people(
@@ -223,31 +233,52 @@ impl Restoration {
         };
     }
 
-    /// The present order is done.
-    fn advance(&mut self, now: Instant) {
-        let State::Setting(place) = self.state else { return };
-        if place >= self.writes.len() {
-            return self.finish();
-        }
-        self.journal.done = place + 1;
-        if self.journal.done < self.writes.len() {
-            let is_noted = now.saturating_duration_since(self.noted) < NOTED;
+    /// The present order is done; `written` unless the drive had the value already.
+    fn advance(&mut self, written: bool, now: Instant) -> Then {
+        let State::Setting(place) = self.state else {
+            return Then::Go;
+        };
+        let Some(write) = self.writes.get(place) else {
+            return self.saved();
+        };
+        self.wrote |= written && !write.volatile;
+        let next = place + 1;
+        self.journal.done = self.journal.done.max(next);
+        if next < self.writes.len() {
+            let is_noted = self.saves > 0 || now.saturating_duration_since(self.noted) < NOTED;
             self.state = if is_noted {
-                State::Setting(self.journal.done)
+                State::Setting(next)
             } else {
-                State::Recording
+                State::Recording(next)
             };
-            return;
+            return Then::Go;
         }
-        if !self.saves() {
-            return self.finish();
+        if !self.saves() || !self.wrote {
+            self.finish();
+            return Then::Go;
+        }
+        if self.saves == MOST_SAVES {
+            return self
+                .stop("the drive loses again and again what is written: is it switched off and on?".to_string());
         }
         self.journal.saved = true;
         self.journal.phase = match self.journal.phase {
             Phase::Writing | Phase::Saving => Phase::Saving,
             Phase::TakingBack | Phase::SavingBack => Phase::SavingBack,
         };
-        self.state = State::Recording;
+        self.state = State::Recording(next);
+        Then::Go
+    }
+
+    /// The drive was told to keep the values. If it was without power before that, it lost some: all are looked at once more.
+    fn saved(&mut self) -> Then {
+        self.saves += 1;
+        self.wrote = false;
+        self.state = State::Setting(0);
+        if self.writes.is_empty() {
+            self.finish();
+        }
+        Then::Go
     }
 
     /// Whether the drive is told to keep the values. Taking back what it was not told to keep needs no save: it wears its memory.
@@ -309,7 +340,6 @@ impl Restoration {
 mod tests {
     use super::super::journal::tests::{journal, write};
     use super::*;
-    use crate::codec::Reply;
 
     const TAKEN: Outcome = Outcome::Acknowledged(Reply::Written);
 
@@ -319,8 +349,11 @@ mod tests {
         Restoration::begin(journal, now)
     }
 
-    fn wanted_ids(restoration: &mut Restoration, now: Instant) -> Vec<String> {
-        let mut all = Vec::new();
+    /// What is wanted until it is over, of a drive that loses what is not saved when it is told to save for the first time, if
+    /// it `forgets`.
+    fn wanted_ids(restoration: &mut Restoration, mut forgets: bool, now: Instant) -> Vec<String> {
+        let (mut all, mut has) = (Vec::new(), std::collections::BTreeSet::new());
+        let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));
         loop {
             match restoration.wanted() {
                 Wanted::Record => {
@@ -328,8 +361,14 @@ mod tests {
                     restoration.recorded(Ok(()), now);
                 }
                 Wanted::Set(order) => {
-                    all.push(order.what());
-                    assert_eq!(restoration.answered(&TAKEN, now), Then::Go);
+                    let new = order.from.is_none() || has.insert(order.address);
+                    if new {
+                        all.push(order.what());
+                    }
+                    if order.from.is_none() && std::mem::take(&mut forgets) {
+                        has.clear();
+                    }
+                    assert_eq!(restoration.answered(if new { &TAKEN } else { &seen }, now), Then::Go);
                 }
                 Wanted::Remove => {
                     all.push("remove".to_string());
@@ -345,7 +384,7 @@ mod tests {
         let now = Instant::now();
         let mut restoration = begun(2, true, now);
         assert_eq!(
-            wanted_ids(&mut restoration, now),
+            wanted_ids(&mut restoration, false, now),
             [
                 "record writing",
                 "parameter 101: 0 -> 1",
@@ -360,7 +399,7 @@ mod tests {
         let mut saved = restoration.journal().clone();
         let mut back = Restoration::undo(saved.clone(), now);
         assert_eq!(
-            wanted_ids(&mut back, now),
+            wanted_ids(&mut back, false, now),
             [
                 "record taking back",
                 "parameter 102: 2 -> 1",
@@ -373,7 +412,26 @@ mod tests {
         assert_eq!(back.end(), Some(&End::TakenBack));
         saved.saved = false;
         let mut back = Restoration::undo(saved, now);
-        assert!(!wanted_ids(&mut back, now).contains(&"save: 0".to_string()));
+        assert!(!wanted_ids(&mut back, false, now).contains(&"save: 0".to_string()));
+    }
+
+    #[test]
+    fn what_a_drive_lost_before_it_was_saved_is_written_and_saved_anew() {
+        let now = Instant::now();
+        let mut restoration = begun(1, true, now);
+        assert_eq!(
+            wanted_ids(&mut restoration, true, now),
+            [
+                "record writing",
+                "parameter 101: 0 -> 1",
+                "record saving",
+                "save: 0",
+                "parameter 101: 0 -> 1",
+                "record saving",
+                "save: 0",
+                "remove"
+            ]
+        );
     }
 
     #[test]

@@ -5,11 +5,9 @@ use super::autopilot::Autopilot;
 use super::cx::{CxDrive, CxOptions};
 use super::model::{Command, DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
-use super::teco::{TecoDrive, TecoOptions};
+use super::teco::{Mode, TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu};
 use std::time::Duration;
-
-pub use super::teco::Mode;
 
 /// Missed actions of an autopilot that lie longer back are passed over.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
@@ -249,6 +247,14 @@ impl SimulatedDrive {
     /// Gives it to the bus, or to panel or terminals.
     pub fn set_remote(&mut self, on: bool) {
         self.model.get_mut().set_remote(on);
+    }
+
+    /// Puts the operator of a TECO into PRGM mode, in which it takes all parameters and does not run, or into DRIVE mode. Other
+    /// models have no such modes.
+    pub fn set_programming(&mut self, on: bool) {
+        if let AnyModel::Teco(teco) = &mut self.model {
+            teco.set_mode(if on { Mode::Program } else { Mode::Drive });
+        }
     }
 
     /// Switches the supply off.

@@ -9,11 +9,11 @@ use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
 use drivegate::command::{Authority, Interruption, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate::drive::ModelPoint;
 use drivegate::parameters::{
-    End, Journal, Names, Next, ParameterFile, Phase, Plan, Reading, Restoration, Then, Wanted, Wishes, differences, plan,
+    End, Journal, Names, Next, ParameterFile, Phase, Plan, Reading, Restoration, Then, Wanted, Wishes, differences,
+    plan,
 };
 use drivegate::plant::Placed;
 use drivegate::process_image::ParamsAccess;
-use drivegate::sim::drive::Mode;
 use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::nx::Command;
 use drivegate::sim::random::Random;
@@ -37,7 +37,13 @@ const FAMILIES: [(&str, Protocol, u32); 4] = [
 ];
 
 /// What is wrong with the line. Every reply that comes is the drive's own.
-const FAULTS: [&str; 5] = ["", "drop=0.05", "deaf=0.05,corrupt=0.05", "truncate=0.05", "drop=0.1,corrupt=0.1"];
+const FAULTS: [&str; 5] = [
+    "",
+    "drop=0.05",
+    "deaf=0.05,corrupt=0.05",
+    "truncate=0.05",
+    "drop=0.1,corrupt=0.1",
+];
 
 /// The gateway was killed.
 struct Cut;
@@ -96,13 +102,13 @@ impl Bench {
             let seed = seed * 2 + u64::from(address);
             rig.with_drive(address, |drive, _| {
                 drive.fill_parameters(seed);
-                if let Some(teco) = drive.as_teco() {
-                    teco.set_mode(Mode::Program);
-                }
+                drive.set_programming(true);
             });
         }
         rig.until("the drives are read", Duration::from_secs(60), |rig| {
-            [DRIVE, SOURCE].iter().all(|drive| rig.good(*drive, ModelPoint::Running).is_some())
+            [DRIVE, SOURCE]
+                .iter()
+                .all(|drive| rig.good(*drive, ModelPoint::Running).is_some())
         });
         let (wanted, present) = (held(&mut rig, SOURCE), held(&mut rig, DRIVE));
         let wishes = Wishes {
@@ -163,18 +169,29 @@ impl Bench {
     /// What the line shows: a parameter is written only right behind the answer that the motor stands, and with the journal on disk.
     fn look(&mut self, seen: Vec<Seen>) {
         let profile = self.rig.drive(DRIVE).image.spec.profile.clone();
-        let running = profile.model_point(ModelPoint::Running).and_then(|point| point.raw()).unwrap().clone();
+        let running = profile
+            .model_point(ModelPoint::Running)
+            .and_then(|point| point.raw())
+            .unwrap()
+            .clone();
         let ours = |pdu: &RequestPdu| match pdu {
             RequestPdu::WriteRegister { address, .. } => {
-                profile.parameters.id(*address).is_some() || self.plan.handling.save.is_some_and(|save| save.0 == *address)
+                profile.parameters.id(*address).is_some()
+                    || self.plan.handling.save.is_some_and(|save| save.0 == *address)
             }
             _ => false,
         };
         for one in seen {
             match one {
                 Seen::Sent(asked) if asked.drive == 0 && ours(&asked.pdu) => {
-                    assert!(self.stands.is_some(), "a parameter was written without asking whether the motor runs");
-                    assert!(self.disk.is_some(), "a parameter was written before the journal was on disk");
+                    assert!(
+                        self.stands.is_some(),
+                        "a parameter was written without asking whether the motor runs"
+                    );
+                    assert!(
+                        self.disk.is_some(),
+                        "a parameter was written before the journal was on disk"
+                    );
                 }
                 Seen::Acted(asked) if asked.drive == 0 && ours(&asked.pdu) => {
                     let taken = !matches!(asked.reply, Some(Reply::Exception(_)));
@@ -182,8 +199,14 @@ impl Bench {
                     let checked = self.stands.take();
                     let fed = self.rig.with_drive(DRIVE, |drive, _| drive.state().running);
                     // Nobody can ask at the moment at which somebody at the drive starts it.
-                    let just_started = self.started.zip(checked).is_some_and(|(started, checked)| started >= checked);
-                    assert!(!taken || !fed || just_started, "a parameter was written while the motor was fed");
+                    let just_started = self
+                        .started
+                        .zip(checked)
+                        .is_some_and(|(started, checked)| started >= checked);
+                    assert!(
+                        !taken || !fed || just_started,
+                        "a parameter was written while the motor was fed"
+                    );
                 }
                 Seen::Over(asked) => {
                     let asks = asked.drive == 0
@@ -230,9 +253,7 @@ impl Bench {
             reference: 3000,
         };
         self.rig.with_drive(DRIVE, |drive, _| {
-            if let Some(teco) = drive.as_teco() {
-                teco.set_mode(if run { Mode::Drive } else { Mode::Program });
-            }
+            drive.set_programming(!run);
             drive.command(command);
         });
     }
@@ -282,7 +303,11 @@ impl Bench {
         let mut open = std::mem::take(&mut self.stops);
         open.retain_mut(|stop| match stop.answer() {
             Some(answer) => {
-                assert!(!matches!(answer.outcome, Outcome::Refused(_)), "a stop was refused: {}", answer.outcome);
+                assert!(
+                    !matches!(answer.outcome, Outcome::Refused(_)),
+                    "a stop was refused: {}",
+                    answer.outcome
+                );
                 self.stopped += usize::from(answer.outcome.is_ok());
                 false
             }
@@ -307,18 +332,27 @@ impl Bench {
             0 => self.rig.points(DRIVE, &[("run", 1.0)]),
             1 => self.rig.points(DRIVE, &[("frequency_reference", 10.0)]),
             2 => self.rig.points(DRIVE, &[("fault_reset", 1.0)]),
-            _ => Order::Write(RequestPdu::WriteRegister { address: 101, value: 4321 }),
+            _ => Order::Write(RequestPdu::WriteRegister {
+                address: 101,
+                value: 4321,
+            }),
         };
         let mut placed = self.rig.place(DRIVE, order);
         let outcome = placed.answer().expect("refused at once").outcome;
-        assert!(matches!(outcome, Outcome::Refused(_)), "an order got through: {outcome}");
+        assert!(
+            matches!(outcome, Outcome::Refused(_)),
+            "an order got through: {outcome}"
+        );
         self.refused += 1;
     }
 
     fn set(&mut self, order: ParameterOrder) -> Result<Outcome, Cut> {
         let origin = Origin::new(SourceKind::LocalSocket, "test");
         let (order, expiry) = (Order::Parameter(order), Duration::from_secs(30));
-        let mut placed = self.rig.drive(DRIVE).place(order, origin, Authority::Write, expiry, self.rig.now);
+        let mut placed = self
+            .rig
+            .drive(DRIVE)
+            .place(order, origin, Authority::Write, expiry, self.rig.now);
         self.rig.bus.command_came(self.rig.now);
         let until = self.rig.now + Duration::from_secs(120);
         loop {
@@ -438,7 +472,12 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
     let after = held(&mut bench.rig, DRIVE);
     for write in &bench.plan.writes {
         let expected = if done { write.to } else { write.from };
-        assert_eq!(after.values[&write.id].value, Ok(expected), "seed {seed}: {}", write.line);
+        assert_eq!(
+            after.values[&write.id].value,
+            Ok(expected),
+            "seed {seed}: {}",
+            write.line
+        );
     }
     let written: BTreeSet<_> = bench.plan.writes.iter().map(|write| &write.id).collect();
     let others = differences(&before, &after);
@@ -448,15 +487,25 @@ fn one(seed: u64, cuts: u64) -> (usize, usize, usize, usize) {
         let source = held(&mut bench.rig, SOURCE);
         let left_out: BTreeSet<_> = bench.plan.left_out.iter().map(|(id, _)| id.clone()).collect();
         let differ = differences(&source, &after);
-        assert!(differ.iter().all(|one| left_out.contains(&one.id)), "seed {seed}: {differ:?}");
+        assert!(
+            differ.iter().all(|one| left_out.contains(&one.id)),
+            "seed {seed}: {differ:?}"
+        );
     }
     let records = bench.rig.with_drive(DRIVE, |drive, _| drive.parameter_writes());
     let sound = FAULTS[seed as usize / FAMILIES.len() % FAULTS.len()].is_empty();
     for (address, record) in records {
         // Somebody who starts the motor in between is seen above.
-        assert!(record.while_fed == 0 || bench.started.is_some(), "seed {seed}: {address} {record:?}");
+        assert!(
+            record.while_fed == 0 || bench.started.is_some(),
+            "seed {seed}: {address} {record:?}"
+        );
         if cuts == 0 && sound {
-            assert!(record.taken <= 1, "seed {seed}: {address} was written {} times", record.taken);
+            assert!(
+                record.taken <= 1,
+                "seed {seed}: {address} was written {} times",
+                record.taken
+            );
         }
     }
     (bench.cuts, bench.refused, bench.stopped, bench.writes)
@@ -474,7 +523,9 @@ fn wherever_it_is_cut_off_the_drive_comes_to_have_all_values_or_the_former_ones(
         stopped += figures.2;
         writes += figures.3;
     }
-    println!("{seeds} restores, {cuts} cuts, {writes} writes taken, {refused} orders refused, {stopped} stops carried out");
+    println!(
+        "{seeds} restores, {cuts} cuts, {writes} writes taken, {refused} orders refused, {stopped} stops carried out"
+    );
     assert!(cuts as u64 >= seeds * 4 / 5 && refused > 0 && stopped > 0);
 }
 

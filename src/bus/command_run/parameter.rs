@@ -187,7 +187,9 @@ impl ParameterRun {
     fn heard_value(&mut self, reply: &Reply) -> Then {
         let value = self.value(reply);
         if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
-            return Then::Over(Outcome::Acknowledged(Reply::Written));
+            // Whoever asks sees by the reply that nothing was written.
+            let reply = if self.in_doubt { Reply::Written } else { reply.clone() };
+            return Then::Over(Outcome::Acknowledged(reply));
         }
         let before = self.order.from;
         if value.zip(before).is_some_and(|(value, from)| from.is_shown_by(value)) {
