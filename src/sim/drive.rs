@@ -5,9 +5,13 @@ use super::autopilot::Autopilot;
 use super::cx::{CxDrive, CxOptions};
 use super::model::{Command, DriveState, Model};
 use super::nx::{NxDrive, NxOptions};
-use super::teco::{Mode, TecoDrive, TecoOptions};
+use super::random::Random;
+use super::teco::{TecoDrive, TecoOptions};
 use crate::codec::{Exception, Reply, RequestPdu};
+use std::collections::BTreeMap;
 use std::time::Duration;
+
+pub use super::parameter_set::Writes;
 
 /// Missed actions of an autopilot that lie longer back are passed over.
 const LONGEST_CATCH_UP: Duration = Duration::from_secs(600);
@@ -249,12 +253,10 @@ impl SimulatedDrive {
         self.model.get_mut().set_remote(on);
     }
 
-    /// Puts the operator of a TECO into PRGM mode, in which it takes all parameters and does not run, or into DRIVE mode. Other
-    /// models have no such modes.
+    /// Brings it into the mode in which it takes all parameters, and does not run, or out of it: PRGM and DRIVE of a TECO. The
+    /// others have no such modes.
     pub fn set_programming(&mut self, on: bool) {
-        if let AnyModel::Teco(teco) = &mut self.model {
-            teco.set_mode(if on { Mode::Program } else { Mode::Drive });
-        }
+        self.model.get_mut().set_programming(on);
     }
 
     /// Switches the supply off.
@@ -276,6 +278,16 @@ impl SimulatedDrive {
     /// What it looks like from outside.
     pub fn state(&self) -> DriveState {
         self.model.get().state()
+    }
+
+    /// What was written over the bus into its parameters since it was made, by PDU address.
+    pub fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
+        self.model.get().parameter_writes()
+    }
+
+    /// Gives its parameters random values of that seed that it would take; where it takes its commands from stays.
+    pub fn fill_parameters(&mut self, seed: u64) {
+        self.model.get_mut().fill_parameters(&mut Random::new(seed));
     }
 
     /// Whether an autopilot still runs it.

@@ -32,6 +32,8 @@ pub(crate) mod motor;
 pub(crate) mod n2;
 pub mod nx;
 pub(crate) mod parameter_set;
+#[cfg(test)]
+mod parameter_tests;
 pub mod random;
 pub mod slave;
 pub mod statistics;

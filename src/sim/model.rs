@@ -2,7 +2,10 @@
 
 use super::SimTime;
 use super::motor::{Load, Motor};
+use super::parameter_set::Writes;
+use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu};
+use std::collections::BTreeMap;
 use std::fmt;
 use std::time::Duration;
 
@@ -171,6 +174,12 @@ pub(crate) trait Model: fmt::Debug {
         self.body_mut().trip(fault);
     }
 
+    /// What was written over the bus into parameters, by PDU address.
+    fn parameter_writes(&self) -> BTreeMap<u16, Writes>;
+
+    /// Gives its parameters random values that it would take, but that it obeys the same commands as before.
+    fn fill_parameters(&mut self, random: &mut Random);
+
     /// Faults that happen now and then, for the autopilot.
     fn usual_faults(&self) -> &'static [u16];
 
@@ -182,6 +191,10 @@ pub(crate) trait Model: fmt::Debug {
 
     /// Gives the drive to the bus, or to panel or terminals.
     fn set_remote(&mut self, on: bool);
+
+    /// Brings it into the mode in which it takes all parameters, and does not run, or out of it. Drives without such a mode
+    /// stay as they are.
+    fn set_programming(&mut self, _on: bool) {}
 
     /// What it looks like from outside.
     fn state(&self) -> DriveState {

@@ -1,4 +1,8 @@
-//! Parameters with their ranges, as any simulated drive keeps them.
+//! Parameters with their ranges, as any simulated drive keeps them, and a record of what was written over the bus.
+
+use std::collections::BTreeMap;
+
+use super::random::Random;
 
 /// One parameter.
 #[derive(Debug, Clone, Copy)]
@@ -18,13 +22,30 @@ pub(crate) struct Parameter {
 pub enum Refused {
     /// There is no such parameter.
     Unknown,
-    /// The value is outside the parameter's range.
+    /// The value is outside the parameter's range, or beyond a parameter that limits it.
     Value,
 }
 
-/// The parameters of one drive by ascending key.
+/// How often a parameter was written over the bus.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Writes {
+    /// Writes that the drive took.
+    pub taken: u32,
+    /// Those of them during which the inverter fed the motor.
+    pub while_fed: u32,
+    /// Writes into the memory that keeps it without power; it stands a limited number of them.
+    pub kept: u32,
+}
+
+/// The parameters of one drive.
 #[derive(Debug, Clone)]
-pub(crate) struct ParameterSet(Vec<Parameter>);
+pub(crate) struct ParameterSet {
+    /// By ascending key.
+    all: Vec<Parameter>,
+    /// Pairs of keys: the first is never below the second.
+    limits: Vec<(u16, u16)>,
+    writes: BTreeMap<u16, Writes>,
+}
 
 impl ParameterSet {
     /// Of (key, minimum, maximum, default); keys may come in any order, the first of equal ones counts.
@@ -35,18 +56,28 @@ impl ParameterSet {
             .collect();
         all.sort_by_key(|parameter| parameter.key);
         all.dedup_by_key(|parameter| parameter.key);
-        ParameterSet(all)
+        ParameterSet {
+            all,
+            limits: Vec::new(),
+            writes: BTreeMap::new(),
+        }
+    }
+
+    /// The first of each pair is never below the second.
+    pub(crate) fn limited(mut self, limits: impl IntoIterator<Item = (u16, u16)>) -> ParameterSet {
+        self.limits.extend(limits);
+        self
     }
 
     fn find(&self, key: u16) -> Result<usize, Refused> {
-        self.0
+        self.all
             .binary_search_by_key(&key, |parameter| parameter.key)
             .map_err(|_| Refused::Unknown)
     }
 
     /// The value of a parameter.
     pub(crate) fn get(&self, key: u16) -> Option<u16> {
-        self.find(key).ok().and_then(|at| self.0.get(at)).map(|p| p.value)
+        self.find(key).ok().and_then(|at| self.all.get(at)).map(|p| p.value)
     }
 
     /// The value of a parameter that every drive of the model has; 0 when it has not.
@@ -57,29 +88,79 @@ impl ParameterSet {
     /// Whether `value` may be written.
     ///
     /// # Errors
-    /// No such parameter, or a value outside its range.
+    /// No such parameter, or a value outside its range or beyond that of a parameter that limits it.
     pub(crate) fn check(&self, key: u16, value: u16) -> Result<(), Refused> {
         let at = self.find(key)?;
-        let inside = self.0.get(at).is_some_and(|p| (p.min..=p.max).contains(&value));
-        if inside { Ok(()) } else { Err(Refused::Value) }
+        let inside = self.all.get(at).is_some_and(|p| (p.min..=p.max).contains(&value));
+        let crossed = self.limits.iter().any(|&(upper, lower)| {
+            (key == upper && value < self.number(lower)) || (key == lower && value > self.number(upper))
+        });
+        if inside && !crossed {
+            Ok(())
+        } else {
+            Err(Refused::Value)
+        }
     }
 
-    /// Writes a parameter that [`ParameterSet::check`] allows.
+    /// Sets a parameter as [`ParameterSet::check`] allows, not over the bus.
     ///
     /// # Errors
-    /// As [`ParameterSet::check`]; nothing is written then.
+    /// As [`ParameterSet::check`]; nothing is set then.
     pub(crate) fn set(&mut self, key: u16, value: u16) -> Result<(), Refused> {
         self.check(key, value)?;
         let at = self.find(key)?;
-        if let Some(parameter) = self.0.get_mut(at) {
+        if let Some(parameter) = self.all.get_mut(at) {
             parameter.value = value;
         }
         Ok(())
     }
 
+    /// A write over the bus: as [`ParameterSet::set`], and recorded; `fed` whether the inverter feeds the motor.
+    ///
+    /// # Errors
+    /// As [`ParameterSet::check`]; nothing is written then.
+    pub(crate) fn write(&mut self, key: u16, value: u16, fed: bool) -> Result<(), Refused> {
+        self.set(key, value)?;
+        let writes = self.writes.entry(key).or_default();
+        writes.taken += 1;
+        writes.while_fed += u32::from(fed);
+        Ok(())
+    }
+
+    /// The memory that keeps the parameter without power was written.
+    pub(crate) fn record_kept(&mut self, key: u16) {
+        self.writes.entry(key).or_default().kept += 1;
+    }
+
+    /// What was written over the bus, by key.
+    pub(crate) fn writes(&self) -> &BTreeMap<u16, Writes> {
+        &self.writes
+    }
+
+    /// Takes over the values of a set with the same parameters.
+    pub(crate) fn take_values(&mut self, other: &ParameterSet) {
+        self.all.clone_from(&other.all);
+    }
+
+    /// Gives all parameters but `spared` random values that the drive could have come to by writes.
+    pub(crate) fn fill(&mut self, random: &mut Random, spared: &[u16]) {
+        for p in self.all.iter_mut().filter(|p| !spared.contains(&p.key)) {
+            // Inside the range of a register.
+            p.value = random.within(u64::from(p.min)..=u64::from(p.max)) as u16;
+        }
+        for &(upper, lower) in &self.limits.clone() {
+            let most = self.number(upper);
+            if let Ok(at) = self.find(lower)
+                && let Some(parameter) = self.all.get_mut(at)
+            {
+                parameter.value = parameter.value.min(most);
+            }
+        }
+    }
+
     /// All of them, by ascending key.
     pub(crate) fn iter(&self) -> impl Iterator<Item = &Parameter> {
-        self.0.iter()
+        self.all.iter()
     }
 }
 
@@ -101,5 +182,35 @@ mod tests {
             (Err(Refused::Value), Err(Refused::Value))
         );
         assert_eq!(set.set(3, 0), Err(Refused::Unknown));
+    }
+
+    #[test]
+    fn limits_and_the_record_of_writes() {
+        let mut set = ParameterSet::new([(1, 0, 9, 2), (2, 0, 9, 5)]).limited([(2, 1)]);
+        assert_eq!((set.check(1, 5), set.check(1, 6)), (Ok(()), Err(Refused::Value)));
+        assert_eq!(
+            (set.write(2, 1, false), set.write(2, 7, true)),
+            (Err(Refused::Value), Ok(()))
+        );
+        assert_eq!(set.write(2, 8, false), Ok(()));
+        set.record_kept(2);
+        let writes = Writes {
+            taken: 2,
+            while_fed: 1,
+            kept: 1,
+        };
+        assert_eq!(set.writes(), &BTreeMap::from([(2, writes)]));
+        let mut random = Random::new(1);
+        let filled: Vec<(u16, u16)> = (0..50)
+            .map(|_| {
+                set.fill(&mut random, &[]);
+                (set.number(1), set.number(2))
+            })
+            .collect();
+        assert!(filled.iter().all(|(lower, upper)| lower <= upper && *upper <= 9));
+        assert!(filled.iter().any(|values| *values != filled[0]));
+        let before = set.number(1);
+        set.fill(&mut random, &[1, 2]);
+        assert_eq!(set.number(1), before);
     }
 }

@@ -300,14 +300,14 @@ fn teco_takes_them_in_program_mode_and_saves_once() {
     );
     let ramp = plan(&teco, &wanted, &present, &only(&["Bn-01"])).unwrap().0;
     assert_eq!(
-        (ids_of(&ramp), ramp.handling.needs),
-        (vec!["Bn-01"], None),
+        (ids_of(&ramp), ramp.handling.needs.is_none()),
+        (vec!["Bn-01"], true),
         "in any mode"
     );
     let lost = plan(&teco, &wanted, &present, &only(&["On-20"])).unwrap().0;
     assert_eq!(lost.handling.save, None, "nothing that could be kept");
     let source = plan(&teco, &wanted, &present, &only(&["Sn-08", "Sn-23"])).unwrap().0;
-    assert_eq!((ids_of(&source), source.left_out), (vec!["Sn-08", "Sn-23"], Vec::new()));
+    assert_eq!((ids_of(&source), source.left_out.len()), (vec!["Sn-08", "Sn-23"], 0));
 }
 
 #[test]

@@ -12,11 +12,15 @@ mod tests;
 pub(crate) use diagnostics::Counters;
 pub(crate) use options::{AddressOffset, CxOptions, OutOfRange};
 
+use std::collections::BTreeMap;
+
 use self::diagnostics::{Diagnostics, count};
 use self::parameters::Parameters;
 use super::SimTime;
 use super::model::{AT_REFERENCE_BAND, Body, Command, Model, UPDATE_PERIOD, unsigned};
 use super::motor::{Feed, Ratings};
+use super::parameter_set::Writes;
+use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// The control bits (drives.md 4.2).
@@ -52,12 +56,19 @@ impl Default for Totals {
     }
 }
 
+/// kW at the shaft of the motor, with an efficiency of 85 %.
+fn nominal_power(plate: &Ratings) -> f64 {
+    3f64.sqrt() * plate.voltage * plate.current * plate.cos_phi * 0.85 / 1000.0
+}
+
 /// A simulated Vacon CX.
 #[derive(Debug, Clone)]
 pub struct CxDrive {
     options: CxOptions,
     parameters: Parameters,
     ratings: Ratings,
+    /// What the unit is built for, kW: that of the motor it was delivered for.
+    unit_power: f64,
     body: Body,
     totals: Totals,
     diagnostics: Diagnostics,
@@ -81,8 +92,10 @@ impl CxDrive {
                 let _ = parameters.set(parameters::address(group, number), value);
             }
         }
+        let ratings = parameters.ratings();
         CxDrive {
-            ratings: parameters.ratings(),
+            unit_power: nominal_power(&ratings),
+            ratings,
             body: Body::new(&options.load, now),
             totals: Totals::default(),
             diagnostics: Diagnostics::default(),
@@ -160,12 +173,6 @@ impl CxDrive {
         }
     }
 
-    /// kW at the shaft, with an efficiency of 85 %.
-    fn nominal_power(&self) -> f64 {
-        let plate = &self.ratings;
-        3f64.sqrt() * plate.voltage * plate.current * plate.cos_phi * 0.85 / 1000.0
-    }
-
     /// Counts the outcome of a message to this drive.
     fn count_reply(&mut self, reply: Option<Reply>) -> Option<Reply> {
         let counters = &mut self.diagnostics.counters;
@@ -210,7 +217,8 @@ impl Model for CxDrive {
         let seconds = UPDATE_PERIOD.as_secs_f64();
         self.body.motor.step(seconds, feed, &self.ratings, &self.options.load);
         let hours = seconds / 3600.0;
-        let energy = self.nominal_power() / 1000.0 * self.body.motor.power(&self.ratings).max(0.0) / 100.0 * hours;
+        let energy =
+            nominal_power(&self.ratings) / 1000.0 * self.body.motor.power(&self.ratings).max(0.0) / 100.0 * hours;
         self.totals.days += hours / 24.0;
         self.totals.trip_hours += hours;
         self.totals.energy += energy;
@@ -276,6 +284,15 @@ impl Model for CxDrive {
             totals: self.totals,
             ..fresh
         };
+    }
+
+    fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
+        self.parameters.writes()
+    }
+
+    fn fill_parameters(&mut self, random: &mut Random) {
+        self.parameters.fill(random);
+        self.ratings = self.parameters.ratings();
     }
 
     /// Overcurrent, drive overtemperature, motor underload, external fault.

@@ -3,9 +3,12 @@
 //! The manual names Par 0.1, 1.1, 1.2 and 3.2 only. The others, their ranges and defaults are plausible values of the
 //! drive's applications, so that there is something to read and the motor has a plate.
 
+use std::collections::BTreeMap;
+
 use super::super::motor::Ratings;
-use super::super::parameter_set::ParameterSet;
 pub(super) use super::super::parameter_set::Refused;
+use super::super::parameter_set::{ParameterSet, Writes};
+use super::super::random::Random;
 
 /// The address of a parameter, 1..=99 of group 0..=98: groups 1 to 98 by hundreds, group 0 at the end.
 pub(super) const fn address(group: u16, number: u16) -> u16 {
@@ -78,7 +81,7 @@ impl Parameters {
             (key, counts(min), counts(max), counts(value))
         });
         Parameters {
-            set: ParameterSet::new(set),
+            set: ParameterSet::new(set).limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)]),
             frequency_step,
         }
     }
@@ -87,21 +90,32 @@ impl Parameters {
         self.set.get(address)
     }
 
-    /// Writes a parameter.
+    /// Sets a parameter, not over the bus.
     ///
     /// # Errors
-    /// No such parameter, or a value outside its range; the minimum frequency may not exceed the maximum.
+    /// No such parameter, or a value outside its range; the minimum frequency may not exceed the maximum. Nothing is set then.
     pub(super) fn set(&mut self, address: u16, value: u16) -> Result<(), Refused> {
-        self.set.check(address, value)?;
-        let crossed = match address {
-            MINIMUM_FREQUENCY => value > self.set.number(MAXIMUM_FREQUENCY),
-            MAXIMUM_FREQUENCY => value < self.set.number(MINIMUM_FREQUENCY),
-            _ => false,
-        };
-        if crossed {
-            return Err(Refused::Value);
-        }
         self.set.set(address, value)
+    }
+
+    /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
+    ///
+    /// # Errors
+    /// As [`Parameters::set`].
+    pub(super) fn write(&mut self, address: u16, value: u16, fed: bool) -> Result<(), Refused> {
+        self.set.write(address, value, fed)?;
+        self.set.record_kept(address);
+        Ok(())
+    }
+
+    /// What was written over the bus, by address.
+    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
+        self.set.writes().clone()
+    }
+
+    /// Random values for all.
+    pub(super) fn fill(&mut self, random: &mut Random) {
+        self.set.fill(random, &[]);
     }
 
     /// Minimum frequency, Hz.

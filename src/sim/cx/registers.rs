@@ -121,7 +121,7 @@ impl CxDrive {
             12..=15 => 0,
             16 => bit(self.ready(), 1) | bit(self.body.shows_running(), 2) | bit(self.body.latch.fault() != 0, 4),
             17 => PROGRAM,
-            18 => unsigned(self.nominal_power() * 10.0),
+            18 => unsigned(self.unit_power * 10.0),
             19 => unsigned(motor.heat),
             _ => return None,
         })
@@ -149,7 +149,8 @@ impl CxDrive {
         if REFERENCES.contains(&item) {
             return Err(Exception::ADDRESS);
         }
-        self.parameters.set(item, value).map_err(|refused| match refused {
+        let written = self.parameters.write(item, value, self.body.motor.fed);
+        written.map_err(|refused| match refused {
             Refused::Unknown => Exception::ADDRESS,
             Refused::Value => Exception::VALUE,
         })?;

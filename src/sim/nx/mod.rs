@@ -19,10 +19,14 @@ pub use options::{Base, NxOptions, SpeedReference, Unit, Values};
 pub use registers::{Hole, Limits};
 pub use signals::StatusBits;
 
+use std::collections::BTreeMap;
+
 use self::parameters::{Parameters, Settings, StopFunction};
 use super::SimTime;
 use super::model::{AT_REFERENCE_BAND, Body, Model};
 use super::motor::Feed;
+use super::parameter_set::Writes;
+use super::random::Random;
 use crate::codec::{Reply, RequestPdu};
 
 /// Registers of process data in and out, IDs 2001..=2011 and 2101..=2111.
@@ -401,6 +405,15 @@ impl Model for NxDrive {
         fresh.settings = fresh.parameters.settings();
         fresh.refresh_output();
         *self = fresh;
+    }
+
+    fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
+        self.parameters.writes()
+    }
+
+    fn fill_parameters(&mut self, random: &mut Random) {
+        self.parameters.fill(random);
+        self.settings = self.parameters.settings();
     }
 
     fn trip(&mut self, fault: u16) {

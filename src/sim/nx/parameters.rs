@@ -3,9 +3,12 @@
 //! The IDs are those of drives.md 3.11 and 11.1; ranges and defaults that no manual at hand prints are plausible values
 //! of the All in One applications.
 
+use std::collections::BTreeMap;
+
 use super::super::motor::Ratings;
-use super::super::parameter_set::ParameterSet;
 pub use super::super::parameter_set::Refused;
+use super::super::parameter_set::{ParameterSet, Writes};
+use super::super::random::Random;
 use super::ControlPlace;
 
 /// ID of the minimum frequency, 0.01 Hz.
@@ -74,7 +77,8 @@ impl Default for Parameters {
             .iter()
             .zip(OUT_SELECTION..)
             .map(|(&item, id)| (id, 0, 1999, item));
-        Parameters(ParameterSet::new(plain.into_iter().chain(selectors)))
+        let set = ParameterSet::new(plain.into_iter().chain(selectors));
+        Parameters(set.limited([(MAXIMUM_FREQUENCY, MINIMUM_FREQUENCY)]))
     }
 }
 
@@ -84,27 +88,33 @@ impl Parameters {
         self.0.get(id)
     }
 
-    /// Whether `value` may be written to the parameter `id`.
+    /// Sets a parameter, not over the bus.
     ///
     /// # Errors
-    /// Unknown ID, or a value outside the range; the minimum frequency may not exceed the maximum.
-    pub fn check(&self, id: u16, value: u16) -> Result<(), Refused> {
-        self.0.check(id, value)?;
-        let crossed = match id {
-            MINIMUM_FREQUENCY => value > self.number(MAXIMUM_FREQUENCY),
-            MAXIMUM_FREQUENCY => value < self.number(MINIMUM_FREQUENCY),
-            _ => false,
-        };
-        if crossed { Err(Refused::Value) } else { Ok(()) }
+    /// Unknown ID, or a value outside the range; the minimum frequency may not exceed the maximum. Nothing is set then.
+    pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
+        self.0.set(id, value)
     }
 
-    /// Writes a parameter that [`Parameters::check`] allows.
+    /// A write over the bus, which is kept without power at once; `fed` whether the inverter feeds the motor.
     ///
     /// # Errors
-    /// As [`Parameters::check`]; nothing is written then.
-    pub fn set(&mut self, id: u16, value: u16) -> Result<(), Refused> {
-        self.check(id, value)?;
-        self.0.set(id, value)
+    /// As [`Parameters::set`].
+    pub(super) fn write(&mut self, id: u16, value: u16, fed: bool) -> Result<(), Refused> {
+        self.0.write(id, value, fed)?;
+        self.0.record_kept(id);
+        Ok(())
+    }
+
+    /// What was written over the bus, by PDU address.
+    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
+        let writes = self.0.writes().iter();
+        writes.map(|(id, writes)| (id.saturating_sub(1), *writes)).collect()
+    }
+
+    /// Random values for all, but that the control place stays.
+    pub(super) fn fill(&mut self, random: &mut Random) {
+        self.0.fill(random, &[CONTROL_PLACE]);
     }
 
     fn number(&self, id: u16) -> u16 {

@@ -152,7 +152,8 @@ impl NxDrive {
             self.trip(value);
             return Ok(());
         }
-        self.parameters.set(id, value).map_err(|refused| match refused {
+        let written = self.parameters.write(id, value, self.body.motor.fed);
+        written.map_err(|refused| match refused {
             Refused::Unknown => Exception::ADDRESS,
             Refused::Value => Exception::VALUE,
         })?;

@@ -12,10 +12,14 @@ mod tests;
 
 pub(crate) use options::{Mode, TecoOptions};
 
+use std::collections::BTreeMap;
+
 use self::parameters::{Parameters, function};
 use super::SimTime;
 use super::model::{Body, Command, Model, UPDATE_PERIOD, unsigned};
 use super::motor::{Feed, Ratings};
+use super::parameter_set::Writes;
+use super::random::Random;
 use crate::codec::{Exception, Reply, RequestPdu};
 
 /// Bits of the operation signals, register 0001H (drives.md 5.3).
@@ -273,6 +277,15 @@ impl Model for TecoDrive {
         self.take_over();
     }
 
+    fn parameter_writes(&self) -> BTreeMap<u16, Writes> {
+        self.parameters.writes()
+    }
+
+    fn fill_parameters(&mut self, random: &mut Random) {
+        self.parameters.fill(random);
+        self.ratings = self.parameters.ratings();
+    }
+
     fn trip(&mut self, fault: u16) {
         self.body.trip(fault & fault::ALL);
     }
@@ -301,6 +314,10 @@ impl Model for TecoDrive {
         self.set_operation(
             rest | (u16::from(command.run) * operation::RUN) | (u16::from(reverse) * operation::REVERSE),
         );
+    }
+
+    fn set_programming(&mut self, on: bool) {
+        self.set_mode(if on { Mode::Program } else { Mode::Drive });
     }
 
     fn set_reset(&mut self, on: bool) {

@@ -3,9 +3,12 @@
 //! Ranges are those of the N2 map (drives.md 6.7), where it has one. Defaults that the manual does not state are plausible
 //! values for a small 440 V drive.
 
+use std::collections::BTreeMap;
+
 use super::super::motor::Ratings;
 pub(super) use super::super::parameter_set::Refused;
-use super::super::parameter_set::{Parameter, ParameterSet};
+use super::super::parameter_set::{Parameter, ParameterSet, Writes};
+use super::super::random::Random;
 use super::options::Digits;
 
 /// One group of parameters.
@@ -148,6 +151,10 @@ const KNOWN: [(u16, u16, u16, u16); 52] = [
 /// PID differential time, 0.01 s.
 const BN_16: (u16, u16, u16, u16) = (0x050F, 0, 100, 0);
 
+/// Upper and lower bounds by their names, Cn-14 and Cn-15, Cn-23 and Cn-24, Cn-45 and Cn-47, Cn-46 and Cn-48; that the drive
+/// refuses a crossing no manual says.
+const LIMITS: [(u16, u16); 4] = [(CN_14, CN_14 + 1), (0x0216, 0x0217), (0x022C, 0x022E), (0x022D, 0x022F)];
+
 /// cos phi of the motor; no parameter holds it.
 const COS_PHI: f64 = 0.85;
 
@@ -191,7 +198,8 @@ impl Parameters {
             .filter(|register| place(*register).is_some_and(|place| !place.reserved))
             .map(|register| (register, 0, u16::MAX, 0));
         // The first of equal registers counts.
-        let mut ram = ParameterSet::new(coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others));
+        let all = coded.into_iter().chain(KNOWN).chain([BN_16]).chain(others);
+        let mut ram = ParameterSet::new(all).limited(LIMITS);
         for &(register, value) in set {
             let _ = ram.set(register, value);
         }
@@ -215,22 +223,52 @@ impl Parameters {
         self.ram.check(register, value)
     }
 
-    /// Writes to RAM.
+    /// Sets a value in RAM, not over the bus.
     pub(super) fn set(&mut self, register: u16, value: u16) -> Result<(), Refused> {
         self.ram.set(register, value)
     }
 
+    /// A write over the bus to RAM; `fed` whether the inverter feeds the motor.
+    pub(super) fn write(&mut self, register: u16, value: u16, fed: bool) -> Result<(), Refused> {
+        self.ram.write(register, value, fed)
+    }
+
     /// Copies RAM to EEPROM, but for On-20 to On-24.
     pub(super) fn save(&mut self) {
-        let saved = self.ram.iter().filter(|parameter| !NOT_SAVED.contains(&parameter.key));
-        for &Parameter { key, value, .. } in saved {
+        self.copy();
+        let keys: Vec<u16> = self.ram.iter().map(|parameter| parameter.key).collect();
+        for key in keys.into_iter().filter(|key| !NOT_SAVED.contains(key)) {
+            self.ram.record_kept(key);
+        }
+    }
+
+    fn copy(&mut self) {
+        let not_saved: Vec<Parameter> = self
+            .eeprom
+            .iter()
+            .filter(|p| NOT_SAVED.contains(&p.key))
+            .copied()
+            .collect();
+        self.eeprom.take_values(&self.ram);
+        for Parameter { key, value, .. } in not_saved {
             let _ = self.eeprom.set(key, value);
         }
     }
 
     /// What a power cycle does: RAM is as the EEPROM.
     pub(super) fn reload(&mut self) {
-        self.ram = self.eeprom.clone();
+        self.ram.take_values(&self.eeprom);
+    }
+
+    /// What was written over the bus, by register.
+    pub(super) fn writes(&self) -> BTreeMap<u16, Writes> {
+        self.ram.writes().clone()
+    }
+
+    /// Random values for all, but that the source of commands stays; in EEPROM, too.
+    pub(super) fn fill(&mut self, random: &mut Random) {
+        self.ram.fill(random, &[SN_08]);
+        self.copy();
     }
 
     /// The motor and its ramps.

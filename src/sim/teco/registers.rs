@@ -198,7 +198,7 @@ impl TecoDrive {
             (Register::Control, 0x000A) => self.control.analogue[0] = value,
             (Register::Control, 0x000B) => self.control.analogue[1] = value,
             (Register::Parameter(_), _) => {
-                let _ = self.parameters.set(address, value);
+                let _ = self.parameters.write(address, value, self.body.motor.fed);
                 self.ratings = self.parameters.ratings();
             }
             (Register::Save, _) => self.parameters.save(),
