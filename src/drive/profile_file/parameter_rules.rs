@@ -114,14 +114,14 @@ impl Rules<'_, '_> {
     }
 }
 
-/// A limit whose upper parameter is, over others, below itself.
+/// A limit of a circle, if there is one.
 fn in_circle(limits: &[Limit]) -> Option<Limit> {
     let mut left = limits.to_vec();
-    // What has nothing below it is in no circle, and neither is what is then left without.
+    // What has nothing below it or nothing above it is in no circle, and neither is what is then left so.
     loop {
-        let uppers: Vec<u16> = left.iter().map(|limit| limit.upper).collect();
+        let (uppers, lowers): (Vec<u16>, Vec<u16>) = left.iter().map(|limit| (limit.upper, limit.lower)).unzip();
         let before = left.len();
-        left.retain(|limit| uppers.contains(&limit.lower));
+        left.retain(|limit| uppers.contains(&limit.lower) && lowers.contains(&limit.upper));
         if left.len() == before {
             return left.first().copied();
         }
@@ -184,4 +184,141 @@ fn read_lock(parent: &Reader<'_>, list: &ParameterList, points: &[Point]) -> Opt
         exception,
         remedy: remedy?,
     })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::super::Profile;
+    use super::super::super::parameters::Limit;
+
+    /// A drive with three parameters and a state; more keys of `[parameters]` from line 19 on.
+    const HEAD: &str = r#"
+name = "p"
+protocols = ["modbus-rtu"]
+[[range]]
+table = "holding"
+first = 0
+last = 99
+write = 1
+[[range]]
+table = "holding"
+first = 100
+last = 199
+[[point]]
+name = "ready"
+at = "holding 1.0"
+[parameters]
+spans = ["id 0 49"]
+list = ["A-1, 50, Upper, Hz, 0.1, 0, 50", "A-2, 51, Lower, Hz, 0.1", "A-3, 52, Other, s, 0.1"]
+"#;
+
+    fn read(keys: &str) -> Result<Profile, String> {
+        let profile = Profile::parse("p.toml", &format!("{HEAD}{keys}"), false);
+        profile.map_err(|found| found.iter().map(|problem| format!("{problem}\n")).collect())
+    }
+
+    #[test]
+    fn rules() {
+        let profile = read(
+            "only_by_name = [\"A-3, address\", \"7..9 , speed, and format\"]\nnameplate = [\"1\"]\nratings = [\"2\"]\nvolatile = [\"A-2..A-3\"]\n\
+             limits = [\"A-1 >= A-2\", \"3 >= 4\"]\nsave = \"0x10 = 1\"\nnote = \"n\"\n\
+             [parameters.lock]\nof = [\"5..6\", \"A-1\"]\nwhile = \"ready\"\nexception = 0x22\nremedy = \"switch\"\n",
+        )
+        .unwrap();
+        let rules = &profile.parameters.rules;
+        let held_back = [0, 1, 5, 6, 8, 9, 52].map(|address| rules.held_back(address));
+        assert_eq!(
+            held_back,
+            [
+                Some("it describes the drive itself"),
+                None,
+                None,
+                Some("speed, and format"),
+                Some("speed, and format"),
+                None,
+                Some("address")
+            ]
+        );
+        assert_eq!((&rules.ratings, &rules.volatile), (&vec![1..=1], &vec![51..=52]));
+        let limits = [(50, 51), (2, 3)].map(|(upper, lower)| Limit { upper, lower });
+        assert_eq!(
+            (rules.limits.as_slice(), rules.save),
+            (limits.as_slice(), Some((16, 1)))
+        );
+        let lock = rules.lock.as_ref().unwrap();
+        assert_eq!(
+            (&lock.of, lock.point, lock.exception),
+            (&vec![4..=5, 50..=50], 0, Some(0x22))
+        );
+        assert_eq!(profile.parameters.at(50).unwrap().range, Some(0.0..=50.0));
+        assert_eq!(read("").unwrap().parameters.rules, Default::default());
+    }
+
+    #[test]
+    fn each_mistake() {
+        let cases = [
+            (
+                "only_by_name = [\"A-1\"]",
+                "`A-1` does not say why; p.toml:19, parameters.only_by_name",
+            ),
+            (
+                "nameplate = [\"A-9\"]",
+                "there is no parameter `A-9`; p.toml:19, parameters.nameplate; did you mean `A-1`?",
+            ),
+            (
+                "ratings = [\"77\"]",
+                "there is no parameter `77`; p.toml:19, parameters.ratings; name one of `list`",
+            ),
+            (
+                "volatile = [\"A-2..A-1\"]",
+                "`A-2..A-1` ends before it begins; p.toml:19, parameters.volatile",
+            ),
+            (
+                "limits = [\"A-1 > A-2\"]",
+                "`A-1 > A-2` is not a limit; p.toml:19, parameters.limits",
+            ),
+            (
+                "limits = [\"A-1 >= A-3\"]",
+                "`A-1 >= A-3` differ in unit or scale; p.toml:19, parameters.limits",
+            ),
+            (
+                "limits = [\"1 >= 2\", \"2 >= 3\", \"3 >= 4\", \"4 >= 2\"]",
+                "the limits of `2` lead back to itself; p.toml:19, parameters.limits",
+            ),
+            ("limits = [\"1 >= 1\"]", "the limits of `1` lead back to itself"),
+            ("save = \"16\"", "`16` is not a write; p.toml:19, parameters.save"),
+            (
+                "save = \"150 = 1\"",
+                "holding 150 cannot be written; p.toml:19, parameters.save",
+            ),
+            (
+                "[parameters.lock]\nof = [\"1\"]\nwhile = \"redy\"\nremedy = \"x\"",
+                "there is no state `redy`; p.toml:21, parameters.lock.while; did you mean `ready`?",
+            ),
+            (
+                "[parameters.lock]\nwhile = \"ready\"\nremedy = \"x\"",
+                "no parameter is named; p.toml:19, parameters.lock.of",
+            ),
+            (
+                "[parameters.lock]\nof = [\"1\"]\nwhile = \"ready\"",
+                "parameters.lock.remedy",
+            ),
+        ];
+        for (keys, wanted) in cases {
+            let found = read(keys).unwrap_err();
+            assert!(found.contains(wanted), "{keys}: {wanted} is not in\n{found}");
+        }
+        let rows = HEAD
+            .replace("0, 50\"", "50, 0\"")
+            .replace("A-3, 52, Other, s, 0.1", "A-3, 52, Other, s, 0.1, 7");
+        let found: String = Profile::parse("p.toml", &rows, false)
+            .unwrap_err()
+            .iter()
+            .map(|problem| format!("{problem}\n"))
+            .collect();
+        assert!(
+            found.contains("`50` to `0` is not a range") && found.contains("6 fields in place of 5 or 7"),
+            "{found}"
+        );
+    }
 }

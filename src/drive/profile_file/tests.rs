@@ -468,6 +468,7 @@ fn the_page_names_every_key() {
         ("\n### `[[identify]]`\n", "identify[]."),
         ("\n### `[n2]`\n", "n2."),
         ("\n### `[parameters]`\n", "parameters."),
+        ("\n### `[parameters.lock]`\n", "parameters.lock."),
         ("\n### `[[range]]`\n", "range[]."),
         ("\n### `[[point]]`\n", "point[]."),
     ] {
