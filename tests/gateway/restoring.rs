@@ -2,6 +2,8 @@
 //! in the middle finds.
 
 use std::fs;
+use std::io::{Read as _, Write as _};
+use std::net::TcpStream;
 use std::time::Duration;
 
 use drivegate::sim::wire::SimulatedBus;
@@ -193,6 +195,11 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
         assert!(plant.held());
         let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
         assert_eq!((code, said.contains("--resume pump-1")), (Some(1), true), "{said}");
+        assert_eq!(
+            function_6(plant.site.modbus, 0x8100, 1),
+            [0x86, 0x01],
+            "refused by Modbus TCP, too"
+        );
         let (code, _, said) = settle(&plant, &["write", "pump-1", "run=false"]);
         assert_eq!(code, Some(0), "a stop is carried out: {said}");
         let (code, _, said) = plant.ran(&["restore", wanted, "pump-1", "--force", "--yes"]);
@@ -226,6 +233,16 @@ fn a_gateway_that_was_killed_in_the_middle_holds_the_drive_until_that_is_settled
     assert!(!plant.held());
     let (code, _, said) = settle(&plant, &["write", "pump-1", "run=true"]);
     assert_eq!(code, Some(0), "{said}");
+}
+
+/// Function and first byte of the answer to a write of one register by Modbus TCP.
+fn function_6(port: u16, register: u16, value: u16) -> [u8; 2] {
+    let mut stream = TcpStream::connect(("127.0.0.1", port)).unwrap();
+    let ([a, b], [c, d]) = (register.to_be_bytes(), value.to_be_bytes());
+    stream.write_all(&[0, 1, 0, 0, 0, 6, 1, 6, a, b, c, d]).unwrap();
+    let mut answer = [0; 9];
+    stream.read_exact(&mut answer).unwrap();
+    [answer[7], answer[8]]
 }
 
 /// A command of its own.

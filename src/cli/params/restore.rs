@@ -107,10 +107,12 @@ fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitC
     let target = target(config, drive)?;
     let line = std::cell::RefCell::new(StatusLine::default());
     let mut refused_to_write = None;
+    let shown = std::cell::Cell::new(false);
     let agreed = |prepared: &RestoreOutcome| {
         line.borrow().end();
-        report::print(&told(drive, prepared));
-        match agrees(drive, prepared, how) {
+        report::print(&told(prepared));
+        shown.set(true);
+        match agrees(drive, how) {
             Ok(()) => true,
             Err(code) => {
                 refused_to_write = Some(code);
@@ -137,9 +139,12 @@ fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitC
         return Ok(code);
     }
     let ended = ended.map_err(|why| failed(&why))?;
-    let text = ended.text.unwrap_or_default();
+    let text = ended.text.clone().unwrap_or_default();
     match ended.stage {
         Stage::Done => {
+            if !shown.get() {
+                report::print(&told(&ended));
+            }
             report::note(&text);
             Ok(ExitCode::SUCCESS)
         }
@@ -158,36 +163,20 @@ fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitC
 }
 
 /// What would be written.
-fn told(drive: &str, prepared: &RestoreOutcome) -> String {
-    let mut text = String::new();
-    let mut section = |title: String, lines: &[String]| {
-        if !lines.is_empty() {
-            text += &format!("{title}\n");
-            for line in lines {
-                text += &format!("  {line}\n");
-            }
-        }
-    };
-    let title = match prepared.writes.len() {
-        1 => format!("1 parameter of {drive} would be written:"),
-        count => format!("{count} parameters of {drive} would be written, in this order:"),
-    };
-    section(title, &prepared.writes);
-    section("Left out:".to_string(), &prepared.left_out);
-    section("To be known:".to_string(), &prepared.notes);
-    section("Forced, and your risk:".to_string(), &prepared.risks);
-    text
+fn told(prepared: &RestoreOutcome) -> String {
+    let plan = prepared.plan.clone().unwrap_or_default();
+    let risks = prepared
+        .risks
+        .iter()
+        .map(|risk| format!("forced, at your risk: {risk}\n"));
+    plan + &risks.collect::<String>()
 }
 
 /// Whether what is prepared is to be written.
 ///
 /// # Errors
 /// The exit code where it is not.
-fn agrees(drive: &str, prepared: &RestoreOutcome, how: &How) -> Result<(), ExitCode> {
-    if prepared.writes.is_empty() {
-        report::note(&format!("nothing differs that would be written to `{drive}`"));
-        return Err(ExitCode::SUCCESS);
-    }
+fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
     if how.dry_run {
         return Err(ExitCode::SUCCESS);
     }

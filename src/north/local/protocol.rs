@@ -11,7 +11,7 @@
 //! {"v":1,"params":{"drive":"pump-1","begin":true}}
 //! {"v":1,"gateway":"plant","params":{"number":3,"done":120,"total":1899,"remaining_s":8.5}}
 //! {"v":1,"params_restore":{"drive":"pump-1","act":{"carry_out":{"number":4}}}}
-//! {"v":1,"gateway":"plant","params_restore":{"number":4,"stage":"working","done":2,"total":12,"writes":["102 Maximum frequency: …"]}}
+//! {"v":1,"gateway":"plant","params_restore":{"number":4,"stage":"working","done":2,"total":12,"plan":"…"}}
 //! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
 //! {"v":1,"gateway":"plant","reload":{"errors":[],"warnings":[],"changes":["changed: MQTT"]}}
 //! {"v":1,"health":{}}
@@ -28,7 +28,7 @@ use serde_json::Value as Json;
 use crate::command::{Answer, CONFIRMED};
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
-use crate::parameters::{RestoreStage, RestoreStatus, Status};
+use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -358,15 +358,9 @@ pub struct RestoreOutcome {
     /// Why it waits.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub waits: Option<String>,
-    /// What is written, in its order, once that is known.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub writes: Vec<String>,
-    /// What differs and is left out, and why.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub left_out: Vec<String>,
-    /// What else is to be known.
-    #[serde(default, skip_serializing_if = "Vec::is_empty")]
-    pub notes: Vec<String>,
+    /// What is written, and what is to be known of it, for people; once that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<String>,
     /// What the user takes upon himself.
     #[serde(default, skip_serializing_if = "Vec::is_empty")]
     pub risks: Vec<String>,
@@ -405,6 +399,10 @@ impl RestoreOutcome {
         let (mut reasons, mut text) = (Vec::new(), None);
         let stage = match &status.stage {
             RestoreStage::Reading => Stage::Reading,
+            RestoreStage::Prepared if plan.writes.is_empty() => {
+                text = Some("nothing differs that would be written".to_string());
+                Stage::Done
+            }
             RestoreStage::Prepared => Stage::Prepared,
             RestoreStage::Refused(why) => {
                 reasons.clone_from(why);
@@ -426,9 +424,7 @@ impl RestoreOutcome {
             done: status.progress.0,
             total: status.progress.1,
             waits: status.waits.clone(),
-            writes: plan.writes.iter().map(|write| write.line.clone()).collect(),
-            left_out: plan.left_out.iter().map(|(id, why)| format!("{id}: {why}")).collect(),
-            notes: plan.notes.clone(),
+            plan: (*plan != Plan::default()).then(|| plan.to_string()),
             risks: status.prepared.risks.clone(),
             reasons,
             text,
