@@ -5,8 +5,8 @@
 use std::collections::BTreeSet;
 use std::time::{Duration, Instant};
 
-use drivegate::codec::{Protocol, Reply, RequestPdu, Table};
-use drivegate::command::{Authority, Interruption, Order, Origin, Outcome, ParameterOrder, SourceKind};
+use drivegate::codec::{Protocol, Reply, RequestPdu};
+use drivegate::command::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate::drive::ModelPoint;
 use drivegate::parameters::{
     End, Journal, Names, Next, ParameterFile, Phase, Plan, Reading, Restoration, Then, Wanted, Wishes, differences,
@@ -252,9 +252,16 @@ impl Bench {
             reverse: false,
             reference: 3000,
         };
-        self.rig.with_drive(DRIVE, |drive, _| {
+        self.rig.with_drive(DRIVE, |drive, now| {
             drive.set_programming(!run);
+            drive.set_reset(run);
             drive.command(command);
+            if !run && drive.state().running {
+                // Its ramp may take an hour.
+                drive.trip(1);
+            }
+            drive.advance(now);
+            drive.set_reset(false);
         });
     }
 

@@ -114,7 +114,7 @@ impl Direct {
                 };
                 request.points.iter().flat_map(of).collect()
             }
-            Request::Params(_) | Request::ParamsRestore(_) => Vec::new(),
+            Request::Params(_) | Request::ParamsRestore(_) => profile.parameters.identification.clone(),
             // What a command is turned into, and whether it is needed at all, depends on what the drive has.
             Request::Write(request) if !request.points.iter().any(|set| is_derived(profile, index(&set.point))) => {
                 Vec::new()
