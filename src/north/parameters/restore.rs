@@ -181,7 +181,16 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
     });
     let stage = match released.await {
         Err(why) => RestoreStage::Failed(why),
-        Ok(None) => RestoreStage::Failed(format!("no restore of `{}` was cut off: nothing is held", spec.name)),
+        Ok(None) if drive.image.hold.why().is_none() => {
+            RestoreStage::Failed(format!("no restore of `{}` was cut off: nothing is held", spec.name))
+        }
+        Ok(None) => {
+            drive.image.hold.set(None);
+            RestoreStage::Ended(format!(
+                "`{}` takes all orders again; there is no journal any more",
+                spec.name
+            ))
+        }
         Ok(Some(aside)) => {
             drive.image.hold.set(None);
             tracing::warn!(
