@@ -148,6 +148,9 @@ struct Making<'a> {
     risks: Vec<Risk>,
 }
 
+/// How an identification ends of which a point was not read.
+const NOT_KNOWN: &str = "not known";
+
 /// A parameter once the plan is carried out.
 struct End {
     id: Id,
@@ -201,6 +204,12 @@ impl Making<'_> {
                 present.drive, present.identification, wanted.identification
             );
             self.doubt(what, "restore to a drive of the same kind");
+        } else if present.identification.contains(NOT_KNOWN) {
+            let what = format!(
+                "whether the drives are of one kind is not known: `{}`",
+                present.identification
+            );
+            self.doubt(what, "read them again");
         }
         if !self.same_application {
             let what = format!(
