@@ -2,6 +2,8 @@
 
 use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{TcpListener, TcpStream};
+use std::os::linux::net::SocketAddrExt;
+use std::os::unix::net::{SocketAddr, UnixListener};
 use std::path::Path;
 use std::process::{Child, Command, ExitStatus, Stdio};
 use std::sync::atomic::{AtomicU16, AtomicU32, Ordering};
@@ -133,13 +135,20 @@ pub(crate) fn until<T>(what: &str, mut ask: impl FnMut() -> Option<T>) -> T {
     }
 }
 
-/// A TCP port that is free now, and that no other test of this process is given. It is none of those that the kernel
-/// gives to whoever asks for any, so that nobody has it by chance before it is bound.
+/// A TCP port that is free now, and that no other test is given, of this process or of another, as long as this process runs:
+/// a socket that is closed to be bound anew would find the other's try there. It is none of those that the kernel gives to
+/// whoever asks for any, so that nobody has it by chance before it is bound.
 pub(crate) fn free_port() -> u16 {
     static NEXT: AtomicU16 = AtomicU16::new(0);
+    static CLAIMED: Mutex<Vec<UnixListener>> = Mutex::new(Vec::new());
     let first = 10_000 + (std::process::id() % 200) as u16 * 100;
     loop {
         let port = first + NEXT.fetch_add(1, Ordering::Relaxed) % 2_000;
+        let name = SocketAddr::from_abstract_name(format!("drivegate-test-port-{port}")).expect("a short name");
+        let Ok(claim) = UnixListener::bind_addr(&name) else {
+            continue;
+        };
+        CLAIMED.lock().unwrap().push(claim);
         if TcpListener::bind(("127.0.0.1", port)).is_ok() {
             return port;
         }
