@@ -27,7 +27,7 @@ const DRIVE: u8 = 1;
 const SOURCE: u8 = 2;
 
 /// Seeds of every test run.
-const SEEDS: u64 = 240;
+const SEEDS: u64 = 100;
 
 const FAMILIES: [(&str, Protocol, u32); 4] = [
     ("vacon-nx", Protocol::ModbusRtu, 38_400),
@@ -515,7 +515,7 @@ fn wherever_it_is_cut_off_the_drive_comes_to_have_all_values_or_the_former_ones(
     let seeds = super::number("RESTORE_SEEDS").unwrap_or(SEEDS);
     let (mut cuts, mut refused, mut stopped, mut writes) = (0, 0, 0, 0);
     for seed in first..first + seeds {
-        let figures = one(seed, 1 + seed % 3);
+        let figures = one(seed, 2 + seed % 3);
         cuts += figures.0;
         refused += figures.1;
         stopped += figures.2;
@@ -524,7 +524,7 @@ fn wherever_it_is_cut_off_the_drive_comes_to_have_all_values_or_the_former_ones(
     println!(
         "{seeds} restores, {cuts} cuts, {writes} writes taken, {refused} orders refused, {stopped} stops carried out"
     );
-    assert!(cuts as u64 >= seeds * 4 / 5 && refused > 0 && stopped > 0);
+    assert!(cuts as u64 >= 2 * seeds && refused > 0 && stopped > 0);
 }
 
 #[test]
