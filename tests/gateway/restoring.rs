@@ -8,19 +8,9 @@ use std::time::Duration;
 
 use drivegate::sim::wire::SimulatedBus;
 
+use super::parameters::few;
 use crate::support::process::{Running, api, drivegate, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
-use crate::support::tools::root;
-
-/// The Vacon NX profile as `few`, whose drives are asked for the parameters with a name only.
-fn few() -> String {
-    let text = fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
-    let changed = text
-        .replace("name = \"vacon-nx\"", "name = \"few\"")
-        .replace("spans = [\"id 100 1998\"]\n", "");
-    assert!(changed.contains("\"few\"") && !changed.contains("spans"));
-    changed
-}
 
 struct Plant {
     site: Site,
