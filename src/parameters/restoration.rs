@@ -283,8 +283,8 @@ impl Restoration {
 
     /// Whether the drive is told to keep the values. Taking back what it was not told to keep needs no save: it wears its memory.
     fn saves(&self) -> bool {
-        let back = self.journal.phase == Phase::TakingBack;
-        self.journal.plan.handling.save.is_some() && !(back && !self.journal.saved)
+        let leaves_out = self.journal.phase == Phase::TakingBack && !self.journal.saved;
+        self.journal.plan.handling.save.is_some() && !leaves_out
     }
 
     fn finish(&mut self) {

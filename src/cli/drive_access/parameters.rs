@@ -42,7 +42,12 @@ impl Conversation<'_> {
             return Ok(direct.ask(request).await);
         }
         let asked = gateway::ask(self.target, request).await?;
-        asked.map_err(|gone| format!("the gateway is gone: {}; the local socket; try again", gone.0))
+        asked.map_err(|gone| {
+            format!(
+                "the gateway is gone: {}; the local socket; start it and try again",
+                gone.0
+            )
+        })
     }
 
     async fn end(self) {
@@ -145,7 +150,12 @@ impl Target {
             };
             outcome = match conversation.ask(&request(next)).await {
                 Ok(outcome) => outcome,
-                Err(why) => break Err(why),
+                Err(why) => {
+                    break Err(format!(
+                        "{why}; `drivegate params restore --look {}` shows the restore",
+                        self.spec.name
+                    ));
+                }
             };
         };
         conversation.end().await;

@@ -256,7 +256,7 @@ fn start(plant: SharedPlant, vault: Arc<Vault>, drive: &DriveHandle, restoration
         restoration,
         origin,
     };
-    tokio::spawn(run.to_its_end());
+    tokio::spawn(run.carry_on());
 }
 
 /// A restore that is carried out.
@@ -270,7 +270,7 @@ struct Run {
 }
 
 impl Run {
-    async fn to_its_end(mut self) {
+    async fn carry_on(mut self) {
         tracing::warn!(
             drive = %self.name, source = self.origin.kind.name(), client = %self.origin.who,
             "its parameters are being restored: {}", self.restoration.journal().phase.name()
