@@ -1,4 +1,4 @@
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 
 use proptest::prelude::*;
@@ -6,7 +6,7 @@ use proptest::prelude::*;
 use super::super::file::Entry;
 use super::super::names::Names;
 use super::*;
-use crate::drive::parameters::{Parameter, ParameterList};
+use crate::drive::parameters::{Limit, Parameter, ParameterList};
 use crate::drive::profile::Profiles;
 
 fn family(name: &str) -> Arc<Profile> {
@@ -110,7 +110,7 @@ fn legal_values(profile: &Profile, seeds: &[u16]) -> Values {
     values
 }
 
-fn keeps(values: &Values, limit: &crate::drive::parameters::Limit) -> bool {
+fn keeps(values: &Values, limit: &Limit) -> bool {
     values[&limit.upper].number() >= values[&limit.lower].number()
 }
 
@@ -134,7 +134,7 @@ fn forced(profile: &Profile, wanted: &Values, present: &Values) -> Plan {
 }
 
 /// The states that the drive goes through, the first one included.
-fn states(plan: &Plan, present: &Values) -> Vec<Values> {
+fn states_of(plan: &Plan, present: &Values) -> Vec<Values> {
     let mut all = vec![present.clone()];
     for write in &plan.writes {
         let mut next = all[all.len() - 1].clone();
@@ -164,7 +164,7 @@ proptest! {
             }
             prop_assume!(keeps_all(&profile, &wanted));
             let plan = forced(&profile, &wanted, &present);
-            let states = states(&plan, &present);
+            let states = states_of(&plan, &present);
             for state in &states {
                 prop_assert!(keeps_all(&profile, state), "{}: {plan}", profile.name);
             }
@@ -180,7 +180,7 @@ proptest! {
             }
             // Back from anywhere.
             let done = usize::from(cut) % (plan.writes.len() + 1);
-            let back = super::tests::states(&plan.back(done), &states[done]);
+            let back = states_of(&plan.back(done), &states[done]);
             for (state, former) in back.iter().zip(states[..=done].iter().rev()) {
                 prop_assert_eq!(state, former);
             }
@@ -188,7 +188,7 @@ proptest! {
             // On from anywhere.
             let rest = forced(&profile, &wanted, &states[done]);
             prop_assert_eq!(rest.writes.len(), plan.writes.len() - done);
-            let on = super::tests::states(&rest, &states[done]);
+            let on = states_of(&rest, &states[done]);
             prop_assert!(on.iter().all(|state| keeps_all(&profile, state)));
             prop_assert_eq!(&on[on.len() - 1], &states[states.len() - 1]);
         }
@@ -203,7 +203,7 @@ proptest! {
         pairs in prop::collection::vec((0..7u16, 0..7u16), 0..9),
     ) {
         // In a circle perhaps; or upper above lower by number, which cannot go in a circle.
-        let limit = |(upper, lower)| crate::drive::parameters::Limit { upper, lower };
+        let limit = |(upper, lower)| Limit { upper, lower };
         let any: Vec<_> = pairs.iter().copied().map(limit).collect();
         let apart = pairs.iter().filter(|(a, b)| a != b);
         let limits: Vec<_> = apart.map(|&(a, b)| limit((a.max(b), a.min(b)))).collect();
@@ -222,7 +222,7 @@ proptest! {
             again.sort_by_key(|write| write.address);
             prop_assert_eq!(&again, &writes);
         }
-        let holds = |limit: &crate::drive::parameters::Limit, state: &[u16]| {
+        let holds = |limit: &Limit, state: &[u16]| {
             state[usize::from(limit.upper)] >= state[usize::from(limit.lower)]
         };
         let mut state = from.clone();
