@@ -17,6 +17,7 @@ use drivegate::sim::faults::FaultPlan;
 use drivegate::sim::statistics::Direction;
 
 use super::rig::{Rig, Setup, reason, with_port};
+use crate::support::process::until;
 
 fn loopback() -> EndpointOptions {
     EndpointOptions::Tcp {
@@ -302,7 +303,7 @@ async fn rs485_by_a_driver_that_cannot() {
 fn a_format_that_the_port_does_not_take_is_warned_about() {
     let pty = rustix_pty();
     let even = LineFormat::new(19_200, "8E1").unwrap();
-    let (_line, warnings) = Line::open(&pty.1, &even, &LineOptions::default()).unwrap();
+    let (_line, warnings) = opened(&pty.1, &even);
     assert_eq!(warnings.len(), 1, "{warnings:?}");
     assert!(
         warnings[0].contains("19200 8N1") && warnings[0].contains("19200 8E1"),
@@ -310,12 +311,12 @@ fn a_format_that_the_port_does_not_take_is_warned_about() {
     );
     drop(_line);
     let plain = LineFormat::new(19_200, "8N1").unwrap();
-    assert!(
-        Line::open(&pty.1, &plain, &LineOptions::default())
-            .unwrap()
-            .1
-            .is_empty()
-    );
+    assert!(opened(&pty.1, &plain).1.is_empty());
+}
+
+/// The port, once nobody else has it: a process that another test starts has what was open until it is another program.
+fn opened(path: &str, format: &LineFormat) -> (Line, Vec<String>) {
+    until("the port", || Line::open(path, format, &LineOptions::default()).ok())
 }
 
 pub(crate) fn rustix_pty() -> (OwnedFd, String) {
@@ -347,9 +348,9 @@ fn a_port_that_is_closed_is_free_at_once() {
     assert!(opens_for_others(&path));
     let format = LineFormat::new(19_200, "8N1").unwrap();
     for _ in 0..2 {
-        let opened = Line::open(&path, &format, &LineOptions::default()).unwrap();
+        let open = opened(&path, &format);
         assert!(!opens_for_others(&path), "it is exclusive");
-        drop(opened);
+        drop(open);
         assert!(opens_for_others(&path), "and free again");
     }
     let kernel = LineOptions {
