@@ -21,7 +21,7 @@ use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
-use crate::north::parameters::keep_reading;
+use crate::north::parameters::{hold_unfinished, keep_reading};
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
@@ -148,6 +148,7 @@ impl Daemon {
         let prepared = daemon.prepare_buses(&settings)?;
         daemon.apply_recorder(&settings).await?;
         daemon.apply_params(&settings);
+        daemon.hold_unfinished(&settings).await;
         daemon.replace_buses(&settings, prepared).await;
         let servers = daemon.prepare_servers(&settings).await?;
         daemon.commit_servers(servers).await;
@@ -205,6 +206,7 @@ impl Daemon {
             self.abort_servers(servers).await;
             return Err(error);
         }
+        self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared).await;
         self.apply_mqtt(&settings).await?;
@@ -297,7 +299,8 @@ impl Daemon {
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
-        let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle));
+        let hold = |spec: &DriveSpec| self.vault.hold(&spec.name);
+        let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_hold(hold(spec)));
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
         let queue = Arc::new(CommandQueue::new().map_err(failed)?);
@@ -339,6 +342,11 @@ impl Daemon {
         }
         let every = params.every;
         self.reader = every.map(|every| tokio::spawn(keep_reading(self.plant.clone(), every)));
+    }
+
+    /// New drives whose parameters may be half restored take no orders but stops, before their bus starts.
+    async fn hold_unfinished(&self, settings: &Settings) {
+        hold_unfinished(&self.vault, settings.buses.iter().flat_map(|bus| &bus.drives)).await;
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.

@@ -15,6 +15,7 @@ use crate::command::{
     self, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Order, Origin, Outcome, Pace, Refusal,
     Ticket, Urgency, WriteStats,
 };
+use crate::drive::parameters::RawValue;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, Events, RefusedCommand};
@@ -111,6 +112,19 @@ fn changes(reading: &Reading<'_>, order: &Order) -> Vec<Change> {
                 resets: false,
             };
             items.into_iter().map(change).collect()
+        }
+        Order::Parameter(order) => {
+            let number = |raw: RawValue| match raw {
+                RawValue::Word(word) => Value::Integer(i64::from(word)),
+                RawValue::Float(_) => Value::Number(raw.number()),
+            };
+            vec![Change {
+                point: order.id.clone(),
+                old: order.from.map(number),
+                new: number(order.to),
+                run: None,
+                resets: false,
+            }]
         }
         Order::Read(_) => Vec::new(),
     }
@@ -347,6 +361,7 @@ impl DriveHandle {
                     .collect();
                 parts.join(" ")
             }
+            Order::Parameter(order) => order.what(),
             Order::Write(pdu) | Order::Read(pdu) => describe::request_on(self.bus.image.spec.protocol, pdu),
         }
     }

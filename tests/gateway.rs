@@ -27,6 +27,7 @@ mod gateway {
     mod reload;
     mod replay;
     mod restart;
+    mod restoring;
     mod slow_log;
     mod trace;
     mod trying;

@@ -1,20 +1,24 @@
 //! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
 
 mod known_words;
+mod parameter;
 mod steps;
 
 use std::collections::VecDeque;
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 pub use self::known_words::KnownWords;
 pub use self::steps::{Step, StepPurpose};
 
+use self::parameter::{ParameterRun, Then};
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, RequestPdu};
-use crate::command::{Command, Interruption, Order, Outcome, Receipt, SourceKind, Ticket, Urgency};
+use crate::command::{Command, Interruption, Order, Outcome, Receipt, Refusal, SourceKind, Ticket, Urgency};
 use crate::drive::Profile;
 
+/// Pause before a parameter is read back once more.
+const LOOK_AGAIN: Duration = Duration::from_millis(100);
 /// Stops to a drive that go before the end of a pulse that was begun.
 const MOST_STOPS: u32 = 8;
 
@@ -84,6 +88,8 @@ pub struct CommandRun {
     waits_for_late: bool,
     /// Stops that were done since it was last written.
     overtaken: u32,
+    /// It is acknowledged only when the drive shows its effect.
+    reads_back: bool,
 }
 
 impl CommandRun {
@@ -105,11 +111,21 @@ impl CommandRun {
             names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
             reference_only,
         };
+        let reads_back = matches!(&order, Order::Parameter(order) if order.from.is_some());
+        let parameter = match &order {
+            Order::Parameter(order) => ParameterRun::new(order.clone(), profile),
+            Order::Points(_) | Order::Write(_) | Order::Read(_) => None,
+        };
         let unsendable = match &order {
             Order::Points(values) => unsendable(profile, values),
             Order::Write(_) | Order::Read(_) => None,
+            Order::Parameter(_) => parameter.is_none().then(|| running_unknown(profile)),
         };
         let actions = match order {
+            Order::Parameter(_) => parameter
+                .map(|run| Action::Parameter(Box::new(run)))
+                .into_iter()
+                .collect(),
             Order::Write(pdu) | Order::Read(pdu) => VecDeque::from([Action::Send(pdu)]),
             Order::Points(_) if unsendable.is_some() && urgency != Urgency::Stop => VecDeque::new(),
             Order::Points(values) => actions(profile, &values, urgency == Urgency::Stop),
@@ -146,6 +162,7 @@ impl CommandRun {
             held_up: false,
             waits_for_late: false,
             overtaken: 0,
+            reads_back,
         }
     }
 
@@ -244,8 +261,36 @@ impl CommandRun {
         self.reached_the_wire
     }
 
+    /// The parameter that it sets, if it sets one.
+    fn parameter(&mut self) -> Option<&mut ParameterRun> {
+        match self.actions.front_mut() {
+            Some(Action::Parameter(run)) => Some(run),
+            _ => None,
+        }
+    }
+
+    /// Whether it sets a parameter and the drive just said that its motor stands: the write goes next on the line.
+    pub fn is_checked(&mut self) -> bool {
+        self.parameter().is_some_and(|run| run.is_checked())
+    }
+
+    /// Something else goes on the line: whether the motor runs is asked again before a parameter is written.
+    pub fn others_go_first(&mut self) {
+        if let Some(run) = self.parameter() {
+            run.check_again();
+        }
+    }
+
+    /// Whether the drive showed its effect before it was acknowledged.
+    pub fn was_read_back(&self) -> bool {
+        self.reads_back
+    }
+
     /// A step of it is on the wire.
     pub fn sent(&mut self, step: &Step) {
+        if let Some(run) = self.parameter().filter(|_| step.purpose == StepPurpose::Execute) {
+            run.written();
+        }
         self.reached_the_wire = true;
         self.begun |= step.pdu.is_write() || self.urgency == Urgency::Read;
         if step.pdu.is_write() {
@@ -270,8 +315,15 @@ impl CommandRun {
 
     /// The answer to its last step may have been a late reply: the step is done again when none can come any more.
     pub fn wait_for_late_replies(&mut self) {
+        self.ask_before_repeating();
         self.tries.in_doubt = true;
         self.waits_for_late = true;
+    }
+
+    fn ask_before_repeating(&mut self) {
+        if let Some(run) = self.parameter() {
+            run.begin_again();
+        }
     }
 
     /// Whether it waits while a late reply could pass for the answer to its step. A stop does only when it was sent once.
@@ -287,7 +339,12 @@ impl CommandRun {
     /// It may go on. Whether it asks again first for what it read before it was held up: a motor may have been stopped
     /// meanwhile.
     pub fn asks_again(&mut self) -> bool {
-        let again = std::mem::take(&mut self.held_up) && self.check == Check::Read;
+        let held_up = std::mem::take(&mut self.held_up);
+        if held_up && self.is_checked() {
+            self.others_go_first();
+            return true;
+        }
+        let again = held_up && self.check == Check::Read;
         if again {
             self.check = Check::NotYet;
         }
@@ -306,6 +363,9 @@ impl CommandRun {
 
     /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command is over.
     pub fn answered(&mut self, step: &Step, reply: Reply, words: &mut KnownWords) -> Option<Outcome> {
+        if self.parameter().is_some() {
+            return self.parameter_answered(step, &reply, words);
+        }
         // A read between the tries of a write does not make them more.
         if !self.tries.in_doubt || step.purpose != StepPurpose::ReadWord {
             self.tries.failures = 0;
@@ -340,6 +400,29 @@ impl CommandRun {
         }
     }
 
+    fn parameter_answered(&mut self, step: &Step, reply: &Reply, words: &mut KnownWords) -> Option<Outcome> {
+        if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
+            words.written(&step.pdu);
+        }
+        let unanswered = self.tries.unanswered.clone();
+        let run = self.parameter()?;
+        let then = run.answered(reply, &unanswered);
+        if !run.is_in_doubt() {
+            (self.tries.failures, self.tries.in_doubt) = (0, false);
+        }
+        match then {
+            Then::Go => None,
+            Then::Pause => {
+                self.actions.push_front(Action::Hold(LOOK_AGAIN));
+                None
+            }
+            Then::Over(outcome) => {
+                self.actions.clear();
+                Some(outcome)
+            }
+        }
+    }
+
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
         let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
@@ -366,6 +449,16 @@ impl CommandRun {
         self.tries.unanswered = how;
         self.tries.in_doubt |= step.pdu.is_write();
         let over = self.tries.failures > retries;
+        if let Some(run) = self.parameter() {
+            if step.purpose == StepPurpose::Release && over {
+                // The value stands all the same.
+                run.released();
+                self.tries.failures = 0;
+                return None;
+            }
+            run.begin_again();
+            return over.then(|| self.without_answer());
+        }
         match step.purpose {
             StepPurpose::Release if over => return self.not_released("no answer"),
             StepPurpose::Compare if self.urgency == Urgency::Stop => {
@@ -391,6 +484,7 @@ impl CommandRun {
 
     /// What was sent was acknowledged, perhaps by a late reply to something else.
     pub fn doubted(&mut self) {
+        self.ask_before_repeating();
         self.tries.in_doubt = true;
     }
 
@@ -483,6 +577,14 @@ impl CommandRun {
         };
         self.finish(&outcome, now);
     }
+}
+
+/// Why no parameter of a family is written whose motor cannot be seen to stand.
+fn running_unknown(profile: &Profile) -> Refusal {
+    Refusal::NotWritable(format!(
+        "profile `{}` does not say where the drive reports whether its motor runs; no parameter is written",
+        profile.name
+    ))
 }
 
 /// What the drive has, as it says.

@@ -85,6 +85,8 @@ pub fn effects(profile: &Profile, order: &Order) -> Vec<Effect> {
                 }
             }
         }
+        // It is read back before it is acknowledged.
+        Order::Parameter(_) => {}
         Order::Read(_) => {}
     }
     effects

@@ -177,7 +177,12 @@ impl DriveState {
             overtaken.overtaken();
         }
         if outcome.is_ok() {
+            let was_read_back = run.was_read_back();
             let (effects, receipts) = run.acknowledge(outcome, now);
+            if was_read_back {
+                receipts.into_iter().for_each(|receipt| receipt.confirm(now));
+                return;
+            }
             self.confirmations
                 .watch(effects, receipts, &image.reading(now, self.fresh), now);
         } else {

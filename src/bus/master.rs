@@ -310,6 +310,20 @@ impl Master {
             };
             drive.sent(*slot, &step, now);
         }
+        let is_command = matches!(
+            turn.purpose,
+            Purpose::Command {
+                slot: Urgency::Command,
+                ..
+            }
+        );
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            if !(is_command && index == turn.drive)
+                && let Some(run) = drive.run(Urgency::Command)
+            {
+                run.others_go_first();
+            }
+        }
         if turn.purpose == Purpose::Background {
             self.background_sent();
         }

@@ -1,4 +1,6 @@
-//! `drivegate params`: parameters of drives read, compared, listed and shown.
+//! `drivegate params`: parameters of drives read, compared, restored, listed and shown.
+
+mod restore;
 
 use std::io::{IsTerminal, Write as _};
 use std::path::{Path, PathBuf};
@@ -12,7 +14,7 @@ use crate::files;
 use crate::north::local::protocol::ParamsOutcome;
 use crate::parameters::{Names, ParameterFile, Store, differences, read as read_file};
 
-/// Reads, compares and shows the parameters of drives.
+/// Reads, compares, restores and shows the parameters of drives.
 ///
 /// Parameters are read at the lowest rank: through a running gateway its process data goes on, without one the command opens the port
 /// itself. A drive is named as in the configuration, a file by its path.
@@ -20,6 +22,7 @@ use crate::parameters::{Names, ParameterFile, Store, differences, read as read_f
 #[command(after_help = "Examples:
   drivegate params read pump-1 -o pump-1.params
   drivegate params diff pump-1.params pump-1
+  drivegate params restore pump-1.params pump-1 --dry-run
   drivegate params list
   drivegate params show pump-1")]
 pub(super) struct Args {
@@ -48,6 +51,26 @@ Exit code 0: nothing differs; 1: something does, or it could not be found out.")
         before: String,
         /// Likewise.
         after: String,
+    },
+    /// Writes what differs from a file to a drive, while its motor stands.
+    #[command(after_help = "Examples:
+  drivegate params restore pump-1.params pump-1
+  drivegate params restore pump-1.params pump-1 --only 102 --yes
+  drivegate params restore --resume pump-1
+
+Shows first what would be written, and asks. The drive needs access = \"control\" and params = \"write\". While parameters are written
+the drive takes no orders but stops; a restore that was cut off keeps it so until it is resumed, undone or released. A gateway
+goes on with the restore when the command is interrupted.")]
+    Restore(restore::RestoreArgs),
+    /// Reads a drive and restores that to another of the same kind.
+    #[command(after_help = "Example:\n  drivegate params clone pump-1 pump-2 --dry-run")]
+    Clone {
+        /// Name of the drive that is read.
+        from: String,
+        /// Name of the drive that is written.
+        to: String,
+        #[command(flatten)]
+        how: restore::How,
     },
     /// Lists the readings that the gateway has kept, oldest first.
     #[command(after_help = "Example:\n  drivegate params list pump-1")]
@@ -90,6 +113,8 @@ pub(super) fn run(args: &Args) -> ExitCode {
     let done = match &args.action {
         Action::Read(read) => read_drive(&args.config, read),
         Action::Diff { before, after } => diff(&args.config, before, after),
+        Action::Restore(args_of_it) => restore::restore(&args.config, args_of_it),
+        Action::Clone { from, to, how } => restore::clone(&args.config, from, to, how),
         Action::List { drive } => list(&args.config, drive.as_deref()),
         Action::Show { of, names } => show(&args.config, of, names.as_deref()),
     };
@@ -136,9 +161,13 @@ type Found = (ParameterFile, std::sync::Arc<crate::drive::Profile>);
 
 fn read_from_drive(config: &Path, drive: &str, afresh: bool, brisk: bool) -> Result<Found, ExitCode> {
     let target = target(config, drive)?;
-    let mut progress = Progress::default();
-    let text = target.read_parameters((afresh, brisk), |outcome| progress.show(outcome));
-    progress.end();
+    let mut line = StatusLine::default();
+    let text = target.read_parameters((afresh, brisk), |outcome| {
+        if outcome.total > 0 {
+            line.show(&reading_in_words(outcome));
+        }
+    });
+    line.end();
     let file = text.map_err(|why| failed(&why)).and_then(|text| {
         ParameterFile::parse(&text).map_err(|why| failed(&format!("the gateway's file is not understood: {why}")))
     });
@@ -147,28 +176,19 @@ fn read_from_drive(config: &Path, drive: &str, afresh: bool, brisk: bool) -> Res
 
 /// One line on a terminal, kept up to date; elsewhere nothing.
 #[derive(Debug, Default)]
-struct Progress {
+struct StatusLine {
     shown: bool,
 }
 
-impl Progress {
-    fn show(&mut self, outcome: &ParamsOutcome) {
+impl StatusLine {
+    fn show(&mut self, text: &str) {
         let mut stderr = std::io::stderr();
-        if !stderr.is_terminal() || outcome.total == 0 {
+        if !stderr.is_terminal() {
             return;
         }
-        let rest = match (&outcome.waits, outcome.remaining_s) {
-            (Some(why), _) => format!("waits: {why}"),
-            (None, Some(seconds)) => format!("about {} left", seconds_in_words(seconds)),
-            (None, None) => String::new(),
-        };
         self.shown = true;
         // A terminal that is gone shows nothing.
-        let _ = write!(
-            stderr,
-            "\r\x1b[K{} of {} addresses, {rest}",
-            outcome.done, outcome.total
-        );
+        let _ = write!(stderr, "\r\x1b[K{text}");
     }
 
     fn end(&self) {
@@ -176,6 +196,15 @@ impl Progress {
             let _ = write!(std::io::stderr(), "\r\x1b[K");
         }
     }
+}
+
+fn reading_in_words(outcome: &ParamsOutcome) -> String {
+    let rest = match (&outcome.waits, outcome.remaining_s) {
+        (Some(why), _) => format!("waits: {why}"),
+        (None, Some(seconds)) => format!("about {} left", seconds_in_words(seconds)),
+        (None, None) => String::new(),
+    };
+    format!("{} of {} addresses, {rest}", outcome.done, outcome.total)
 }
 
 fn seconds_in_words(seconds: f64) -> String {

@@ -1,12 +1,13 @@
 //! Which commands are let through: authority first, then address, then value; and why the others are not, in words.
 //! Codes and exceptions of a `Refusal` are in `command/mod.rs`. Pure.
 
-use super::{Authority, Order, Refusal, Urgency};
+use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
 use crate::drive::model::Kind;
+use crate::drive::profile::AddressRange;
 use crate::drive::{ModelPoint, Point, Source, Value};
-use crate::process_image::{Access, Reading};
+use crate::process_image::{Access, DriveSpec, Hold, ParamsAccess, Reading};
 
 /// An order that may go to the bus.
 #[derive(Debug, Clone, PartialEq)]
@@ -41,17 +42,81 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
             } else {
                 Urgency::Command
             };
-            Ok(Admitted {
-                order: Order::Write(pdu),
-                urgency,
-                reference_only: false,
-            })
+            not_held(
+                drive,
+                Admitted {
+                    order: Order::Write(pdu),
+                    urgency,
+                    reference_only: false,
+                },
+            )
         }
         Order::Points(values) => {
             authority(drive, client)?;
-            points(drive, values)
+            not_held(drive, points(drive, values)?)
+        }
+        Order::Parameter(order) => {
+            authority(drive, client)?;
+            parameter(drive, &order)?;
+            Ok(Admitted {
+                order: Order::Parameter(order),
+                urgency: Urgency::Command,
+                reference_only: false,
+            })
         }
     }
+}
+
+/// While parameters are restored, or are half restored, only stops get through.
+fn not_held(drive: &Reading<'_>, admitted: Admitted) -> Result<Admitted, Refusal> {
+    match drive
+        .hold
+        .and_then(Hold::why)
+        .filter(|_| admitted.urgency != Urgency::Stop)
+    {
+        Some(why) => Err(Refusal::NotAllowed(why.to_string())),
+        None => Ok(admitted),
+    }
+}
+
+/// A restore writes parameters where the drive's configuration says so, and only while it holds the drive.
+fn parameter(drive: &Reading<'_>, order: &ParameterOrder) -> Result<(), Refusal> {
+    let (spec, id) = (drive.spec, &order.id);
+    may_restore(spec).map_err(Refusal::NotAllowed)?;
+    if drive.hold.and_then(Hold::why).is_none() {
+        return Err(Refusal::NotAllowed(format!(
+            "parameter {id} of `{}` is written by a restore only; nothing was written",
+            spec.name
+        )));
+    }
+    let words = order.to.words().len();
+    let takes = |range: &AddressRange| usize::from(range.write) >= words;
+    if !spec.profile.range(Table::Holding, order.address).is_some_and(takes) {
+        return Err(Refusal::NotWritable(format!(
+            "parameter {id} of `{}` is read-only or unknown",
+            spec.name
+        )));
+    }
+    Ok(())
+}
+
+/// Whether parameters of a drive may be restored.
+///
+/// # Errors
+/// Why not, and what to do.
+pub fn may_restore(spec: &DriveSpec) -> Result<(), String> {
+    let name = &spec.name;
+    if spec.access != Access::Control {
+        return Err(format!(
+            "drive `{name}` is only monitored; set access = \"control\" and params = \"write\" for it"
+        ));
+    }
+    if spec.params != ParamsAccess::Write {
+        return Err(format!(
+            "the parameters of `{name}` are only read; set params = \"write\" for the drive"
+        ));
+    }
+    Ok(())
 }
 
 /// Why nothing goes out on a line that another master owns.

@@ -10,15 +10,17 @@
 mod admit;
 mod audit;
 mod background;
+mod parameter;
 mod queue;
 mod ticket;
 
-pub use admit::{Admitted, admit, sets_twice, written};
+pub use admit::{Admitted, admit, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
 pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
     BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
 };
+pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
@@ -170,6 +172,8 @@ pub enum Order {
     Write(RequestPdu),
     /// A raw read outside the plan.
     Read(RequestPdu),
+    /// One parameter set by a restore, while the motor stands.
+    Parameter(ParameterOrder),
 }
 
 /// Rank of a command on the bus.
@@ -266,6 +270,8 @@ pub enum Outcome {
     Purged,
     /// An action of supervision that waited while a client came back; not sent.
     Withdrawn,
+    /// The drive acknowledged it and shows another value.
+    NotTaken(String),
     /// It was begun and did not come to its end: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
     /// The port is not open.
@@ -291,6 +297,7 @@ impl Outcome {
             Outcome::Replaced => "replaced",
             Outcome::Purged => "purged",
             Outcome::Withdrawn => "withdrawn",
+            Outcome::NotTaken(_) => "not_taken",
             Outcome::Interrupted(_) => "interrupted",
             Outcome::BusDown => "bus_down",
             Outcome::Offline => "offline",
@@ -307,6 +314,7 @@ impl Outcome {
             | Outcome::Exception(_)
             | Outcome::TimedOut
             | Outcome::Garbled
+            | Outcome::NotTaken(_)
             | Outcome::Interrupted(_) => Reach::Sent,
             Outcome::Expired | Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::ShuttingDown => {
                 Reach::Queued
@@ -325,7 +333,7 @@ impl Outcome {
         match self {
             Outcome::Acknowledged(_) => None,
             Outcome::Exception(code) if code.0 <= 0x0B => Some(*code),
-            Outcome::Exception(_) | Outcome::Garbled => Some(Exception::DEVICE_FAILURE),
+            Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => Some(Exception::DEVICE_FAILURE),
             Outcome::Refused(refusal) => Some(refusal.exception()),
             Outcome::QueueFull => Some(Exception::BUSY),
             Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
@@ -349,6 +357,7 @@ impl fmt::Display for Outcome {
             Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
             Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
+            Outcome::NotTaken(shown) => write!(f, "the drive acknowledged it, but {shown}"),
             Outcome::Interrupted(why) => {
                 let why = match why {
                     Interruption::Stop => "a stop came in",
@@ -386,6 +395,12 @@ pub enum Refusal {
     /// There is no drive of that name.
     #[error("{0}")]
     UnknownDrive(String),
+    /// The drive, asked for it, says that its motor runs: no parameter is written.
+    #[error("{0}")]
+    MotorRuns(String),
+    /// The drive, asked for it, has neither the value that a restore found nor the one that it is to write.
+    #[error("{0}")]
+    OtherValue(String),
 }
 
 impl Refusal {
@@ -394,7 +409,7 @@ impl Refusal {
     /// The code in results.
     pub fn code(&self) -> &'static str {
         match self {
-            Refusal::NotAllowed(_) => "not_allowed",
+            Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => "not_allowed",
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => "not_writable",
             Refusal::BadValue(_) => "bad_value",
             Refusal::UnknownDrive(_) => Refusal::UNKNOWN_DRIVE,
@@ -404,7 +419,7 @@ impl Refusal {
     /// The Modbus exception.
     pub fn exception(&self) -> Exception {
         match self {
-            Refusal::NotAllowed(_) => Exception::FUNCTION,
+            Refusal::NotAllowed(_) | Refusal::MotorRuns(_) | Refusal::OtherValue(_) => Exception::FUNCTION,
             Refusal::NotWritable(_) | Refusal::NotKnown(_) => Exception::ADDRESS,
             Refusal::BadValue(_) => Exception::VALUE,
             Refusal::UnknownDrive(_) => Exception::GATEWAY_PATH,
@@ -443,6 +458,7 @@ mod tests {
             Outcome::Replaced,
             Outcome::Purged,
             Outcome::Withdrawn,
+            Outcome::NotTaken(String::new()),
             Outcome::Interrupted(Interruption::Stop),
             Outcome::BusDown,
             Outcome::Offline,

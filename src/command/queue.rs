@@ -350,7 +350,7 @@ impl Command {
     fn is_bare_stop(&self) -> bool {
         match &self.order {
             Order::Points(values) => values.len() == 1,
-            Order::Write(_) | Order::Read(_) => false,
+            Order::Write(_) | Order::Read(_) | Order::Parameter(_) => false,
         }
     }
 

@@ -12,7 +12,9 @@ use crate::document::{Finding, Place, Raw as Node, Reader, nearest};
 use crate::drive::model::Kind;
 use crate::drive::profile::Profiles;
 use crate::drive::{ModelPoint, Plan, PlannedRead, Point, PollClass, Profile, Value};
-use crate::process_image::{Access, DriveSpec, LeaseAction, OnShutdown, PointTrigger, Supervision, TriggerLimit};
+use crate::process_image::{
+    Access, DriveSpec, LeaseAction, OnShutdown, ParamsAccess, PointTrigger, Supervision, TriggerLimit,
+};
 
 /// Points that a message names.
 const MOST_NAMED: usize = 4;
@@ -58,6 +60,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
     let turnaround = DRIVE.turnaround.read(reader);
     let triggers = read_triggers(reader, profile.as_deref());
     let raw_writes = raw_writes::read(reader, profile.as_deref());
+    let params = read_params(reader, access);
     reader.finish();
     let spec = match (&name, address, unit, profile) {
         (Some((name, _)), Some(address), Some(unit), Some(profile)) => Some(DriveSpec {
@@ -74,6 +77,7 @@ pub(super) fn read(reader: &Reader<'_>, around: &Surroundings<'_>) -> Found {
             frequency_range,
             triggers,
             raw_writes,
+            params,
         }),
         _ => None,
     };
@@ -96,6 +100,19 @@ const fn address_form(protocol: Protocol) -> &'static Number {
         Protocol::ModbusRtu | Protocol::ModbusAscii => &MODBUS_ADDRESSES,
         Protocol::N2 => &N2_ADDRESSES,
     }
+}
+
+/// Whether parameters may be restored, which is a command like any other.
+fn read_params(reader: &Reader<'_>, access: Access) -> ParamsAccess {
+    let params = DRIVE.params.get(reader);
+    if params == ParamsAccess::Write && access != Access::Control {
+        reader.problem(
+            DRIVE.params.name,
+            "params = \"write\" lets parameters be restored, and nothing is written to a drive that is only monitored",
+            "set access = \"control\" for the drive, or params = \"read\"",
+        );
+    }
+    params
 }
 
 /// Addresses that a drive can have on a line of that protocol.

@@ -22,7 +22,7 @@ use crate::line::{Level, MOST_RTS_DELAY, Rs485, Spin};
 use crate::north::modbus_tcp::{Role, Uncached};
 use crate::north::mqtt::History;
 use crate::north::slot::SlotAccess;
-use crate::process_image::{Access, LeaseAction, OnShutdown};
+use crate::process_image::{Access, LeaseAction, OnShutdown, ParamsAccess};
 
 /// Declares tables: for each a type with its keys as fields, a constant of it, its schema and its documentation.
 macro_rules! keys {
@@ -337,6 +337,9 @@ keys! {
             } }] }),
             range: "true, false or ranges of PDU addresses such as [[101, 199]]",
         }, or "`false`";
+        /// What may be done with its [parameters](parameters.md#restoring): `"read"`, or `"write"`: they may be restored, too, which
+        /// needs `access = "control"`.
+        params: ParamsAccess = Words(&[("read", ParamsAccess::Read), ("write", ParamsAccess::Write)]), default "read";
         /// Values that make a [recording](recordings.md), beside faults.
         trigger: Present = Own { schema: || each(Trigger::schema()), range: "[[bus.drive.trigger]]" }, or "none";
     }

@@ -160,6 +160,26 @@ impl RawValue {
         }
     }
 
+    /// The words of a write.
+    pub fn words(self) -> Vec<u16> {
+        match self {
+            RawValue::Word(word) => vec![word],
+            RawValue::Float(bits) => vec![(bits >> 16) as u16, bits as u16],
+        }
+    }
+
+    /// Whether a drive that shows `other` has this value: an object of N2 is kept in counts of its own.
+    pub fn is_shown_by(self, other: RawValue) -> bool {
+        match (self, other) {
+            (RawValue::Word(one), RawValue::Word(other)) => one == other,
+            (RawValue::Float(one), RawValue::Float(other)) => {
+                let (one, other) = (f32::from_bits(one), f32::from_bits(other));
+                (one - other).abs() <= 1e-5 * one.abs().max(other.abs())
+            }
+            (RawValue::Word(_), RawValue::Float(_)) | (RawValue::Float(_), RawValue::Word(_)) => false,
+        }
+    }
+
     /// As a number: counts of a register, or the value of an object.
     pub fn number(self) -> f64 {
         match self {

@@ -84,6 +84,7 @@ pub(super) fn empty_snapshot(spec: &DriveSpec) -> Snapshot {
 pub(super) fn reading<'d>(spec: &'d DriveSpec, snapshot: &Arc<Snapshot>, at: Instant) -> Reading<'d> {
     Reading {
         spec,
+        hold: None,
         snapshot: snapshot.clone(),
         now: at,
         stale_after: ANY_AGE,

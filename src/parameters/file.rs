@@ -28,7 +28,7 @@ const HEAD: &str = "# drivegate parameters 1";
 /// Longest file that is read, bytes.
 pub(super) const MOST_BYTES: u64 = 4 * 1024 * 1024;
 /// Bytes of the checksum that are written.
-const CHECKSUM: usize = 16;
+pub(super) const CHECKSUM: usize = 16;
 
 /// The name of a parameter; sorted as people count: 2 before 10.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -237,10 +237,26 @@ impl ParameterFile {
 
 /// The value in a file: one without a decimal point is a register.
 fn shown(value: &Result<RawValue, String>) -> String {
+    value.as_ref().map_or_else(|_| "?".to_string(), |value| text_of(*value))
+}
+
+/// A value as it is written down: one without a decimal point is a register.
+pub(super) fn text_of(value: RawValue) -> String {
     match value {
-        Ok(RawValue::Word(word)) => word.to_string(),
-        Ok(RawValue::Float(bits)) => format!("{:?}", f32::from_bits(*bits)),
-        Err(_) => "?".to_string(),
+        RawValue::Word(word) => word.to_string(),
+        RawValue::Float(bits) => format!("{:?}", f32::from_bits(bits)),
+    }
+}
+
+/// The value that [`text_of`] wrote down.
+pub(super) fn value_of(text: &str) -> Option<RawValue> {
+    match text.parse::<u16>() {
+        Ok(word) => Some(RawValue::Word(word)),
+        Err(_) if text.bytes().all(|byte| byte.is_ascii_digit()) => None,
+        Err(_) => {
+            let value = text.parse::<f32>().ok().filter(|value| value.is_finite())?;
+            Some(RawValue::Float(value.to_bits()))
+        }
     }
 }
 
@@ -257,22 +273,18 @@ fn entry(value: &str, note: &str) -> Option<Entry> {
             note: note.to_string(),
         });
     }
-    let value = match value.parse::<u16>() {
-        Ok(word) => RawValue::Word(word),
-        Err(_) if value.bytes().all(|byte| byte.is_ascii_digit()) => return None,
-        Err(_) => RawValue::Float(value.parse::<f32>().ok().filter(|value| value.is_finite())?.to_bits()),
-    };
+    let value = value_of(value)?;
     Some(Entry {
         value: Ok(value),
         note: note.to_string(),
     })
 }
 
-fn one_line(text: &str) -> String {
+pub(super) fn one_line(text: &str) -> String {
     text.chars().map(|c| if c.is_control() { ' ' } else { c }).collect()
 }
 
-fn hex(bytes: &[u8], count: usize) -> String {
+pub(super) fn hex(bytes: &[u8], count: usize) -> String {
     bytes.iter().take(count).map(|byte| format!("{byte:02x}")).collect()
 }
 

@@ -1,19 +1,23 @@
-//! The parameter vault: the parameters of drives read, kept, compared. What a reading asks next, files and differences are
-//! pure; `store` has the files on disk, `vault` the readings
-//! that go on; `north::parameters` does them.
+//! The parameter vault: the parameters of drives read, kept, compared and restored. What a reading asks next, what a restore
+//! writes next, files and differences are pure; `store` and `journal` have the files on disk, `vault` the readings and
+//! restores that go on; `north::parameters` does them.
 
 mod difference;
 mod file;
+mod journal;
 mod names;
 mod plan;
 mod reading;
+mod restoration;
 mod store;
 mod vault;
 
 pub use difference::{Difference, differences};
 pub use file::{Entry, FileError, Id, ParameterFile};
+pub use journal::{Journal, JournalFile, Phase};
 pub use names::Names;
 pub use plan::{Handling, Need, ParameterWrite, Plan, Risk, Wishes, plan};
 pub use reading::{Next, Reading};
+pub use restoration::{End, Restoration, Then, Wanted};
 pub use store::{Kept, Store, read};
-pub use vault::{Status, Vault};
+pub use vault::{Prepared, RestoreStage, RestoreStatus, Status, Vault};

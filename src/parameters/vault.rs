@@ -1,12 +1,15 @@
-//! What readings go on, one a drive at a time, and what came of the last ones.
+//! What readings and restores go on, one of each a drive at a time, and what came of the last ones.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use super::file::ParameterFile;
+use super::journal::JournalFile;
 use super::names::Names;
+use super::plan::Plan;
 use super::store::Store;
+use crate::process_image::Hold;
 
 /// How far the reading of a drive is.
 #[derive(Debug, Clone, PartialEq)]
@@ -23,9 +26,63 @@ pub struct Status {
     pub result: Option<Result<Arc<ParameterFile>, String>>,
 }
 
+/// What a restore is at.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum RestoreStage {
+    /// The drive is read.
+    Reading,
+    /// What would be written is known; whoever asked for it decides.
+    Prepared,
+    /// It may not be done: the reasons.
+    Refused(Vec<String>),
+    /// Parameters are written.
+    Working,
+    /// It is over: what the drive has now.
+    Ended(String),
+    /// It was given up: why, and what to do.
+    Failed(String),
+}
+
+/// What a restore would write.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Prepared {
+    /// The writes.
+    pub plan: Plan,
+    /// What the user takes upon himself.
+    pub risks: Vec<String>,
+}
+
+/// How far the restore of a drive is.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RestoreStatus {
+    /// Its number: a later one has a higher one.
+    pub number: u64,
+    /// What it is at.
+    pub stage: RestoreStage,
+    /// Addresses that were read, or parameters that were written, and all.
+    pub progress: (usize, usize),
+    /// Why it waits.
+    pub waits: Option<String>,
+    /// What it writes, once that is known.
+    pub prepared: Arc<Prepared>,
+    /// Somebody wants it to end before the next parameter.
+    pub is_unwanted: bool,
+}
+
+impl RestoreStatus {
+    /// Whether the drive is read or written.
+    pub fn goes_on(&self) -> bool {
+        matches!(self.stage, RestoreStage::Reading | RestoreStage::Working)
+    }
+}
+
 #[derive(Debug, Default)]
 struct State {
     numbered: u64,
+    restores: BTreeMap<String, RestoreStatus>,
+    holds: BTreeMap<String, Arc<Hold>>,
+    /// Drives whose journal was looked for.
+    looked_for: BTreeSet<String>,
     readings: BTreeMap<String, Status>,
     /// The last reading of each drive since the gateway started, whether the disk took it or not.
     last: BTreeMap<String, Arc<ParameterFile>>,
@@ -130,6 +187,72 @@ impl Vault {
     pub fn update(&self, drive: &str, change: impl FnOnce(&mut Status)) {
         if let Some(reading) = self.lock().readings.get_mut(drive) {
             change(reading);
+        }
+    }
+
+    /// What keeps orders from that drive, the same under whatever configuration.
+    pub fn hold(&self, drive: &str) -> Arc<Hold> {
+        self.lock().holds.entry(drive.to_string()).or_default().clone()
+    }
+
+    /// Where the journal of that drive is; none without a store.
+    pub fn journal(&self, drive: &str) -> Option<JournalFile> {
+        let state = self.lock();
+        Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
+    }
+
+    /// Of these drives those whose journal nobody has looked for; from now on somebody has.
+    pub fn not_looked_for(&self, drives: impl Iterator<Item = String>) -> Vec<String> {
+        let mut state = self.lock();
+        drives.filter(|drive| state.looked_for.insert(drive.clone())).collect()
+    }
+
+    /// How far the last restore of that drive is, if there was one since the gateway started.
+    pub fn restore(&self, drive: &str) -> Option<RestoreStatus> {
+        self.lock().restores.get(drive).cloned()
+    }
+
+    /// A restore of that drive begins, at that stage; its number.
+    ///
+    /// # Errors
+    /// Another one goes on.
+    pub fn begin_restore(&self, drive: &str, stage: RestoreStage) -> Result<u64, String> {
+        let mut state = self.lock();
+        if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {
+            return Err(format!("a restore of the parameters of `{drive}` goes on already"));
+        }
+        state.numbered += 1;
+        let begun = RestoreStatus {
+            number: state.numbered,
+            stage,
+            progress: (0, 0),
+            waits: None,
+            prepared: Arc::default(),
+            is_unwanted: false,
+        };
+        let number = begun.number;
+        state.restores.insert(drive.to_string(), begun);
+        Ok(number)
+    }
+
+    /// The restore of that number, which is prepared, begins to write; what.
+    ///
+    /// # Errors
+    /// It is not the last one, or not prepared.
+    pub fn carry_out(&self, drive: &str, number: u64) -> Result<Arc<Prepared>, String> {
+        let mut state = self.lock();
+        let restore = state.restores.get_mut(drive).filter(|restore| restore.number == number);
+        let restore = restore.filter(|restore| restore.stage == RestoreStage::Prepared);
+        let restore = restore.ok_or_else(|| format!("that restore of `{drive}` is not prepared any more"))?;
+        restore.stage = RestoreStage::Working;
+        restore.progress = (0, restore.prepared.plan.writes.len());
+        Ok(restore.prepared.clone())
+    }
+
+    /// Something is new of the restore of that drive.
+    pub fn update_restore(&self, drive: &str, change: impl FnOnce(&mut RestoreStatus)) {
+        if let Some(restore) = self.lock().restores.get_mut(drive) {
+            change(restore);
         }
     }
 }

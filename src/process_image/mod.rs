@@ -5,11 +5,13 @@
 
 mod contradiction;
 mod health;
+mod hold;
 mod snapshot;
 mod tape;
 mod trace;
 
 pub use health::{BusHealth, Histogram, HistogramSnapshot, Outcome, PollCycle};
+pub use hold::Hold;
 pub use snapshot::{Cadence, Link, Reading, Snapshot, Unavailable};
 pub use tape::{TAPE_BYTES, Tape, Taped, TapedFrame, TapedRead, Taping, Verdict};
 pub use trace::{Direction, FrameRecord, Trace};
@@ -38,6 +40,16 @@ pub enum Access {
     Control,
     /// Another master owns the line (`mode = "listen"` of the bus): nothing is ever sent.
     Listen,
+}
+
+/// What may be done with the parameters of a drive.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum ParamsAccess {
+    /// They are read.
+    #[default]
+    Read,
+    /// They are restored, too.
+    Write,
 }
 
 /// What is done when a drive's lease runs out.
@@ -101,6 +113,8 @@ pub struct DriveSpec {
     pub triggers: Vec<PointTrigger>,
     /// What raw writes may set beside writable points.
     pub raw_writes: RawWrites,
+    /// What may be done with its parameters.
+    pub params: ParamsAccess,
 }
 
 /// A value that makes a recording when it holds for a time.
@@ -147,6 +161,8 @@ pub struct DriveImage {
     pub spec: DriveSpec,
     /// The requests that read it.
     pub plan: Plan,
+    /// Why it takes no orders but stops, if that is so.
+    pub hold: Arc<Hold>,
     /// Cadence of the slow class, which the staleness of slow points depends on.
     slow_cycle: Duration,
     /// Process data of a line that cannot be faster is not stale before that age, ns; a reload may change it.
@@ -176,6 +192,7 @@ impl DriveImage {
         DriveImage {
             spec,
             plan,
+            hold: Arc::default(),
             slow_cycle,
             stale_floor: AtomicU64::new(0),
             snapshot,
@@ -188,6 +205,12 @@ impl DriveImage {
             unsupervised: AtomicBool::new(false),
             written: Mutex::default(),
         }
+    }
+
+    /// The same with the hold of an earlier image of the drive.
+    #[must_use]
+    pub fn with_hold(self, hold: Arc<Hold>) -> DriveImage {
+        DriveImage { hold, ..self }
     }
 
     /// The drive took these values of holding registers: where they are parameters they did not change by themselves.
@@ -259,6 +282,7 @@ impl DriveImage {
         let snapshot = self.snapshot();
         Reading {
             spec: &self.spec,
+            hold: Some(&self.hold),
             snapshot,
             now,
             stale_after: stale_after.max(Duration::from_nanos(self.stale_floor.load(Ordering::Relaxed))),
@@ -430,6 +454,7 @@ impl DriveSpec {
             frequency_range: None,
             triggers: Vec::new(),
             raw_writes: RawWrites::Points,
+            params: ParamsAccess::Read,
         }
     }
 

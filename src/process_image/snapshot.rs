@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::DriveSpec;
+use super::{DriveSpec, Hold};
 use crate::codec::{Exception, Table};
 use crate::drive::model::Kind;
 use crate::drive::{Bound, ModelPoint, Plan, PollClass, Quality, Raw, Sample, Source, State, Value};
@@ -238,6 +238,8 @@ impl Snapshot {
 pub struct Reading<'d> {
     /// As configured.
     pub spec: &'d DriveSpec,
+    /// Why it takes no orders but stops, if that is so; none of a past in which nobody gives orders.
+    pub hold: Option<&'d Hold>,
     /// What is known.
     pub snapshot: Arc<Snapshot>,
     /// When the reader looks.

@@ -14,7 +14,7 @@ use crate::support::tools::root;
 const MAXIMUM_FREQUENCY: u16 = 101;
 
 /// The Vacon NX profile as `few`, whose drives are asked for the parameters with a name only.
-fn few() -> String {
+pub(super) fn few() -> String {
     let text = fs::read_to_string(root().join("profiles/vacon-nx.toml")).unwrap();
     let changed = text
         .replace("name = \"vacon-nx\"", "name = \"few\"")

@@ -31,6 +31,7 @@ mod orders;
 mod parameters;
 mod prediction;
 mod recorder;
+mod restore;
 mod rig;
 mod scenario;
 mod situations;

@@ -4,6 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use super::known_words::KnownWords;
+use super::parameter::ParameterRun;
 use crate::codec::n2::Session;
 use crate::codec::{RequestPdu, Table};
 use crate::command::{Refusal, written};
@@ -34,6 +35,8 @@ pub(super) enum Action {
     PulseEnd { raw: Raw, bit: u8, invert: bool },
     /// Two update periods of the drive.
     Hold(Duration),
+    /// A parameter, which has steps of its own.
+    Parameter(Box<ParameterRun>),
 }
 
 /// What a request of a command is for.
@@ -47,6 +50,10 @@ pub enum StepPurpose {
     Execute,
     /// Gives an overridden output back to the drive's own control.
     Release,
+    /// Asks whether the motor runs, right before a parameter is written.
+    AskRunning,
+    /// Asks whether the drive took a parameter.
+    ReadBack,
 }
 
 /// One request of a command.
@@ -223,6 +230,7 @@ pub(super) fn step_of(action: &Action, words: &KnownWords, profile: &Profile, kn
     match action {
         Action::Hold(_) => None,
         Action::Send(pdu) => Some(execute(pdu)),
+        Action::Parameter(run) => Some(run.step()),
         Action::Release(pdu) => Some(Step::new(StepPurpose::Release, pdu.clone())),
         Action::Change { pdu, table, items } => match known.check {
             // What was read earlier is no proof: it may have been changed at the drive since. Nothing is left out by it.

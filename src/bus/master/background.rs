@@ -1,5 +1,6 @@
 //! Background exchanges: when one goes on the line, and what came of it.
 
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::{Master, Purpose, Turn, TurnEnd};
@@ -9,9 +10,10 @@ use crate::bus::schedule::Admission;
 use crate::bus::transaction::Ended;
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Urgency, written};
+use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Refusal, Urgency, written};
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
+use crate::process_image::DriveImage;
 
 /// Time of an exchange whose request is not decoded, at most.
 const LONGEST_UNCHECKED: Duration = Duration::from_millis(500);
@@ -35,6 +37,24 @@ impl Begun {
             pdu: self.request.pdu.clone(),
         }
     }
+}
+
+/// Whether a request may write to a drive that takes no orders but stops; a broadcast reaches all.
+fn is_held(request: &BackgroundRequest, drives: &[Arc<DriveImage>]) -> bool {
+    let passed_on = request.passed_on.as_ref().filter(|passed_on| passed_on.may_write);
+    let stops = |image: &DriveImage| {
+        let stop = |(table, items): (Table, Vec<(u16, u16)>)| {
+            items
+                .iter()
+                .any(|(address, value)| image.spec.profile.is_stop(table, *address, *value))
+        };
+        written(&request.pdu).is_some_and(stop)
+    };
+    passed_on.is_some_and(|passed_on| {
+        let reached = |(index, _): &(usize, &Arc<DriveImage>)| *index == request.drive || passed_on.address == 0;
+        let mut reached = drives.iter().enumerate().filter(reached);
+        reached.any(|(_, image)| image.hold.why().is_some() && !stops(image))
+    })
 }
 
 impl Master {
@@ -68,6 +88,11 @@ impl Master {
             queue.remove(now, &Outcome::Offline, |r| {
                 r.drive != NO_DRIVE && !schedule.is_online(r.drive)
             });
+            let drives = &bus.image.drives;
+            if let Some(why) = drives.iter().find_map(|image| image.hold.why()) {
+                let held = Outcome::Refused(Refusal::NotAllowed(why.to_string()));
+                queue.remove(now, &held, |r| is_held(r, drives));
+            }
         }
     }
 

@@ -7,7 +7,7 @@ use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, Interruption, Order, Outcome, Urgency};
+use crate::command::{Chosen, Command, Interruption, Order, Outcome, Refusal, Urgency};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
@@ -94,6 +94,13 @@ impl Master {
     fn decide(&mut self, now: Instant) -> Option<Result<Turn, Instant>> {
         self.purge(now);
         let mut commands = self.commands(now);
+        if self.shutdown.is_none()
+            && !commands.waits(Urgency::Stop)
+            && let Some(ready) = self.checked_write(now)
+        {
+            self.turns.served(Urgency::Command, commands.waits(Urgency::Read));
+            return Some(Ok(self.turn(ready, now)));
+        }
         let rank = self.turns.rank(|rank| commands.waits(rank));
         if self.shutdown.is_some() {
             self.abandon_background(Outcome::ShuttingDown, Interruption::ShuttingDown, now);
@@ -116,6 +123,38 @@ impl Master {
                 wake.fold(until, Instant::min)
             })),
             Decision::Command(rank) => self.command(rank, &mut commands, now),
+        }
+    }
+
+    /// The write of a parameter to a drive that said, in the exchange before, that its motor stands: nothing but a stop goes
+    /// between the two.
+    fn checked_write(&mut self, now: Instant) -> Option<Ready> {
+        let (slot, rank) = (Urgency::Command, Urgency::Command);
+        let Master {
+            drives,
+            bus,
+            n2_late,
+            sessions,
+            ..
+        } = self;
+        let is_checked = |drive: &mut DriveState| drive.run(slot).is_some_and(CommandRun::is_checked);
+        let (drive, state) = drives
+            .iter_mut()
+            .enumerate()
+            .find_map(|(index, drive)| is_checked(drive).then_some((index, drive)))?;
+        let image = bus.image.drives.get(drive)?;
+        match state.wanted(image, n2_late, now) {
+            Wanted::Step(Urgency::Command, step)
+                if step.pdu.is_write() && sessions.before(drive, Some(slot), now).is_none() =>
+            {
+                Some(Ready {
+                    drive,
+                    slot,
+                    rank,
+                    step,
+                })
+            }
+            _ => None,
         }
     }
 
@@ -238,6 +277,15 @@ impl Master {
         };
         if !online {
             command.answer(&Outcome::Offline, now);
+            return;
+        }
+        // It was admitted before the drive was held.
+        let is_restore = matches!(command.order, Order::Parameter(_));
+        if command.urgency == Urgency::Command
+            && !is_restore
+            && let Some(why) = image.hold.why()
+        {
+            command.answer(&Outcome::Refused(Refusal::NotAllowed(why.to_string())), now);
             return;
         }
         let mut run = CommandRun::new(command, &image.spec.profile);

@@ -114,7 +114,7 @@ impl Direct {
                 };
                 request.points.iter().flat_map(of).collect()
             }
-            Request::Params(_) => Vec::new(),
+            Request::Params(_) | Request::ParamsRestore(_) => profile.parameters.identification.clone(),
             // What a command is turned into, and whether it is needed at all, depends on what the drive has.
             Request::Write(request) if !request.points.iter().any(|set| is_derived(profile, index(&set.point))) => {
                 Vec::new()
@@ -127,7 +127,7 @@ impl Direct {
             polled.iter().all(|index| is_settled(&reading, *index))
         })
         .await;
-        answer(request, &self.daemon.plant().load(), origin()).await
+        answer(request, &self.daemon.plant(), origin()).await
     }
 
     /// Closes the port.

@@ -65,6 +65,9 @@ fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
         | Request::Params(_)
         | Request::Reload(_)
         | Request::Health(_) => "try again",
+        Request::ParamsRestore(_) => {
+            "a restore that was begun goes on in the gateway: look at `drivegate params restore --look DRIVE`"
+        }
         Request::Write(_) => "whether the drive took the command is not known: read before you repeat it",
     };
     format!("the gateway did not answer: {error}; {}; {remedy}", path.display())
@@ -76,6 +79,7 @@ fn refused(path: &Path, code: FailureCode, message: &str) -> String {
         FailureCode::NoParameters => {
             "parameters can be read of drives whose profile lists them, on lines that the gateway owns"
         }
+        FailureCode::NotRestored => return format!("{message}; {}", path.display()),
         FailureCode::NotRecorded => "set max_count of [recordings] above 0 and reload",
         FailureCode::OtherConfiguration | FailureCode::UnknownDrive | FailureCode::UnknownPoint => {
             "the gateway there runs with another configuration: reload it, or name its file by --config"

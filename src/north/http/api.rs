@@ -67,6 +67,9 @@ pub(super) struct Drive<'d> {
     blocked_by: Vec<String>,
     /// The same with evidence and remedy.
     why: Vec<Cause>,
+    /// Why it takes no orders but stops.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    held: Option<String>,
     turnaround_ms: Option<f64>,
     transactions: Outcomes,
     /// `null` where the drive does not say whether it runs.
@@ -107,6 +110,7 @@ impl<'d> Drive<'d> {
             fault_text: reading.fault_text(),
             blocked_by: why.words(),
             why: why.causes,
+            held: image.hold.why().map(|why| why.to_string()),
             turnaround_ms: image.turnaround().map(fine_millis),
             transactions: Outcomes::new(|outcome| image.counted(outcome)),
             starts: tells_running.then_some(totals.starts),

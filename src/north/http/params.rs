@@ -2,7 +2,8 @@
 
 use serde::Serialize;
 
-use crate::parameters::{ParameterFile, Status};
+use crate::north::local::protocol::RestoreOutcome;
+use crate::parameters::{ParameterFile, RestoreStatus, Status};
 
 /// The parameters of a drive.
 #[derive(Debug, Serialize)]
@@ -14,6 +15,9 @@ pub(super) struct Parameters<'a> {
     reading: Option<RunningReading<'a>>,
     /// Why the last try failed.
     error: Option<&'a str>,
+    /// The last restore since the gateway started, or the one that goes on.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    restore: Option<RestoreOutcome>,
 }
 
 #[derive(Debug, Serialize)]
@@ -47,7 +51,12 @@ struct RunningReading<'a> {
 }
 
 impl<'a> Parameters<'a> {
-    pub(super) fn new(drive: &'a str, last: Option<&'a ParameterFile>, status: Option<&'a Status>) -> Parameters<'a> {
+    pub(super) fn new(
+        drive: &'a str,
+        last: Option<&'a ParameterFile>,
+        status: Option<&'a Status>,
+        restore: Option<&RestoreStatus>,
+    ) -> Parameters<'a> {
         let running = status.filter(|status| status.result.is_none());
         let failed = status.and_then(|status| status.result.as_ref()?.as_ref().err());
         Parameters {
@@ -60,6 +69,7 @@ impl<'a> Parameters<'a> {
                 waits: status.waits.as_deref(),
             }),
             error: failed.map(String::as_str),
+            restore: restore.map(RestoreOutcome::new),
         }
     }
 }

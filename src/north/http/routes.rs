@@ -296,7 +296,14 @@ async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> R
             Err(response) => return response,
         },
     };
-    Json(Parameters::new(&name, last.as_deref(), status.as_ref())).into_response()
+    let restore = plant.parameters.restore(&name);
+    Json(Parameters::new(
+        &name,
+        last.as_deref(),
+        status.as_ref(),
+        restore.as_ref(),
+    ))
+    .into_response()
 }
 
 /// The last reading on disk.

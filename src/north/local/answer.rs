@@ -7,7 +7,8 @@ use serde_json::Value as Json;
 
 use super::protocol::{
     Expected, Failure, FailureCode, Outcome, ParamsOutcome, ParamsRequest, PointValue, ReadOutcome, ReadRequest,
-    RecordOutcome, RecordRequest, Request, Setting, WhyRequest, Word, WriteOutcome, WriteRequest, port_of,
+    RecordOutcome, RecordRequest, Request, RestoreAct, RestoreOutcome, RestoreRequest, Setting, WhyRequest, Word,
+    WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refusal};
@@ -15,8 +16,9 @@ use crate::document::nearest;
 use crate::drive::why::Explanation;
 use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::command_json::resolve;
-use crate::north::parameters::{How, begin_reading};
-use crate::plant::{DriveHandle, Plant};
+use crate::north::parameters::{Again, How, begin_reading, carry_out, prepare, release, take_up};
+use crate::parameters::{Id, ParameterFile, Wishes};
+use crate::plant::{DriveHandle, Plant, SharedPlant};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
 /// Most points of one request; a profile has some hundred.
@@ -25,13 +27,15 @@ const MAX_POINTS: usize = 1024;
 const FORWARDED: Duration = Duration::from_secs(10);
 
 /// Does what `request` asks for, as `origin`; waits for the drive where that is needed.
-pub async fn answer(request: &Request, plant: &Plant, origin: Origin) -> Outcome {
+pub async fn answer(request: &Request, shared: &SharedPlant, origin: Origin) -> Outcome {
+    let plant = &*shared.load_full();
     let answered = match request {
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
         Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
         Request::Why(request) => why(request, plant).map(Outcome::Why),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
         Request::Params(request) => params(request, plant, origin).map(Outcome::Params),
+        Request::ParamsRestore(request) => restore(request, shared, origin).await.map(Outcome::ParamsRestore),
         Request::Reload(_) | Request::Health(_) => {
             let message = "this is no request to a drive";
             Err(Failure::new(FailureCode::BadRequest, message))
@@ -319,6 +323,37 @@ fn params(request: &ParamsRequest, plant: &Plant, origin: Origin) -> Result<Para
     let status = vault.status(&request.drive);
     let status = status.ok_or_else(|| fail(format!("the parameters of `{}` were not read yet", request.drive)))?;
     Ok(ParamsOutcome::new(&status))
+}
+
+async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin) -> Result<RestoreOutcome, Failure> {
+    let plant = shared.load_full();
+    let drive = drive_of(&plant, &request.drive, request.expect.as_ref())?;
+    let vault = &plant.parameters;
+    let fail = |why: String| Failure::new(FailureCode::NotRestored, why);
+    match &request.act {
+        RestoreAct::Prepare { file, only, force } => {
+            let wanted =
+                ParameterFile::parse(file).map_err(|why| fail(format!("the file is not understood: {why}")))?;
+            let wishes = Wishes {
+                only: only.iter().map(|id| Id::new(id)).collect(),
+                force: *force,
+            };
+            prepare(vault, drive, wanted, wishes, origin).map_err(fail)?;
+        }
+        RestoreAct::CarryOut { number } => carry_out(shared, &drive, *number, origin).map_err(fail)?,
+        RestoreAct::Resume => take_up(shared, &drive, Again::Resume, origin).await.map_err(fail)?,
+        RestoreAct::Undo => take_up(shared, &drive, Again::Undo, origin).await.map_err(fail)?,
+        RestoreAct::Release => release(shared, &drive, &origin).await.map_err(fail)?,
+        RestoreAct::Look => {}
+    }
+    let status = vault.restore(&request.drive);
+    let none = || {
+        fail(format!(
+            "no parameters of `{}` were restored since the gateway started",
+            request.drive
+        ))
+    };
+    Ok(RestoreOutcome::new(&status.ok_or_else(none)?))
 }
 
 /// The point and its value: as over MQTT, and the text of an enumeration too.

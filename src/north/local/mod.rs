@@ -70,7 +70,7 @@ impl Asked {
                 .await
                 .map(Outcome::Reload),
             Request::Health(asked) => control::health(control, asked, &plant, &self.stats).map(Outcome::Health),
-            of_drive => Ok(answer(of_drive, &plant, origin).await),
+            of_drive => Ok(answer(of_drive, &self.plant, origin).await),
         };
         answered.unwrap_or_else(Outcome::Error)
     }

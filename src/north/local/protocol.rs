@@ -10,6 +10,8 @@
 //! {"v":1,"gateway":"plant","record":{"id":"20260302T074012.118Z-pump-1","after_s":10.0}}
 //! {"v":1,"params":{"drive":"pump-1","begin":true}}
 //! {"v":1,"gateway":"plant","params":{"number":3,"done":120,"total":1899,"remaining_s":8.5}}
+//! {"v":1,"params_restore":{"drive":"pump-1","act":{"carry_out":{"number":4}}}}
+//! {"v":1,"gateway":"plant","params_restore":{"number":4,"stage":"working","done":2,"total":12,"plan":"…"}}
 //! {"v":1,"reload":{"config":"/etc/drivegate/drivegate.toml"}}
 //! {"v":1,"gateway":"plant","reload":{"errors":[],"warnings":[],"changes":["changed: MQTT"]}}
 //! {"v":1,"health":{}}
@@ -26,7 +28,7 @@ use serde_json::Value as Json;
 use crate::command::{Answer, CONFIRMED};
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
-use crate::parameters::Status;
+use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -50,6 +52,8 @@ pub enum Request {
     Record(RecordRequest),
     /// The parameters of one drive.
     Params(ParamsRequest),
+    /// Parameters restored to one drive.
+    ParamsRestore(RestoreRequest),
     /// The gateway reads its configuration anew.
     Reload(OfGateway),
     /// Whether the gateway is ready.
@@ -105,6 +109,49 @@ pub struct ParamsRequest {
     /// It may take 18 % of a busy line in place of 1.5 %.
     #[serde(default)]
     pub brisk: bool,
+}
+
+/// Parameters restored to one drive.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RestoreRequest {
+    /// Name of the drive.
+    pub drive: String,
+    /// Which configuration the client has in mind; absent: whatever the gateway runs with.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub expect: Option<Expected>,
+    /// What is to be done.
+    pub act: RestoreAct,
+}
+
+/// What is to be done with a restore.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum RestoreAct {
+    /// The drive is read, and what would be written is found out.
+    Prepare {
+        /// The file of parameters.
+        file: String,
+        /// These alone; empty: all.
+        #[serde(default)]
+        only: Vec<String>,
+        /// What can be forced is a risk, not a refusal.
+        #[serde(default)]
+        force: bool,
+    },
+    /// What the restore of that number found out is written.
+    CarryOut {
+        /// Its number.
+        number: u64,
+    },
+    /// How far it is.
+    Look,
+    /// One that was cut off goes on.
+    Resume,
+    /// One that was cut off is taken back.
+    Undo,
+    /// One that was cut off is left as it is.
+    Release,
 }
 
 /// Points of one drive.
@@ -206,6 +253,8 @@ pub enum Outcome {
     Record(RecordOutcome),
     /// A reading of parameters goes on, or is over.
     Params(ParamsOutcome),
+    /// A restore goes on, or is over.
+    ParamsRestore(RestoreOutcome),
     /// The configuration was read anew.
     Reload(ReloadOutcome),
     /// The gateway is ready, or not.
@@ -291,6 +340,94 @@ impl ParamsOutcome {
             waits: status.waits.clone(),
             file,
             error,
+        }
+    }
+}
+
+/// A restore of parameters.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RestoreOutcome {
+    /// Its number.
+    pub number: u64,
+    /// What it is at.
+    pub stage: Stage,
+    /// Addresses that were read, or parameters that are done.
+    pub done: usize,
+    /// All of them.
+    pub total: usize,
+    /// Why it waits.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub waits: Option<String>,
+    /// What is written, and what is to be known of it, for people; once that is known.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub plan: Option<String>,
+    /// What the user takes upon himself.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub risks: Vec<String>,
+    /// Why it may not be done.
+    #[serde(default, skip_serializing_if = "Vec::is_empty")]
+    pub reasons: Vec<String>,
+    /// How it ended.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub text: Option<String>,
+}
+
+/// What a restore is at.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Stage {
+    /// The drive is read.
+    Reading,
+    /// What would be written is known.
+    Prepared,
+    /// It may not be done.
+    Refused,
+    /// Parameters are written.
+    Working,
+    /// It is over.
+    Done,
+    /// It was given up.
+    Failed,
+    /// One that this version does not know.
+    #[serde(other)]
+    Other,
+}
+
+impl RestoreOutcome {
+    pub(crate) fn new(status: &RestoreStatus) -> RestoreOutcome {
+        let plan = &status.prepared.plan;
+        let (mut reasons, mut text) = (Vec::new(), None);
+        let stage = match &status.stage {
+            RestoreStage::Reading => Stage::Reading,
+            RestoreStage::Prepared if plan.writes.is_empty() => {
+                text = Some("nothing differs that would be written".to_string());
+                Stage::Done
+            }
+            RestoreStage::Prepared => Stage::Prepared,
+            RestoreStage::Refused(why) => {
+                reasons.clone_from(why);
+                Stage::Refused
+            }
+            RestoreStage::Working => Stage::Working,
+            RestoreStage::Ended(how) => {
+                text = Some(how.clone());
+                Stage::Done
+            }
+            RestoreStage::Failed(why) => {
+                text = Some(why.clone());
+                Stage::Failed
+            }
+        };
+        RestoreOutcome {
+            number: status.number,
+            stage,
+            done: status.progress.0,
+            total: status.progress.1,
+            waits: status.waits.clone(),
+            plan: (*plan != Plan::default()).then(|| plan.to_string()),
+            risks: status.prepared.risks.clone(),
+            reasons,
+            text,
         }
     }
 }
@@ -446,6 +583,8 @@ pub enum FailureCode {
     NotRecorded,
     /// The parameters of that drive cannot be read.
     NoParameters,
+    /// Nothing can be restored to that drive.
+    NotRestored,
     /// The client's port is none of this gateway's.
     OtherGateway,
     /// The gateway stops.

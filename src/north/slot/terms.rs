@@ -244,6 +244,10 @@ impl Tool {
                 );
                 return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
             }
+            // While its parameters are restored nothing else reaches it but what stops it.
+            if let Some(why) = drive.image.hold.why().filter(|_| !stops(drive, pdu, now)) {
+                return self.refuse(drive, pdu, Refusal::NotAllowed(why.to_string()), now);
+            }
             // Limits hold for each of them.
             if let Meaning::Write(pdu) = &request.meaning
                 && let Err(refusal) = command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write)

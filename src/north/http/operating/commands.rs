@@ -83,7 +83,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => StatusCode::CONFLICT,
-        Outcome::Exception(_) | Outcome::Garbled => StatusCode::BAD_GATEWAY,
+        Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
         Outcome::TimedOut | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
         Outcome::Expired | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull | Outcome::ShuttingDown => {
             StatusCode::SERVICE_UNAVAILABLE

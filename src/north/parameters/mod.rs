@@ -1,9 +1,12 @@
-//! Parameters of drives read by background exchanges: on demand of a client, and every so often.
+//! Parameters of drives: read by background exchanges, on demand of a client and every so often, and restored (`restore`).
 
-use std::collections::BTreeMap;
+mod restore;
+
+use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
+pub use self::restore::{Again, carry_out, hold_unfinished, prepare, release, take_up};
 use crate::command::{Origin, Pace, SourceKind};
 use crate::drive::parameters::RawValue;
 use crate::event::{Event, EventKind};
@@ -61,13 +64,21 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     };
     let names = vault.names(&drive.image.spec.profile.name);
     let begun = Instant::now();
-    let result = read(
-        &vault,
-        &drive,
-        origin,
-        last.as_deref().filter(|_| !how.afresh),
-        (how.pace, &names),
-    )
+    let spec = &drive.image.spec;
+    let known = last
+        .as_deref()
+        .filter(|last| !how.afresh && last.family == spec.profile.name);
+    let known = known
+        .map(|last| Reading::addresses_of(&spec.profile, last))
+        .unwrap_or_default();
+    let result = read(&drive, origin, known, (how.pace, &names), |looks| {
+        vault.update(&name, |job| {
+            job.waits = looks.waits;
+            if job.waits.is_none() {
+                (job.progress, job.remaining) = (looks.progress, remaining(looks.progress, looks.worked));
+            }
+        });
+    })
     .await;
     if let Ok(file) = &result {
         if let Some(last) = &last {
@@ -81,25 +92,37 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
     vault.end(&name, result);
 }
 
+/// How far a reading is.
+struct Looks {
+    /// Addresses that were asked, and all.
+    progress: (usize, usize),
+    /// Time for that, without the pauses.
+    worked: Duration,
+    waits: Option<String>,
+}
+
+/// Reads the parameters at the `known` addresses, or all where none is known; `seen` is told how far it is.
 async fn read(
-    vault: &Vault,
     drive: &DriveHandle,
     origin: Origin,
-    last: Option<&ParameterFile>,
+    known: BTreeSet<u16>,
     (pace, names): (Pace, &Names),
+    mut seen: impl FnMut(Looks),
 ) -> Result<ParameterFile, String> {
     let spec = &drive.image.spec;
-    let known = last.filter(|last| last.family == spec.profile.name);
-    let known = known
-        .map(|last| Reading::addresses_of(&spec.profile, last))
-        .unwrap_or_default();
     let mut reading = Reading::new(spec.profile.clone(), known);
     let begun = Instant::now();
     let (mut paused, mut away_since): (Duration, Option<Instant>) = (Duration::ZERO, None);
     while let Some(pdu) = reading.request() {
         let now = Instant::now();
         let outcome = drive.read_in_background(pdu, pace, origin.clone(), EXPIRY, now).await;
-        match reading.answered(&outcome) {
+        let next = reading.answered(&outcome);
+        let mut looks = Looks {
+            progress: reading.progress(),
+            worked: begun.elapsed().saturating_sub(paused),
+            waits: None,
+        };
+        match next {
             Next::Go => away_since = None,
             Next::Failed(why) => return Err(why),
             Next::Pause(pause, why) => {
@@ -107,18 +130,14 @@ async fn read(
                 if since.elapsed() > AWAY {
                     return Err(format!("{why}, for {} minutes", AWAY.as_secs() / 60));
                 }
-                vault.update(&spec.name, |job| job.waits = Some(why));
+                looks.waits = Some(why);
+                seen(looks);
                 tokio::time::sleep(pause).await;
                 paused += now.elapsed();
                 continue;
             }
         }
-        let worked = begun.elapsed().saturating_sub(paused);
-        vault.update(&spec.name, |job| {
-            job.progress = reading.progress();
-            job.remaining = remaining(job.progress, worked);
-            job.waits = None;
-        });
+        seen(looks);
     }
     let time = humantime::format_rfc3339_seconds(SystemTime::now()).to_string();
     Ok(reading.file(&spec.name, &identification(drive), &time, names))

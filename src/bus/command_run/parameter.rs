@@ -1,0 +1,230 @@
+//! One parameter set as one command: what the drive has, whether its motor runs, the write, what it has then. Pure.
+//!
+//! A write that was not answered is not repeated before the drive was asked what it made of it.
+
+use super::steps::{Step, StepPurpose};
+use crate::codec::n2::Session;
+use crate::codec::{Reply, RequestPdu, Table};
+use crate::command::{Outcome, ParameterOrder, Refusal};
+use crate::drive::model::Kind;
+use crate::drive::parameters::RawValue;
+use crate::drive::{ModelPoint, Profile, Raw};
+
+/// Reads of a value that was acknowledged until it counts as not taken.
+const LOOKS: u32 = 3;
+
+/// How far it is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Stage {
+    /// The drive is asked for its value.
+    Value,
+    /// It is asked whether its motor runs.
+    Running,
+    /// The motor stands: the write goes next on the line.
+    Write,
+    /// What N2 overrides is given back to the drive's own control.
+    Release,
+    /// The drive is asked for its value again.
+    ReadBack,
+}
+
+/// What comes after an answer.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Then {
+    /// The next step.
+    Go,
+    /// The next step, after a pause.
+    Pause,
+    /// It is over.
+    Over(Outcome),
+}
+
+/// A parameter that is being set.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct ParameterRun {
+    order: ParameterOrder,
+    stage: Stage,
+    running: Raw,
+    kind: Kind,
+    releases: bool,
+    /// A write was sent whose effect is not known.
+    in_doubt: bool,
+    looks: u32,
+}
+
+impl ParameterRun {
+    /// One that has not begun; none where the family does not report whether its motor runs.
+    pub(super) fn new(order: ParameterOrder, profile: &Profile) -> Option<ParameterRun> {
+        let running = profile.model_point(ModelPoint::Running)?;
+        let mut run = ParameterRun {
+            stage: Stage::Value,
+            running: running.raw()?.clone(),
+            kind: running.kind(),
+            releases: profile.releases(Table::Holding),
+            in_doubt: false,
+            looks: 0,
+            order,
+        };
+        run.stage = run.first();
+        Some(run)
+    }
+
+    fn first(&self) -> Stage {
+        match self.order.from {
+            Some(_) => Stage::Value,
+            None => Stage::Running,
+        }
+    }
+
+    /// The request of its present stage.
+    pub(super) fn step(&self) -> Step {
+        let (purpose, pdu) = match self.stage {
+            Stage::Value => (StepPurpose::Compare, self.order.read()),
+            Stage::Running => (
+                StepPurpose::AskRunning,
+                RequestPdu::Read {
+                    table: self.running.table,
+                    start: self.running.address,
+                    count: self.running.form.items(),
+                },
+            ),
+            Stage::Write => (StepPurpose::Execute, self.order.write()),
+            Stage::Release => {
+                let (table, address) = (Table::Holding, self.order.address);
+                (
+                    StepPurpose::Release,
+                    RequestPdu::N2(Session::Release { table, address }),
+                )
+            }
+            Stage::ReadBack => (StepPurpose::ReadBack, self.order.read()),
+        };
+        Step { purpose, pdu }
+    }
+
+    /// Whether the motor was just found standing: the write must be next on the line.
+    pub(super) fn is_checked(&self) -> bool {
+        self.stage == Stage::Write
+    }
+
+    /// Something else went on the line: whether the motor runs is asked again.
+    pub(super) fn check_again(&mut self) {
+        if self.stage == Stage::Write {
+            self.stage = Stage::Running;
+        }
+    }
+
+    /// The write is on the line.
+    pub(super) fn written(&mut self) {
+        self.in_doubt = true;
+    }
+
+    /// No answer to be believed came: what the drive has is asked before anything is written again.
+    pub(super) fn begin_again(&mut self) {
+        if self.stage != Stage::Release {
+            self.stage = self.first();
+        }
+    }
+
+    /// Whether a write was sent whose effect is not known.
+    pub(super) fn is_in_doubt(&self) -> bool {
+        self.in_doubt
+    }
+
+    /// What was overridden is the drive's own again, or stays overridden.
+    pub(super) fn released(&mut self) {
+        self.stage = Stage::ReadBack;
+    }
+
+    /// The drive answered the present step; `unanswered` is the outcome of a write of which nothing is known.
+    pub(super) fn answered(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
+        match (self.stage, reply) {
+            (Stage::Release, _) => {
+                self.released();
+                Then::Go
+            }
+            (Stage::Write, Reply::Exception(code)) => {
+                self.in_doubt = false;
+                Then::Over(Outcome::Exception(*code))
+            }
+            (_, Reply::Exception(_)) if self.in_doubt => Then::Over(unanswered.clone()),
+            (_, Reply::Exception(code)) => Then::Over(Outcome::Exception(*code)),
+            (Stage::Write, _) if self.order.from.is_none() => Then::Over(Outcome::Acknowledged(Reply::Written)),
+            (Stage::Write, _) if self.releases => self.go(Stage::Release),
+            (Stage::Write, _) => self.go(Stage::ReadBack),
+            (Stage::Running, reply) => self.heard_running(reply, unanswered),
+            (Stage::Value, reply) => self.heard_value(reply),
+            (Stage::ReadBack, reply) => self.heard_back(reply),
+        }
+    }
+
+    fn go(&mut self, stage: Stage) -> Then {
+        self.stage = stage;
+        Then::Go
+    }
+
+    fn heard_running(&mut self, reply: &Reply, unanswered: &Outcome) -> Then {
+        let words = reply.words().unwrap_or_default();
+        // A reply that does not say so is no motor that stands.
+        let stands = self
+            .running
+            .decode(&words, self.kind)
+            .is_some_and(|runs| !runs.as_bool());
+        if stands {
+            return self.go(Stage::Write);
+        }
+        Then::Over(match self.in_doubt && self.order.from.is_none() {
+            true => unanswered.clone(),
+            false => Outcome::Refused(Refusal::MotorRuns(
+                "the motor runs, and parameters are written only while it stands; nothing was written".to_string(),
+            )),
+        })
+    }
+
+    fn value(&self, reply: &Reply) -> Option<RawValue> {
+        RawValue::of_words(&reply.words().unwrap_or_default())
+    }
+
+    fn heard_value(&mut self, reply: &Reply) -> Then {
+        let value = self.value(reply);
+        if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
+            // Whoever asks sees by the reply that nothing was written.
+            let reply = if self.in_doubt { Reply::Written } else { reply.clone() };
+            return Then::Over(Outcome::Acknowledged(reply));
+        }
+        let before = self.order.from;
+        if value.zip(before).is_some_and(|(value, from)| from.is_shown_by(value)) {
+            // A write of before, if there was one, was not taken.
+            self.in_doubt = false;
+            return self.go(Stage::Running);
+        }
+        let shown = shown(value);
+        Then::Over(match self.in_doubt {
+            true => Outcome::NotTaken(shown),
+            false => Outcome::Refused(Refusal::OtherValue(format!(
+                "{shown}, neither what it had when the restore began ({}) nor what is restored ({}): somebody changed it; nothing \
+                 was written",
+                before.map_or(f64::NAN, RawValue::number),
+                self.order.to.number()
+            ))),
+        })
+    }
+
+    fn heard_back(&mut self, reply: &Reply) -> Then {
+        let value = self.value(reply);
+        if value.is_some_and(|value| self.order.to.is_shown_by(value)) {
+            return Then::Over(Outcome::Acknowledged(Reply::Written));
+        }
+        self.looks += 1;
+        if self.looks < LOOKS {
+            return Then::Pause;
+        }
+        Then::Over(Outcome::NotTaken(shown(value)))
+    }
+}
+
+fn shown(value: Option<RawValue>) -> String {
+    match value {
+        Some(value) => format!("it shows {}", value.number()),
+        None => "what it shows is no value".to_string(),
+    }
+}

@@ -1,0 +1,203 @@
+//! `drivegate params restore` and `clone`: what would be written, then that written.
+
+use std::io::{BufRead as _, IsTerminal as _, Write as _};
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+
+use super::super::drive_access::target;
+use super::super::{EXIT_FAILED, EXIT_USAGE, report};
+use super::{StatusLine, failed, read_file, read_from_drive};
+use crate::north::local::protocol::{RestoreAct, RestoreOutcome, Stage};
+use crate::parameters::{Entry, Id, ParameterFile};
+
+#[derive(Debug, clap::Args)]
+pub(super) struct RestoreArgs {
+    /// File that `params read` wrote.
+    #[arg(required_unless_present_any = ["resume", "undo", "release", "look"])]
+    file: Option<PathBuf>,
+    /// Name of the drive to which it is restored.
+    #[arg(required_unless_present_any = ["resume", "undo", "release", "look"])]
+    drive: Option<String>,
+    #[command(flatten)]
+    how: How,
+    /// Writes the rest of a restore that was cut off.
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run"])]
+    resume: Option<String>,
+    /// Writes the former values of a restore that was cut off.
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume"])]
+    undo: Option<String>,
+    /// Leaves the drive as a restore that was cut off left it, and lets it take all orders again. One that goes on ends before its
+    /// next parameter.
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume", "undo"])]
+    release: Option<String>,
+    /// Shows how far a restore is, until it is over.
+    #[arg(long, value_name = "DRIVE", conflicts_with_all = ["file", "drive", "only", "force", "yes", "dry_run", "resume", "undo", "release"])]
+    look: Option<String>,
+}
+
+#[derive(Debug, clap::Args)]
+pub(super) struct How {
+    /// This parameter alone; may be given several times, and names also those that are never restored otherwise.
+    #[arg(long, value_name = "ID")]
+    only: Vec<String>,
+    /// Restores to a drive that differs; what is risked is named.
+    #[arg(long)]
+    force: bool,
+    /// Writes without asking.
+    #[arg(long)]
+    yes: bool,
+    /// Shows what would be written, and writes nothing.
+    #[arg(long, conflicts_with = "yes")]
+    dry_run: bool,
+}
+
+pub(super) fn restore(config: &Path, args: &RestoreArgs) -> Result<ExitCode, ExitCode> {
+    let again = [
+        (&args.resume, RestoreAct::Resume),
+        (&args.undo, RestoreAct::Undo),
+        (&args.release, RestoreAct::Release),
+        (&args.look, RestoreAct::Look),
+    ];
+    for (drive, act) in again {
+        if let Some(drive) = drive {
+            return carry(config, drive, act, &args.how);
+        }
+    }
+    // clap has made sure of both.
+    let (Some(file), Some(drive)) = (&args.file, &args.drive) else {
+        return Err(ExitCode::from(EXIT_USAGE));
+    };
+    let file = read_file(file).map_err(|why| failed(&format!("{why}; name a file that `params read` wrote")))?;
+    write(config, &file, drive, &args.how)
+}
+
+/// Reads one drive and restores that to another.
+pub(super) fn clone(config: &Path, from: &str, to: &str, how: &How) -> Result<ExitCode, ExitCode> {
+    if from == to {
+        report::error("a drive is not cloned to itself; command line; name two drives");
+        return Err(ExitCode::from(EXIT_USAGE));
+    }
+    let (file, _) = read_from_drive(config, from, false, true)?;
+    write(config, &file, to, how)
+}
+
+fn write(config: &Path, file: &ParameterFile, drive: &str, how: &How) -> Result<ExitCode, ExitCode> {
+    let act = RestoreAct::Prepare {
+        file: without_notes(file).text(),
+        only: how.only.clone(),
+        force: how.force,
+    };
+    carry(config, drive, act, how)
+}
+
+/// The file without what is for people, which the gateway has itself.
+fn without_notes(file: &ParameterFile) -> ParameterFile {
+    let bare = |(id, entry): (&Id, &Entry)| {
+        let value = entry.value.clone().map_err(|_| String::new());
+        let note = String::new();
+        (id.clone(), Entry { value, note })
+    };
+    ParameterFile {
+        values: file.values.iter().map(bare).collect(),
+        ..file.clone()
+    }
+}
+
+fn carry(config: &Path, drive: &str, act: RestoreAct, how: &How) -> Result<ExitCode, ExitCode> {
+    let target = target(config, drive)?;
+    let line = std::cell::RefCell::new(StatusLine::default());
+    let mut refused_to_write = None;
+    let shown = std::cell::Cell::new(false);
+    let agreed = |prepared: &RestoreOutcome| {
+        line.borrow().end();
+        report::print(&told(prepared));
+        shown.set(true);
+        match agrees(drive, how) {
+            Ok(()) => true,
+            Err(code) => {
+                refused_to_write = Some(code);
+                false
+            }
+        }
+    };
+    let progress = |status: &RestoreOutcome| {
+        let what = match status.stage {
+            Stage::Reading => "addresses read",
+            _ => "parameters written",
+        };
+        let waits = status
+            .waits
+            .as_ref()
+            .map(|why| format!(", waits: {why}"))
+            .unwrap_or_default();
+        line.borrow_mut()
+            .show(&format!("{} of {} {what}{waits}", status.done, status.total));
+    };
+    let ended = target.restore_parameters(act, agreed, progress);
+    line.borrow().end();
+    if let Some(code) = refused_to_write {
+        return Ok(code);
+    }
+    let ended = ended.map_err(|why| failed(&why))?;
+    let text = ended.text.clone().unwrap_or_default();
+    match ended.stage {
+        Stage::Done => {
+            if !shown.get() {
+                report::print(&told(&ended));
+            }
+            report::note(&text);
+            Ok(ExitCode::SUCCESS)
+        }
+        Stage::Refused => {
+            for reason in &ended.reasons {
+                report::error(reason);
+            }
+            Err(ExitCode::from(EXIT_FAILED))
+        }
+        Stage::Prepared => {
+            report::note(&format!("a restore to `{drive}` is prepared, and nothing was written"));
+            Ok(ExitCode::SUCCESS)
+        }
+        _ => Err(failed(&text)),
+    }
+}
+
+/// What would be written.
+fn told(prepared: &RestoreOutcome) -> String {
+    let plan = prepared.plan.clone().unwrap_or_default();
+    let risks = prepared
+        .risks
+        .iter()
+        .map(|risk| format!("forced, at your risk: {risk}\n"));
+    plan + &risks.collect::<String>()
+}
+
+/// Whether what is prepared is to be written.
+///
+/// # Errors
+/// The exit code where it is not.
+fn agrees(drive: &str, how: &How) -> Result<(), ExitCode> {
+    if how.dry_run {
+        return Err(ExitCode::SUCCESS);
+    }
+    if how.yes {
+        return Ok(());
+    }
+    let (stdin, mut stderr) = (std::io::stdin(), std::io::stderr());
+    if !stdin.is_terminal() || !stderr.is_terminal() {
+        return Err(failed(
+            "nothing was written: there is no terminal on which to ask; command line; add --yes to write that, or --dry-run",
+        ));
+    }
+    // A terminal that is gone gives no answer.
+    let _ = write!(stderr, "Write that to {drive}? [y/N] ");
+    let mut answer = String::new();
+    let _ = stdin.lock().read_line(&mut answer);
+    match answer.trim() {
+        "y" | "Y" | "yes" => Ok(()),
+        _ => {
+            report::note("nothing was written");
+            Err(ExitCode::from(EXIT_FAILED))
+        }
+    }
+}

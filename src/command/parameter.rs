@@ -1,0 +1,54 @@
+//! The order that sets one parameter.
+
+use crate::codec::{RequestPdu, Table};
+use crate::drive::parameters::RawValue;
+
+/// One parameter to set. The bus asks the drive for its value and whether its motor runs, writes, and reads the value back; nothing else
+/// goes on the line between the answer that the motor stands and the write. A drive that has the value already is not written,
+/// since what it keeps wears its memory: the reply is then that of the read.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ParameterOrder {
+    /// What the family calls it.
+    pub id: String,
+    /// PDU address of its (first) holding register.
+    pub address: u16,
+    /// What the drive must have before, unless it has `to`; none of a register that cannot be read, which is written once and not
+    /// read back.
+    pub from: Option<RawValue>,
+    /// What is written.
+    pub to: RawValue,
+}
+
+impl ParameterOrder {
+    /// The read of its value.
+    pub fn read(&self) -> RequestPdu {
+        RequestPdu::Read {
+            table: Table::Holding,
+            start: self.address,
+            count: if matches!(self.to, RawValue::Float(_)) { 2 } else { 1 },
+        }
+    }
+
+    /// The write.
+    pub fn write(&self) -> RequestPdu {
+        match self.to {
+            RawValue::Word(value) => RequestPdu::WriteRegister {
+                address: self.address,
+                value,
+            },
+            RawValue::Float(_) => RequestPdu::WriteRegisters {
+                start: self.address,
+                values: self.to.words(),
+            },
+        }
+    }
+
+    /// In one line, for the audit.
+    pub fn what(&self) -> String {
+        let (id, to) = (&self.id, self.to.number());
+        match self.from {
+            Some(from) => format!("parameter {id}: {} -> {to}", from.number()),
+            None => format!("{id}: {to}"),
+        }
+    }
+}

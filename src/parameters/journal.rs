@@ -1,0 +1,442 @@
+//! The journal of a restore: the former values, the new ones and how far it is, on disk before the first parameter is
+//! written, so that a restore that was cut off can be resumed or taken back.
+//!
+//! ```text
+//! # drivegate restore 1
+//! drive: pump-1
+//! family: vacon-nx
+//! begun: 2026-03-02T07:40:12Z
+//! by: local_socket uid 0
+//! phase: writing
+//! done: 1
+//! saved: no
+//! save: none
+//! need: none
+//!
+//! 101 5000 10000 kept 102 # 102 Maximum frequency: 50.00 Hz → 100.00 Hz
+//! checksum: 5e884898da28047151d0e56f8dc62927
+//! ```
+//!
+//! A row is the PDU address, the former value, the new one, whether the drive keeps it without power, and the name of the parameter.
+
+use std::fmt::Write as _;
+use std::fs::{self, File};
+use std::io::{self, Read as _};
+use std::path::{Path, PathBuf};
+
+use ring::digest::{SHA256, digest};
+
+use super::file::{self, CHECKSUM, Id, MOST_BYTES};
+use super::plan::{Handling, Need, ParameterWrite, Plan};
+use crate::drive::Profile;
+use crate::files;
+
+/// The first line.
+const HEAD: &str = "# drivegate restore 1";
+/// Name of the file, in the directory of the drive's readings.
+const NAME: &str = "restore.journal";
+/// Name of one that was set aside.
+const RELEASED: &str = "restore.released";
+
+/// What a restore is doing.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Phase {
+    /// It writes the new values.
+    Writing,
+    /// All are written; the drive is told to keep them.
+    Saving,
+    /// It writes the former values.
+    TakingBack,
+    /// All former values are written; the drive is told to keep them.
+    SavingBack,
+}
+
+impl Phase {
+    const ALL: [(Phase, &'static str); 4] = [
+        (Phase::Writing, "writing"),
+        (Phase::Saving, "saving"),
+        (Phase::TakingBack, "taking back"),
+        (Phase::SavingBack, "saving the former values"),
+    ];
+
+    /// In words.
+    pub fn name(self) -> &'static str {
+        Phase::ALL
+            .iter()
+            .find(|(phase, _)| *phase == self)
+            .map_or("", |(_, name)| name)
+    }
+}
+
+/// The journal of a restore.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Journal {
+    /// Name of the drive.
+    pub drive: String,
+    /// Name of its profile.
+    pub family: String,
+    /// When the restore began, RFC 3339.
+    pub begun: String,
+    /// Who began it.
+    pub by: String,
+    /// What it is doing.
+    pub phase: Phase,
+    /// Parameters of this phase that were done when the journal was written; perhaps more were.
+    pub done: usize,
+    /// The drive may have been told to keep values of this restore.
+    pub saved: bool,
+    /// What is written in the first phase.
+    pub plan: Plan,
+}
+
+impl Journal {
+    /// The file. `profile` names the point that must hold.
+    pub fn text(&self, profile: &Profile) -> String {
+        let yes = |is: bool| if is { "yes" } else { "no" };
+        let handling = &self.plan.handling;
+        let save = handling.save.map(|(address, value)| format!("{address} {value}"));
+        let need = handling.needs.as_ref().map(|need| {
+            let point = profile.points.get(need.point).map_or("?", |point| point.name.as_str());
+            let code = need.exception.map_or("-".to_string(), |code| code.to_string());
+            format!("{point} {} {code} {}", yes(need.value), file::one_line(&need.remedy))
+        });
+        let none = || "none".to_string();
+        let mut text = format!(
+            "{HEAD}\ndrive: {}\nfamily: {}\nbegun: {}\nby: {}\nphase: {}\ndone: {}\nsaved: {}\nsave: {}\nneed: {}\n\n",
+            self.drive,
+            self.family,
+            self.begun,
+            file::one_line(&self.by),
+            self.phase.name(),
+            self.done,
+            yes(self.saved),
+            save.unwrap_or_else(none),
+            need.unwrap_or_else(none),
+        );
+        for write in &self.plan.writes {
+            let (from, to) = (file::text_of(write.from), file::text_of(write.to));
+            let kept = if write.volatile { "volatile" } else { "kept" };
+            let (address, id, line) = (write.address, &write.id, file::one_line(&write.line));
+            // Writing to a string does not fail.
+            let _ = writeln!(text, "{address} {from} {to} {kept} {id} # {line}");
+        }
+        let checksum = checksum(&text);
+        let _ = writeln!(text, "checksum: {checksum}");
+        text
+    }
+
+    /// Reads a journal of a drive of that family.
+    ///
+    /// # Errors
+    /// What is wrong.
+    pub fn parse(text: &str, profile: &Profile) -> Result<Journal, String> {
+        let body = text.trim_end_matches('\n');
+        let (body, sum) = body.rsplit_once('\n').ok_or("it is empty, or its end is missing")?;
+        let body = format!("{body}\n");
+        if !body.starts_with(&format!("{HEAD}\n")) {
+            return Err(format!("its first line is not `{HEAD}`"));
+        }
+        if sum.strip_prefix("checksum: ") != Some(checksum(&body).as_str()) {
+            return Err("it does not fit its checksum: it is damaged, or was edited".to_string());
+        }
+        let mut lines = body.lines().skip(1);
+        let mut header = |key: &str| {
+            let line = lines.next().unwrap_or_default();
+            let value = line.strip_prefix(key).and_then(|rest| rest.strip_prefix(": "));
+            value
+                .map(str::to_string)
+                .ok_or_else(|| format!("expected `{key}: …`, there is `{line}`"))
+        };
+        let (drive, family, begun, by) = (header("drive")?, header("family")?, header("begun")?, header("by")?);
+        if family != profile.name {
+            return Err(format!(
+                "it is of a drive of family {family}, and the drive is configured as {}",
+                profile.name
+            ));
+        }
+        let phase = header("phase")?;
+        let phase = Phase::ALL
+            .iter()
+            .find(|(_, name)| *name == phase)
+            .map(|(phase, _)| *phase);
+        let phase = phase.ok_or("its phase is not known")?;
+        let done = header("done")?.parse().map_err(|_| "`done` is not a number")?;
+        let saved = yes_or_no(&header("saved")?)?;
+        let save = match header("save")?.as_str() {
+            "none" => None,
+            text => Some(pair(text).ok_or("`save` is not an address and a value")?),
+        };
+        let needs = match header("need")?.as_str() {
+            "none" => None,
+            text => Some(need(text, profile)?),
+        };
+        let rows = lines.filter(|line| !line.is_empty());
+        let writes: Result<Vec<ParameterWrite>, String> = rows
+            .map(|line| row(line).ok_or_else(|| format!("`{line}` is not a parameter with its values")))
+            .collect();
+        Ok(Journal {
+            drive,
+            family,
+            begun,
+            by,
+            phase,
+            done,
+            saved,
+            plan: Plan {
+                writes: writes?,
+                handling: Handling { needs, save },
+                ..Plan::default()
+            },
+        })
+    }
+}
+
+fn yes_or_no(text: &str) -> Result<bool, String> {
+    match text {
+        "yes" => Ok(true),
+        "no" => Ok(false),
+        other => Err(format!("`{other}` is neither yes nor no")),
+    }
+}
+
+fn pair(text: &str) -> Option<(u16, u16)> {
+    let (address, value) = text.split_once(' ')?;
+    Some((address.parse().ok()?, value.parse().ok()?))
+}
+
+fn need(text: &str, profile: &Profile) -> Result<Need, String> {
+    let mut parts = text.splitn(4, ' ');
+    let mut part = || parts.next().unwrap_or_default();
+    let (name, value, code, remedy) = (part(), part(), part(), part());
+    let point = profile
+        .point_index(name)
+        .ok_or_else(|| format!("profile `{}` has no point `{name}`", profile.name))?;
+    let exception = match code {
+        "-" => None,
+        code => Some(code.parse().map_err(|_| format!("`{code}` is no exception code"))?),
+    };
+    Ok(Need {
+        point,
+        value: yes_or_no(value)?,
+        exception,
+        remedy: remedy.to_string(),
+    })
+}
+
+fn row(line: &str) -> Option<ParameterWrite> {
+    let (row, note) = line.split_once(" # ")?;
+    let mut parts = row.splitn(5, ' ');
+    let address = parts.next()?.parse().ok()?;
+    let (from, to) = (file::value_of(parts.next()?)?, file::value_of(parts.next()?)?);
+    let volatile = match parts.next()? {
+        "volatile" => true,
+        "kept" => false,
+        _ => return None,
+    };
+    Some(ParameterWrite {
+        id: Id::new(parts.next()?),
+        address,
+        from,
+        to,
+        line: note.to_string(),
+        volatile,
+    })
+}
+
+fn checksum(text: &str) -> String {
+    file::hex(digest(&SHA256, text.as_bytes()).as_ref(), CHECKSUM)
+}
+
+/// Where the journal of one drive is kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct JournalFile {
+    dir: PathBuf,
+}
+
+impl JournalFile {
+    /// Below that directory of readings.
+    pub fn new(params: &Path, drive: &str) -> JournalFile {
+        JournalFile {
+            dir: params.join(drive),
+        }
+    }
+
+    /// Its path.
+    pub fn path(&self) -> PathBuf {
+        self.dir.join(NAME)
+    }
+
+    /// Puts a journal on disk: when this returns it is there after a power failure too, and one that was there before is either
+    /// whole or replaced.
+    ///
+    /// # Errors
+    /// It is not certain to be there.
+    pub fn write(&self, text: &str) -> io::Result<()> {
+        files::replace(&self.path(), text.as_bytes())?;
+        // The entry of the file, and those of directories that may be new.
+        self.dir.ancestors().take(3).try_for_each(sync)
+    }
+
+    /// The journal, if there is one.
+    ///
+    /// # Errors
+    /// Whether there is one is not known, or it cannot be read.
+    pub fn read(&self) -> io::Result<Option<String>> {
+        let mut bytes = Vec::new();
+        match File::open(self.path()) {
+            Ok(file) => file.take(MOST_BYTES).read_to_end(&mut bytes)?,
+            Err(error) if is_absent(&error) => return Ok(None),
+            Err(error) => return Err(error),
+        };
+        Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
+    }
+
+    /// The restore is over: there is no journal any more.
+    ///
+    /// # Errors
+    /// It may still be there.
+    pub fn remove(&self) -> io::Result<()> {
+        match fs::remove_file(self.path()) {
+            Err(error) if is_absent(&error) => Ok(()),
+            Err(error) => Err(error),
+            Ok(()) => sync(&self.dir),
+        }
+    }
+
+    /// Sets the journal aside, with the former values in it; where.
+    ///
+    /// # Errors
+    /// It is still where it was.
+    pub fn release(&self) -> io::Result<PathBuf> {
+        let aside = self.dir.join(RELEASED);
+        fs::rename(self.path(), &aside)?;
+        sync(&self.dir)?;
+        Ok(aside)
+    }
+}
+
+fn sync(dir: &Path) -> io::Result<()> {
+    // A relative path of one part has the working directory above it.
+    let dir = if dir.as_os_str().is_empty() {
+        Path::new(".")
+    } else {
+        dir
+    };
+    File::open(dir)?.sync_all()
+}
+
+fn is_absent(error: &io::Error) -> bool {
+    matches!(error.kind(), io::ErrorKind::NotFound | io::ErrorKind::NotADirectory)
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::drive::parameters::RawValue;
+    use crate::drive::profile::Profiles;
+
+    pub(crate) fn profile() -> std::sync::Arc<Profile> {
+        Profiles::built_in().get("vacon-nx").unwrap().clone()
+    }
+
+    pub(crate) fn write(id: u16, from: u16, to: u16) -> ParameterWrite {
+        ParameterWrite {
+            id: Id::new(&id.to_string()),
+            address: id - 1,
+            from: RawValue::Word(from),
+            to: RawValue::Word(to),
+            line: format!("{id}: {from} → {to}"),
+            volatile: id.is_multiple_of(2),
+        }
+    }
+
+    pub(crate) fn journal(writes: Vec<ParameterWrite>) -> Journal {
+        Journal {
+            drive: "pump-1".to_string(),
+            family: "vacon-nx".to_string(),
+            begun: "2026-03-02T07:40:12Z".to_string(),
+            by: "local_socket uid 0".to_string(),
+            phase: Phase::Writing,
+            done: 0,
+            saved: false,
+            plan: Plan {
+                writes,
+                ..Plan::default()
+            },
+        }
+    }
+
+    #[test]
+    fn damage_and_other_families_are_told() {
+        let profile = profile();
+        let mut journal = journal(vec![write(102, 5000, 10_000)]);
+        journal.plan.handling = Handling {
+            needs: Some(Need {
+                point: 0,
+                value: false,
+                exception: Some(0x22),
+                remedy: "switch the operator to PRGM".to_string(),
+            }),
+            save: Some((0x0900, 0)),
+        };
+        let text = journal.text(&profile);
+        assert_eq!(Journal::parse(&text, &profile), Ok(journal.clone()));
+        let why = |text: &str| Journal::parse(text, &profile).unwrap_err();
+        assert!(why(&text.replace("5000", "5001")).contains("checksum"));
+        assert!(why("").contains("empty"));
+        journal.family = "vacon-cx".to_string();
+        assert!(why(&journal.text(&profile)).contains("family vacon-cx"));
+    }
+
+    #[test]
+    fn it_is_there_until_it_is_removed_or_set_aside() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = JournalFile::new(&folder.path().join("state/params"), "pump-1");
+        assert_eq!(file.read().unwrap(), None);
+        file.write("one").unwrap();
+        file.write("two").unwrap();
+        assert_eq!(file.read().unwrap().as_deref(), Some("two"));
+        file.remove().unwrap();
+        file.remove().unwrap();
+        assert_eq!(file.read().unwrap(), None);
+        file.write("three").unwrap();
+        let aside = file.release().unwrap();
+        assert_eq!(
+            (file.read().unwrap(), fs::read(aside).unwrap()),
+            (None, b"three".to_vec())
+        );
+        fs::write(folder.path().join("state/params/file"), "").unwrap();
+        let below_a_file = JournalFile::new(&folder.path().join("state/params/file"), "x");
+        assert_eq!(below_a_file.read().unwrap(), None);
+        assert!(below_a_file.write("x").is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn nothing_is_lost_and_no_cut_is_taken_for_a_whole(
+            rows in proptest::collection::vec((2u16..2000, any::<u16>(), any::<u16>()), 0..40),
+            done in 0usize..50,
+            cut in any::<proptest::sample::Index>(),
+        ) {
+            let profile = profile();
+            let mut journal = journal(rows.into_iter().map(|(id, from, to)| write(id, from, to)).collect());
+            journal.done = done;
+            let text = journal.text(&profile);
+            prop_assert_eq!(Journal::parse(&text, &profile), Ok(journal));
+            let cut = cut.index(text.len() - 1);
+            if let Some(part) = text.get(..cut) {
+                prop_assert!(Journal::parse(part, &profile).is_err());
+            }
+        }
+
+        #[test]
+        fn no_text_is_too_odd(text in "\\PC*") {
+            let profile = profile();
+            let _ = Journal::parse(&text, &profile);
+            let body = format!("{HEAD}\n{text}\n");
+            let _ = Journal::parse(&format!("{body}checksum: {}\n", checksum(&body)), &profile);
+        }
+    }
+}

@@ -1,0 +1,476 @@
+//! A restore that goes on: what is done next, and what an answer means. Pure: time is an argument, what is on disk and on the
+//! line is done by whoever asks.
+//!
+//! Every parameter is an order of its own, which the bus carries out only when the drive has the former value or the new
+//! one, and only while its motor stands; a drive that has the new value is not written. So a restore that was cut off anywhere is resumed or taken back by going
+//! through all of its parameters again, whatever had reached the drive.
+
+use std::time::{Duration, Instant};
+
+use super::journal::{Journal, Phase};
+use super::plan::ParameterWrite;
+use crate::codec::{Exception, Reply};
+use crate::command::{Outcome, ParameterOrder, Refusal};
+use crate::drive::parameters::RawValue;
+
+/// A restore that cannot go on for that long ends.
+const MOST_WAIT: Duration = Duration::from_secs(3600);
+/// Pause before a busy drive is asked again.
+const BUSY_PAUSE: Duration = Duration::from_millis(200);
+/// Pause before the next try where somebody has to do something: the motor runs, the drive is away.
+const PAUSE: Duration = Duration::from_secs(1);
+/// How often the journal is told how far the restore is.
+const NOTED: Duration = Duration::from_secs(1);
+/// Saves of one restore, at most: a drive that loses what was written before it was saved is written and saved anew.
+const MOST_SAVES: u32 = 3;
+
+/// What is done next.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Wanted {
+    /// The journal as it is now must be on disk before anything else.
+    Record,
+    /// This order is given to the bus.
+    Set(ParameterOrder),
+    /// The journal is removed.
+    Remove,
+    /// Nothing: it is over.
+    Nothing,
+}
+
+/// What comes after an answer.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Then {
+    /// What is wanted next.
+    Go,
+    /// The same again after that time, for the reason given.
+    Pause(Duration, String),
+}
+
+/// How a restore ended.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum End {
+    /// The drive has all new values.
+    Done,
+    /// The drive has all former values.
+    TakenBack,
+    /// It was given up before anything was written: why.
+    NothingWritten(String),
+    /// It was given up with the drive half restored, perhaps, and the journal left: why.
+    Unfinished(String),
+}
+
+#[derive(Debug, Clone, PartialEq)]
+enum State {
+    /// The journal must be written, before the parameter at that place has its turn.
+    Recording(usize),
+    /// The parameter at that place has its turn; behind the last one the save.
+    Setting(usize),
+    /// It is over, but for the journal.
+    Removing(End),
+    Over(End),
+}
+
+/// A restore that goes on.
+#[derive(Debug)]
+pub struct Restoration {
+    journal: Journal,
+    /// The writes of the present direction, in their order.
+    writes: Vec<ParameterWrite>,
+    state: State,
+    /// Something may have been written.
+    touched: bool,
+    /// Something was written that is not saved.
+    wrote: bool,
+    saves: u32,
+    /// Since when it cannot go on.
+    waits_since: Option<Instant>,
+    noted: Instant,
+}
+
+impl Restoration {
+    /// One that begins.
+    pub fn begin(journal: Journal, now: Instant) -> Restoration {
+        Restoration::of(journal, false, now)
+    }
+
+    /// One that was cut off goes on.
+    pub fn resume(mut journal: Journal, now: Instant) -> Restoration {
+        journal.phase = Phase::Writing;
+        Restoration::of(journal, true, now)
+    }
+
+    /// One that was cut off is taken back.
+    pub fn undo(mut journal: Journal, now: Instant) -> Restoration {
+        journal.phase = Phase::TakingBack;
+        Restoration::of(journal, true, now)
+    }
+
+    fn of(mut journal: Journal, touched: bool, now: Instant) -> Restoration {
+        journal.done = 0;
+        let writes = match journal.phase {
+            Phase::Writing | Phase::Saving => journal.plan.writes.clone(),
+            Phase::TakingBack | Phase::SavingBack => journal.plan.back(journal.plan.writes.len()).writes,
+        };
+        Restoration {
+            journal,
+            writes,
+            state: State::Recording(0),
+            touched,
+            wrote: true,
+            saves: 0,
+            waits_since: None,
+            noted: now,
+        }
+    }
+
+    /// What is done next.
+    pub fn wanted(&self) -> Wanted {
+        match &self.state {
+            State::Recording(_) => Wanted::Record,
+            State::Setting(place) => match self.writes.get(*place) {
+                Some(write) => Wanted::Set(ParameterOrder {
+                    id: write.id.name().to_string(),
+                    address: write.address,
+                    from: Some(write.from),
+                    to: write.to,
+                }),
+                None => match self.journal.plan.handling.save {
+                    Some((address, value)) => Wanted::Set(ParameterOrder {
+                        id: "save".to_string(),
+                        address,
+                        from: None,
+                        to: RawValue::Word(value),
+                    }),
+                    None => Wanted::Nothing,
+                },
+            },
+            State::Removing(_) => Wanted::Remove,
+            State::Over(_) => Wanted::Nothing,
+        }
+    }
+
+    /// The journal as it must be on disk.
+    pub fn journal(&self) -> &Journal {
+        &self.journal
+    }
+
+    /// Parameters that are done, and all.
+    pub fn progress(&self) -> (usize, usize) {
+        (self.journal.done, self.writes.len())
+    }
+
+    /// How it ended, once it is over.
+    pub fn end(&self) -> Option<&End> {
+        match &self.state {
+            State::Over(end) => Some(end),
+            _ => None,
+        }
+    }
+
+    /// The journal is on disk, or could not be written: then nothing more is written to the drive.
+    pub fn recorded(&mut self, result: Result<(), String>, now: Instant) {
+        self.noted = now;
+        match result {
+            Ok(()) => match self.state {
+                State::Recording(place) if place < self.writes.len() || self.saves() => {
+                    self.state = State::Setting(place)
+                }
+                _ => self.finish(),
+            },
+            Err(why) => self.give_up(format!("the journal cannot be written: {why}")),
+        }
+    }
+
+    /// The journal is removed, or could not be.
+    pub fn removed(&mut self, result: Result<(), String>) {
+        if let State::Removing(end) = &self.state {
+            self.state = State::Over(match result {
+                Ok(()) => end.clone(),
+                Err(why) => End::Unfinished(format!("all is written, but the journal cannot be removed: {why}")),
+            });
+        }
+    }
+
+    /// The order that [`Restoration::wanted`] gave ended so.
+    pub fn answered(&mut self, outcome: &Outcome, now: Instant) -> Then {
+        let clean = matches!(outcome, Outcome::Refused(_) | Outcome::Exception(_));
+        let not_sent = matches!(
+            outcome,
+            Outcome::Offline | Outcome::BusDown | Outcome::QueueFull | Outcome::Expired | Outcome::Purged
+        );
+        if !clean && !not_sent {
+            self.touched = true;
+        }
+        match outcome {
+            Outcome::Acknowledged(reply) => {
+                self.waits_since = None;
+                self.advance(*reply == Reply::Written, now)
+            }
+            Outcome::NotTaken(_) => self.stop(outcome.to_string()),
+            Outcome::Refused(Refusal::MotorRuns(_)) => self.wait_for_people(
+                "the motor runs; stop it".to_string(),
+                "the motor runs, and parameters are written only while it stands",
+                now,
+            ),
+            Outcome::Exception(code) => self.refused(*code, now),
+            Outcome::Refused(refusal) => self.stop(refusal.to_string()),
+            Outcome::TimedOut | Outcome::Garbled => self.pause(PAUSE, "the drive does not answer to be believed", now),
+            Outcome::Interrupted(_) | Outcome::Purged | Outcome::Replaced | Outcome::Withdrawn => {
+                self.pause(BUSY_PAUSE, "something else went first", now)
+            }
+            Outcome::Expired | Outcome::QueueFull => self.pause(PAUSE, "the line is busy", now),
+            Outcome::Offline => self.pause(PAUSE, "the drive does not answer", now),
+            Outcome::BusDown => self.pause(PAUSE, "the bus is down", now),
+            Outcome::ShuttingDown => self.pause(PAUSE, "the gateway stops, or the bus starts anew", now),
+        }
+    }
+
+    /// It cannot go on: somebody stops it from outside.
+    pub fn give_up(&mut self, why: String) {
+        self.state = match self.touched {
+            true => State::Over(End::Unfinished(why)),
+            false => State::Removing(End::NothingWritten(why)),
+        };
+    }
+
+    /// The present order is done; `written` unless the drive had the value already.
+    fn advance(&mut self, written: bool, now: Instant) -> Then {
+        let State::Setting(place) = self.state else {
+            return Then::Go;
+        };
+        let Some(write) = self.writes.get(place) else {
+            return self.saved();
+        };
+        self.wrote |= written && !write.volatile;
+        let next = place + 1;
+        self.journal.done = self.journal.done.max(next);
+        if next < self.writes.len() {
+            let is_noted = self.saves > 0 || now.saturating_duration_since(self.noted) < NOTED;
+            self.state = if is_noted {
+                State::Setting(next)
+            } else {
+                State::Recording(next)
+            };
+            return Then::Go;
+        }
+        if !self.saves() || !self.wrote {
+            self.finish();
+            return Then::Go;
+        }
+        if self.saves == MOST_SAVES {
+            return self
+                .stop("the drive loses again and again what is written: is it switched off and on?".to_string());
+        }
+        self.journal.saved = true;
+        self.journal.phase = match self.journal.phase {
+            Phase::Writing | Phase::Saving => Phase::Saving,
+            Phase::TakingBack | Phase::SavingBack => Phase::SavingBack,
+        };
+        self.state = State::Recording(next);
+        Then::Go
+    }
+
+    /// The drive was told to keep the values. If it was without power before that, it lost some: all are looked at once more.
+    fn saved(&mut self) -> Then {
+        self.saves += 1;
+        self.wrote = false;
+        self.state = State::Setting(0);
+        if self.writes.is_empty() {
+            self.finish();
+        }
+        Then::Go
+    }
+
+    /// Whether the drive is told to keep the values. Taking back what it was not told to keep needs no save: it wears its memory.
+    fn saves(&self) -> bool {
+        let leaves_out = self.journal.phase == Phase::TakingBack && !self.journal.saved;
+        self.journal.plan.handling.save.is_some() && !leaves_out
+    }
+
+    fn finish(&mut self) {
+        self.state = State::Removing(match self.journal.phase {
+            Phase::Writing | Phase::Saving => End::Done,
+            Phase::TakingBack | Phase::SavingBack => End::TakenBack,
+        });
+    }
+
+    /// The drive refused it.
+    fn refused(&mut self, code: Exception, now: Instant) -> Then {
+        let need = self.journal.plan.handling.needs.clone();
+        match need.filter(|need| need.exception == Some(code.0)) {
+            _ if code == Exception::BUSY => self.pause(BUSY_PAUSE, "the drive is busy", now),
+            Some(need) => self.wait_for_people(
+                need.remedy.clone(),
+                &format!("the drive refused it with {code}: {}", need.remedy),
+                now,
+            ),
+            None => self.stop(format!("the drive refused it with {code}")),
+        }
+    }
+
+    /// What somebody at the drive can mend is waited for once something is written; before that there is no need to.
+    fn wait_for_people(&mut self, waits: String, why: &str, now: Instant) -> Then {
+        match self.touched {
+            true => self.pause(PAUSE, &waits, now),
+            false => self.stop(why.to_string()),
+        }
+    }
+
+    fn pause(&mut self, pause: Duration, why: &str, now: Instant) -> Then {
+        let since = *self.waits_since.get_or_insert(now);
+        if now.saturating_duration_since(since) > MOST_WAIT {
+            return self.stop(format!("{why}, for {} minutes", MOST_WAIT.as_secs() / 60));
+        }
+        Then::Pause(pause, why.to_string())
+    }
+
+    /// It ends at the present order.
+    fn stop(&mut self, why: String) -> Then {
+        let place = match &self.state {
+            State::Setting(place) => self.writes.get(*place).map(|write| write.line.clone()),
+            _ => None,
+        };
+        let what = place.unwrap_or_else(|| "saving the values".to_string());
+        self.give_up(format!("{what}: {why}"));
+        Then::Go
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::journal::tests::{journal, write};
+    use super::*;
+
+    const TAKEN: Outcome = Outcome::Acknowledged(Reply::Written);
+
+    fn begun(count: u16, save: bool, now: Instant) -> Restoration {
+        let mut journal = journal((0..count).map(|n| write(101 + n, n, n + 1)).collect());
+        journal.plan.handling.save = save.then_some((0x0900, 0));
+        Restoration::begin(journal, now)
+    }
+
+    /// What is wanted until it is over, of a drive that loses what is not saved when it is told to save for the first time, if
+    /// it `forgets`.
+    fn wanted_ids(restoration: &mut Restoration, mut forgets: bool, now: Instant) -> Vec<String> {
+        let (mut all, mut has) = (Vec::new(), std::collections::BTreeSet::new());
+        let seen = Outcome::Acknowledged(Reply::Registers(vec![0]));
+        loop {
+            match restoration.wanted() {
+                Wanted::Record => {
+                    all.push(format!("record {}", restoration.journal().phase.name()));
+                    restoration.recorded(Ok(()), now);
+                }
+                Wanted::Set(order) => {
+                    let new = order.from.is_none() || has.insert(order.address);
+                    if new {
+                        all.push(order.what());
+                    }
+                    if order.from.is_none() && std::mem::take(&mut forgets) {
+                        has.clear();
+                    }
+                    assert_eq!(restoration.answered(if new { &TAKEN } else { &seen }, now), Then::Go);
+                }
+                Wanted::Remove => {
+                    all.push("remove".to_string());
+                    restoration.removed(Ok(()));
+                }
+                Wanted::Nothing => return all,
+            }
+        }
+    }
+
+    #[test]
+    fn the_journal_comes_first_and_goes_last() {
+        let now = Instant::now();
+        let mut restoration = begun(2, true, now);
+        assert_eq!(
+            wanted_ids(&mut restoration, false, now),
+            [
+                "record writing",
+                "parameter 101: 0 -> 1",
+                "parameter 102: 1 -> 2",
+                "record saving",
+                "save: 0",
+                "remove"
+            ]
+        );
+        assert_eq!(restoration.end(), Some(&End::Done));
+        // What was told to be kept is told to be kept again when it is taken back; what was not, is not.
+        let mut saved = restoration.journal().clone();
+        let mut back = Restoration::undo(saved.clone(), now);
+        assert_eq!(
+            wanted_ids(&mut back, false, now),
+            [
+                "record taking back",
+                "parameter 102: 2 -> 1",
+                "parameter 101: 1 -> 0",
+                "record saving the former values",
+                "save: 0",
+                "remove"
+            ]
+        );
+        assert_eq!(back.end(), Some(&End::TakenBack));
+        saved.saved = false;
+        let mut back = Restoration::undo(saved, now);
+        assert!(!wanted_ids(&mut back, false, now).contains(&"save: 0".to_string()));
+    }
+
+    #[test]
+    fn what_a_drive_lost_before_it_was_saved_is_written_and_saved_anew() {
+        let now = Instant::now();
+        let mut restoration = begun(1, true, now);
+        assert_eq!(
+            wanted_ids(&mut restoration, true, now),
+            [
+                "record writing",
+                "parameter 101: 0 -> 1",
+                "record saving",
+                "save: 0",
+                "parameter 101: 0 -> 1",
+                "record saving",
+                "save: 0",
+                "remove"
+            ]
+        );
+    }
+
+    #[test]
+    fn without_a_journal_nothing_is_written() {
+        let now = Instant::now();
+        let mut restoration = begun(2, false, now);
+        restoration.recorded(Err("no space left".to_string()), now);
+        assert_eq!(restoration.wanted(), Wanted::Remove);
+        restoration.removed(Ok(()));
+        assert!(matches!(restoration.end(), Some(End::NothingWritten(why)) if why.contains("no space left")));
+    }
+
+    #[test]
+    fn it_ends_at_the_first_that_does_not_stick() {
+        let now = Instant::now();
+        let mut restoration = begun(3, false, now);
+        restoration.recorded(Ok(()), now);
+        restoration.answered(&TAKEN, now);
+        restoration.answered(&Outcome::NotTaken("it shows 7".to_string()), now);
+        assert_eq!(restoration.wanted(), Wanted::Nothing);
+        assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.starts_with("102: 1 → 2: ")));
+        assert_eq!(restoration.progress(), (1, 3));
+    }
+
+    #[test]
+    fn what_people_can_mend_is_waited_for_once_something_is_written() {
+        let (now, runs) = (Instant::now(), Outcome::Refused(Refusal::MotorRuns("runs".to_string())));
+        let mut restoration = begun(3, false, now);
+        restoration.recorded(Ok(()), now);
+        restoration.answered(&runs, now);
+        restoration.removed(Ok(()));
+        assert!(matches!(restoration.end(), Some(End::NothingWritten(_))));
+        let mut restoration = begun(3, false, now);
+        restoration.recorded(Ok(()), now);
+        restoration.answered(&TAKEN, now);
+        assert!(matches!(restoration.answered(&runs, now), Then::Pause(..)));
+        assert!(matches!(restoration.answered(&Outcome::Offline, now), Then::Pause(..)));
+        assert!(matches!(restoration.wanted(), Wanted::Set(order) if order.id == "102"));
+        restoration.answered(&runs, now + MOST_WAIT + PAUSE);
+        assert!(matches!(restoration.end(), Some(End::Unfinished(why)) if why.contains("60 minutes")));
+    }
+}

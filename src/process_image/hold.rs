@@ -1,0 +1,22 @@
+//! Why a drive takes no orders but stops.
+
+use std::sync::Arc;
+
+use arc_swap::ArcSwapOption;
+
+/// Set while the parameters of a drive are being restored, or were left half restored. One drive has the same hold under
+/// whatever image a reload gives it.
+#[derive(Debug, Default)]
+pub struct Hold(ArcSwapOption<String>);
+
+impl Hold {
+    /// From now on the drive takes no orders but stops, for the reason given; or all again.
+    pub fn set(&self, why: Option<String>) {
+        self.0.store(why.map(Arc::new));
+    }
+
+    /// Why it takes no orders but stops, and what ends that; nothing where it takes all.
+    pub fn why(&self) -> Option<Arc<String>> {
+        self.0.load_full()
+    }
+}
