@@ -451,6 +451,25 @@ fn what_a_search_prints_passes_check() {
     assert!(Path::new(&line.port()).exists());
 }
 
+/// A read that reaches a gateway in the moment of its end is done all the same.
+#[test]
+fn a_gateway_that_just_ends_is_asked_again() {
+    let line = Line::start();
+    let socket = line.socket();
+    let listener = std::os::unix::net::UnixListener::bind(&socket).unwrap();
+    let ends = std::thread::spawn(move || {
+        let (client, _) = listener.accept().unwrap();
+        until("its request", || {
+            let waits = rustix::io::ioctl_fionread(&client).unwrap();
+            (waits > 0).then_some(())
+        });
+        std::fs::remove_file(&socket).unwrap();
+    });
+    let read = line.command("read", &["pump-1", "ready"]);
+    ends.join().unwrap();
+    assert_eq!(read.code, 0, "{}{}", read.out, read.err);
+}
+
 /// Each family is found on the line that its simulator makes, and what is printed for it passes `check` and is read.
 #[test]
 fn every_family_is_found_by_reading() {

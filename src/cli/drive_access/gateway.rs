@@ -2,6 +2,7 @@
 
 use std::io;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 use tokio::net::UnixStream;
 
@@ -10,6 +11,12 @@ use crate::cli::local_client::{exchange, is_nobody};
 use crate::cli::report;
 use crate::north::local::protocol::{FailureCode, Outcome, Request};
 use crate::north::local::{RuntimeDirectories, SocketPath};
+
+/// How often a request that only reads is sent in all where the connection is cut off: a gateway that just ends does that, and
+/// has gone a moment later.
+const TRIES: u32 = 5;
+/// Pause before the next of them.
+const PAUSE: Duration = Duration::from_millis(200);
 
 /// Why no gateway was asked, for the message when the port cannot be opened either.
 #[derive(Debug)]
@@ -22,26 +29,34 @@ pub(super) struct NotFound(pub(super) String);
 pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Outcome, NotFound>, String> {
     let paths = target.settings.socket.of_client(&RuntimeDirectories::of_this_process());
     let (mut reasons, mut others) = (Vec::new(), Vec::new());
-    for path in &paths {
-        let stream = match UnixStream::connect(path).await {
-            Ok(stream) => stream,
-            Err(error) if is_nobody(&error) => continue,
-            Err(error) => {
-                let reason = format!("cannot connect to {}: {error}", path.display());
-                // A serial port is locked by its owner; with a device server there would be two masters on the line.
-                if target.bus.spec.port.contains("://") {
-                    return Err(format!(
-                        "{reason}; bus `{}`; use sudo, or join the group of the socket",
-                        target.bus.spec.name
-                    ));
+    'paths: for path in &paths {
+        let mut tries = 1;
+        let response = loop {
+            let stream = match UnixStream::connect(path).await {
+                Ok(stream) => stream,
+                Err(error) if is_nobody(&error) => continue 'paths,
+                Err(error) => {
+                    let reason = format!("cannot connect to {}: {error}", path.display());
+                    // A serial port is locked by its owner; with a device server there would be two masters on the line.
+                    if target.bus.spec.port.contains("://") {
+                        return Err(format!(
+                            "{reason}; bus `{}`; use sudo, or join the group of the socket",
+                            target.bus.spec.name
+                        ));
+                    }
+                    reasons.push(reason);
+                    continue 'paths;
                 }
-                reasons.push(reason);
-                continue;
+            };
+            match exchange(stream, request).await {
+                Ok(response) => break response,
+                Err(error) if tries < TRIES && is_cut_off(&error) && only_reads(request) => {
+                    tries += 1;
+                    tokio::time::sleep(PAUSE).await;
+                }
+                Err(error) => return Err(lost(path, request, &error)),
             }
         };
-        let response = exchange(stream, request)
-            .await
-            .map_err(|error| lost(path, request, &error))?;
         match response.result {
             Outcome::Error(failure) if failure.code == FailureCode::OtherGateway => {
                 others.push(format!("at {} {}", path.display(), failure.message));
@@ -55,6 +70,16 @@ pub(super) async fn ask(target: &Target, request: &Request) -> Result<Result<Out
     }
     reasons.extend(others);
     Ok(Err(NotFound(not_found(target, &paths, reasons))))
+}
+
+/// Whether a request may be sent again without doing anything twice.
+fn only_reads(request: &Request) -> bool {
+    matches!(request, Request::Read(_) | Request::Why(_) | Request::Health(_))
+}
+
+fn is_cut_off(error: &io::Error) -> bool {
+    use io::ErrorKind::{BrokenPipe, ConnectionReset, UnexpectedEof};
+    matches!(error.kind(), BrokenPipe | ConnectionReset | UnexpectedEof)
 }
 
 fn lost(path: &Path, request: &Request, error: &io::Error) -> String {
