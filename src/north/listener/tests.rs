@@ -1,5 +1,6 @@
 use std::collections::VecDeque;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicU16, Ordering};
 
 use tokio::io::AsyncReadExt;
 use tokio::sync::mpsc;
@@ -171,8 +172,16 @@ fn specs(addresses: &[SocketAddr]) -> Vec<ListenerSpec> {
     addresses.iter().map(spec).collect()
 }
 
+/// None of those that the system gives to whoever asks for any, who would have it before it is bound again.
 fn free_address() -> SocketAddr {
-    bind("127.0.0.1:0".parse().unwrap()).unwrap().local_addr().unwrap()
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let first = 7_000 + (std::process::id() % 25) as u16 * 100;
+    let addresses =
+        std::iter::repeat_with(|| SocketAddr::from(([127, 0, 0, 1], first + NEXT.fetch_add(1, Ordering::Relaxed))));
+    addresses
+        .take(100)
+        .find(|address| bind(*address).is_ok())
+        .expect("a free port")
 }
 
 #[tokio::test]

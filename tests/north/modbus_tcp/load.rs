@@ -14,7 +14,7 @@ use rustix::process::{Resource, Rlimit, getrlimit, setrlimit};
 use tokio::io::{AsyncReadExt, AsyncWriteExt};
 
 use super::rig::{Client, PATIENCE, Rig, frame, options, registers, until, words};
-use crate::support::process::Running;
+use crate::support::process::{Running, free_port};
 
 /// Random enough for disorder, and the same in each run.
 mod rand_free {
@@ -276,10 +276,7 @@ fn vandal(address: SocketAddr, mut dice: Dice) {
 fn few_files_mean_few_connections() {
     let dir = tempfile::tempdir().unwrap();
     let file = dir.path().join("drivegate.toml");
-    let address = std::net::TcpListener::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap();
+    let address = SocketAddr::from(([127, 0, 0, 1], free_port()));
     let text = format!(
         "[gateway]\nname = \"g\"\n[modbus_tcp]\nlisten = [\"{address}\"]\nmax_connections = 400\n\
          max_connections_per_address = 400\n"

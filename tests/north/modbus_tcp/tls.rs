@@ -21,7 +21,7 @@ use tokio::net::TcpStream;
 use tokio_rustls::TlsConnector;
 
 use super::rig::{Client, PATIENCE, Rig, frame, listener, options, registers, until, words};
-use crate::support::process::Running;
+use crate::support::process::{Running, free_port};
 use crate::support::tools;
 
 /// Runs the script.
@@ -463,10 +463,7 @@ async fn the_daemon_takes_new_certificates() {
     };
     install("gateway");
     std::fs::copy(WORKS.file("own/ca.crt"), at("ca.crt")).unwrap();
-    let port = std::net::TcpListener::bind("127.0.0.1:0")
-        .unwrap()
-        .local_addr()
-        .unwrap();
+    let port = SocketAddr::from(([127, 0, 0, 1], free_port()));
     let text = format!(
         "[gateway]\nname = \"g\"\n[modbus_tcp.tls]\nlisten = [\"{port}\"]\ncertificate = \"server.crt\"\n\
          key = \"server.key\"\nclient_ca = \"ca.crt\"\nroles = {{ operator = \"control\" }}\n[log]\nformat = \"json\"\n"

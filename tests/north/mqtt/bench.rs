@@ -495,7 +495,8 @@ async fn stand_in(plant: SharedPlant, orders: Arc<Mutex<Vec<Ordered>>>) {
                 let name = |index: usize| drive.spec.profile.points[index].name.clone();
                 if let Order::Points(points) = &command.order {
                     let points = points.iter().map(|(index, value)| (name(*index), *value)).collect();
-                    let life = command.expires.saturating_duration_since(now);
+                    // It may have come after `now`.
+                    let life = command.expires.saturating_duration_since(Instant::now());
                     orders.lock().unwrap().push((command.drive, points, life));
                 }
                 command.answer(&Outcome::Acknowledged(Reply::Written), now);
