@@ -411,6 +411,10 @@ def main():
         disk.mkdir(exist_ok=True)
         mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", disk], capture_output=True, text=True)
         small_disk = mounted.returncode == 0
+        # Numbers of pseudo-terminals are given out again: a gateway whose line was killed must not open one of somebody else.
+        own = ["mount", "-t", "devpts", "-o", "newinstance,ptmxmode=0666", "devpts", "/dev/pts"]
+        if subprocess.run(own, capture_output=True, check=False).returncode == 0:
+            subprocess.run(["mount", "--bind", "/dev/pts/ptmx", "/dev/ptmx"], capture_output=True, check=False)
     sys.exit(asyncio.run(run(options, directory, small_disk)))
 
 
