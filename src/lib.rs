@@ -28,7 +28,7 @@
 //! - [`process_image`]: the process image; many readers, one writer a bus.
 //! - [`mod@command`]: what may be commanded, the queue, the ticket that answers once.
 //! - [`history`]: trends and counters; the trip recorder: what was read and sent before and after a fault, kept on disk.
-//! - [`parameters`]: the parameter vault: what a reading asks next, files, differences.
+//! - [`parameters`]: the parameter vault: what a reading asks next, files, differences, restores.
 //! - [`plant`]: all images and queues, as the north sides see them.
 //! - [`mod@line`]: the half-duplex wire; open, send, receive, wait to tens of microseconds.
 //! - [`bus`]: one exchange ([`bus::transaction`]), which poll is next ([`bus::schedule`]), all decisions about drives and
