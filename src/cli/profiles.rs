@@ -300,7 +300,7 @@ fn place(profile: &Profile, point: &Point) -> (String, String, String) {
             }
         }
         Source::Derived(derived) => {
-            let names: Vec<&str> = derived.sources().into_iter().map(|i| name_of(profile, i)).collect();
+            let names: Vec<&str> = derived.sources().map(|i| name_of(profile, i)).collect();
             (
                 format!("from {}", names.join(", ")),
                 "derived".to_string(),

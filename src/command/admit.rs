@@ -243,7 +243,7 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
             Source::Derived(derived) => match derived.band().filter(|(of, ..)| taken_by(*of) == index) {
                 Some((_, minimum, maximum)) => drive
                     .band_for_commands(minimum, maximum)
-                    .and_then(|band| derived.value(&[value], Some(band))),
+                    .and_then(|band| derived.value([value], Some(band))),
                 None => continue,
             },
             Source::Raw(_) => continue,

@@ -1,5 +1,7 @@
 //! Points derived from the points of the drive. Pure.
 
+use std::time::Instant;
+
 use super::model::{Quality, Sample, Value, tidy};
 
 /// One end of a band: another point, or a number from the manual.
@@ -85,22 +87,21 @@ impl Derived {
     }
 
     /// The points that the value itself is derived from, without the ends of a band.
-    pub fn sources(&self) -> Vec<usize> {
-        match self {
+    pub fn sources(&self) -> impl Iterator<Item = usize> {
+        let (first, second, more): (Option<usize>, Option<usize>, &[usize]) = match self {
             Derived::Band { of, .. }
             | Derived::Percent { of, .. }
             | Derived::Zero { of, .. }
-            | Derived::LowestBit { of } => vec![*of],
-            Derived::Equal { of, to, .. } => vec![*of, *to],
-            Derived::All { of } => of.clone(),
-        }
+            | Derived::LowestBit { of } => (Some(*of), None, &[]),
+            Derived::Equal { of, to, .. } => (Some(*of), Some(*to), &[]),
+            Derived::All { of } => (None, None, of),
+        };
+        first.into_iter().chain(second).chain(more.iter().copied())
     }
 
     /// All points that it depends on, including the ends of a band.
     pub(crate) fn rests_on(&self) -> Vec<usize> {
-        let mut points = self.sources();
-        points.extend(self.ends());
-        points
+        self.sources().chain(self.ends()).collect()
     }
 
     /// The points that are the ends of its band.
@@ -113,8 +114,9 @@ impl Derived {
     }
 
     /// The value for these values of the sources; `None` if it cannot be computed.
-    pub(crate) fn value(&self, sources: &[Value], band: Option<(f64, f64)>) -> Option<Value> {
-        let first = sources.first()?;
+    pub(crate) fn value(&self, sources: impl IntoIterator<Item = Value>, band: Option<(f64, f64)>) -> Option<Value> {
+        let mut sources = sources.into_iter();
+        let first = sources.next()?;
         match self {
             Derived::Band { .. } => {
                 let (low, high) = band?;
@@ -126,10 +128,13 @@ impl Derived {
             }
             Derived::Zero { within, .. } => Some(Value::Bool(first.as_f64().abs() <= *within)),
             Derived::Equal { within, .. } => {
-                let apart = tidy((first.as_f64().abs() - sources.get(1)?.as_f64().abs()).abs());
+                let apart = tidy((first.as_f64().abs() - sources.next()?.as_f64().abs()).abs());
                 Some(Value::Bool(apart <= *within))
             }
-            Derived::All { .. } => Some(Value::Bool(sources.iter().all(|v| v.as_bool()))),
+            // Not `all`, which would leave sources unasked that decide quality and age.
+            Derived::All { .. } => Some(Value::Bool(
+                sources.fold(first.as_bool(), |all, value| all & value.as_bool()),
+            )),
             Derived::LowestBit { .. } => {
                 let mask = first.as_f64() as u64;
                 let number = if mask == 0 {
@@ -154,15 +159,20 @@ impl Derived {
     }
 
     /// The sample derived from those of the sources: the worst quality, the oldest time.
-    pub(crate) fn sample(&self, sources: &[Sample], band: Option<(f64, f64)>) -> Sample {
-        let values: Option<Vec<Value>> = sources.iter().map(|s| s.value).collect();
-        let value = values.and_then(|values| self.value(&values, band));
-        let Some(value) = value else { return Sample::NONE };
-        Sample {
+    pub(crate) fn sample(&self, sources: impl Iterator<Item = Sample>, band: Option<(f64, f64)>) -> Sample {
+        let (mut quality, mut at, mut complete) = (Quality::Good, None::<Instant>, true);
+        let values = sources.filter_map(|source| {
+            quality = quality.worse(source.quality);
+            at = source.at.map(|time| at.map_or(time, |at| at.min(time))).or(at);
+            complete &= source.value.is_some();
+            source.value
+        });
+        let value = self.value(values, band).filter(|_| complete);
+        value.map_or(Sample::NONE, |value| Sample {
             value: Some(value),
-            quality: sources.iter().map(|s| s.quality).fold(Quality::Good, Quality::worse),
-            at: sources.iter().filter_map(|s| s.at).min(),
-        }
+            quality,
+            at,
+        })
     }
 }
 
@@ -189,12 +199,12 @@ mod tests {
             minimum,
             maximum,
         };
-        assert_eq!(band.value(&[Value::Number(50.0)], BAND), Some(Value::Number(30.0)));
-        assert_eq!(percent.value(&[Value::Number(30.0)], BAND), Some(Value::Number(50.0)));
+        assert_eq!(band.value([Value::Number(50.0)], BAND), Some(Value::Number(30.0)));
+        assert_eq!(percent.value([Value::Number(30.0)], BAND), Some(Value::Number(50.0)));
         assert_eq!(band.inverse(30.0, (10.0, 50.0)), Some(50.0));
         assert_eq!(percent.inverse(50.0, (10.0, 50.0)), Some(30.0));
-        assert_eq!(percent.value(&[Value::Number(30.0)], Some((5.0, 5.0))), None);
-        assert_eq!(percent.value(&[Value::Number(30.0)], None), None);
+        assert_eq!(percent.value([Value::Number(30.0)], Some((5.0, 5.0))), None);
+        assert_eq!(percent.value([Value::Number(30.0)], None), None);
         assert_eq!(band.inverse(30.0, (5.0, 5.0)), None);
     }
 
@@ -202,30 +212,30 @@ mod tests {
     fn states_and_codes() {
         let number = Value::Number;
         let zero = Derived::Zero { of: 0, within: 0.0 };
-        assert_eq!(zero.value(&[number(0.0)], None), Some(Value::Bool(true)));
-        assert_eq!(zero.value(&[number(-0.01)], None), Some(Value::Bool(false)));
+        assert_eq!(zero.value([number(0.0)], None), Some(Value::Bool(true)));
+        assert_eq!(zero.value([number(-0.01)], None), Some(Value::Bool(false)));
         let equal = Derived::Equal {
             of: 0,
             to: 1,
             within: 0.01,
         };
         assert_eq!(
-            equal.value(&[number(10.0), number(10.01)], None),
+            equal.value([number(10.0), number(10.01)], None),
             Some(Value::Bool(true))
         );
         assert_eq!(
-            equal.value(&[number(10.0), number(10.02)], None),
+            equal.value([number(10.0), number(10.02)], None),
             Some(Value::Bool(false))
         );
-        assert_eq!(equal.value(&[number(10.0)], None), None);
+        assert_eq!(equal.value([number(10.0)], None), None);
         let all = Derived::All { of: vec![0, 1] };
         assert_eq!(
-            all.value(&[Value::Bool(true), Value::Bool(false)], None),
+            all.value([Value::Bool(true), Value::Bool(false)], None),
             Some(Value::Bool(false))
         );
         let lowest = Derived::LowestBit { of: 0 };
         for (mask, code) in [(0, 0), (1, 1), (0x0204, 3), (0x1000, 13), (0x8000, 16)] {
-            assert_eq!(lowest.value(&[Value::Integer(mask)], None), Some(Value::Integer(code)));
+            assert_eq!(lowest.value([Value::Integer(mask)], None), Some(Value::Integer(code)));
         }
     }
 
@@ -237,8 +247,11 @@ mod tests {
             at: None,
         };
         let all = Derived::All { of: vec![0, 1] };
-        let made = all.sample(&[sample(Quality::Good), sample(Quality::Stale)], None);
+        let made = all.sample([sample(Quality::Good), sample(Quality::Stale)].into_iter(), None);
         assert_eq!((made.value, made.quality), (Some(Value::Bool(true)), Quality::Stale));
-        assert_eq!(all.sample(&[sample(Quality::Good), Sample::NONE], None), Sample::NONE);
+        assert_eq!(
+            all.sample([sample(Quality::Good), Sample::NONE].into_iter(), None),
+            Sample::NONE
+        );
     }
 }

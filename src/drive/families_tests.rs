@@ -346,13 +346,13 @@ fn teco_faults() {
             (12, "undervoltage or power loss"),
         ] {
             // A higher bit beside it does not count.
-            let code = lowest.value(&[Value::Number(f64::from((1 << bit) | 0x1000))], None);
+            let code = lowest.value([Value::Number(f64::from((1 << bit) | 0x1000))], None);
             let Some(Value::Integer(code)) = code else {
                 panic!("{name} {bit}")
             };
             assert_eq!((code, profile.fault_text(code).as_str()), (bit + 1, text), "{name}");
         }
-        assert_eq!(lowest.value(&[Value::Integer(0)], None), Some(Value::Integer(0)));
+        assert_eq!(lowest.value([Value::Integer(0)], None), Some(Value::Integer(0)));
     }
 }
 

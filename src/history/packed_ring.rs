@@ -1,6 +1,7 @@
 //! A ring of entries packed into bytes, bounded by bytes and by age: a line of 10 ms has thousands of entries, each of them
 //! smaller than the allocations that it would take by itself.
 
+use std::borrow::Cow;
 use std::collections::VecDeque;
 use std::marker::PhantomData;
 use std::time::{Duration, Instant};
@@ -115,8 +116,8 @@ impl<T: Packed> PackedRing<T> {
         self.bytes.is_empty()
     }
 
-    /// Adds an entry, the newest; `gone` gets those that have to go for it.
-    pub(super) fn push(&mut self, entry: &T, mut gone: impl FnMut(T)) {
+    /// Adds an entry, the newest; `gone` gets those that have to go for it, packed.
+    pub(super) fn push(&mut self, entry: &T, mut gone: impl FnMut(Instant, &[u8])) {
         let now = entry.at();
         let start = *self.start.get_or_insert(now);
         self.entry.clear();
@@ -130,9 +131,7 @@ impl<T: Packed> PackedRing<T> {
             if !is_old && self.bytes.len() + size <= self.most_bytes {
                 break;
             }
-            if let Some(entry) = self.unpack(0, oldest, at) {
-                gone(entry);
-            }
+            gone(at, &self.slice(HEAD, oldest));
             self.bytes.drain(..(HEAD + oldest).min(self.bytes.len()));
         }
         if self.bytes.capacity() - self.bytes.len() < size {
@@ -148,7 +147,7 @@ impl<T: Packed> PackedRing<T> {
         let mut place = 0;
         std::iter::from_fn(move || {
             let (length, at) = self.head(place, self.start?)?;
-            let entry = self.unpack(place, length, at);
+            let entry = T::unpack(at, &self.slice(place + HEAD, length));
             place += HEAD + length;
             entry
         })
@@ -156,23 +155,28 @@ impl<T: Packed> PackedRing<T> {
 
     /// Length and time of the entry there.
     fn head(&self, place: usize, start: Instant) -> Option<(usize, Instant)> {
-        let mut head = [0; HEAD];
-        if self.bytes.len() < place + HEAD {
-            return None;
-        }
-        head.iter_mut()
-            .zip(self.bytes.range(place..))
-            .for_each(|(to, from)| *to = *from);
+        let head = self.slice(place, HEAD);
         let (length, time) = head.split_first_chunk()?;
         let length = usize::try_from(u32::from_le_bytes(*length)).ok()?;
         let at = instant(start, i64::from_le_bytes(*time.first_chunk()?));
         (self.bytes.len() >= place + HEAD + length).then_some((length, at))
     }
 
-    fn unpack(&self, place: usize, length: usize, at: Instant) -> Option<T> {
-        let first = place + HEAD;
-        let bytes: Vec<u8> = self.bytes.range(first..first + length).copied().collect();
-        T::unpack(at, &bytes)
+    /// That many bytes from there on, as far as there are so many. They are copied where they go over the end of the memory.
+    fn slice(&self, place: usize, length: usize) -> Cow<'_, [u8]> {
+        let (first, second) = self.bytes.as_slices();
+        match place.checked_sub(first.len()) {
+            Some(place) => Cow::Borrowed(
+                second
+                    .get(place..)
+                    .and_then(|rest| rest.get(..length))
+                    .unwrap_or_default(),
+            ),
+            None => match first.get(place..place + length) {
+                Some(bytes) => Cow::Borrowed(bytes),
+                None => Cow::Owned(self.bytes.range(place..).take(length).copied().collect()),
+            },
+        }
     }
 }
 
@@ -216,20 +220,20 @@ mod tests {
         let mut ring = PackedRing::new(11 * packed_read(2), Duration::from_secs(10));
         let mut gone = Vec::new();
         for second in 0..20 {
-            ring.push(&read(at(second), &[1, second as u16]), |entry| {
-                gone.push(entry.words[1])
+            ring.push(&read(at(second), &[1, second as u16]), |at, bytes| {
+                gone.push(TapedRead::unpack(at, bytes).expect("a read").words[1])
             });
         }
         assert_eq!((ring.iter().count(), gone.len()), (11, 9), "by age");
         assert_eq!(gone, (0..9).collect::<Vec<u16>>());
         let most = (11 * packed_read(2) - packed_read(0)) / 2;
-        ring.push(&read(at(20), &vec![7; most]), drop);
+        ring.push(&read(at(20), &vec![7; most]), |_, _| ());
         assert_eq!(
             ring.iter().map(|entry| entry.at).collect::<Vec<_>>(),
             [at(20)],
             "by bytes"
         );
-        ring.push(&read(at(20), &vec![7; 9999]), drop);
+        ring.push(&read(at(20), &vec![7; 9999]), |_, _| ());
         assert_eq!(
             ring.iter().next().map(|entry| entry.words.len()),
             Some(9999),
@@ -241,10 +245,10 @@ mod tests {
     fn memory_grows_with_what_is_in_it_and_no_further() {
         let mut ring = PackedRing::new(1 << 20, Duration::from_secs(3600));
         let start = Instant::now();
-        ring.push(&read(start, &[0; 11]), drop);
+        ring.push(&read(start, &[0; 11]), |_, _| ());
         assert!(ring.bytes.capacity() <= (1 << 20) / STEPS + 64);
         for count in 0..100_000 {
-            ring.push(&read(start + Duration::from_millis(count), &[0; 11]), drop);
+            ring.push(&read(start + Duration::from_millis(count), &[0; 11]), |_, _| ());
         }
         let most = (1 << 20) + (1 << 20) / STEPS + 64;
         assert!(ring.bytes.capacity() <= most, "{}", ring.bytes.capacity());
@@ -264,7 +268,7 @@ mod tests {
                 bytes: bytes.into(),
             }).collect();
             let mut ring = PackedRing::new(1 << 20, Duration::from_secs(10));
-            frames.iter().for_each(|frame| ring.push(frame, |_| unreachable!("all fit")));
+            frames.iter().for_each(|frame| ring.push(frame, |_, _| unreachable!("all fit")));
             prop_assert_eq!(ring.iter().collect::<Vec<_>>(), frames.clone());
             let size: usize = frames.iter().map(|frame| packed_frame(frame.bytes.len())).sum();
             prop_assert_eq!(ring.bytes.len(), size);

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::budget::Budget;
 use super::drives::{DriveHistory, History};
 use super::line::LineHistory;
-use super::packed_ring::PackedRing;
+use super::packed_ring::{Packed, PackedRing};
 use super::ring::{Ring, Timed};
 use super::trigger::{LineErrors, Trigger, TriggerKind, Watch};
 use super::{Clock, RecorderOptions};
@@ -301,7 +301,7 @@ impl LineRing {
                     let failed = frame.drive.filter(|_| frame.verdict.is_error());
                     let burst = failed.filter(|drive| self.answers(*drive));
                     let burst = burst.and_then(|drive| self.errors.note(frame.at, drive));
-                    self.frames.push(&frame, drop);
+                    self.frames.push(&frame, |_, _| ());
                     if let Some((drive, trigger)) = burst
                         && let Some(drive) = self.drives.get_mut(drive)
                     {
@@ -374,8 +374,10 @@ impl DriveRing {
             return None;
         }
         let base = &mut self.base;
-        self.samples.push(&read, |gone| {
-            Arc::make_mut(base).store(gone.table, gone.start, &gone.words, gone.at);
+        self.samples.push(&read, |at, packed| {
+            if let Some(gone) = TapedRead::unpack(at, packed) {
+                Arc::make_mut(base).store(gone.table, gone.start, &gone.words, at);
+            }
         });
         self.watch.look(&reading, at, options.warnings)
     }

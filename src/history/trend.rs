@@ -191,7 +191,7 @@ impl DriveTrend {
             }
             let since = read.at.saturating_duration_since(self.epoch);
             let kept = point.kept.get_or_insert_with(Kept::new);
-            kept.add(since, value.as_f64() as f32, known.good_for(point.index));
+            kept.add(since, value.as_f64() as f32, || known.good_for(point.index));
         }
     }
 
@@ -252,9 +252,13 @@ impl Kept {
         }
     }
 
-    /// A value was read `since` the beginning; the one before was good for `good_for`.
-    fn add(&mut self, since: Duration, value: f32, good_for: Duration) {
-        let before = self.last.filter(|(at, _)| since.saturating_sub(*at) <= good_for);
+    /// A value was read `since` the beginning; the one before was good for `good_for`, which matters where it left steps out.
+    fn add(&mut self, since: Duration, value: f32, good_for: impl Fn() -> Duration) {
+        let [finest, ..] = RANGES;
+        let before = self
+            .last
+            .filter(|(at, _)| number(*at, finest.step) + 1 < number(since, finest.step))
+            .filter(|(at, _)| since.saturating_sub(*at) <= good_for());
         for (buckets, range) in self.ranges.iter_mut().zip(RANGES) {
             let number = number(since, range.step);
             let between = before.map(|(at, before)| (self::number(at, range.step), before));
@@ -306,7 +310,7 @@ fn registers_of(profile: &Profile, index: usize) -> Vec<Registers> {
         }
         // A point rests on points before it only: the profile is refused otherwise.
         Source::Derived(derived) => {
-            let sources = derived.sources().into_iter().filter(|source| *source != index);
+            let sources = derived.sources().filter(|source| *source != index);
             sources.flat_map(|source| registers_of(profile, source)).collect()
         }
     }

@@ -277,7 +277,7 @@ impl Reading<'_> {
         match &point.source {
             Source::Raw(raw) => limit(raw),
             Source::Derived(derived) => {
-                let sources = derived.sources().into_iter().map(|source| self.good_for(source));
+                let sources = derived.sources().map(|source| self.good_for(source));
                 sources.min().unwrap_or(Duration::ZERO)
             }
         }
@@ -341,18 +341,18 @@ impl Reading<'_> {
         match &point.source {
             Source::Raw(raw) => self.raw_sample(raw, point.kind()),
             Source::Derived(derived) => {
-                let sources: Vec<Sample> = derived.sources().into_iter().map(|i| self.sample(i)).collect();
+                let sources = || derived.sources().map(|source| self.sample(source));
                 let Some((_, low, high)) = derived.band() else {
-                    return derived.sample(&sources, None);
+                    return derived.sample(sources(), None);
                 };
                 if let Some(band) = self.band(low, high) {
-                    return derived.sample(&sources, Some(band));
+                    return derived.sample(sources(), Some(band));
                 }
                 // What the ends were last makes a value of what the source was last, which is as good as they are.
                 let Some((band, quality)) = self.last_band(low, high) else {
                     return Sample::NONE;
                 };
-                let sample = derived.sample(&sources, Some(band));
+                let sample = derived.sample(sources(), Some(band));
                 Sample {
                     quality: sample.quality.worse(quality),
                     ..sample

@@ -57,6 +57,13 @@ def buses(remote, drives, directory, fewer=False):
     return text, names
 
 
+def unit_environment():
+    """The environment that the systemd unit gives the service."""
+    unit = pathlib.Path(__file__).resolve().parents[2] / "systemd/drivegate.service"
+    lines = [line.split("=", 1)[1] for line in unit.read_text().splitlines() if line.startswith("Environment=")]
+    return dict(part.split("=", 1) for line in lines for part in line.split())
+
+
 class Program:
     """A child process with its log; it ends with the soak."""
 
@@ -100,7 +107,7 @@ class Gateway(Program):
         self.parts = (remote, drives, simulated)
         self.broker, self.state, self.directory = broker, state, directory
         self.write()
-        super().__init__(name, directory, [binary, "run", "--config", self.config], env)
+        super().__init__(name, directory, [binary, "run", "--config", self.config], {**unit_environment(), **(env or {})})
 
     def text(self, fewer=False, level="info"):
         lines, self.names = buses(*self.parts, fewer)

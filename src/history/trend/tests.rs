@@ -42,7 +42,7 @@ impl Rig {
         let since = self.clock.now.saturating_duration_since(self.trend.epoch);
         let of = |trend: &&mut PointTrend| trend.point == ModelPoint::MotorCurrent;
         let trend = self.trend.points.iter_mut().find(of).unwrap();
-        trend.kept.get_or_insert_with(Kept::new).add(since, value, good_for);
+        trend.kept.get_or_insert_with(Kept::new).add(since, value, || good_for);
         self.fed.push((self.clock.now, value, good_for));
     }
 
