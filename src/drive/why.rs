@@ -133,6 +133,8 @@ pub struct Situation<'s> {
     pub read_at: Option<Instant>,
     /// Whether this gateway may command it.
     pub is_commandable: bool,
+    /// Why it takes no orders but stops, if that is so, and what ends that.
+    pub held: Option<String>,
     /// The last order that concerns the run command; asked for only while the motor does not run.
     pub order: &'s dyn Fn() -> Option<RunOrder>,
 }
@@ -146,6 +148,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
     };
     if let Some(cause) = look.unreachable() {
         let mut causes = vec![cause];
+        causes.extend(look.held());
         causes.extend(look.order_in_the_way((situation.order)(), None));
         return Explanation {
             runs: None,
@@ -164,6 +167,7 @@ pub fn explain(profile: &Profile, sample: &dyn Fn(usize) -> Sample, situation: &
     causes.extend(look.local_control(&causes));
     causes.extend(look.uncharged());
     causes.extend(look.not_ready(&causes));
+    causes.extend(look.held().filter(|_| runs != Some(true)));
     causes.extend(look.command(&causes));
     causes.extend(look.warning());
     if causes.is_empty() && runs == Some(false) {
@@ -326,6 +330,13 @@ impl Look<'_> {
         let evidence = "ready is off, and the drive does not tell why".to_string();
         let remedy = "check its enable and interlock inputs, the mains, and what its display shows";
         Some(self.cause("not_ready", evidence, at, remedy))
+    }
+
+    /// It takes no order to run, whoever gives it.
+    fn held(&self) -> Option<Cause> {
+        let remedy = "let the restore of its parameters end; `drivegate params restore` resumes, undoes or releases one that was cut off";
+        let held = self.situation.held.clone();
+        held.map(|why| self.cause("held", why, None, remedy))
     }
 
     /// What is wrong with the commands.

@@ -4,7 +4,7 @@ use std::time::Duration;
 
 use crate::command::{AuditRecord, CONFIRMED, SourceKind, WriteStats};
 use crate::drive::why::{self, Contact, Explanation, Fate, Giver, RunOrder, RunWish, Situation};
-use crate::process_image::{Access, BusImage, Link, Reading};
+use crate::process_image::{Access, BusImage, Hold, Link, Reading};
 
 /// Whether the drive of `reading`, on that bus, runs, and why not.
 pub(crate) fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats) -> Explanation {
@@ -18,6 +18,7 @@ pub(crate) fn explain(reading: &Reading<'_>, bus: &BusImage, writes: &WriteStats
         contact: contact(reading, bus),
         read_at: reading.snapshot.fast_at,
         is_commandable: spec.access == Access::Control,
+        held: reading.hold.and_then(Hold::why).map(|why| why.to_string()),
         order: &order,
     };
     why::explain(&spec.profile, &|point| reading.sample(point), &situation)

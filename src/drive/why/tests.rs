@@ -16,6 +16,7 @@ struct Says {
     order: Option<RunOrder>,
     contact: Contact,
     is_commandable: bool,
+    held: Option<String>,
 }
 
 /// Of each family: online, ready, run ordered at half speed, and the motor stands.
@@ -26,6 +27,7 @@ fn stands(family: &str) -> Says {
         order: None,
         contact: Contact::Fresh,
         is_commandable: true,
+        held: None,
     };
     let bits = [
         ("ready", true),
@@ -99,6 +101,7 @@ impl Says {
             contact: self.contact.clone(),
             read_at: Some(at),
             is_commandable: self.is_commandable,
+            held: self.held.clone(),
             order: &|| self.order.clone(),
         };
         explain(&self.profile, &sample, &situation)
@@ -237,6 +240,27 @@ fn what_became_of_the_last_order() {
     let mut monitored = stands("vacon-nx").off("run");
     monitored.is_commandable = false;
     assert!(monitored.explain().causes[0].remedy.contains("only monitors"));
+}
+
+#[test]
+fn a_drive_that_is_held_takes_no_order() {
+    let held = |mut says: Says| {
+        says.held = Some("half restored".to_string());
+        says
+    };
+    let refused = || {
+        stands("vacon-nx")
+            .off("run")
+            .ordered(RunWish::Run, Fate::Refused, Giver::Client)
+    };
+    let explanation = held(refused()).explain();
+    assert_eq!(explanation.words(), ["held", "order_refused"]);
+    assert_eq!(explanation.causes[0].evidence, "half restored");
+    let mut silent = refused();
+    silent.contact = Contact::Silent;
+    assert_eq!(held(silent).words(), "offline held order_refused");
+    let ramps = held(stands("vacon-nx").on("running"));
+    assert_eq!(ramps.explain().runs, Some(true), "it runs, whoever started it");
 }
 
 #[test]
