@@ -323,7 +323,7 @@ impl ConnectionLimit {
                 return Err(NoPlace::Limit(LimitReached::Total(table.limits.total)));
             }
             Decision::Replace(index) => {
-                let displaced = table.open.swap_remove(index);
+                let displaced = table.open.remove(index);
                 table.closing += 1;
                 displaced.close(CloseReason::Displaced);
                 Some(displaced.address)
@@ -365,7 +365,7 @@ impl Drop for ConnectionPermit {
     fn drop(&mut self) {
         let mut table = self.limit.lock();
         match table.open.iter().position(|place| Arc::ptr_eq(place, &self.place)) {
-            Some(index) => drop(table.open.swap_remove(index)),
+            Some(index) => drop(table.open.remove(index)),
             None => table.closing = table.closing.saturating_sub(1),
         }
     }

@@ -81,6 +81,26 @@ fn an_address_keeps_what_it_uses_and_yields_what_it_does_not() {
 }
 
 #[test]
+fn of_those_that_came_in_one_millisecond_the_first_yields() {
+    let bench = Bench::new(Limits::new(8, 8));
+    let newcomer = Newcomer {
+        address: host(1),
+        listener: 0,
+        cancel: &bench.cancel,
+    };
+    let connect = |_| {
+        bench
+            .limit
+            .acquire(newcomer, bench.now, || Some(Authority::Write))
+            .unwrap()
+            .0
+    };
+    let permits: Vec<ConnectionPermit> = (0..12).map(connect).collect();
+    let displaced: Vec<usize> = (0..12).filter(|n| is_displaced(&permits[*n])).collect();
+    assert_eq!(displaced, [0, 1, 2, 3]);
+}
+
+#[test]
 fn the_longest_idle_connection_of_the_largest_holder_yields() {
     let mut bench = Bench::new(Limits::new(4, 3));
     let permits: Vec<_> = [1, 1, 1, 2].map(|n| bench.reader(n).unwrap().0).into();

@@ -166,7 +166,6 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPerm
     let (read_half, mut write_half) = stream.split();
     let mut reader = BufReader::new(read_half);
     loop {
-        place.use_at(Instant::now(), false);
         let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader));
         let Some(Ok(Ok(line))) = place.closing().run_until_cancelled(request).await else {
             break;
@@ -188,6 +187,7 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPerm
         if !matches!(written, Ok(Ok(()))) || !goes_on {
             break;
         }
+        place.use_at(Instant::now(), false);
     }
     if place.close_reason() == Some(CloseReason::Displaced) {
         turn_away(&stream, &asked.plant.load());
