@@ -7,6 +7,7 @@ Touches nothing but its directory, and the loopback. As root it works in a mount
 
 import argparse
 import asyncio
+import json
 import os
 import pathlib
 import random
@@ -85,6 +86,7 @@ class Soak:
             self.programs.append(self.clocked)
         else:
             self.judge.skip("clock steps: libfaketime is not installed (package faketime)")
+        self.earlier_events(state)
         self.broker.start()
         self.simulator.start()
         await asyncio.sleep(2)
@@ -93,7 +95,6 @@ class Soak:
             self.clocked.start()
         self.mqtt = Mqtt(broker, "drivegate/soak", self.drives, self.orders, self.judge)
         await self.ready(60)
-        await self.fill()
         self.modbus = Modbus(self.gateway.modbus, self.drives, self.orders, self.judge, "modbus")
         await self.modbus.connect()
         self.clock_modbus = None
@@ -105,15 +106,26 @@ class Soak:
         for work in (self.behave, self.read, self.intrude):
             self.tasks.append(asyncio.create_task(self.forever(work)))
 
-    async def fill(self):
-        """Fills the gateway's list of the last events, which takes hours by itself and would pass for a leak."""
-        for _ in range(EVENTS // (2 * len(self.drives))):
-            for drive in self.drives:
-                drive.control ^= 1
-                drive.warning = not drive.warning
-            await asyncio.sleep(0.25)
-        for drive in self.drives:
-            drive.control, drive.warning = 0, False
+    def earlier_events(self, state):
+        """As many events of an earlier run as the gateway keeps: filling that list takes hours by itself and would pass for a leak."""
+        names = [(drive.name, "remote") for drive in self.drives] + [(name, name.split("-")[0]) for name in self.simulated]
+        by = "mqtt drivegate/soak/drive/{}/set"
+        texts = {
+            "started": "drive {} has started: ordered by " + by,
+            "stopped": "drive {} has stopped: ordered by " + by,
+            "refused_command": "refused write holding 33024 = 0x0001 from modbus_tcp 127.0.0.2:42239: this client may not write: its address "
+            'is not in `write`, or, with TLS, its certificate has no role that `roles` maps to "control" (19 commands of it were refused)',
+        }
+        begin = time.time() - 86400
+        with open(pathlib.Path(state) / "events.jsonl", "w", encoding="utf-8") as file:
+            for number in range(EVENTS):
+                name, bus = names[number % len(names)]
+                kind = "refused_command" if number % 8 == 7 else ("started", "stopped")[number // len(names) % 2]
+                at = time.strftime("%Y-%m-%dT%H:%M:%S.000Z", time.gmtime(begin + number))
+                event = {"id": number + 1, "boot": "00000000000050ac", "time": at, "event": kind, "bus": bus, "drive": name}
+                if kind != "refused_command":
+                    event["by"] = by.format(name)
+                file.write(json.dumps({**event, "text": texts[kind].format(name, name)}) + "\n")
 
     async def ready(self, seconds):
         """Waits until every drive was polled."""

@@ -22,6 +22,7 @@ check() {
 check '.config.User == "65532:65532"'
 check '.config.Entrypoint == ["/drivegate"]'
 check '.config.Healthcheck.Test == ["CMD", "/drivegate", "health", "--config", "/etc/drivegate/drivegate.toml"]'
+check '.config.Env | contains(["MALLOC_ARENA_MAX=2"])'
 for label in version revision source title licenses; do
     check ".config.Labels[\"org.opencontainers.image.$label\"] | length > 0"
 done
@@ -56,7 +57,7 @@ touch "$work/bundle/rootfs/host/line"
 jq --null-input --arg configuration "$work/configuration" --arg line "$line" --argjson settings "$(jq .config "$settings")" '{
     ociVersion: "1.0.2",
     process: {
-        user: {uid: 65532, gid: 65532}, cwd: "/", noNewPrivileges: true, env: ["PATH=/"],
+        user: {uid: 65532, gid: 65532}, cwd: "/", noNewPrivileges: true, env: (["PATH=/"] + ($settings.Env // [])),
         args: ($settings.Entrypoint + $settings.Cmd),
         capabilities: {bounding: [], effective: [], permitted: []}
     },
