@@ -248,11 +248,20 @@ mod tests {
         ring.push(&read(start, &[0; 11]), |_, _| ());
         assert!(ring.bytes.capacity() <= (1 << 20) / STEPS + 64);
         for count in 0..100_000 {
-            ring.push(&read(start + Duration::from_millis(count), &[0; 11]), |_, _| ());
+            ring.push(
+                &read(start + Duration::from_millis(count), &[count as u16; 11]),
+                |_, _| (),
+            );
         }
         let most = (1 << 20) + (1 << 20) / STEPS + 64;
         assert!(ring.bytes.capacity() <= most, "{}", ring.bytes.capacity());
-        assert_eq!(ring.iter().count(), (1 << 20) / packed_read(11));
+        let kept = (1 << 20) / packed_read(11);
+        let newest = (100_000 - kept as u64..100_000)
+            .map(|count| read(start + Duration::from_millis(count), &[count as u16; 11]));
+        assert!(
+            ring.iter().eq(newest),
+            "entries that go over the end of the memory, too"
+        );
     }
 
     proptest! {
