@@ -162,7 +162,7 @@ impl<T: Packed> PackedRing<T> {
         (self.bytes.len() >= place + HEAD + length).then_some((length, at))
     }
 
-    /// That many bytes from there on, as far as there are so many. They are copied where they go over the end of the memory.
+    /// `length` bytes from `place` on, less or nothing if the ring ends before; copied only where they wrap around.
     fn slice(&self, place: usize, length: usize) -> Cow<'_, [u8]> {
         let (first, second) = self.bytes.as_slices();
         match place.checked_sub(first.len()) {
@@ -258,10 +258,7 @@ mod tests {
         let kept = (1 << 20) / packed_read(11);
         let newest = (100_000 - kept as u64..100_000)
             .map(|count| read(start + Duration::from_millis(count), &[count as u16; 11]));
-        assert!(
-            ring.iter().eq(newest),
-            "entries that go over the end of the memory, too"
-        );
+        assert!(ring.iter().eq(newest), "entries that wrap around, too");
     }
 
     proptest! {

@@ -252,7 +252,7 @@ impl Kept {
         }
     }
 
-    /// A value was read `since` the beginning; the one before was good for `good_for`, which matters where it left steps out.
+    /// A value was read `since` the beginning; the one before was good for `good_for`. That matters only if steps lie between the two.
     fn add(&mut self, since: Duration, value: f32, good_for: impl Fn() -> Duration) {
         let [finest, ..] = RANGES;
         let before = self
