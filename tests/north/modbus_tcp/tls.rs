@@ -338,8 +338,8 @@ async fn handshakes_keep_nobody_out() {
     // Readers cannot take the place of who may write.
     let reader = || TlsClient::connect(address, WORKS.client(Some("own/screen"), &TLS13));
     let mut readers = [reader().await.unwrap(), reader().await.unwrap()];
-    // The server may end the second handshake after the first reader has its answer, and then takes its place for the second:
-    // what the second one hears says that it is decided.
+    // The server may complete the second handshake only after the first reader has its reply, and then gives the second reader
+    // the place of the first. Once the second was answered or closed, that is decided.
     let mut answered = [0; 2];
     for answered in &mut answered {
         for reader in &mut readers {
