@@ -94,7 +94,7 @@ const place = (n) => n.toFixed(1);
 /// One plot. `digits`: of its figures; `time`: writes a time at the axis.
 class Plot {
   constructor(group, { title, unit, digits }) {
-    Object.assign(this, { group, title, unit, digits, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined });
+    Object.assign(this, { group, title, unit, digits, samples: [], marks: [], reach: Infinity, aim: null, includes: [], resting: undefined, loading: true });
     this.svg = draw("svg", { role: "img", "aria-label": title, height: group.height });
     this.reading = make("span", "reading");
     this.spread = make("span", "sub");
@@ -116,7 +116,13 @@ class Plot {
   /// `reach`: how long a sample is in force, ms; `aim`: what the values are meant to be;
   /// `includes`: values that the axis has in any case.
   show(samples, { reach = Infinity, marks = [], aim = null, includes = [] } = {}) {
-    Object.assign(this, { samples, reach, marks, aim, includes });
+    Object.assign(this, { samples, reach, marks, aim, includes, loading: false });
+    this.render();
+  }
+
+  /// Empty until values of another time are there.
+  wait() {
+    Object.assign(this, { samples: [], loading: true });
     this.render();
   }
 
@@ -147,9 +153,9 @@ class Plot {
     // Its own view cuts off what lies beyond the range.
     const inner = draw("svg", { x: LEFT, width: this.width, height, viewBox: `${LEFT} 0 ${this.width} ${height}` }, ...this.gaps(), ...this.lines());
     const parts = [...this.grid(), inner, ...this.events()];
-    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, "no values in this time"));
+    if (known.length === 0) parts.push(draw("text", { class: "none", x: LEFT + this.width / 2, y: height / 2 }, this.loading ? "loading …" : "no values in this time"));
     this.svg.replaceChildren(...parts, this.needle, this.dot);
-    const said = known.length ? `between ${this.figure(low)} and ${this.figure(high)} ${this.unit}` : "no values";
+    const said = known.length ? `between ${this.figure(low)} and ${this.figure(high)} ${this.unit}` : this.loading ? "loading" : "no values";
     this.svg.setAttribute("aria-label", `${this.title}, ${this.group.spoken()}: ${said}`);
     this.cursor();
   }

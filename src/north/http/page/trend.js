@@ -23,6 +23,7 @@ const nowOf = (point) => {
 export function trends(drive) {
   const chosen = { span: SPANS[0], points: null, next: 0 };
   const plots = new Map();
+  const links = [];
   const group = new PlotGroup({
     name: "Cursor of the trends", moment: (t) => clock(new Date(t)),
     label: (t, step) => clock(new Date(t)).slice(-8, step < MINUTE ? undefined : -3),
@@ -45,7 +46,7 @@ export function trends(drive) {
     chosen.span = span;
     chosen.next = 0;
     buttons.forEach((button, place) => button.setAttribute("aria-pressed", String(SPANS[place] === span)));
-    for (const plot of plots.values()) plot.show([]);
+    for (const plot of plots.values()) plot.wait();
   }
 
   function create(points) {
@@ -54,9 +55,14 @@ export function trends(drive) {
     for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit) }));
   }
 
+  // The same links for every time: new ones would take the focus from those that somebody is on.
   function linkFiles(span) {
-    const links = chosen.points.flatMap(({ point }) => [" ", anchor(`api/v1/${address(`point=${point}`, span)}&format=csv`, "", titleOf(point))]);
-    files.replaceChildren("As CSV: ", anchor(`api/v1/${address("", span)}&format=csv`, "", "all"), ...links);
+    if (!links.length) {
+      const titles = [["", "all"], ...chosen.points.map(({ point }) => [`point=${point}`, titleOf(point)])];
+      links.push(...titles.map(([query, title]) => ({ query, element: anchor("", "", title) })));
+      files.append("As CSV:", ...links.flatMap(({ element }) => [" ", element]));
+    }
+    for (const { query, element } of links) element.setAttribute("href", `api/v1/${address(query, span)}&format=csv`);
   }
 
   choose(SPANS[0]);

@@ -75,6 +75,12 @@ async function keyboardIsEnough(page, base) {
   const said = await page.eval(() => document.activeElement.getAttribute("aria-valuetext"));
   assert.match(said, /\d\d:\d\d:\d\d: Speed .*, Current .*/);
   await tabTo("all");
+  // The trends are drawn again and again; the focus stays.
+  for (const _ of [1, 2]) {
+    await page.eval(() => { window.drawn = document.querySelector(".curve"); });
+    await page.until(() => !window.drawn.isConnected);
+  }
+  assert.equal(await page.eval("document.activeElement.textContent"), "all", "a refresh takes the focus away");
 }
 
 async function main() {
