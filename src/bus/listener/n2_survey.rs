@@ -256,6 +256,100 @@ fn list(seen: &Seen) -> String {
     if seen.is_empty() {
         return "not seen".to_string();
     }
-    let one = |(what, count): (&String, &u64)| format!("{what} ({count} times)");
+    let one = |(what, count): (&String, &u64)| format!("{what} ({count}×)");
     seen.iter().map(one).collect::<Vec<_>>().join(", ")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A request and its reply, both without the carriage return.
+    fn exchange(began: Instant, request: &str, reply: &str) -> Heard {
+        Heard::Exchange(Box::new(Exchange {
+            address: 1,
+            request: None,
+            frame: format!("{request}\r").into_bytes(),
+            quiet_since: began,
+            began,
+            sent: began,
+            heard: format!("{reply}\r").into_bytes(),
+            replied: Some(began),
+            at: began,
+            asked_by: began,
+            ended: None,
+            doubt: None,
+        }))
+    }
+
+    fn report(exchanges: &[(&str, &str)]) -> String {
+        let start = Instant::now();
+        let mut survey = N2Survey::default();
+        for (second, (request, reply)) in exchanges.iter().enumerate() {
+            survey.add(&exchange(start + Duration::from_secs(second as u64), request, reply));
+        }
+        survey.report()
+    }
+
+    /// What the report says of an assumption.
+    fn said<'r>(report: &'r str, assumption: &str) -> &'r str {
+        let mut lines = report.lines().skip_while(|line| !line.contains(assumption));
+        lines.nth(1).map_or("no such line", str::trim)
+    }
+
+    // Frames: the worked examples of N2 (identify, poll, read BI2, ADF5 and ADI1, override and release of AO1).
+
+    #[test]
+    fn what_fits_is_confirmed() {
+        let report = report(&[
+            (">01FA7", "N00"),
+            (">01FA7", "A1061"),
+            (">0104C5", "A"),
+            (">0105C6", "A"),
+            (">0112020288", "A4064"),
+            (">011505028E", "A3FC00000AC"),
+            (">011601028B", "A0035C8"),
+            (">017203014248000020", "A"),
+            (">017303018F", "A"),
+        ]);
+        // Nine requests and four replies with data.
+        assert_eq!(said(&report, "checksum"), "confirmed by 13 lines");
+        assert_eq!(said(&report, "region in override"), "2 digits (2×)");
+        assert!(
+            said(&report, "status byte").starts_with("values seen: 40 (1×)"),
+            "{report}"
+        );
+        assert_eq!(said(&report, "before Identify"), "1 times N00 was answered");
+        assert_eq!(said(&report, "device type"), "10 (1×)");
+        assert_eq!(said(&report, "released at once"), "1 overrides, 1 releases");
+        assert_eq!(
+            said(&report, "polls for changes"),
+            "0/4 (1×), 0/5 (1×); every 1.0 s a drive"
+        );
+        assert_eq!(said(&report, "no changes"), "A alone (2×)");
+        assert_eq!(said(&report, "a float has"), "8 digits (1×)");
+        assert_eq!(said(&report, "an integer has"), "4 digits (1×)");
+        assert_eq!(said(&report, "refusal"), "without a checksum (1×)");
+        assert_eq!(said(&report, "object numbers"), "5 of 1 and more, 0 of 0");
+    }
+
+    #[test]
+    fn what_differs_is_told() {
+        let report = report(&[
+            (">01FA8", "A1062"),
+            (">017230142480000F0", "A"),
+            (">011505028E", "A003FC000000C"),
+            (">011601028B", "A00003528"),
+            (">011505028E", "A7FC00000B0"),
+        ]);
+        assert!(
+            said(&report, "checksum").starts_with("confirmed by 7 lines; 2 others"),
+            "{report}"
+        );
+        assert_eq!(said(&report, "region in override"), "1 digit (1×)");
+        assert_eq!(said(&report, "a float has"), "10 digits (1×), 8 digits (1×)");
+        assert_eq!(said(&report, "an integer has"), "6 digits (1×)");
+        assert_eq!(said(&report, "NaN"), "7FC00000 (1×)");
+        assert_eq!(said(&N2Survey::default().report(), "checksum"), "not seen");
+    }
 }
