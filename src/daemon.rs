@@ -103,7 +103,8 @@ impl Daemon {
     /// As [`Daemon::start`].
     pub async fn start_with(settings: Settings, control: Option<Control>) -> Result<Daemon, StartError> {
         let settings = file_limit::fit(settings);
-        let (events, writes) = (Events::default(), Arc::new(WriteStats::default()));
+        let drives = settings.buses.iter().map(|bus| bus.drives.len()).sum();
+        let (events, writes) = (Events::of_drives(drives), Arc::new(WriteStats::default()));
         let recordings = Arc::new(Recordings::default());
         let vault = Arc::new(Vault::default());
         let history = Arc::new(History::default());

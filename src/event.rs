@@ -16,8 +16,12 @@ pub use fair_ring::FairRing;
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
-/// Events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
+/// Most events that a listener may be behind: one of every drive of 66 full lines at once, 16 of every one of a thousand drives.
 pub const BURST: usize = 16_384;
+/// Events that a listener of a small plant may be behind: 16 of every one of 256 drives. There is room for it from the start.
+const SMALL_BURST: usize = 4096;
+/// Events of each drive that a listener may be behind.
+const OF_EACH_DRIVE: usize = 16;
 /// Events of drives and buses kept for late readers.
 const KEPT: usize = 4096;
 /// Refused commands kept beside them.
@@ -300,8 +304,16 @@ struct Store {
 
 impl Default for Events {
     fn default() -> Self {
+        Events::of_drives(BURST / OF_EACH_DRIVE)
+    }
+}
+
+impl Events {
+    /// For so many drives: a listener may be behind by 16 events of each, by 4,096 at least and [`BURST`] at most.
+    pub fn of_drives(drives: usize) -> Events {
+        let burst = drives.saturating_mul(OF_EACH_DRIVE).clamp(SMALL_BURST, BURST);
         Events {
-            sender: broadcast::channel(BURST).0,
+            sender: broadcast::channel(burst).0,
             store: Arc::new(Mutex::new(Store {
                 number: 0,
                 earlier: 0,
@@ -311,9 +323,7 @@ impl Default for Events {
             })),
         }
     }
-}
 
-impl Events {
     fn store(&self) -> MutexGuard<'_, Store> {
         self.store.lock().unwrap_or_else(PoisonError::into_inner)
     }
@@ -372,7 +382,7 @@ impl Events {
         self.publish_in(store, event);
     }
 
-    /// Hears all events from now on; a listener that is more than [`BURST`] behind loses the oldest.
+    /// Hears all events from now on; a listener that is further behind than [`Events::of_drives`] says loses the oldest.
     pub fn subscribe(&self) -> broadcast::Receiver<Arc<Event>> {
         self.sender.subscribe()
     }
@@ -450,14 +460,16 @@ mod tests {
 
     #[test]
     fn a_burst_of_all_drives_reaches_who_is_busy_and_who_comes_late() {
-        let events = Events::default();
-        let mut busy = events.subscribe();
-        (0..BURST).for_each(|n| events.publish(event(n.to_string())));
-        let heard = std::iter::from_fn(|| busy.try_recv().ok());
-        assert!(heard.map(|e| e.id).eq(1..=BURST as u64));
-        let kept = events.recent();
-        assert_eq!(kept.len(), KEPT);
-        assert_eq!(kept.last().map(|e| e.id), Some(BURST as u64));
+        for (drives, burst) in [(4, 4096), (300, 4800), (1_000_000, BURST)] {
+            let events = Events::of_drives(drives);
+            let mut busy = events.subscribe();
+            (0..burst).for_each(|n| events.publish(event(n.to_string())));
+            let heard = std::iter::from_fn(|| busy.try_recv().ok());
+            assert!(heard.map(|e| e.id).eq(1..=burst as u64), "{drives} drives");
+            let kept = events.recent();
+            assert_eq!(kept.len(), KEPT);
+            assert_eq!(kept.last().map(|e| e.id), Some(burst as u64));
+        }
     }
 
     #[test]

@@ -26,7 +26,7 @@ const AUDIT_LINES: Level = Level::INFO;
 
 /// Lines buffered for a slow reader of the log, and as many of commands that were sent to a drive; further ones are dropped
 /// and counted.
-const WAITING: usize = 8192;
+const WAITING: usize = 4096;
 
 /// The log of a running program; buffered lines are written when it is dropped.
 #[derive(Debug)]

@@ -12,6 +12,7 @@ mod points;
 mod ranges;
 mod reference;
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
@@ -22,7 +23,7 @@ use super::model::ModelPoint;
 use super::parameters::ParameterList;
 use super::profile::{AddressRange, FaultText, Point, Profile, Profiles, Source};
 use crate::codec::{LineFormat, Protocol};
-use crate::document::{self, Document, Finding, Node, Problem, Reader};
+use crate::document::{self, Document, Finding, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
 use ranges::{Offsets, check_overlaps, read_range};
@@ -51,7 +52,10 @@ impl Profiles {
             let mut profiles = Profiles::default();
             for (file, source) in BUILT_IN {
                 if let Ok(profile) = Profile::parse(file, source, true) {
-                    profiles.insert(profile);
+                    profiles.insert(Profile {
+                        text: Cow::Borrowed(source),
+                        ..profile
+                    });
                 }
             }
             profiles
@@ -161,15 +165,23 @@ impl Profile {
         let mut document = Document::parse(file, source);
         let (_, base) = base::peek(&document);
         if let Some(under) = base.as_deref().and_then(|base| known.get(base)) {
-            base::lay_over(&mut document, &under.tree, &under.name);
+            let parsed;
+            let tree = match &under.tree {
+                Some(tree) => tree,
+                None => {
+                    parsed = Document::parse(&under.name, &under.text);
+                    parsed.root()
+                }
+            };
+            base::lay_over(&mut document, tree, &under.name);
         }
         base::change_points(&mut document);
         let profile = read_profile(&document.reader(), built_in, known);
-        let tree = document.root().clone();
+        let tree = (!built_in).then(|| document.root().clone());
         let problems = document.into_problems();
         match profile {
             Some(profile) if problems.is_empty() => Ok(Profile {
-                text: source.to_string(),
+                text: Cow::Owned(source.to_string()),
                 tree,
                 ..profile
             }),
@@ -257,8 +269,8 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         points,
         faults,
         model,
-        text: String::new(),
-        tree: Node::empty_table(None),
+        text: Cow::Borrowed(""),
+        tree: None,
     };
     reader.finish();
     name.map(|_| profile)
