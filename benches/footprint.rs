@@ -146,6 +146,15 @@ fn instructions(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<f64
     Ok(total.trim().parse::<f64>()? / exchanges)
 }
 
+/// The environment that the systemd unit gives the daemon; it says how memory is kept.
+fn unit_environment() -> impl Iterator<Item = (&'static str, &'static str)> {
+    include_str!("../systemd/drivegate.service")
+        .lines()
+        .filter_map(|line| line.strip_prefix("Environment="))
+        .flat_map(str::split_ascii_whitespace)
+        .filter_map(|part| part.split_once('='))
+}
+
 /// A process of this bench; ended when dropped.
 struct Process(Child);
 
@@ -199,7 +208,7 @@ impl Site {
         wait("the simulator", || {
             directory.path().join(format!("line{}", plant.buses)).exists()
         })?;
-        let daemon = quiet(program.args(["run", "--config"]).arg(&config))?;
+        let daemon = quiet(program.args(["run", "--config"]).arg(&config).envs(unit_environment()))?;
         let site = Site {
             daemon,
             http,
