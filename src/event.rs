@@ -291,14 +291,17 @@ pub struct Events {
 }
 
 /// The last events. Those of drives and buses are apart from refused commands, and no drive or kind pushes out another.
+///
+/// Each is kept as its line of JSON, one block of memory: as an [`Event`] it is six blocks and twice the bytes, and as some
+/// thousands of them come and go for months, small blocks are what the free memory ends up scattered between.
 #[derive(Debug)]
 struct Store {
     /// Of the last event of this run.
     number: u64,
     /// Events of earlier runs, which come before all of this one.
     earlier: u64,
-    kept: FairRing<(EventKind, String), Arc<Event>>,
-    refused: FairRing<String, Arc<Event>>,
+    kept: FairRing<(EventKind, Arc<str>), Arc<str>>,
+    refused: FairRing<Arc<str>, Arc<str>>,
     limit: RefusalLimit<Event>,
 }
 
@@ -343,10 +346,9 @@ impl Events {
         } else {
             tracing::info!(target: "drivegate::event", kind, bus = %event.bus, drive, count = event.count, "{}", event.text);
         }
-        let event = Arc::new(event);
-        store.keep(event.clone());
+        store.keep(&event);
         // Nobody listening is no error.
-        let _ = self.sender.send(event);
+        let _ = self.sender.send(Arc::new(event));
     }
 
     /// Publishes that a command was refused: the first of a kind at once, then one event a second for each client, which
@@ -392,39 +394,41 @@ impl Events {
         let mut store = self.store();
         for event in earlier {
             store.earlier += 1;
-            store.keep(Arc::new(event));
+            store.keep(&event);
         }
     }
 
     /// The last events of this run, oldest first: 4,096 of drives and buses and 512 refused commands at most.
-    pub fn recent(&self) -> Vec<Arc<Event>> {
-        let mut all = self.store().all();
-        all.retain(|event| event.boot.is_this());
-        all
+    pub fn recent(&self) -> Vec<Event> {
+        let all = self.store().lines();
+        let events = all.iter().filter_map(|line| from_line(line.as_bytes()).ok());
+        events.filter(|event| event.boot.is_this()).collect()
     }
 
     /// The newest events that match, newest first, also those of earlier runs.
-    pub fn search(&self, search: &Search) -> Vec<Arc<Event>> {
-        let all = self.store().all();
+    pub fn search(&self, search: &Search) -> Vec<Event> {
+        let all = self.store().lines();
         log::newest(&all, search)
     }
 }
 
 impl Store {
-    fn keep(&mut self, event: Arc<Event>) {
-        let number = self.earlier + self.number;
-        let source = event.drive.clone().unwrap_or_else(|| event.bus.clone());
+    fn keep(&mut self, event: &Event) {
+        // A time before 1970 or after 9999 has no line.
+        let Ok(line) = serde_json::to_string(event) else { return };
+        let (number, line) = (self.earlier + self.number, Arc::from(line));
+        let source = Arc::from(event.drive.as_deref().unwrap_or(&event.bus));
         match event.kind {
-            EventKind::RefusedCommand => self.refused.push(source, number, event),
-            kind => self.kept.push((kind, source), number, event),
+            EventKind::RefusedCommand => self.refused.push(source, number, line),
+            kind => self.kept.push((kind, source), number, line),
         }
     }
 
-    /// All that are kept, oldest first.
-    fn all(&self) -> Vec<Arc<Event>> {
+    /// The lines of all that are kept, oldest first. They are read without the lock: publishers do not wait for that.
+    fn lines(&self) -> Vec<Arc<str>> {
         let mut all: Vec<_> = self.kept.iter().chain(self.refused.iter()).collect();
         all.sort_unstable_by_key(|(number, _)| *number);
-        all.into_iter().map(|(_, event)| event.clone()).collect()
+        all.into_iter().map(|(_, line)| line.clone()).collect()
     }
 }
 

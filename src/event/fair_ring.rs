@@ -27,28 +27,34 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
 
     /// Keeps an item of `source`.
     pub fn push(&mut self, source: K, number: u64, item: T) {
+        // The key that is there already: its clones share what it holds.
+        let source = match self.sources.get_key_value(&source) {
+            Some((known, _)) => known.clone(),
+            None => source,
+        };
         if self.kept >= self.capacity {
             let largest = self.shares.last().map(|(share, _, of)| (*share, of.clone()));
             let own = self.sources.get(&source).map_or(0, VecDeque::len);
             if let Some((share, of)) = largest {
-                let from = if own >= share { source.clone() } else { of };
+                let from = if own >= share { &source } else { &of };
                 self.change(from, VecDeque::pop_front);
                 self.kept -= 1;
             }
         }
-        self.change(source, |items| items.push_back((number, item)));
+        self.change(&source, |items| items.push_back((number, item)));
         self.kept += 1;
     }
 
-    fn change<R>(&mut self, source: K, change: impl FnOnce(&mut VecDeque<(u64, T)>) -> R) {
-        let mut items = self.sources.remove(&source).unwrap_or_default();
+    fn change<R>(&mut self, source: &K, change: impl FnOnce(&mut VecDeque<(u64, T)>) -> R) {
+        let items = self.sources.entry(source.clone()).or_default();
         if let Some((oldest, _)) = items.front() {
             self.shares.remove(&(items.len(), Reverse(*oldest), source.clone()));
         }
-        change(&mut items);
+        change(items);
         if let Some((oldest, _)) = items.front() {
             self.shares.insert((items.len(), Reverse(*oldest), source.clone()));
-            self.sources.insert(source, items);
+        } else {
+            self.sources.remove(source);
         }
     }
 

@@ -56,7 +56,7 @@ pub(super) async fn events(
     if accept.contains("application/json") && !accept.contains("text/event-stream") {
         let kept = RecentEvents {
             last: event_id(newest),
-            events: kept.iter().map(Arc::as_ref).collect(),
+            events: kept.iter().collect(),
         };
         return ([(header::VARY, "accept")], Json(kept)).into_response();
     }
@@ -64,7 +64,7 @@ pub(super) async fn events(
         Ok(permit) => permit,
         Err(refused) => return full(&refused),
     };
-    let kept: Vec<Message> = kept.iter().map(|event| event_message(event)).collect();
+    let kept: Vec<Message> = kept.iter().map(event_message).collect();
     let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
     respond(stream::iter(kept).chain(live), permit)
 }
