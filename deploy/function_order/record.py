@@ -26,8 +26,8 @@ ORDER = ROOT / "deploy/function_order/order.ld"
 TARGET = ROOT / "target/function_order"
 
 HEAD = """\
-/* Which functions a running gateway executes: first those of the start and of polling, then those that HTTP adds,
-   then those of MQTT, Modbus TCP, commands, events and the other protocols. The rest follows in the usual order.
+/* Which functions a running gateway executes: first those of the start and of polling, with what stands beside them;
+   then those that HTTP adds, then those of MQTT, Modbus TCP, commands, events and the other protocols. The rest follows in the usual order.
    Written by deploy/function_order/record.py; see docs/development.md, The order of functions. */
 SECTIONS
 {
@@ -43,6 +43,10 @@ INSERT BEFORE .text;
 # What a pattern may take in besides, bytes and share of what is executed: little in the first part, which each gateway has in memory;
 # more in the others, as that makes the file shorter.
 TOLERANCES = [(200, 0.1), (1000, 0.3), (1000, 0.3)]
+
+# What stands beside the first part: a change of the code, or of what the compiler inlines, brings something of these along sooner or later.
+NEIGHBOURS = [f"9drivegate{len(room)}{room}" for room in ("bus", "codec", "daemon", "diagnosis", "drive", "event", "line", "plant", "process_image")]
+NEIGHBOURS += ["5tokio7runtime", "12tracing_core"]
 
 # Name, protocol, baud rate, format, profile, drives.
 PLAIN = [(f"line{n}", "modbus-rtu", 115200, "8N1", "vacon-nx", 1) for n in range(1, 5)]
@@ -253,16 +257,19 @@ def write(all_functions, *parts):
     rest = sorted(bytes_of)
     with ORDER.open("w") as file:
         file.write(HEAD)
-        for part, (most, share) in zip(parts, TOLERANCES):
+        for number, (part, (most, share)) in enumerate(zip(parts, TOLERANCES)):
             found = patterns(part & set(rest), bytes_of, rest, most, share)
             for pattern in found:
                 # In `.text.unlikely.` are the functions that the compiler holds to be rare.
                 whole = "" if pattern.endswith("*") else f" .text*.{pattern}.llvm.*"
                 file.write(f"    *(.text*.{pattern}{whole})\n")
             taken = {name for pattern in found for name in matching(pattern, rest)}
-            rest = [name for name in rest if name not in taken]
             size = sum(bytes_of[name] for name in taken) / 1e6
             print(f"{len(part & taken)} functions, {len(taken - part)} others, {len(found)} patterns: {size:.1f} MB", flush=True)
+            if number == 0:
+                file.writelines(f"    *(.text*._R*{path}*)\n" for path in NEIGHBOURS)
+                taken |= {name for name in rest if any(path in name for path in NEIGHBOURS)}
+            rest = [name for name in rest if name not in taken]
         file.write(TAIL)
     print(f"{ORDER.relative_to(ROOT)}: {ORDER.stat().st_size} bytes")
 
