@@ -11,10 +11,13 @@ fn main() {
     println!("cargo::rerun-if-env-changed=DRIVEGATE_FUNCTION_ORDER");
     let is = |name: &str, value: &str| env::var(name).is_ok_and(|found| found == value);
     let flags = env::var("CARGO_ENCODED_RUSTFLAGS").unwrap_or_default();
-    let reads_scripts = !OTHERS.iter().any(|linker| flags.contains(linker));
-    let wanted = !is("DRIVEGATE_FUNCTION_ORDER", "none");
-    if wanted && is("PROFILE", "release") && is("CARGO_CFG_TARGET_OS", "linux") && reads_scripts {
-        let root = env::var("CARGO_MANIFEST_DIR").unwrap_or_default();
+    let other = OTHERS
+        .iter()
+        .any(|name| flags.contains(&format!("fuse-ld={name}")) || flags.contains(&format!("linker={name}")));
+    let wanted = !is("DRIVEGATE_FUNCTION_ORDER", "none") && !other;
+    let root = env::var("CARGO_MANIFEST_DIR").unwrap_or_default();
+    // `-Wl,` parts its words at commas.
+    if wanted && is("PROFILE", "release") && is("CARGO_CFG_TARGET_OS", "linux") && !root.contains(',') {
         println!("cargo::rustc-link-arg-bins=-Wl,-T,{root}/{ORDER}");
     }
 }

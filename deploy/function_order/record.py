@@ -91,7 +91,7 @@ def program(*command):
 
 
 def get(port, path):
-    """Status and body; 0 where there is none: an emulated gateway is slow enough to hit its own time limits."""
+    """Status and body; 0 where there is none: under valgrind a gateway is slow enough to hit its own time limits."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
     try:
         connection.request("GET", path)
@@ -108,7 +108,7 @@ def wait_until_ready(port):
         if get(port, "/readyz")[0] == 200:
             return
         time.sleep(1)
-    sys.exit("error: the emulated gateway is not ready after 2 minutes")
+    sys.exit("error: the gateway under valgrind is not ready after 2 minutes")
 
 
 def use_http(port):
@@ -117,7 +117,8 @@ def use_http(port):
         get(port, path)
 
 
-def use_everything(port, modbus, broker, units, names, process, directory):
+def use_everything(port, modbus, broker, names, gateway):
+    """What SCADA clients, MQTT clients and people at the page ask for, and a reload."""
     page = get(port, "/")[1].decode(errors="replace")
     for path in re.findall(r'(?:src|href)="(/?[^":#]+)"', page):
         get(port, path if path.startswith("/") else f"/{path}")
@@ -130,18 +131,18 @@ def use_everything(port, modbus, broker, units, names, process, directory):
     requests = [struct.pack(">BHH", 3, 0x8000, 40), struct.pack(">BHH", 4, 0x8200, 16), struct.pack(">BHH", 3, 2101, 8)]
     requests += [struct.pack(">BHH", 6, 0x8101, 2500), struct.pack(">BHH", 6, 0x8100, 1), struct.pack(">BHHBHH", 16, 0x8100, 2, 4, 1, 3000)]
     requests += [struct.pack(">BHH", 6, 0x8100, 0), struct.pack(">BHH", 1, 0, 8), b"\x2b\x0e\x01\x00"]
-    for round in range(2):
-        for unit, name in zip(units, names):
+    for turn in range(2):
+        for unit, name in enumerate(names, 1):
             for number, pdu in enumerate(requests):
                 client.sendall(struct.pack(">HHHB", number, 0, len(pdu) + 1, unit) + pdu)
                 client.recv(512)
             get(port, f"/api/v1/drives/{name}")
             get(port, f"/api/v1/drives/{name}/trend?from=-1m")
-            for payload in ('{"id": "a%d", "run": true, "speed_reference": 40}' % round, '{"run": false}', '{"fault_reset": true}', "{"):
+            for payload in ('{"id": "a%d", "run": true, "speed_reference": 40}' % turn, '{"run": false}', '{"fault_reset": true}', "{"):
                 topic = f"drivegate/record/drive/{name}/set"
                 subprocess.run(["mosquitto_pub", "-p", str(broker), "-q", "1", "-t", topic, "-m", payload], check=True)
             use_http(port)
-        process.send_signal(signal.SIGHUP)
+        gateway.send_signal(signal.SIGHUP)
         time.sleep(5)
     client.close()
 
@@ -195,6 +196,7 @@ def patterns(executed, bytes_of, names, most, share):
 
 
 def record(binary, seconds, lines, cycle, more, use):
+    """Names of the functions that a gateway executes before and while it is used."""
     with tempfile.TemporaryDirectory() as folder:
         directory, port = pathlib.Path(folder), free_port()
         config = configuration(directory, lines, cycle, port, more)
@@ -208,7 +210,7 @@ def record(binary, seconds, lines, cycle, more, use):
                 wait_until_ready(port)
                 time.sleep(seconds)
                 before = log.stat().st_size
-                use(port, gateway, directory)
+                use(port, gateway)
                 time.sleep(seconds)
                 gateway.terminate()
                 gateway.wait(120)
@@ -233,7 +235,7 @@ def main():
     )
     binary = TARGET / "release/drivegate"
     print("a gateway of four lines with HTTP", flush=True)
-    polling, http_only = record(binary, seconds, PLAIN, "10ms", "", lambda port, *_: use_http(port))
+    polling, http_only = record(binary, seconds, PLAIN, "10ms", "", lambda port, _: use_http(port))
     modbus, broker = free_port(), free_port()
     more = f'[modbus_tcp]\nlisten = ["127.0.0.1:{modbus}"]\nallow = ["127.0.0.0/8"]\nwrite = ["127.0.0.1/32"]\n'
     more += f'[mqtt]\nurl = "mqtt://127.0.0.1:{broker}"\nbase = "drivegate/record"\ncommands = true\nhistory = "changes"\n'
@@ -241,12 +243,13 @@ def main():
     with program("mosquitto", "-p", str(broker)):
         mixed = set().union(*record(
             binary, seconds, MIXED, "250ms", more,
-            lambda port, gateway, directory: use_everything(port, modbus, broker, range(1, len(names) + 1), names, gateway, directory),
+            lambda port, gateway: use_everything(port, modbus, broker, names, gateway),
         ))
     write(list(functions(binary)), polling, http_only, mixed)
 
 
 def write(all_functions, *parts):
+    """Writes the order: the functions of each part that are in none before it."""
     bytes_of, alike = {}, {}
     for address, size, name in all_functions:
         bytes_of[anywhere(name)] = bytes_of.get(anywhere(name), 0) + size
