@@ -218,7 +218,7 @@ class Plot {
       // A sample between two gaps is a point.
       if (points.length === 1) line += "h0.1";
     }
-    const drawn = [draw("path", { class: "band", d: band }), draw("path", { class: "curve", d: line })];
+    const drawn = line ? [draw("path", { class: "band", d: band }), draw("path", { class: "curve", d: line })] : [];
     if (this.aim !== null) {
       const y = place(this.y(this.aim));
       const aim = draw("line", { class: "aim", x1: LEFT, x2: LEFT + this.width, y1: y, y2: y });

@@ -40,12 +40,14 @@ export function trends(drive) {
   choices.setAttribute("role", "group");
   choices.setAttribute("aria-label", "Time shown");
   const element = section("trends", "Trends", choices, note, group.element, files);
-  const address = (points, span) => `drives/${encodeURIComponent(drive)}/trend?${points}${span ? `&from=${span[1]}` : ""}`;
+  const all = `drives/${encodeURIComponent(drive)}/trend`;
+  const address = (query, span) => `${all}?${query}from=${span[1]}`;
 
   function choose(span) {
     chosen.span = span;
     chosen.next = 0;
     buttons.forEach((button, place) => button.setAttribute("aria-pressed", String(SPANS[place] === span)));
+    for (const { query, element } of links) element.setAttribute("href", `api/v1/${address(query, span)}&format=csv`);
     for (const plot of plots.values()) plot.wait();
   }
 
@@ -53,16 +55,11 @@ export function trends(drive) {
     const first = (names) => names.map((name) => points.find(({ point }) => point === name)).find(Boolean);
     chosen.points = SHOWN.map(first).filter(Boolean);
     for (const { point, unit } of chosen.points) plots.set(point, group.add({ title: titleOf(point), unit, digits: digitsOf(unit) }));
-  }
-
-  // The same links for every time: new ones would take the focus from those that somebody is on.
-  function linkFiles(span) {
-    if (!links.length) {
-      const titles = [["", "all"], ...chosen.points.map(({ point }) => [`point=${point}`, titleOf(point)])];
-      links.push(...titles.map(([query, title]) => ({ query, element: anchor("", "", title) })));
-      files.append("As CSV:", ...links.flatMap(({ element }) => [" ", element]));
-    }
-    for (const { query, element } of links) element.setAttribute("href", `api/v1/${address(query, span)}&format=csv`);
+    // The same links for every time: new ones would take the focus from those that somebody is on.
+    const titles = chosen.points.map(({ point }) => [`point=${point}&`, titleOf(point)]);
+    links.push(...[["", "all"], ...titles].map(([query, title]) => ({ query, element: anchor("", "", title) })));
+    if (titles.length) files.append("As CSV:", ...links.flatMap(({ element }) => [" ", element]));
+    choose(chosen.span);
   }
 
   choose(SPANS[0]);
@@ -75,9 +72,9 @@ export function trends(drive) {
     async refresh(load, marks) {
       if (performance.now() < chosen.next) return;
       const span = chosen.span;
-      if (!chosen.points) create((await load(address(""))).points);
+      if (!chosen.points) create((await load(all)).points);
       // In one request, so that all have the same times; one alone comes without a list.
-      const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}`, span))].flat() : [];
+      const replies = chosen.points.length ? [await load(address(`point=${[...plots.keys()].join(",")}&`, span))].flat() : [];
       if (span !== chosen.span) return;
       chosen.next = performance.now() + span[2];
       text(note, replies.length ? "" : "This family has none of the points that are kept.");
@@ -87,7 +84,6 @@ export function trends(drive) {
       group.setRange(Date.parse(replies[0].from), Date.parse(replies[0].to), step);
       for (const reply of replies) plots.get(reply.point).show(samplesOf(reply), { reach: 1.5 * step, marks });
       group.moved();
-      linkFiles(span);
     },
   };
 }

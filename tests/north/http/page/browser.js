@@ -123,6 +123,12 @@ class Page {
     await this.send("Input.insertText", { text });
   }
 
+  /// From now on an answer takes that long to come, ms.
+  async slow(latency) {
+    await this.send("Network.enable");
+    await this.send("Network.emulateNetworkConditions", { offline: false, latency, downloadThroughput: -1, uploadThroughput: -1 });
+  }
+
   /// What the browser spent so far, in seconds: LayoutDuration, RecalcStyleDuration, TaskDuration.
   async spent() {
     await this.send("Performance.enable", { timeDomain: "threadTicks" });

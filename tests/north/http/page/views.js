@@ -40,8 +40,10 @@ async function looks(page, [hash, sign, wanted], base, check) {
   assert.equal(violations.join("\n"), "", `${hash} at ${width[1]} px`);
 }
 
-/// From the top of the page to a drive, its trends and back, by keys alone; what has the focus is seen.
+/// From the top of the page to a drive, its trends and back, by keys alone; what has the focus is seen. The keys are faster than
+/// the connection.
 async function keyboardIsEnough(page, base) {
+  await page.slow(300);
   await page.open(`${base}#/`);
   await page.until(() => document.querySelector(".rows .row"));
   await page.eval(() => document.activeElement.blur());
