@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::line_state::{Exchanged, LineState};
-use super::master::{Handover, Master, Turn, TurnEnd};
+use super::master::{Handover, Master, Purpose, Turn, TurnEnd};
 use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
@@ -55,6 +55,8 @@ pub struct BusCore {
     /// What is on the line.
     asked: Option<Turn>,
     tap: Option<Tap>,
+    /// Empty; kept for its memory.
+    news: Vec<News>,
 }
 
 impl BusCore {
@@ -78,6 +80,7 @@ impl BusCore {
             quiet_until: before.quiet_until,
             asked: None,
             tap: None,
+            news: Vec::new(),
         }
     }
 
@@ -136,9 +139,9 @@ impl BusCore {
 
     /// Chooses what goes out next; else until when nothing does.
     fn choose(&mut self, now: Instant) -> Option<Instant> {
-        let mut news = Vec::new();
+        let mut news = std::mem::take(&mut self.news);
         let next = self.master.next(now, &mut news);
-        self.report_all(&news, now);
+        self.report_all(news, now);
         self.report.tick(now);
         let turn = match next {
             Ok(turn) => turn,
@@ -196,7 +199,7 @@ impl BusCore {
 
     /// The chosen frame goes to the port at `now`: to be called before the port gets it, since what the port does with
     /// it is not known.
-    pub fn sending(&mut self, now: Instant) -> Vec<u8> {
+    pub fn sending(&mut self, now: Instant) -> &[u8] {
         let Some(Chosen {
             turn,
             request,
@@ -204,7 +207,7 @@ impl BusCore {
             since,
         }) = self.chosen.take()
         else {
-            return Vec::new();
+            return &[];
         };
         if self.line.babbles(since) {
             tracing::warn!(bus = %self.bus.image.spec.name, "the line does not fall silent; speaking all the same");
@@ -213,13 +216,13 @@ impl BusCore {
         self.report
             .diagnosis
             .sending(now.saturating_duration_since(quiet_since));
-        let drive = Some(turn.drive).filter(|drive| *drive < self.bus.image.drives.len());
-        self.tap = self.report.tap(drive, &request, &frame, quiet_since, now);
+        let drive = self.known(&turn);
+        self.tap = self.report.asked(drive, &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
-        self.line.send(request, frame.clone(), sending, late, now);
+        self.line.send(request, frame, sending, late, now);
         self.asked = Some(turn);
-        frame
+        self.line.frame()
     }
 
     /// Bytes came in.
@@ -244,12 +247,18 @@ impl BusCore {
     fn over(&mut self, mut exchanged: Exchanged, now: Instant) {
         let Some(turn) = self.asked.take() else { return };
         self.report.exchanged(turn.drive, &exchanged, now);
+        let drive = self.known(&turn);
+        let heard = exchanged.transaction.seen();
+        self.report.answered(drive, heard, &exchanged.ended, now);
         if let Some(tap) = self.tap.take() {
             tap.ended(&exchanged.ended, now);
         }
         self.master.put_late(exchanged.transaction.take_late());
         let mangled = exchanged.transaction.is_mangled_reply();
-        let frame = exchanged.transaction.take_reply_frame();
+        let frame = match turn.purpose {
+            Purpose::Background => exchanged.transaction.reply_frame().to_vec(),
+            Purpose::Poll(_) | Purpose::Session(..) | Purpose::Command { .. } => Vec::new(),
+        };
         let Exchanged { ended, began, took, .. } = exchanged;
         let end = TurnEnd {
             ended,
@@ -262,18 +271,25 @@ impl BusCore {
     }
 
     fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant) {
-        let news = self.master.done(turn, end, now);
-        self.report_all(&news, now);
+        let mut news = std::mem::take(&mut self.news);
+        self.master.done(turn, end, now, &mut news);
+        self.report_all(news, now);
     }
 
-    fn report_all(&mut self, news: &[News], now: Instant) {
-        for one in news {
-            if let Some(drive) = self.report.apply(one, now)
+    /// The drive of a turn, unless no entry names it.
+    fn known(&self, turn: &Turn) -> Option<usize> {
+        Some(turn.drive).filter(|drive| *drive < self.bus.image.drives.len())
+    }
+
+    fn report_all(&mut self, mut news: Vec<News>, now: Instant) {
+        for one in news.drain(..) {
+            if let Some(drive) = self.report.apply(&one, now)
                 && self.bus.image.tape.takes(Taping::Everything)
             {
                 self.master.fault_came(drive, now);
             }
         }
+        self.news = news;
     }
 }
 

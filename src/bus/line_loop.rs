@@ -279,8 +279,7 @@ impl Worker {
                     // A thread that was held up may not have seen the last bytes.
                     let count = line.receive(&mut buffer)?;
                     if count == 0 {
-                        let frame = core.sending(Instant::now());
-                        line.send(&frame)?;
+                        line.send(core.sending(Instant::now()))?;
                     } else {
                         core.heard(buffer.get(..count).unwrap_or_default(), Instant::now());
                     }

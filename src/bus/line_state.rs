@@ -165,6 +165,13 @@ impl LineState {
         });
     }
 
+    /// The frame of the request that is on the line.
+    pub fn frame(&self) -> &[u8] {
+        self.underway
+            .as_ref()
+            .map_or(&[], |underway| underway.transaction.frame())
+    }
+
     /// Whether an exchange is under way.
     pub fn is_underway(&self) -> bool {
         self.underway.is_some()

@@ -117,7 +117,7 @@ pub struct TurnEnd {
     pub took: Duration,
     /// What could not be believed was the drive's own reply, mangled.
     pub mangled: bool,
-    /// The frame of the reply, as the drive sent it.
+    /// The frame of the reply, as the drive sent it, to [`Purpose::Background`].
     pub frame: Vec<u8>,
 }
 

@@ -20,7 +20,7 @@ use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
 use crate::event::{Event, EventKind, Events};
 use crate::plant::explain;
 use crate::process_image::{
-    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Taping,
+    Access, BusImage, DriveImage, LeaseAction, Link, Outcome as Counted, PollCycle, Snapshot, TapedRead, Verdict,
 };
 
 /// The load of the line is reckoned over this time.
@@ -412,9 +412,9 @@ impl Report {
         });
     }
 
-    /// Looks at an exchange for the recorder and for whoever listens to the frames; `None` while nobody does. The request was given to the
-    /// line at `began`, which had been silent since `quiet_since`.
-    pub(super) fn tap(
+    /// A request was given to the line, which had been silent since `quiet_since`, at `began`: for the recorder, and for
+    /// whoever listens to the frames; `None` while nobody does.
+    pub(super) fn asked(
         &self,
         index: Option<usize>,
         request: &Request,
@@ -422,12 +422,18 @@ impl Report {
         quiet_since: Instant,
         began: Instant,
     ) -> Option<Tap> {
-        if !self.image.trace.wanted() && !self.image.tape.takes(Taping::Everything) {
+        tap::tape(&self.image, index, frame, Verdict::Sent, began);
+        if !self.image.trace.wanted() {
             return None;
         }
         let tap = Tap::new(self.image.clone(), index, request.clone(), frame.to_vec(), began);
         tap.sent(quiet_since, began);
         Some(tap)
+    }
+
+    /// The exchange is over; `heard` is all that came, for the recorder.
+    pub(super) fn answered(&self, index: Option<usize>, heard: &[u8], ended: &Ended, now: Instant) {
+        tap::tape(&self.image, index, heard, tap::taped(ended), now);
     }
 
     /// Bytes that are nobody's answer came in an exchange.

@@ -14,17 +14,15 @@ use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict
 /// Bytes of one exchange that are kept; a line that babbles beyond shows its beginning.
 const KEPT: usize = 2048;
 
-/// One exchange that somebody listens to.
+/// One exchange that somebody listens to. Somebody did when the request went out: a trace never begins with half an
+/// exchange.
 #[derive(Debug)]
 pub(super) struct Tap {
     image: Arc<BusImage>,
-    index: Option<usize>,
     drive: Option<String>,
     request: Request,
     frame: Vec<u8>,
     hearing: Hearing,
-    /// Somebody listened when the request went out: a trace never begins with half an exchange.
-    traced: bool,
 }
 
 impl Tap {
@@ -40,9 +38,7 @@ impl Tap {
         let drive = index.and_then(|index| image.drives.get(index));
         let drive = drive.map(|drive| drive.spec.name.clone());
         Tap {
-            traced: image.trace.wanted(),
             image,
-            index,
             drive,
             request,
             hearing: Hearing::new(format, began + format.chars(frame.len())),
@@ -52,7 +48,6 @@ impl Tap {
 
     /// Publishes the request.
     pub(super) fn sent(&self, quiet_since: Instant, began: Instant) {
-        self.tape(&self.frame, Verdict::Sent, began);
         self.image.trace.publish(|| FrameRecord {
             time: time_of_day(began),
             gap: Some(began.saturating_duration_since(quiet_since)),
@@ -71,10 +66,6 @@ impl Tap {
 
     /// Publishes what came back, a record for each frame.
     pub(super) fn ended(self, ended: &Ended, now: Instant) {
-        self.tape(&self.hearing.bytes, taped(ended), now);
-        if !self.traced {
-            return;
-        }
         let protocol = self.image.spec.protocol;
         let answered = matches!(ended, Ended::Reply(_));
         let parts = describe::parts(protocol, &self.request, &self.frame, &self.hearing.bytes, answered);
@@ -98,10 +89,6 @@ impl Tap {
         }
     }
 
-    fn tape(&self, bytes: &[u8], verdict: Verdict, at: Instant) {
-        self.image.tape.frame(|| frame(self.index, bytes, verdict, at));
-    }
-
     fn reply(&self, at: Instant, gap: Option<Duration>, bytes: &[u8], decode: String, verdict: String) {
         self.image.trace.publish(|| FrameRecord {
             time: time_of_day(at),
@@ -115,16 +102,18 @@ impl Tap {
     }
 }
 
-fn frame(drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) -> TapedFrame {
-    TapedFrame {
+/// Gives the recorder a request, or all bytes that came until its exchange was over.
+pub(super) fn tape(image: &BusImage, drive: Option<usize>, bytes: &[u8], verdict: Verdict, at: Instant) {
+    image.tape.frame(|| TapedFrame {
         at,
         drive,
         verdict,
-        bytes: bytes.into(),
-    }
+        bytes: bytes.get(..KEPT).unwrap_or(bytes).into(),
+    });
 }
 
-fn taped(ended: &Ended) -> Verdict {
+/// How the recorder calls the end of an exchange.
+pub(super) fn taped(ended: &Ended) -> Verdict {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Verdict::Exception,
         Ended::Reply(_) => Verdict::Ok,
@@ -135,9 +124,7 @@ fn taped(ended: &Ended) -> Verdict {
 
 /// Publishes bytes that came between two exchanges.
 pub(super) fn noise(image: &BusImage, bytes: &[u8], quiet_since: Instant, now: Instant) {
-    image
-        .tape
-        .frame(|| frame(None, bytes.get(..KEPT).unwrap_or(bytes), Verdict::Foreign, now));
+    tape(image, None, bytes, Verdict::Foreign, now);
     image.trace.publish(|| {
         let mut hearing = Hearing::new(image.spec.format, quiet_since);
         hearing.add(bytes, now);

@@ -8,6 +8,7 @@
 //! believed, the request is repeated. N2 replies are not believed there at all. What stands before the colon of a
 //! Modbus ASCII frame is no garbage but noise, which its decoder skips.
 
+use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use super::n2_late_replies::{N2LateReplies, Taken};
@@ -58,8 +59,8 @@ pub struct Transaction {
     garbage: Option<(&'static str, Instant)>,
     /// What came may be the whole reply: until when more of it is waited for.
     whole_at: Option<Instant>,
-    /// The frame of the reply, as it came.
-    reply_frame: Vec<u8>,
+    /// Where the frame of the reply stands in `received`.
+    reply: Range<usize>,
     first_byte: Option<Instant>,
     foreign: u32,
     echo: bool,
@@ -97,7 +98,7 @@ impl Transaction {
             reply_time,
             garbage: None,
             whole_at: None,
-            reply_frame: Vec::new(),
+            reply: 0..0,
             first_byte: None,
             foreign: 0,
             echo,
@@ -238,8 +239,7 @@ impl Transaction {
     }
 
     fn replied(&mut self, at: usize, used: usize, reply: Reply) -> Step {
-        let taken = self.received.drain(..(at + used).min(self.received.len()));
-        self.reply_frame = taken.skip(at).collect();
+        self.reply = at..(at + used).min(self.received.len());
         Step::Done(Ended::Reply(reply))
     }
 
@@ -249,16 +249,15 @@ impl Transaction {
         self.protocol == Protocol::ModbusRtu && matches!(self.request.pdu, RequestPdu::Other(_)) && regular
     }
 
-    /// The frame of the reply, as the drive sent it.
-    pub fn take_reply_frame(&mut self) -> Vec<u8> {
-        let mut frame = std::mem::take(&mut self.reply_frame);
+    /// The frame of the reply, as the drive sent it; empty without one.
+    pub fn reply_frame(&self) -> &[u8] {
+        let frame = self.received.get(self.reply.clone()).unwrap_or_default();
         let before = match self.protocol {
             // Blanks and glitches of a line that changes direction.
             Protocol::N2 => frame.iter().position(u8::is_ascii_graphic).unwrap_or(0),
-            protocol => protocol.noise(&frame),
+            protocol => protocol.noise(frame),
         };
-        frame.drain(..before.min(frame.len()));
-        frame
+        frame.get(before..).unwrap_or_default()
     }
 
     /// The reply that stands whole behind garbage.
@@ -358,7 +357,7 @@ impl Transaction {
 
     /// Bytes that came behind the reply, or were no reply.
     pub fn rest(&self) -> &[u8] {
-        &self.received
+        self.received.get(self.reply.end..).unwrap_or_default()
     }
 }
 

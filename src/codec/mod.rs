@@ -162,19 +162,16 @@ impl Protocol {
     /// Whether bytes that are no sound reply begin as the reply to `request` does, so that they were that reply, mangled on
     /// the line, and no noise before it. An N2 reply shows nothing of its request: there the length has to do.
     pub fn begins_reply(self, request: &Request, bytes: &[u8]) -> bool {
-        let mut head = vec![request.address, request.pdu.function()];
+        let head = [request.address, request.pdu.function()];
         match self {
             Protocol::ModbusRtu => bytes.len() > 3 && bytes.starts_with(&head),
             Protocol::ModbusAscii => {
-                let text: Vec<u8> = head
-                    .drain(..)
-                    .flat_map(|byte| format!("{byte:02X}").into_bytes())
-                    .collect();
+                let text: String = head.iter().map(|byte| format!("{byte:02X}")).collect();
                 let begun = bytes
                     .iter()
                     .position(|byte| *byte == b':')
                     .and_then(|at| bytes.get(at + 1..));
-                begun.is_some_and(|rest| rest.len() > 6 && rest.to_ascii_uppercase().starts_with(&text))
+                begun.is_some_and(|rest| rest.len() > 6 && rest.to_ascii_uppercase().starts_with(text.as_bytes()))
             }
             Protocol::N2 => bytes.len() >= n2::least_reply_chars(&request.pdu).max(5) - 1,
         }

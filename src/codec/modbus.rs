@@ -85,7 +85,8 @@ fn put(out: &mut Vec<u8>, word: u16) {
 }
 
 fn words(bytes: &[u8]) -> Vec<u16> {
-    bytes.chunks_exact(2).filter_map(|pair| be(pair, 0)).collect()
+    let (pairs, _) = bytes.as_chunks();
+    pairs.iter().copied().map(u16::from_be_bytes).collect()
 }
 
 fn pack(bits: &[bool], out: &mut Vec<u8>) {

@@ -14,15 +14,21 @@ pub fn encode_frame(address: u8, pdu: &[u8], out: &mut Vec<u8>) {
     let start = out.len();
     out.push(address);
     out.extend_from_slice(pdu);
+    end_frame(start, out);
+}
+
+/// Appends the CRC of what is in `out` from `start` on.
+fn end_frame(start: usize, out: &mut Vec<u8>) {
     let crc = crc16(out.get(start..).unwrap_or_default());
     out.extend_from_slice(&crc.to_le_bytes());
 }
 
 /// Appends the request's frame to `out`.
 pub fn encode_request(request: &Request, out: &mut Vec<u8>) {
-    let mut pdu = Vec::with_capacity(request.pdu.encoded_len());
-    request.pdu.encode(&mut pdu);
-    encode_frame(request.address, &pdu, out);
+    let start = out.len();
+    out.push(request.address);
+    request.pdu.encode(out);
+    end_frame(start, out);
 }
 
 /// The address and PDU of a whole frame whose CRC is right.

@@ -178,8 +178,14 @@ impl Tape {
 
     /// All entries since the last call, oldest first, and how many were dropped.
     pub fn take(&self) -> (Vec<Taped>, u64) {
-        let waiting = std::mem::take(&mut *self.waiting.lock().unwrap_or_else(PoisonError::into_inner));
-        (waiting.entries, waiting.lost)
+        let mut waiting = self.waiting.lock().unwrap_or_else(PoisonError::into_inner);
+        let next = Waiting {
+            // Until the next call about as many come.
+            entries: Vec::with_capacity(waiting.entries.len()),
+            ..Waiting::default()
+        };
+        let taken = std::mem::replace(&mut *waiting, next);
+        (taken.entries, taken.lost)
     }
 }
 

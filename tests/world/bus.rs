@@ -272,7 +272,7 @@ impl WorldBus {
 
     fn send(&mut self, now: Instant, seen: &mut Vec<Seen>) {
         self.note_over(seen);
-        let frame = self.core.sending(now);
+        let frame = self.core.sending(now).to_vec();
         self.exchanges += 1;
         let turn = self.core.asked().expect("a turn is on the line");
         let asked = Asked {

@@ -185,14 +185,17 @@ impl ListenCore {
             return;
         };
         let (quiet_since, began) = (exchange.quiet_since, exchange.began);
-        let Some(mut tap) = self.report.tap(index, request, &exchange.frame, quiet_since, began) else {
-            return;
+        let tap = self.report.asked(index, request, &exchange.frame, quiet_since, began);
+        let doubted = exchange.doubt.map(Ended::Corrupt);
+        let ended = match &exchange.ended {
+            Some(Ended::Reply(_)) => doubted.as_ref().or(exchange.ended.as_ref()),
+            ended => ended.as_ref(),
         };
-        tap.heard(&exchange.heard, exchange.at);
-        match (&exchange.ended, exchange.doubt) {
-            (Some(Ended::Reply(_)), Some(doubt)) => tap.ended(&Ended::Corrupt(doubt), exchange.at),
-            (Some(ended), _) => tap.ended(ended, exchange.at),
-            (None, _) => {}
+        let Some(ended) = ended else { return };
+        self.report.answered(index, &exchange.heard, ended, exchange.at);
+        if let Some(mut tap) = tap {
+            tap.heard(&exchange.heard, exchange.at);
+            tap.ended(ended, exchange.at);
         }
     }
 

@@ -20,22 +20,20 @@ const STOPS_IN_VAIN: u32 = 10;
 
 impl Master {
     /// The exchange of a turn is over; what that changes.
-    pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Vec<News> {
-        let mut news = Vec::new();
+    pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.note_late(turn, &end, now);
         match &turn.purpose {
-            Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, &mut news),
-            Purpose::Poll(poll) => self.polled(poll, end.ended, end.took, now, &mut news),
-            Purpose::Background => self.background_over(turn, end, now, &mut news),
+            Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, news),
+            Purpose::Poll(poll) => self.polled(poll, end.ended, end.took, now, news),
+            Purpose::Background => self.background_over(turn, end, now, news),
             Purpose::Command { slot, rank, step } => {
                 let step = Step {
                     purpose: *step,
                     pdu: turn.pdu.clone(),
                 };
-                self.commanded(turn.drive, *slot, *rank, &step, end, now, &mut news);
+                self.commanded(turn.drive, *slot, *rank, &step, end, now, news);
             }
         }
-        news
     }
 
     /// A fault came up in a drive: it is asked for what its profile names for that.
@@ -153,9 +151,9 @@ impl Master {
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
         }
-        let polled = match &ended {
+        let polled = match ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
-            Ended::Reply(Reply::Exception(code)) => Polled::Refused(*code),
+            Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) => {
                 self.read(poll, reply, now, news);
                 Polled::Ok
@@ -193,14 +191,14 @@ impl Master {
     }
 
     /// The drive answered a read of the plan.
-    fn read(&mut self, poll: &Poll, reply: &Reply, now: Instant, news: &mut Vec<News>) {
+    fn read(&mut self, poll: &Poll, reply: Reply, now: Instant, news: &mut Vec<News>) {
         let (read, pdu) = (poll.read, poll.read.pdu());
         let Some(drive) = self.drives.get_mut(poll.drive) else {
             return;
         };
         let at = drive.late.asked_by(&pdu, now);
         drive.late.answered(&pdu, now);
-        if let Some(words) = reply.words() {
+        if let Some(words) = reply.into_words() {
             self.learn(poll.drive, read, words, at, news);
         }
     }

@@ -157,17 +157,14 @@ impl Rig {
                 let took = if ended == Ended::Silent { TIMEOUT } else { COST };
                 self.now += took;
                 let mangled = false;
-                news.append(&mut self.master.done(
-                    &turn,
-                    TurnEnd {
-                        ended,
-                        began,
-                        took,
-                        mangled,
-                        frame: Vec::new(),
-                    },
-                    self.now,
-                ));
+                let end = TurnEnd {
+                    ended,
+                    began,
+                    took,
+                    mangled,
+                    frame: Vec::new(),
+                };
+                self.master.done(&turn, end, self.now, &mut news);
                 self.wire.push((began, turn));
             }
         }
@@ -419,7 +416,7 @@ fn what_was_on_the_wire_when_the_port_was_lost_is_not_told_to_be_unsent() {
             frame: Vec::new(),
         };
         rig.now += COST;
-        rig.master.done(&turn, end, rig.now);
+        rig.master.done(&turn, end, rig.now, &mut Vec::new());
     }
     let mut waiting = rig.order(0, "a", ModelPoint::SpeedReference, Value::Number(20.0));
     rig.bus.queue.close(Outcome::BusDown, rig.now);
@@ -547,7 +544,7 @@ fn a_mangled_reply_may_come_once_more_where_one_that_never_came_may_not() {
         rig.master.last_answered = Some((turn.drive, written));
         assert!(!rig.master.sending(&turn, rig.now).could_be_doubled);
         rig.now += COST;
-        rig.master.done(&turn, garbled, rig.now);
+        rig.master.done(&turn, garbled, rig.now, &mut Vec::new());
         turn.drive = 1 - turn.drive;
         assert_eq!(rig.master.sending(&turn, rig.now).could_be_doubled, expected);
     }

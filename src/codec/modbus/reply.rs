@@ -28,9 +28,14 @@ pub enum Reply {
 impl Reply {
     /// What was read: registers, or bits as 0 and 1.
     pub fn words(&self) -> Option<Vec<u16>> {
+        self.clone().into_words()
+    }
+
+    /// As [`Reply::words`].
+    pub fn into_words(self) -> Option<Vec<u16>> {
         match self {
-            Reply::Registers(words) => Some(words.clone()),
-            Reply::Bits(bits) => Some(bits.iter().map(|bit| u16::from(*bit)).collect()),
+            Reply::Registers(words) => Some(words),
+            Reply::Bits(bits) => Some(bits.into_iter().map(u16::from).collect()),
             _ => None,
         }
     }
