@@ -97,14 +97,16 @@ image: package-tools ## Build the container images into dist/ for ARCHITECTURES
 release: package-tools ## Build all that a release consists of into dist/
 	deploy/package/release.sh $(ARCHITECTURES)
 
-test-package: package-tools ## Install, upgrade, downgrade, remove and purge the package in a booted Debian; wants root
-	machine="$$(dpkg --print-architecture)"; deploy/package/deb.sh "$$machine"; deploy/package/test/package.sh dist/drivegate_*_"$$machine".deb
+test-package: package-tools ## Install, upgrade, downgrade, remove and purge the packages in a booted Debian, ARM under qemu; wants root
+	deploy/package/deb.sh $(ARCHITECTURES)
+	for each in $(ARCHITECTURES); do deploy/package/test/package.sh dist/drivegate_*_"$$each".deb; done
 
 test-static: package-tools ## Start the static binaries of ARCHITECTURES, ARM under qemu: the demo and one command
 	deploy/package/test/static.sh $(ARCHITECTURES)
 
-test-image: package-tools ## Build the image for this machine and run it by runc; wants root
-	machine="$$(dpkg --print-architecture)"; deploy/package/image.sh "$$machine"; deploy/package/test/image.sh dist/drivegate_*_image_"$$machine".tar
+test-image: package-tools ## Build the images and run them by runc, ARM under qemu; wants root
+	deploy/package/image.sh $(ARCHITECTURES)
+	for each in $(ARCHITECTURES); do deploy/package/test/image.sh dist/drivegate_*_image_"$$each".tar; done
 
 clean: ## Remove everything that was built or installed here
 	cargo clean

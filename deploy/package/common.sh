@@ -46,6 +46,32 @@ ARCHITECTURES=(amd64 arm64 armhf)
 # Where finished files go.
 DIST=${DIST:-dist}
 
+# Has the kernel run programs of that architecture by qemu; `end_emulation` takes that back. Needs root.
+HANDLER=
+emulate() {
+    local cpu class machine folder=/proc/sys/fs/binfmt_misc
+    case $1 in
+        "$(dpkg --print-architecture)") return ;;
+        arm64) cpu=aarch64 class='\x02' machine='\xb7' ;;
+        armhf) cpu=arm class='\x01' machine='\x28' ;;
+        *) fail "no emulator for \"$1\"" "$0" "test it on such a machine" ;;
+    esac
+    [ -e $folder/register ] || mount -t binfmt_misc binfmt_misc $folder ||
+        fail "the kernel cannot run foreign programs" "$folder" "load binfmt_misc, or test $1 on such a machine"
+    # One of Debian's packages is as good.
+    [ ! -e "$folder/qemu-$cpu" ] || return 0
+    printf ':qemu-%s:M::%s:%s:%s:F' "$cpu" \
+        "\\x7fELF$class\\x01\\x01\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x00\\x02\\x00$machine\\x00" \
+        '\xff\xff\xff\xff\xff\xff\xff\x00\xff\xff\xff\xff\xff\xff\xff\xff\xfe\xff\xff\xff' \
+        "$(command -v "qemu-$cpu")" >$folder/register
+    HANDLER=$folder/qemu-$cpu
+}
+
+end_emulation() {
+    [ -z "$HANDLER" ] || echo -1 >"$HANDLER"
+    HANDLER=
+}
+
 # A pre-release sorts before its release: 1.0.0-rc.1 is 1.0.0~rc.1.
 debian_version() {
     version | sed 's/-/~/'

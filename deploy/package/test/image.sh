@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Runs the image of this machine's architecture by runc, as the compose file does: no capabilities, read-only root, user
+# Runs the image by runc, one of a foreign architecture under qemu, as the compose file does: no capabilities, read-only root, user
 # 65532, only what is mounted is writable. Needs root.
 #   deploy/package/test/image.sh ARCHIVE
 set -euo pipefail
@@ -40,9 +40,14 @@ simulator=
 stop() {
     $runc delete --force $container 2>/dev/null || true
     [ -z "$simulator" ] || kill "$simulator" 2>/dev/null || true
+    end_emulation
 }
 runc="runc --root $work/state"
 trap stop EXIT
+case $(jq -r '.architecture + (.variant // "")' "$settings") in
+    armv7) emulate armhf ;;
+    *) emulate "$(jq -r .architecture "$settings")" ;;
+esac
 "$work/bundle/rootfs/drivegate" simulate --profile vacon-nx --addresses 1 --link "$work/line" >"$work/simulator" 2>&1 &
 simulator=$!
 for _ in {1..120}; do

@@ -17,7 +17,16 @@ trap 'ended $? "$BASH_COMMAND"' EXIT
 
 step() { echo "--- $*"; }
 pid() { systemctl show --property=MainPID --value drivegate; }
-program() { readlink "/proc/$(pid)/exe"; }
+# On an emulated processor the kernel runs the emulator, whose first argument is the program.
+program() {
+    local exe arguments
+    exe=$(readlink "/proc/$(pid)/exe")
+    mapfile -d '' -t arguments <"/proc/$(pid)/cmdline"
+    case $exe in
+    */qemu-*) echo "${arguments[1]}" ;;
+    *) echo "$exe" ;;
+    esac
+}
 installed() { dpkg-query --showformat='${db:Status-Abbrev}${Version}' --show drivegate; }
 contains() { grep --quiet --fixed-strings -- "$2" <<<"$1" || { echo "no \"$2\" in: $1"; return 1; }; }
 until_true() {
