@@ -226,8 +226,9 @@ pub(super) mod tests {
         assert_eq!(dropped.try_recv().unwrap().outcome, Outcome::ShuttingDown);
         assert_eq!(stats.results().values().sum::<u64>(), 2);
         assert_eq!(stats.seconds().count, 2);
-        let audited: Vec<_> = stats.audit().recent().iter().map(|r| r.result).collect();
-        assert_eq!(audited, ["timeout", "shutting_down"]);
+        let audited = stats.audit().parsed();
+        let results: Vec<_> = audited.iter().map(|r| &r["result"]).collect();
+        assert_eq!(results, ["timeout", "shutting_down"]);
     }
 
     #[test]
@@ -239,17 +240,20 @@ pub(super) mod tests {
         let mut confirmation = ticket.confirmation();
         let receipt = ticket.acknowledge(acknowledged.clone(), now + Duration::from_millis(5));
         assert_eq!(answer.try_recv().unwrap().outcome, acknowledged);
-        assert!(stats.audit().recent().is_empty(), "one line has both");
+        assert!(stats.audit().parsed().is_empty(), "one line has both");
         receipt.confirm(now + Duration::from_millis(9));
         assert_eq!(confirmation.try_recv(), Ok(Duration::from_millis(9)));
-        let record = &stats.audit().recent()[0];
-        assert_eq!((record.result, record.latency.as_millis()), ("confirmed", 5));
-        assert_eq!(record.confirmed, Some(Duration::from_millis(9)));
+        let record = &stats.audit().parsed()[0];
+        assert_eq!(
+            (&record["result"], &record["latency_ms"]),
+            (&"confirmed".into(), &5.0.into())
+        );
+        assert_eq!(record["confirmed_ms"], 9.0);
         let (mut ticket, _answer) = self::ticket(&stats, now);
         let mut confirmation = ticket.confirmation();
         drop(ticket.acknowledge(acknowledged, now));
         assert!(confirmation.try_recv().is_err());
-        assert_eq!(stats.audit().recent()[1].result, "acknowledged");
+        assert_eq!(stats.audit().parsed()[1]["result"], "acknowledged");
         assert_eq!(stats.results().values().sum::<u64>(), 2);
     }
 }

@@ -485,10 +485,14 @@ fn commands_of_the_other_master_are_told_when_they_change() {
         "{texts:?}"
     );
     assert!(texts[1].contains("run=false"), "{texts:?}");
-    let audited = scene.writes.audit().recent();
+    let audited = scene.writes.audit().recent(None);
     assert_eq!(audited.len(), 2);
-    assert_eq!((audited[0].source, audited[0].result), ("other_master", "acknowledged"));
-    assert_eq!(audited[1].points[0].old, Some(Value::Bool(true)));
+    assert!(audited[0].contains(r#""source":"other_master""#) && audited[0].contains(r#""result":"acknowledged""#));
+    assert!(
+        audited[1].contains(r#""points":[{"point":"run","old":true,"new":false}]"#),
+        "{}",
+        audited[1]
+    );
     // A reference that moves in every cycle: one a second.
     for step in 0..600 {
         scene.ask(1, &run(0, 1000 + step), 1);

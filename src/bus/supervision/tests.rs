@@ -160,10 +160,10 @@ impl Bench {
     }
 
     /// Results of the gateway's own orders.
-    fn own_results(&self) -> Vec<&'static str> {
-        let audit = self.stats.audit().recent();
-        let own = audit.iter().filter(|r| r.source == SourceKind::Supervision.name());
-        own.map(|r| r.result).collect()
+    fn own_results(&self) -> Vec<serde_json::Value> {
+        let audit = self.stats.audit().parsed();
+        let own = audit.iter().filter(|r| r["source"] == SourceKind::Supervision.name());
+        own.map(|r| r["result"].clone()).collect()
     }
 
     /// A reference of a client waits from now on.

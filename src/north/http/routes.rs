@@ -354,11 +354,9 @@ async fn audit(State(app): State<Arc<AppState>>, RawQuery(query): RawQuery) -> R
         return no_drive(&plant, drive);
     }
     let _turn = app.turn().await;
-    let records = plant.writes.audit().recent();
-    let wanted = records
-        .iter()
-        .filter(|record| drive.as_ref().is_none_or(|drive| record.drive == *drive));
-    Json(wanted.map(Arc::as_ref).collect::<Vec<_>>()).into_response()
+    let records = plant.writes.audit().recent(drive.as_deref());
+    let list = format!("[{}]", records.join(","));
+    ([(header::CONTENT_TYPE, "application/json")], list).into_response()
 }
 
 /// The recordings, oldest first.

@@ -37,7 +37,8 @@ pub(super) struct Commands {
     waiting: PendingCommands,
     /// In the order of acknowledgement.
     confirming: PendingCommands,
-    memory: Memory<Message>,
+    /// With the payloads of their results.
+    memory: Memory<Arc<[u8]>>,
     rules: Rules,
 }
 
@@ -134,7 +135,7 @@ impl Commands {
             match self.memory.repeated(&taken, print, stops, now) {
                 None => {}
                 Some(Repetition::Pending) => return None,
-                Some(Repetition::Answered(previous)) => return Some(reply.again(previous)),
+                Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
                 Some(Repetition::Outdated(why)) => {
                     let why = format!("it repeats an earlier command, {why}; send it with another `id`");
                     return refuse(Refusal::NotAllowed(why), request.id, origin);
@@ -230,7 +231,8 @@ impl Commands {
         let message = finished
             .reply
             .message(finished.id, &finished.answer, finished.confirmed, time);
-        self.memory.finished(finished.number, &message);
+        self.memory
+            .finished(finished.number, &message.payload.as_slice().into());
         message
     }
 

@@ -84,12 +84,11 @@ impl Reply {
         &self.topic
     }
 
-    /// The result of an earlier command, once more.
-    pub(super) fn again(&self, previous: Message) -> Message {
+    /// The message with that result.
+    pub(super) fn with(&self, payload: Vec<u8>) -> Message {
         Message {
-            topic: self.topic.as_str().into(),
             correlation: self.correlation.clone(),
-            ..previous
+            ..Message::not_retained(self.topic.as_str(), payload)
         }
     }
 
@@ -106,11 +105,7 @@ impl Reply {
         confirmed: Option<Duration>,
         time: SystemTime,
     ) -> Message {
-        let payload = CommandResult::new(id.as_ref(), &self.drive, answer, confirmed, time).to_json();
-        Message {
-            correlation: self.correlation.clone(),
-            ..Message::not_retained(self.topic.as_str(), payload)
-        }
+        self.with(CommandResult::new(id.as_ref(), &self.drive, answer, confirmed, time).to_json())
     }
 }
 

@@ -141,8 +141,11 @@ fn refusals_are_reported_audited_and_answered_and_nothing_is_queued() {
     );
     let unknown = (crate::command::SourceKind::Mqtt, "unknown_drive");
     assert_eq!(bench.plant.writes.results().get(&unknown), Some(&1));
-    let record = bench.plant.writes.audit().recent().pop().unwrap();
-    assert_eq!((record.result, record.drive.as_str()), ("unknown_drive", "p11"));
+    let record = bench.plant.writes.audit().parsed().pop().unwrap();
+    assert_eq!(
+        (&record["result"], &record["drive"]),
+        (&"unknown_drive".into(), &"p11".into())
+    );
     assert!(
         result["error"]["message"]
             .as_str()

@@ -208,8 +208,8 @@ fn what_is_wrong_is_refused_with_its_reason() {
         None,
         "there is no such drive"
     );
-    let seen = bench.plant.writes.audit().recent();
-    assert!(seen.iter().all(|record| record.source == "sparkplug"));
+    let seen = bench.plant.writes.audit().parsed();
+    assert!(seen.iter().all(|record| record["source"] == "sparkplug"));
 }
 
 #[test]
