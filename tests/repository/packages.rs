@@ -143,6 +143,17 @@ fn the_image_says_what_it_is_and_whether_it_is_well() {
     assert!(read("deploy/compose.yaml").contains("DRIVEGATE_COMMIT: ${DRIVEGATE_COMMIT:-unknown}"));
 }
 
+#[test]
+fn unit_and_image_keep_memory_in_the_same_way() {
+    let unit = read("systemd/drivegate.service");
+    let environment = unit.lines().filter_map(|line| line.strip_prefix("Environment="));
+    let wanted: Vec<_> = environment.flat_map(str::split_ascii_whitespace).collect();
+    assert!(wanted.len() > 1, "{wanted:?}");
+    let image = read("deploy/Dockerfile").replace("\\\n", " ");
+    let own = image.lines().find_map(|line| line.strip_prefix("ENV ")).unwrap();
+    assert_eq!(own.split_ascii_whitespace().collect::<Vec<_>>(), wanted);
+}
+
 /// Serial drivers with a fixed device number (Linux, Documentation/admin-guide/devices.txt); a container is given numbers.
 const MAJORS: [(&str, u32); 6] = [
     ("ttyS", 4),

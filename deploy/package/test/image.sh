@@ -22,7 +22,7 @@ check() {
 check '.config.User == "65532:65532"'
 check '.config.Entrypoint == ["/drivegate"]'
 check '.config.Healthcheck.Test == ["CMD", "/drivegate", "health", "--config", "/etc/drivegate/drivegate.toml"]'
-check '.config.Env | contains(["MALLOC_ARENA_MAX=1"])'
+check '.config.Env | contains(["MALLOC_ARENA_MAX=1", "GLIBC_TUNABLES=glibc.malloc.tcache_count=0"])'
 for label in version revision source title licenses; do
     check ".config.Labels[\"org.opencontainers.image.$label\"] | length > 0"
 done
