@@ -398,17 +398,28 @@ impl Events {
         }
     }
 
-    /// The last events of this run, oldest first: 4,096 of drives and buses and 512 refused commands at most.
+    /// The last events of this run, oldest first, each with its id as a line of JSON: 4,096 of drives and buses and 512
+    /// refused commands at most.
+    pub fn recent_lines(&self) -> Vec<(u64, Arc<str>)> {
+        let (earlier, all) = {
+            let store = self.store();
+            (store.earlier, store.lines())
+        };
+        let of_this_run =
+            |(number, line): (u64, Arc<str>)| Some((number.checked_sub(earlier).filter(|id| *id > 0)?, line));
+        all.into_iter().filter_map(of_this_run).collect()
+    }
+
+    /// The same as events.
     pub fn recent(&self) -> Vec<Event> {
-        let all = self.store().lines();
-        let events = all.iter().filter_map(|line| from_line(line.as_bytes()).ok());
-        events.filter(|event| event.boot.is_this()).collect()
+        let lines = self.recent_lines().into_iter();
+        lines.filter_map(|(_, line)| from_line(line.as_bytes()).ok()).collect()
     }
 
     /// The newest events that match, newest first, also those of earlier runs.
     pub fn search(&self, search: &Search) -> Vec<Event> {
         let all = self.store().lines();
-        log::newest(&all, search)
+        log::newest(all.iter().map(|(_, line)| &**line), search)
     }
 }
 
@@ -424,11 +435,12 @@ impl Store {
         }
     }
 
-    /// The lines of all that are kept, oldest first. They are read without the lock: publishers do not wait for that.
-    fn lines(&self) -> Vec<Arc<str>> {
-        let mut all: Vec<_> = self.kept.iter().chain(self.refused.iter()).collect();
+    /// The lines of all that are kept with their numbers, oldest first. They are read without the lock: publishers do not
+    /// wait for that.
+    fn lines(&self) -> Vec<(u64, Arc<str>)> {
+        let mut all: Vec<_> = self.kept.iter().chain(self.refused.iter()).cloned().collect();
         all.sort_unstable_by_key(|(number, _)| *number);
-        all.into_iter().map(|(_, line)| line.clone()).collect()
+        all
     }
 }
 

@@ -1,6 +1,5 @@
 //! The history of events: what is searched for in it, and the form of an event on disk. Pure.
 
-use std::sync::Arc;
 use std::time::SystemTime;
 
 use serde::Deserialize;
@@ -57,18 +56,21 @@ impl Search {
 }
 
 /// The newest of `all` (lines, oldest first) that match, newest first.
-pub(super) fn newest(all: &[Arc<str>], search: &Search) -> Vec<Event> {
+pub(super) fn newest<'l>(
+    all: impl DoubleEndedIterator<Item = &'l str> + ExactSizeIterator + Clone,
+    search: &Search,
+) -> Vec<Event> {
     let words = search.text.as_ref().map(|text| text.to_lowercase());
-    let read = |line: &Arc<str>| from_line(line.as_bytes()).ok();
+    let read = |line: &str| from_line(line.as_bytes()).ok();
     let end = match &search.before {
         // One that is not kept any more had older ones before it, which are gone as well.
         Some(Before::Event(boot, id)) => {
             let is_it = |event: Event| event.boot == *boot && event.id >= *id;
-            all.iter().position(|line| read(line).is_some_and(is_it)).unwrap_or(0)
+            all.clone().position(|line| read(line).is_some_and(is_it)).unwrap_or(0)
         }
         _ => all.len(),
     };
-    let candidates = all.iter().take(end).rev().filter_map(read);
+    let candidates = all.take(end).rev().filter_map(read);
     let found = candidates.filter(|event| search.finds(event, words.as_deref()));
     found.take(search.limit).collect()
 }
@@ -173,8 +175,11 @@ mod tests {
             event(3, EventKind::FaultEnd, "pump-1", "the fault is gone"),
             event(4, EventKind::Fault, "pump-2", "fieldbus fault"),
         ];
-        let lines = events.map(|event| serde_json::to_string(&event).unwrap().into());
-        newest(&lines, search).iter().map(|event| event.id).collect()
+        let lines = events.map(|event| serde_json::to_string(&event).unwrap());
+        newest(lines.iter().map(String::as_str), search)
+            .iter()
+            .map(|event| event.id)
+            .collect()
     }
 
     #[test]

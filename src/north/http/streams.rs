@@ -15,6 +15,7 @@ use axum::response::sse::{Event as Message, KeepAlive, Sse};
 use axum::response::{IntoResponse, Response};
 use futures_util::{Stream, StreamExt, stream};
 use serde::Serialize;
+use serde_json::value::RawValue;
 use tokio::sync::broadcast;
 use tokio_stream::wrappers::BroadcastStream;
 use tokio_stream::wrappers::errors::BroadcastStreamRecvError as Lost;
@@ -45,18 +46,21 @@ pub(super) async fn events(
     let plant = app.plant.load();
     // Subscribed before the recent events are read: an event in between is in both and is sent once.
     let live = plant.events.subscribe();
-    let mut kept = plant.events.recent();
-    let newest = kept.last().map_or(0, |event| event.id);
+    let mut kept = plant.events.recent_lines();
+    let newest = kept.last().map_or(0, |(id, _)| *id);
     let seen = header_text(&headers, &LAST_EVENT_ID)
         .and_then(|id| last_seen(id, instance()))
         .filter(|seen| *seen <= newest)
         .unwrap_or(0);
-    kept.retain(|event| event.id > seen);
+    kept.retain(|(id, _)| *id > seen);
     let accept = header_text(&headers, &header::ACCEPT).unwrap_or_default();
     if accept.contains("application/json") && !accept.contains("text/event-stream") {
         let kept = RecentEvents {
             last: event_id(newest),
-            events: kept.iter().collect(),
+            events: kept
+                .iter()
+                .filter_map(|(_, line)| serde_json::from_str(line).ok())
+                .collect(),
         };
         return ([(header::VARY, "accept")], Json(kept)).into_response();
     }
@@ -64,9 +68,10 @@ pub(super) async fn events(
         Ok(permit) => permit,
         Err(refused) => return full(&refused),
     };
-    let kept: Vec<Message> = kept.iter().map(event_message).collect();
+    // A message is made when the client takes it.
+    let kept = stream::iter(kept).map(|(id, line)| Message::default().id(event_id(id)).data(line));
     let live = messages_of(live, move |event| (event.id > newest).then(|| event_message(&event)));
-    respond(stream::iter(kept).chain(live), permit)
+    respond(kept.chain(live), permit)
 }
 
 /// `GET /api/v1/trace?bus=`: the frames of one bus, or of all, from now on.
@@ -191,7 +196,7 @@ fn event_id(number: u64) -> String {
 struct RecentEvents<'e> {
     /// For `Last-Event-ID` of the next request.
     last: String,
-    events: Vec<&'e Event>,
+    events: Vec<&'e RawValue>,
 }
 
 fn event_message(event: &Event) -> Message {
