@@ -1,8 +1,13 @@
 //! Every metric with its name, help, labels and values. Those of the common drive model are listed in `model`; counters
 //! of the servers come from `NorthStats`.
 
+use std::borrow::Cow;
+use std::fmt;
+use std::sync::Arc;
 use std::sync::atomic::Ordering;
 use std::time::{Instant, SystemTime};
+
+use prometheus_client::encoding::{EncodeLabel, EncodeLabelSet, LabelSetEncoder};
 
 use super::model::MODEL;
 use super::process;
@@ -12,8 +17,53 @@ use crate::north::{NorthStats, ServerKind};
 use crate::plant::{BusHandle, Plant};
 use crate::process_image::{BusHealth, BusImage, DriveImage, HistogramSnapshot, Outcome, Reading, public_points};
 
-/// Label names and values.
-pub(super) type Labels = Vec<(&'static str, String)>;
+/// Label of a series: its name and value.
+type Label = (&'static str, Cow<'static, str>);
+
+/// Labels of a series. A plant has thousands of them, so that those of a drive share what they have in common.
+#[derive(Debug, Clone, Default)]
+pub(super) struct Labels {
+    of: Option<Arc<[Label]>>,
+    own: [Option<Label>; 2],
+}
+
+impl Labels {
+    fn of<const N: usize>(labels: [(&'static str, &str); N]) -> Labels {
+        let owned = labels.map(|(name, value)| (name, Cow::Owned(value.to_string())));
+        Labels {
+            of: Some(Arc::new(owned)),
+            own: [None, None],
+        }
+    }
+
+    /// These with one of its own.
+    fn with(&self, name: &'static str, value: impl Into<Cow<'static, str>>) -> Labels {
+        Labels {
+            of: self.of.clone(),
+            own: [Some((name, value.into())), None],
+        }
+    }
+
+    /// These with two of its own.
+    fn with_both(&self, first: Label, second: Label) -> Labels {
+        Labels {
+            of: self.of.clone(),
+            own: [Some(first), Some(second)],
+        }
+    }
+
+    pub(super) fn is_empty(&self) -> bool {
+        self.of.is_none() && self.own.iter().all(Option::is_none)
+    }
+}
+
+impl EncodeLabelSet for Labels {
+    fn encode(&self, encoder: &mut LabelSetEncoder<'_>) -> fmt::Result {
+        let shared = self.of.iter().flat_map(|of| of.iter());
+        let mut all = shared.chain(self.own.iter().flatten());
+        all.try_for_each(|label| label.encode(encoder.encode_label()))
+    }
+}
 
 /// Kind of a family.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -57,7 +107,7 @@ impl Family {
 
     fn of(kind: Kind, name: &'static str, help: &'static str, figure: SeriesValue) -> Family {
         let mut family = Family::new(kind, name, help);
-        family.add(Vec::new(), figure);
+        family.add(Labels::default(), figure);
         family
     }
 
@@ -138,16 +188,16 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         up.add(labels.clone(), flag(reading.snapshot.link.is_online()));
         if let Some(current) = reading.state() {
             for one in State::ALL {
-                state.add(with(&labels, "state", one.name()), flag(one == current));
+                state.add(labels.with("state", one.name()), flag(one == current));
             }
         }
         for cause in drive.why(&reading).words() {
-            blocked.add(with(&labels, "reason", &cause), SeriesValue::Value(1.0));
+            blocked.add(labels.with("reason", cause), SeriesValue::Value(1.0));
         }
         let fault_text =
             Some(reading.fault_text()).filter(|text| reading.is_set(ModelPoint::Fault) && !text.is_empty());
         if let Some(text) = fault_text {
-            fault_info.add(with(&labels, "text", &text), SeriesValue::Value(1.0));
+            fault_info.add(labels.with("text", text), SeriesValue::Value(1.0));
         }
         if let Some(time) = reading.age() {
             age.add(labels.clone(), SeriesValue::Value(time.as_secs_f64()));
@@ -155,7 +205,7 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         points(&reading, &labels, &mut model, &mut point);
         for outcome in Outcome::ALL {
             let count = SeriesValue::Count(image.counted(outcome));
-            transactions.add(with(&labels, "outcome", outcome.name()), count);
+            transactions.add(labels.with("outcome", outcome.name()), count);
         }
         if let Some(time) = image.turnaround() {
             turnaround.add(labels, SeriesValue::Value(time.as_secs_f64()));
@@ -209,8 +259,8 @@ fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &
         match own {
             Some(family) => family.add(labels.clone(), SeriesValue::Value(value)),
             None => {
-                let mut labels = with(labels, "point", name);
-                labels.push(("unit", point.map(|p| p.unit.clone()).unwrap_or_default()));
+                let unit = point.map(|p| p.unit.clone()).unwrap_or_default();
+                let labels = labels.with_both(("point", name.to_string().into()), ("unit", unit.into()));
                 other.add(labels, SeriesValue::Value(value));
             }
         }
@@ -233,7 +283,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     ];
     let looks: Vec<(Labels, &BusHandle, BusHealth)> = handles
         .iter()
-        .map(|h| (vec![("bus", h.image.spec.name.clone())], h, h.image.health()))
+        .map(|h| (Labels::of([("bus", &h.image.spec.name)]), h, h.image.health()))
         .collect();
     for (name, help, value) in gauges {
         let mut family = Family::new(Kind::Gauge, name, help);
@@ -267,8 +317,8 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
     for (labels, handle, _) in looks {
         let image = &handle.image;
         for verdict in &image.diagnosis.load().verdicts {
-            let mut labels = with(&labels, "drive", verdict.drive.as_deref().unwrap_or_default());
-            labels.push(("verdict", verdict.verdict.name().to_string()));
+            let drive = verdict.drive.clone().unwrap_or_default();
+            let labels = labels.with_both(("drive", drive.into()), ("verdict", verdict.verdict.name().into()));
             diagnosis.add(labels, SeriesValue::Value(1.0));
         }
         for (class, times) in [
@@ -276,7 +326,7 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
             (PollClass::Slow, &image.slow_cycles),
         ] {
             cycles.add(
-                with(&labels, "class", class.name()),
+                labels.with("class", class.name()),
                 SeriesValue::Histogram(times.snapshot()),
             );
         }
@@ -293,7 +343,7 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
         "Commands answered, by source and result.",
     );
     for ((source, result), count) in plant.writes.results() {
-        let labels = vec![("source", source.name().to_string()), ("result", result.to_string())];
+        let labels = Labels::default().with_both(("source", source.name().into()), ("result", result.into()));
         results.add(labels, SeriesValue::Count(count));
     }
     all.push(results);
@@ -311,7 +361,7 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
     if let Some(file) = plant.writes.audit().file() {
         let (sent, not_sent) = file.lost();
         for (kind, count) in [("sent", sent), ("not_sent", not_sent)] {
-            lost.add(vec![("kind", kind.to_string())], SeriesValue::Count(count));
+            lost.add(Labels::default().with("kind", kind), SeriesValue::Count(count));
         }
     }
     all.push(lost);
@@ -326,7 +376,10 @@ fn recordings(plant: &Plant, all: &mut Vec<Family>) {
     let counts = plant.recordings.made();
     for kind in TriggerKind::ALL {
         let count = counts.get(&kind).copied().unwrap_or_default();
-        made.add(vec![("trigger", kind.name().to_string())], SeriesValue::Count(count));
+        made.add(
+            Labels::default().with("trigger", kind.name()),
+            SeriesValue::Count(count),
+        );
     }
     all.push(made);
 }
@@ -341,7 +394,7 @@ fn parameters(plant: &Plant, all: &mut Vec<Family>) {
     for drive in plant.drives() {
         let key = (drive.image.spec.bus.clone(), drive.image.spec.name.clone());
         let count = counts.get(&key).copied().unwrap_or_default();
-        changed.add(vec![("bus", key.0), ("drive", key.1)], SeriesValue::Count(count));
+        changed.add(labels_of(&drive.image), SeriesValue::Count(count));
     }
     all.push(changed);
 }
@@ -359,7 +412,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "Modbus TCP requests answered, by function code and outcome.",
     );
     for (function, outcome, count) in stats.modbus_tcp.requests() {
-        let labels = vec![("function", function), ("outcome", outcome.to_string())];
+        let labels = Labels::default().with_both(("function", function.into()), ("outcome", outcome.into()));
         requests.add(labels, SeriesValue::Count(count));
     }
     all.push(requests);
@@ -369,7 +422,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "Requests of tools at the slots, by outcome.",
     );
     for (bus, outcome, count) in stats.slots.requests() {
-        let labels = vec![("bus", bus), ("outcome", outcome.name().to_string())];
+        let labels = Labels::default().with_both(("bus", bus.into()), ("outcome", outcome.name().into()));
         tools.add(labels, SeriesValue::Count(count));
     }
     all.push(tools);
@@ -380,10 +433,8 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
     );
     for server in ServerKind::ALL {
         for (reason, count) in stats.refused.of(server).filter(|(_, count)| *count > 0) {
-            let labels = vec![
-                ("server", server.name().to_string()),
-                ("reason", reason.name().to_string()),
-            ];
+            let labels =
+                Labels::default().with_both(("server", server.name().into()), ("reason", reason.name().into()));
             refused.add(labels, SeriesValue::Count(count));
         }
     }
@@ -419,7 +470,7 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
     );
     for (kind, count) in mqtt.losses() {
-        lost.add(vec![("kind", kind.name().to_string())], SeriesValue::Count(count));
+        lost.add(Labels::default().with("kind", kind.name()), SeriesValue::Count(count));
     }
     all.push(lost);
 }
@@ -442,11 +493,11 @@ fn reload(stats: &NorthStats, all: &mut Vec<Family>) {
 }
 
 fn build(plant: &Plant) -> Family {
-    let labels = vec![
-        ("version", env!("CARGO_PKG_VERSION").to_string()),
-        ("commit", super::COMMIT.unwrap_or("unknown").to_string()),
-        ("gateway", plant.gateway.clone()),
-    ];
+    let labels = Labels::of([
+        ("version", env!("CARGO_PKG_VERSION")),
+        ("commit", super::COMMIT.unwrap_or("unknown")),
+        ("gateway", &plant.gateway),
+    ]);
     let mut family = Family::new(
         Kind::Gauge,
         "drivegate_build_info",
@@ -501,13 +552,7 @@ fn process(figures: &process::ProcessStats, all: &mut Vec<Family>) {
 }
 
 fn labels_of(drive: &DriveImage) -> Labels {
-    vec![("bus", drive.spec.bus.clone()), ("drive", drive.spec.name.clone())]
-}
-
-fn with(labels: &Labels, name: &'static str, value: &str) -> Labels {
-    let mut labels = labels.clone();
-    labels.push((name, value.to_string()));
-    labels
+    Labels::of([("bus", &drive.spec.bus), ("drive", &drive.spec.name)])
 }
 
 fn flag(it_is: bool) -> SeriesValue {
