@@ -7,9 +7,7 @@ use std::time::Instant;
 use serde_json::Value as Json;
 
 use super::recorder::{Capture, Note, NoteBody, reading};
-use super::recording::{
-    Bus, Column, CommandNote, Drive, EventNote, Frame, Further, Header, Read, Recording, Sample, VERSION, hex,
-};
+use super::recording::{Bus, Column, CommandNote, Drive, EventNote, Frame, Further, Header, Read, Recording, VERSION};
 use super::summary;
 use crate::drive::{Profile, Source};
 use crate::process_image::{Reading, Snapshot, TapedRead, value_or_null};
@@ -20,38 +18,32 @@ pub fn assemble(capture: &Capture) -> Recording {
     let profile = &spec.profile;
     let seconds = |at: Instant| seconds(at, capture.trigger.at);
     let names = capture.bus.drives.iter().map(|drive| drive.spec.name.clone());
-    let mut recording = Recording {
-        header: Header {
-            drivegate_recording: VERSION,
-            id: capture.id.clone(),
-            time: humantime::format_rfc3339_micros(capture.clock.wall_at(capture.trigger.at)).to_string(),
-            trigger: capture.trigger.kind,
-            summary: String::new(),
-            first: true,
-            more: Vec::new(),
-            drive: Drive {
-                name: spec.name.clone(),
-                address: spec.address,
-                profile: profile.name.clone(),
-            },
-            bus: Bus {
-                name: capture.bus.spec.name.clone(),
-                protocol: capture.bus.spec.protocol.name().to_string(),
-                format: capture.bus.spec.format.to_string(),
-                drives: names.collect(),
-            },
-            from: seconds(capture.span.0),
-            to: seconds(capture.span.1),
-            points: columns(profile),
-            values: Vec::new(),
-            reads: Vec::new(),
-            lost: capture.lost,
+    let mut recording = Recording::new(Header {
+        drivegate_recording: VERSION,
+        id: capture.id.clone(),
+        time: humantime::format_rfc3339_micros(capture.clock.wall_at(capture.trigger.at)).to_string(),
+        trigger: capture.trigger.kind,
+        summary: String::new(),
+        first: true,
+        more: Vec::new(),
+        drive: Drive {
+            name: spec.name.clone(),
+            address: spec.address,
+            profile: profile.name.clone(),
         },
-        samples: Vec::new(),
-        events: Vec::new(),
-        commands: Vec::new(),
-        frames: Vec::new(),
-    };
+        bus: Bus {
+            name: capture.bus.spec.name.clone(),
+            protocol: capture.bus.spec.protocol.name().to_string(),
+            format: capture.bus.spec.format.to_string(),
+            drives: names.collect(),
+        },
+        from: seconds(capture.span.0),
+        to: seconds(capture.span.1),
+        points: columns(profile),
+        values: Vec::new(),
+        reads: Vec::new(),
+        lost: capture.lost,
+    });
     let further = capture.more.iter().map(|trigger| Further {
         t: seconds(trigger.at),
         trigger: trigger.kind,
@@ -66,7 +58,7 @@ pub fn assemble(capture: &Capture) -> Recording {
         t: seconds(frame.at),
         drive: frame.drive,
         verdict: frame.verdict,
-        hex: hex(&frame.bytes),
+        bytes: frame.bytes.clone(),
     });
     recording.frames = frames.collect();
     recording.header.summary = summary::of(&recording, &capture.trigger.text, profile);
@@ -110,12 +102,9 @@ fn add_samples(capture: &Capture, recording: &mut Recording) {
             reads.len() - 1
         });
         let reading = reading(spec, &snapshot, taped.at);
-        let points = reads.get(read).map(|read| read.points.as_slice()).unwrap_or_default();
-        recording.samples.push(Sample {
-            t: seconds(taped.at, capture.trigger.at),
-            read,
-            values: points.iter().map(|point| value(&reading, *point)).collect(),
-        });
+        let points = reads.get(read).map(|read| read.points.clone()).unwrap_or_default();
+        let t = seconds(taped.at, capture.trigger.at);
+        recording.add_sample(t, read, points.iter().map(|point| value(&reading, *point)));
     }
     let at_trigger = at_trigger.unwrap_or(snapshot);
     let reading = reading(spec, &at_trigger, capture.trigger.at);

@@ -16,7 +16,7 @@ pub fn json(recording: &Recording) -> Json {
     let samples = recording.samples.iter().map(|sample| {
         let points = header.reads.get(sample.read).map(|read| read.points.as_slice());
         let names = points.unwrap_or_default().iter().map(|place| name(*place));
-        let values: BTreeMap<&str, &Json> = names.zip(&sample.values).collect();
+        let values: BTreeMap<&str, &Json> = names.zip(recording.values(sample)).collect();
         json!({ "t": sample.t, "points": values })
     });
     let known: BTreeMap<&str, &Json> = (0..).map(name).zip(&header.values).collect();
@@ -64,7 +64,7 @@ pub fn csv(recording: &Recording) -> String {
         let points = header.reads.get(sample.read).map_or(&[][..], |read| &read.points);
         for place in &places {
             let value = points.iter().position(|point| point == place);
-            match value.and_then(|at| sample.values.get(at)) {
+            match value.and_then(|at| recording.values(sample).get(at)) {
                 None | Some(Json::Null) => text.push(','),
                 Some(value) => drop(write!(text, ",{value}")),
             }

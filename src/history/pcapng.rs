@@ -4,7 +4,7 @@
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use super::export::moment;
-use super::recording::{Frame, Recording, bytes_of};
+use super::recording::{Frame, Recording};
 use crate::codec::{Protocol, RequestPdu, describe};
 use crate::process_image::Verdict;
 
@@ -44,9 +44,8 @@ pub fn pcapng(recording: &Recording) -> Vec<u8> {
     let protocol = Protocol::from_name(&header.bus.protocol);
     for frame in &recording.frames {
         let at = moment(start, frame.t).unwrap_or(UNIX_EPOCH);
-        let bytes = bytes_of(&frame.hex).unwrap_or_default();
-        let comment = comment(recording, frame, protocol, &bytes);
-        block(&mut out, PACKET, &packet(at, frame.verdict, &bytes, &comment));
+        let comment = comment(recording, frame, protocol, &frame.bytes);
+        block(&mut out, PACKET, &packet(at, frame.verdict, &frame.bytes, &comment));
     }
     out
 }

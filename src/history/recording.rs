@@ -1,6 +1,10 @@
 //! A recording and the form of its file (`docs/recordings.md`): a JSON object a line, the header first, the end last. Pure.
 
+use std::borrow::Cow;
 use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::ops::Range;
+use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 use serde_json::Value as Json;
@@ -107,15 +111,15 @@ pub struct Read {
     pub points: Vec<usize>,
 }
 
-/// The values of one read.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+/// One read; its values: [`Recording::values`].
+#[derive(Debug, Clone, PartialEq)]
 pub struct Sample {
     /// When it was read.
     pub t: f64,
     /// Place of the read in the header.
     pub read: usize,
-    /// A value for each point of the read; null where it is none.
-    pub values: Vec<Json>,
+    /// Where its values stand among those of all samples.
+    values: Range<usize>,
 }
 
 /// An event.
@@ -155,19 +159,46 @@ pub struct Frame {
     pub drive: Option<usize>,
     /// What it was.
     pub verdict: Verdict,
-    /// The bytes, two hexadecimal digits each.
-    pub hex: String,
+    /// The bytes; in the file two hexadecimal digits each.
+    #[serde(rename = "hex", with = "hexadecimal")]
+    pub bytes: Arc<[u8]>,
+}
+
+mod hexadecimal {
+    use std::borrow::Cow;
+    use std::sync::Arc;
+
+    use serde::{Deserialize, Deserializer, Serializer};
+
+    pub(super) fn serialize<S: Serializer>(bytes: &[u8], serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(&super::hex(bytes))
+    }
+
+    pub(super) fn deserialize<'de, D: Deserializer<'de>>(deserializer: D) -> Result<Arc<[u8]>, D::Error> {
+        let digits = Cow::<str>::deserialize(deserializer)?;
+        let bytes = super::bytes_of(&digits).map(Arc::from);
+        bytes.ok_or_else(|| serde::de::Error::custom("the bytes of the frame are not hexadecimal"))
+    }
 }
 
 /// A line of the file after the header.
 #[derive(Debug, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-enum Line {
-    Sample(Sample),
-    Event(EventNote),
-    Command(CommandNote),
-    Frame(Frame),
+enum Line<'l> {
+    Sample(SampleLine<'l>),
+    Event(Cow<'l, EventNote>),
+    Command(Cow<'l, CommandNote>),
+    Frame(Cow<'l, Frame>),
     End(End),
+}
+
+/// A sample with its values.
+#[derive(Debug, Serialize, Deserialize)]
+struct SampleLine<'l> {
+    t: f64,
+    read: usize,
+    /// A value for each point of the read; null where it is none.
+    values: Cow<'l, [Json]>,
 }
 
 /// The last line.
@@ -186,6 +217,8 @@ pub struct Recording {
     pub header: Header,
     /// What was read, oldest first.
     pub samples: Vec<Sample>,
+    /// The values of all samples: in one list, as a recording has thousands of samples.
+    values: Vec<Json>,
     /// Events, oldest first.
     pub events: Vec<EventNote>,
     /// Commands, oldest first.
@@ -245,14 +278,48 @@ impl Header {
 }
 
 impl Recording {
+    /// An empty one.
+    pub fn new(header: Header) -> Recording {
+        Recording {
+            header,
+            samples: Vec::new(),
+            values: Vec::new(),
+            events: Vec::new(),
+            commands: Vec::new(),
+            frames: Vec::new(),
+        }
+    }
+
+    /// Appends a sample.
+    pub(super) fn add_sample(&mut self, t: f64, read: usize, values: impl IntoIterator<Item = Json>) {
+        let start = self.values.len();
+        self.values.extend(values);
+        let values = start..self.values.len();
+        self.samples.push(Sample { t, read, values });
+    }
+
+    /// A value for each point of the read of a sample; null where it is none.
+    pub fn values(&self, sample: &Sample) -> &[Json] {
+        self.values.get(sample.values.clone()).unwrap_or_default()
+    }
+
     /// The bytes of its file.
     pub fn to_bytes(&self) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(128 * (self.samples.len() + self.frames.len()) + 4096);
         add(&mut bytes, &self.header);
-        let events = self.events.iter().cloned().map(Line::Event);
-        let commands = self.commands.iter().cloned().map(Line::Command);
-        let samples = self.samples.iter().cloned().map(Line::Sample);
-        let frames = self.frames.iter().cloned().map(Line::Frame);
+        let events = self.events.iter().map(|event| Line::Event(Cow::Borrowed(event)));
+        let commands = self
+            .commands
+            .iter()
+            .map(|command| Line::Command(Cow::Borrowed(command)));
+        let samples = self.samples.iter().map(|sample| {
+            Line::Sample(SampleLine {
+                t: sample.t,
+                read: sample.read,
+                values: self.values(sample).into(),
+            })
+        });
+        let frames = self.frames.iter().map(|frame| Line::Frame(Cow::Borrowed(frame)));
         let mut lines = 1;
         for line in events.chain(commands).chain(samples).chain(frames) {
             add(&mut bytes, &line);
@@ -269,13 +336,7 @@ impl Recording {
     /// They are no whole, sound recording of this version: what is wrong, and where.
     pub fn parse(bytes: &[u8]) -> Result<Recording, RecordingError> {
         let (header, mut offset) = Header::parse(bytes)?;
-        let mut recording = Recording {
-            header,
-            samples: Vec::new(),
-            events: Vec::new(),
-            commands: Vec::new(),
-            frames: Vec::new(),
-        };
+        let mut recording = Recording::new(header);
         let mut lines = 1;
         loop {
             let rest = bytes.get(offset..).unwrap_or_default();
@@ -283,7 +344,7 @@ impl Recording {
                 return Err(fault(bytes.len(), "the file has no end line: it is cut short"));
             };
             let text = rest.get(..length).unwrap_or_default();
-            let line: Line = serde_json::from_slice(text)
+            let line: Line<'_> = serde_json::from_slice(text)
                 .map_err(|error| fault(offset + error.column(), format!("the line is damaged ({error})")))?;
             match line {
                 Line::Sample(sample) => {
@@ -291,16 +352,11 @@ impl Recording {
                     if read.is_none_or(|read| read.points.len() != sample.values.len()) {
                         return Err(fault(offset, "the sample does not fit the reads of the header"));
                     }
-                    recording.samples.push(sample);
+                    recording.add_sample(sample.t, sample.read, sample.values.into_owned());
                 }
-                Line::Event(event) => recording.events.push(event),
-                Line::Command(command) => recording.commands.push(command),
-                Line::Frame(frame) => {
-                    if bytes_of(&frame.hex).is_none() {
-                        return Err(fault(offset, "the bytes of the frame are not hexadecimal"));
-                    }
-                    recording.frames.push(frame);
-                }
+                Line::Event(event) => recording.events.push(event.into_owned()),
+                Line::Command(command) => recording.commands.push(command.into_owned()),
+                Line::Frame(frame) => recording.frames.push(frame.into_owned()),
                 Line::End(end) => {
                     recording.check_end(bytes, offset, lines, &end)?;
                     let after = offset + length + 1;
@@ -345,7 +401,7 @@ impl Recording {
         };
         let samples = self.samples.iter();
         samples
-            .filter_map(|sample| Some((sample.t, sample.values.get(value(sample)?)?)))
+            .filter_map(|sample| Some((sample.t, self.values(sample).get(value(sample)?)?)))
             .collect()
     }
 }
@@ -357,12 +413,17 @@ fn add(bytes: &mut Vec<u8>, line: &impl Serialize) {
 }
 
 /// Two hexadecimal digits for each byte.
-pub(super) fn hex(bytes: &[u8]) -> String {
-    bytes.iter().map(|byte| format!("{byte:02X}")).collect()
+pub(crate) fn hex(bytes: &[u8]) -> String {
+    let mut digits = String::with_capacity(2 * bytes.len());
+    for byte in bytes {
+        // Writing to a string cannot fail.
+        let _ = write!(digits, "{byte:02X}");
+    }
+    digits
 }
 
 /// The bytes of hexadecimal digits.
-pub(super) fn bytes_of(hex: &str) -> Option<Vec<u8>> {
+fn bytes_of(hex: &str) -> Option<Vec<u8>> {
     if !hex.is_ascii() || !hex.len().is_multiple_of(2) {
         return None;
     }

@@ -160,7 +160,7 @@ fn the_samples_of_a_trip_are_those_on_the_wire_to_the_poll() {
     let write = recording
         .frames
         .iter()
-        .any(|frame| frame.hex.starts_with("0106") || frame.hex.starts_with("0110"));
+        .any(|frame| frame.bytes.starts_with(&[1, 6]) || frame.bytes.starts_with(&[1, 16]));
     assert!(write, "its command is among the frames");
 }
 

@@ -6,6 +6,7 @@ use serde_json::Value as Json;
 
 use crate::cli::{printable, report};
 use crate::history::Recording;
+use crate::history::recording::hex;
 use crate::process_image::Verdict;
 
 /// Samples that are shown before and after the trigger.
@@ -79,7 +80,7 @@ fn timeline(recording: &Recording) -> String {
             .and_then(|place| drives.get(place))
             .map_or("-", String::as_str);
         let what = match frame.verdict {
-            Verdict::Corrupt => format!("a reply of {name} cannot be believed: {}", frame.hex),
+            Verdict::Corrupt => format!("a reply of {name} cannot be believed: {}", hex(&frame.bytes)),
             _ => format!("{name} did not reply"),
         };
         (frame.t, what)
@@ -123,7 +124,7 @@ fn samples(recording: &Recording) -> String {
     let titles = columns.iter().map(|(_, place)| title(*place));
     let mut table = report::table(std::iter::once("t, s".to_string()).chain(titles));
     for sample in of_read.iter().skip(from).take(SHOWN.0 + SHOWN.1) {
-        let value = |at: usize| match sample.values.get(at) {
+        let value = |at: usize| match recording.values(sample).get(at) {
             None | Some(Json::Null) => "-".to_string(),
             Some(value) => value.to_string(),
         };

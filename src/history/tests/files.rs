@@ -93,7 +93,7 @@ fn exports() {
         t: 0.5,
         drive: Some(0),
         verdict: Verdict::Ok,
-        hex: "01030200017984".to_string(),
+        bytes: [1, 3, 2, 0, 1, 0x79, 0x84].into(),
     });
     let csv = export::csv(&recording);
     let mut lines = csv.lines();
