@@ -12,7 +12,7 @@ use std::time::{Instant, SystemTime};
 use serde::{Deserialize, Serialize};
 use tokio::sync::broadcast;
 
-pub use fair_ring::FairRing;
+pub use fair_ring::{FairRing, in_order};
 pub use log::{Before, LineError, Search, from_line};
 pub use refusals::RefusalLimit;
 
@@ -438,9 +438,7 @@ impl Store {
     /// The lines of all that are kept with their numbers, oldest first. They are read without the lock: publishers do not
     /// wait for that.
     fn lines(&self) -> Vec<(u64, Arc<str>)> {
-        let mut all: Vec<_> = self.kept.iter().chain(self.refused.iter()).cloned().collect();
-        all.sort_unstable_by_key(|(number, _)| *number);
-        all
+        in_order(&self.kept, &self.refused)
     }
 }
 

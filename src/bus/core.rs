@@ -217,7 +217,7 @@ impl BusCore {
             .diagnosis
             .sending(now.saturating_duration_since(quiet_since));
         let drive = self.known(&turn);
-        self.tap = self.report.asked(drive, &request, &frame, quiet_since, now);
+        self.tap = self.report.tape_request(drive, &request, &frame, quiet_since, now);
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
         self.line.send(request, frame, sending, late, now);
@@ -249,7 +249,7 @@ impl BusCore {
         self.report.exchanged(turn.drive, &exchanged, now);
         let drive = self.known(&turn);
         let heard = exchanged.transaction.seen();
-        self.report.answered(drive, heard, &exchanged.ended, now);
+        self.report.tape_reply(drive, heard, &exchanged.ended, now);
         if let Some(tap) = self.tap.take() {
             tap.ended(&exchanged.ended, now);
         }

@@ -414,7 +414,7 @@ impl Report {
 
     /// A request was given to the line, which had been silent since `quiet_since`, at `began`: for the recorder, and for
     /// whoever listens to the frames; `None` while nobody does.
-    pub(super) fn asked(
+    pub(super) fn tape_request(
         &self,
         index: Option<usize>,
         request: &Request,
@@ -431,8 +431,8 @@ impl Report {
         Some(tap)
     }
 
-    /// The exchange is over; `heard` is all that came, for the recorder.
-    pub(super) fn answered(&self, index: Option<usize>, heard: &[u8], ended: &Ended, now: Instant) {
+    /// Gives the recorder what came of a request, which may be nothing.
+    pub(super) fn tape_reply(&self, index: Option<usize>, heard: &[u8], ended: &Ended, now: Instant) {
         tap::tape(&self.image, index, heard, tap::taped(ended), now);
     }
 

@@ -16,7 +16,7 @@ use serde::{Deserialize, Serialize, Serializer};
 use tokio::sync::broadcast;
 
 use crate::drive::Value;
-use crate::event::{FairRing, RefusalLimit};
+use crate::event::{FairRing, RefusalLimit, in_order};
 
 pub use file::{AuditFile, AuditFileOptions};
 
@@ -302,10 +302,10 @@ impl Audit {
             drive: Cow<'l, str>,
         }
         let is_of = |line: &str, drive| serde_json::from_str(line).is_ok_and(|line: Addressed<'_>| line.drive == drive);
-        let records = self.records();
-        let mut all: Vec<_> = records.sent.iter().chain(records.unsent.iter()).cloned().collect();
-        drop(records);
-        all.sort_unstable_by_key(|(number, _)| *number);
+        let all = {
+            let records = self.records();
+            in_order(&records.sent, &records.unsent)
+        };
         let lines = all.into_iter().map(|(_, line)| line);
         lines
             .filter(|line| drive.is_none_or(|drive| is_of(line, drive)))

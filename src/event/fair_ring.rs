@@ -64,6 +64,16 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
     }
 }
 
+/// The items of two rings that are numbered together, with their numbers, in their order.
+pub fn in_order<K1: Ord + Clone, K2: Ord + Clone, T: Clone>(
+    one: &FairRing<K1, T>,
+    other: &FairRing<K2, T>,
+) -> Vec<(u64, T)> {
+    let mut all: Vec<_> = one.iter().chain(other.iter()).cloned().collect();
+    all.sort_unstable_by_key(|(number, _)| *number);
+    all
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

@@ -185,14 +185,16 @@ impl ListenCore {
             return;
         };
         let (quiet_since, began) = (exchange.quiet_since, exchange.began);
-        let tap = self.report.asked(index, request, &exchange.frame, quiet_since, began);
+        let tap = self
+            .report
+            .tape_request(index, request, &exchange.frame, quiet_since, began);
         let doubted = exchange.doubt.map(Ended::Corrupt);
         let ended = match &exchange.ended {
             Some(Ended::Reply(_)) => doubted.as_ref().or(exchange.ended.as_ref()),
             ended => ended.as_ref(),
         };
         let Some(ended) = ended else { return };
-        self.report.answered(index, &exchange.heard, ended, exchange.at);
+        self.report.tape_reply(index, &exchange.heard, ended, exchange.at);
         if let Some(mut tap) = tap {
             tap.heard(&exchange.heard, exchange.at);
             tap.ended(ended, exchange.at);
