@@ -29,6 +29,7 @@ WARM_UP = 20  # minutes that do not count for the slope of RSS
 SLOPE_BOUND = 0.1  # MiB an hour
 JUDGED_FROM = 80  # minutes after the warm-up from which the slope is judged
 ANSWER_LIMIT = 40.0  # seconds until an order counts as lost
+CPU_LIMIT = 15.0  # percent of a core in any minute; about 5 with the load alone
 EVENTS = 5000  # more than the gateway keeps
 
 
@@ -302,6 +303,8 @@ class Soak:
             return
         rss, fds, threads, cpu = self.process.sample()
         self.samples.append((number + 1, rss))
+        if cpu > CPU_LIMIT:
+            self.judge.violation(f"{cpu:.1f} % of a core in a minute with {what}")
         try:
             status, _ = await http_get(self.gateway.http, "/healthz")
             if status != 200:

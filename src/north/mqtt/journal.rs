@@ -72,6 +72,8 @@ struct Place {
     /// First part of the names of the files.
     name: &'static str,
     max_bytes: u64,
+    /// Creates the file of a segment.
+    create: fn(&Path) -> io::Result<File>,
     /// Locked while the journal is open, since two gateways would damage each other's files.
     _lock: File,
 }
@@ -115,6 +117,7 @@ impl Journal {
                 dir: dir.to_path_buf(),
                 name,
                 max_bytes,
+                create: |path| OpenOptions::new().read(true).write(true).create_new(true).open(path),
                 _lock: lock,
             }),
             ..Journal::in_memory()
@@ -387,7 +390,7 @@ impl Journal {
         let Some(place) = &self.place else { return Ok(()) };
         let number = self.next_segment;
         let path = place.dir.join(format!("{}-{number:012}{SUFFIX}", place.name));
-        let file = OpenOptions::new().read(true).write(true).create_new(true).open(&path)?;
+        let file = (place.create)(&path)?;
         self.next_segment = number.saturating_add(1);
         self.segments.push_back(Segment {
             number,
@@ -400,8 +403,11 @@ impl Journal {
         Ok(())
     }
 
-    /// Deletes the oldest segment with its messages; false if there is none.
+    /// Deletes the oldest segment with its messages, which gives back its room; false if there is none.
     fn drop_oldest(&mut self) -> io::Result<bool> {
+        if self.segments.front().is_none_or(|oldest| oldest.end == 0) {
+            return Ok(false);
+        }
         let Some(oldest) = self.segments.pop_front() else {
             return Ok(false);
         };

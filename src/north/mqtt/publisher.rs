@@ -217,7 +217,8 @@ impl Publisher {
             }
             self.buses_at = Some(now + LOOK.min(pace.max).min(pace.min.max(Duration::from_millis(25))));
         }
-        (updates, self.next(all, now))
+        let buses_at = self.buses_at;
+        (updates, self.next(all, now, buses_at))
     }
 
     /// Records values while the broker is away, and when to call again; see [`Publisher::tick`].
@@ -237,7 +238,8 @@ impl Publisher {
         for drive in &mut self.drives {
             updates.extend(drive.recorder.ripe(now));
         }
-        (updates, self.next(all, now))
+        // Nothing is recorded of the buses.
+        (updates, self.next(all, now, None))
     }
 
     /// What was recorded and not returned yet.
@@ -268,12 +270,12 @@ impl Publisher {
         true
     }
 
-    fn next(&self, all: bool, now: Instant) -> Instant {
+    fn next(&self, all: bool, now: Instant, buses_at: Option<Instant>) -> Instant {
         if !all {
             return now;
         }
         let drives = self.drives.iter().filter_map(|drive| drive.look_at);
-        drives.chain(self.buses_at).min().unwrap_or(now + LOOK)
+        drives.chain(buses_at).min().unwrap_or(now + LOOK)
     }
 }
 

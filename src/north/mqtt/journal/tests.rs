@@ -233,6 +233,34 @@ fn a_disk_that_takes_nothing_leaves_the_order_alone() {
 }
 
 #[test]
+fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut journal = open(dir.path(), 256 << 10);
+    let real = journal.place.as_ref().unwrap().create;
+    journal.place.as_mut().unwrap().create = |path| {
+        let first = path.to_string_lossy().ends_with("1.log");
+        assert!(first, "one more segment on a full disk: {}", path.display());
+        std::os::unix::fs::symlink("/dev/full", path)?;
+        OpenOptions::new().read(true).write(true).open(path)
+    };
+    for n in 0..100 {
+        journal.append(event(n), false);
+        assert!(is_full(&journal.write().unwrap_err()));
+    }
+    assert!(journal.take(30).iter().map(|(_, m)| number(m)).eq(0..30));
+    // There is room again.
+    let segment = journal.segments.front_mut().unwrap();
+    fs::remove_file(&segment.path).unwrap();
+    segment.file = real(&segment.path).unwrap();
+    journal.place.as_mut().unwrap().create = real;
+    journal.write().unwrap();
+    assert_eq!(numbers(&take_all(&mut journal)), (30..100).collect::<Vec<_>>());
+    drop(journal);
+    let mut journal = open(dir.path(), 256 << 10);
+    assert_eq!(numbers(&take_all(&mut journal)), (0..100).collect::<Vec<_>>());
+}
+
+#[test]
 fn messages_beyond_the_memory_are_lost_and_counted_once() {
     let dir = tempfile::tempdir().unwrap();
     let inner = dir.path().join("buffer");

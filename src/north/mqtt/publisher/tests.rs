@@ -329,6 +329,8 @@ fn the_values_of_an_outage_are_recorded() {
     for (mode, expected) in [(History::All, 6), (History::Changes, 3), (History::Off, 0)] {
         let mut bench = Bench::new();
         bench.publisher.telemetry.history = mode;
+        // The broker goes after this.
+        bench.after(20);
         let mut arrays = Vec::new();
         for value in [2500, 2500, 2501, 2501, 2501, 2502] {
             bench.read(0x0023, value);
@@ -336,7 +338,9 @@ fn the_values_of_an_outage_are_recorded() {
             for ms in [0, 50, 50] {
                 bench.now += Duration::from_millis(ms);
                 bench.wall += Duration::from_millis(ms);
-                arrays.extend(bench.publisher.record(bench.now, bench.wall).0);
+                let (complete, next) = bench.publisher.record(bench.now, bench.wall);
+                arrays.extend(complete);
+                assert!(next > bench.now, "{mode:?}: nothing is left to look at now");
             }
         }
         assert!(arrays.is_empty());
