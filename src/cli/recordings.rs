@@ -165,7 +165,7 @@ fn export(form: &Export, recording: &Recording) -> Result<ExitCode, ExitCode> {
     let bytes = match form {
         Export { csv: true, .. } => export::csv(recording).into_bytes(),
         Export { pcap: true, .. } => pcapng::pcapng(recording),
-        _ => (serde_json::to_string(&export::json(recording)).unwrap_or_default() + "\n").into_bytes(),
+        _ => (export::json(recording) + "\n").into_bytes(),
     };
     match &form.output {
         None => Ok(report::print_bytes(&bytes)),

@@ -4,34 +4,69 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::time::{Duration, SystemTime};
 
-use serde_json::{Value as Json, json};
+use serde::{Serialize, Serializer};
+use serde_json::{Map, Value as Json, json};
 
-use super::recording::Recording;
+use super::recording::{CommandNote, EventNote, Frame, Recording};
 
-/// One JSON object: the header, `samples` with their values by point, `events`, `commands`, `frames`.
-pub fn json(recording: &Recording) -> Json {
-    let mut json = serde_json::to_value(&recording.header).unwrap_or_default();
-    let header = &recording.header;
-    let name = |place: usize| header.points.get(place).map_or("", |column| column.name.as_str());
-    let samples = recording.samples.iter().map(|sample| {
-        let points = header.reads.get(sample.read).map(|read| read.points.as_slice());
-        let names = points.unwrap_or_default().iter().map(|place| name(*place));
-        let values: BTreeMap<&str, &Json> = names.zip(recording.values(sample)).collect();
-        json!({ "t": sample.t, "points": values })
-    });
-    let known: BTreeMap<&str, &Json> = (0..).map(name).zip(&header.values).collect();
-    if let Json::Object(object) = &mut json {
-        object.insert("values".into(), json!(known));
-        object.insert("samples".into(), samples.collect());
-        for (key, list) in [
-            ("events", json!(recording.events)),
-            ("commands", json!(recording.commands)),
-            ("frames", json!(recording.frames)),
-        ] {
-            object.insert(key.into(), list);
-        }
+/// One JSON object: the header, `values` by point, `samples` with theirs, `events`, `commands`, `frames`. It is written a
+/// sample at a time: as a tree, a recording of 1 MB takes 10 MB of memory.
+pub fn json(recording: &Recording) -> String {
+    let mut header = match serde_json::to_value(&recording.header) {
+        Ok(Json::Object(header)) => header,
+        _ => Map::new(),
+    };
+    let names = (0..).map(|place| name(recording, place));
+    let known: BTreeMap<&str, &Json> = names.zip(&recording.header.values).collect();
+    header.insert("values".into(), json!(known));
+    let object = Object {
+        header,
+        samples: Samples(recording),
+        events: &recording.events,
+        commands: &recording.commands,
+        frames: &recording.frames,
+    };
+    // Strings, numbers and null can always be serialized.
+    serde_json::to_string(&object).unwrap_or_default()
+}
+
+#[derive(Serialize)]
+struct Object<'r> {
+    #[serde(flatten)]
+    header: Map<String, Json>,
+    samples: Samples<'r>,
+    events: &'r [EventNote],
+    commands: &'r [CommandNote],
+    frames: &'r [Frame],
+}
+
+struct Samples<'r>(&'r Recording);
+
+impl Serialize for Samples<'_> {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        let Samples(recording) = self;
+        serializer.collect_seq(recording.samples.iter().map(|sample| {
+            let read = recording.header.reads.get(sample.read);
+            let points = read.map_or(&[][..], |read| &read.points);
+            let names = points.iter().map(|place| name(recording, *place));
+            SampleObject {
+                t: sample.t,
+                points: names.zip(recording.values(sample)).collect(),
+            }
+        }))
     }
-    json
+}
+
+#[derive(Serialize)]
+struct SampleObject<'r> {
+    t: f64,
+    points: BTreeMap<&'r str, &'r Json>,
+}
+
+/// The name of a point.
+fn name(recording: &Recording, place: usize) -> &str {
+    let column = recording.header.points.get(place);
+    column.map_or("", |column| column.name.as_str())
 }
 
 /// A line for each sample, with a column for each point that was read: RFC 4180 with a header line. A point that another

@@ -391,6 +391,8 @@ class Soak:
 
 async def run(options, directory, small_disk):
     soak = Soak(options, directory, small_disk)
+    # Whoever ends the soak ends its processes.
+    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, asyncio.current_task().cancel)
     try:
         await soak.start()
         for number in range(max(1, round(options.hours * 60))):

@@ -110,7 +110,7 @@ fn exports() {
         (at_trigger[column("fault")], at_trigger[column("motor_current [A]")]),
         ("true", "10.0")
     );
-    let json = export::json(&recording);
+    let json: serde_json::Value = serde_json::from_str(&export::json(&recording)).unwrap();
     assert_eq!(json["samples"][300]["points"]["fault"], true);
     assert_eq!(
         (&json["trigger"], &json["values"]["dc_link_voltage"]),

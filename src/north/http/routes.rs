@@ -375,8 +375,8 @@ async fn recording(State(app): State<Arc<AppState>>, Path(id): Path<String>) -> 
     };
     let wanted = id.clone();
     let read = tokio::task::spawn_blocking(move || {
-        let json = |recording| export::json(&recording).to_string();
-        recordings.read(&wanted).map(|read| read.map(json))
+        let read = recordings.read(&wanted);
+        read.map(|read| read.map(|recording| export::json(&recording)))
     });
     match read.await {
         Ok(Some(Ok(json))) => ([(header::CONTENT_TYPE, "application/json")], json).into_response(),
