@@ -312,13 +312,14 @@ impl Journal {
         self.acknowledged = self.acknowledged.max(number.min(self.last));
     }
 
-    /// Writes what was appended and acknowledged.
+    /// Writes what was appended and acknowledged; whether there was anything to write.
     ///
     /// # Errors
     /// The disk does not take it; it stays in memory, and the next call tries again.
-    pub(super) fn write(&mut self) -> io::Result<()> {
+    pub(super) fn write(&mut self) -> io::Result<bool> {
+        let mut written = false;
         if self.place.is_none() {
-            return Ok(());
+            return Ok(written);
         }
         self.remove_acknowledged()?;
         while let Some((number, _)) = self.unwritten.front() {
@@ -330,17 +331,18 @@ impl Journal {
                 Err(error) if is_full(&error) && self.drop_oldest()? => {}
                 other => other?,
             }
+            written = true;
         }
         if self.marked < self.acknowledged && self.segments.iter().any(|s| s.end > 0) {
             let (mark, acknowledged) = (record::mark(self.acknowledged), self.acknowledged);
             match self.write_at_end(&mark) {
-                Ok(()) => self.marked = acknowledged,
+                Ok(()) => (self.marked, written) = (acknowledged, true),
                 // Its messages are delivered again after a restart; nothing is dropped for it.
                 Err(error) if is_full(&error) => {}
                 Err(error) => return Err(error),
             }
         }
-        Ok(())
+        Ok(written)
     }
 
     /// Writes messages into the last segment, as many as fit.

@@ -322,7 +322,7 @@ impl Thread {
     fn write(&mut self) {
         let written = self.journal.write();
         match written {
-            Ok(()) if std::mem::take(&mut self.failing) => {
+            Ok(true) if std::mem::take(&mut self.failing) => {
                 tracing::info!("{} takes the MQTT buffer again", self.dir.display());
             }
             Err(error) if !std::mem::replace(&mut self.failing, true) => {

@@ -248,16 +248,25 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
         assert!(is_full(&journal.write().unwrap_err()));
     }
     assert!(journal.take(30).iter().map(|(_, m)| number(m)).eq(0..30));
+    journal.append(event(100), true);
+    journal.acknowledge(101);
+    assert!(
+        !journal.write().unwrap(),
+        "nothing is left to write: the disk may be full all the same"
+    );
+    for n in 101..201 {
+        journal.append(event(n), false);
+    }
     // There is room again.
     let segment = journal.segments.front_mut().unwrap();
     fs::remove_file(&segment.path).unwrap();
     segment.file = real(&segment.path).unwrap();
     journal.place.as_mut().unwrap().create = real;
-    journal.write().unwrap();
-    assert_eq!(numbers(&take_all(&mut journal)), (30..100).collect::<Vec<_>>());
+    assert!(journal.write().unwrap());
+    assert_eq!(numbers(&take_all(&mut journal)), (101..201).collect::<Vec<_>>());
     drop(journal);
     let mut journal = open(dir.path(), 256 << 10);
-    assert_eq!(numbers(&take_all(&mut journal)), (0..100).collect::<Vec<_>>());
+    assert_eq!(numbers(&take_all(&mut journal)), (101..201).collect::<Vec<_>>());
 }
 
 #[test]
