@@ -18,14 +18,15 @@ use std::path::{Path, PathBuf};
 
 use rustix::fs::{FlockOperation, flock};
 
-use super::outbox::Message;
+use super::outbox::{KEPT_BYTES, LOADED_BYTES, Message};
 use super::record::{self, Entry, Record};
 
 const SUFFIX: &str = ".log";
 const DAMAGED: &str = ".damaged";
 /// Largest and smallest size of a segment, bytes; between them a 64th of the buffer.
 const SEGMENT: (u64, u64) = (4 << 10, 256 << 10);
-/// Maximum number of messages that wait in memory because the disk does not take them.
+/// Maximum number of messages that wait in memory because the disk does not take them; their size is at most
+/// [`KEPT_BYTES`].
 const UNWRITTEN: usize = crate::event::BURST;
 /// Files with damaged records that are kept.
 const QUARANTINED: usize = 16;
@@ -53,6 +54,7 @@ pub(super) struct Journal {
     /// Loaded from disk, not taken yet.
     loaded: VecDeque<(u64, Message)>,
     unwritten: VecDeque<(u64, Message)>,
+    unwritten_bytes: usize,
     /// The last number given to a message.
     last: u64,
     /// Up to here messages were loaded, taken or lost.
@@ -87,6 +89,7 @@ impl Journal {
             next_segment: 1,
             loaded: VecDeque::new(),
             unwritten: VecDeque::new(),
+            unwritten_bytes: 0,
             last: 0,
             passed: 0,
             acknowledged: 0,
@@ -219,36 +222,55 @@ impl Journal {
                 return;
             }
         }
-        if self.unwritten.len() == UNWRITTEN
-            && let Some((number, _)) = self.unwritten.pop_front()
-            && number > self.passed
+        let bytes = message.bytes();
+        while (self.unwritten.len() == UNWRITTEN || self.unwritten_bytes + bytes > KEPT_BYTES)
+            && let Some(number) = self.drop_unwritten()
         {
-            self.lost += 1;
-            self.counted += 1;
+            if number > self.passed {
+                self.lost += 1;
+                self.counted += 1;
+            }
         }
+        self.unwritten_bytes += bytes;
         self.unwritten.push_back((self.last, message));
     }
 
-    /// Takes up to `most` messages in order, with their numbers.
+    /// Drops the first message that waits to be written; its number.
+    fn drop_unwritten(&mut self) -> Option<u64> {
+        let (number, message) = self.unwritten.pop_front()?;
+        self.unwritten_bytes -= message.bytes();
+        Some(number)
+    }
+
+    /// Takes messages in order, with their numbers: up to `most`, and no more once they have [`LOADED_BYTES`].
     pub(super) fn take(&mut self, most: usize) -> Vec<(u64, Message)> {
-        let mut taken = Vec::new();
-        while taken.len() < most {
-            if let Some(next) = self.loaded.pop_front() {
-                taken.push(next);
+        let (mut taken, mut bytes) = (Vec::new(), 0);
+        let all_of_disk = loop {
+            if taken.len() >= most || bytes >= LOADED_BYTES {
+                break false;
+            } else if let Some((number, message)) = self.loaded.pop_front() {
+                bytes += message.bytes();
+                taken.push((number, message));
             } else if !self.load() {
-                break;
+                break true;
             }
-        }
-        if self.loaded.is_empty() {
+        };
+        if all_of_disk {
             let passed = self.passed;
+            let fits = |(_, message): &&(u64, Message)| {
+                let fits = bytes < LOADED_BYTES;
+                bytes += message.bytes();
+                fits
+            };
             let rest = self.unwritten.iter().filter(|(number, _)| *number > passed);
-            for (number, message) in rest.take(most - taken.len()).cloned().collect::<Vec<_>>() {
+            let rest: Vec<_> = rest.take(most - taken.len()).take_while(fits).cloned().collect();
+            for (number, message) in rest {
                 self.pass(number);
                 taken.push((number, message));
             }
         }
-        if self.place.is_none() {
-            self.unwritten.retain(|(number, _)| *number > self.passed);
+        while self.place.is_none() && self.unwritten.front().is_some_and(|(number, _)| *number <= self.passed) {
+            self.drop_unwritten();
         }
         taken
     }
@@ -324,7 +346,7 @@ impl Journal {
         self.remove_acknowledged()?;
         while let Some((number, _)) = self.unwritten.front() {
             if *number <= self.acknowledged {
-                self.unwritten.pop_front();
+                self.drop_unwritten();
                 continue;
             }
             match self.write_some() {
@@ -368,7 +390,7 @@ impl Journal {
             self.drop_oldest()?;
         }
         self.write_at_end(&bytes)?;
-        let written: Vec<u64> = self.unwritten.drain(..count).map(|(number, _)| number).collect();
+        let written: Vec<u64> = (0..count).filter_map(|_| self.drop_unwritten()).collect();
         if let (Some(segment), Some(first), Some(last)) = (self.segments.back_mut(), written.first(), written.last()) {
             segment.numbers = Some((segment.numbers.map_or(*first, |(first, _)| first), *last));
             if *last <= self.passed {

@@ -16,10 +16,13 @@ const RESULTS: usize = 16_384;
 const RESULT_BYTES: usize = 32 << 20;
 /// Results that may wait on one topic; beyond it, commands that would be answered there are refused.
 const RESULTS_OF_TOPIC: usize = 2048;
-/// Maximum number of messages of a queue in memory; with a buffer, the others wait on disk.
+/// Maximum number of messages of a queue in memory, and their size in bytes; with a buffer, the others wait on disk. An
+/// array of the history has up to 32 KiB.
 const KEPT: usize = crate::event::BURST;
-/// Maximum number of messages loaded from disk at a time: more than any window.
+pub(super) const KEPT_BYTES: usize = 16 << 20;
+/// Maximum number of messages loaded from disk at a time, more than any window, and the size from which on no more are.
 const LOADED: usize = 1024;
+pub(super) const LOADED_BYTES: usize = 1 << 20;
 /// Number of lost connections after which a result is dropped: its response topic may be the cause.
 const RESULT_ATTEMPTS: u8 = 2;
 
@@ -50,7 +53,7 @@ impl Message {
         }
     }
 
-    fn bytes(&self) -> usize {
+    pub(super) fn bytes(&self) -> usize {
         self.topic.len() + self.payload.len() + self.correlation.as_ref().map_or(0, Vec::len)
     }
 }
@@ -215,11 +218,12 @@ impl Outbox {
         self.serial += 1;
         let serial = self.serial;
         let queue = self.queue_mut(kind);
-        let full = kind != Kind::Result && queue.entries.len() >= KEPT;
-        if full {
+        let mut dropped = 0;
+        while kind != Kind::Result && queue.is_full_for(&message) {
             // Entries in flight are dropped last: they have probably been delivered.
             let victim = queue.entries.iter().position(|e| !e.in_flight).unwrap_or(0);
             queue.remove(victim);
+            dropped += 1;
         }
         queue.bytes += message.bytes();
         queue.entries.push_back(Entry {
@@ -230,8 +234,8 @@ impl Outbox {
             attempts: 0,
         });
         match kind {
-            Kind::Event => self.lost.events += u64::from(full),
-            Kind::History => self.lost.history += u64::from(full),
+            Kind::Event => self.lost.events += dropped,
+            Kind::History => self.lost.history += dropped,
             Kind::Result => {}
         }
     }
@@ -266,7 +270,11 @@ impl Outbox {
 
     /// Number of messages of that kind that may be loaded from disk now.
     pub(super) fn room(&self, kind: Kind) -> usize {
-        LOADED.saturating_sub(self.queue(kind).entries.len())
+        let queue = self.queue(kind);
+        match queue.bytes < LOADED_BYTES {
+            true => LOADED.saturating_sub(queue.entries.len()),
+            false => 0,
+        }
     }
 
     /// The first message of that kind that is not acknowledged and on disk.
@@ -473,6 +481,10 @@ impl Outbox {
 }
 
 impl Queue {
+    fn is_full_for(&self, message: &Message) -> bool {
+        self.entries.len() >= KEPT || !self.entries.is_empty() && self.bytes + message.bytes() > KEPT_BYTES
+    }
+
     fn next(&self, kind: Kind, free: bool) -> Option<(Key, Message)> {
         let entry = self.entries.iter().find(|e| !e.in_flight)?;
         let may = free || !entry.message.acknowledged;

@@ -7,6 +7,7 @@
 use std::io;
 use std::path::PathBuf;
 use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::time::{Duration, Instant};
 
 use flume::{Receiver, RecvTimeoutError, Sender, TrySendError};
@@ -14,10 +15,11 @@ use tokio::sync::mpsc;
 
 use super::Buffer;
 use super::journal::Journal;
-use super::outbox::Message;
+use super::outbox::{KEPT_BYTES, Message};
 use crate::north::{MqttLoss, NorthStats};
 
-/// Jobs that wait for the disk: a burst of events and its acknowledgements.
+/// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
+/// [`KEPT_BYTES`].
 const JOBS: usize = 2 * crate::event::BURST;
 /// Messages that are written at a time.
 const BATCH: usize = 1024;
@@ -82,6 +84,8 @@ pub(super) struct Store {
 struct Disk {
     lost: LostCount,
     jobs: Sender<Job>,
+    /// Size of the messages among them.
+    bytes: Arc<AtomicUsize>,
     loaded: mpsc::Receiver<Loaded>,
     ended: tokio::sync::oneshot::Receiver<()>,
 }
@@ -98,8 +102,10 @@ impl Store {
         let (sender, loaded) = mpsc::channel(4);
         let (end, ended) = tokio::sync::oneshot::channel();
         let of_thread = lost.clone();
+        let bytes: Arc<AtomicUsize> = Arc::default();
+        let waiting = bytes.clone();
         let work = move || {
-            Thread::open(&buffer, name, sender, of_thread).work(&todo);
+            Thread::open(&buffer, name, sender, of_thread).work(&todo, &waiting);
             // The client may be gone.
             let _ = end.send(());
         };
@@ -108,6 +114,7 @@ impl Store {
                 disk: Some(Disk {
                     lost,
                     jobs,
+                    bytes,
                     loaded,
                     ended,
                 }),
@@ -127,13 +134,13 @@ impl Store {
             return Some((None, message));
         };
         let now = self.opened && room && self.through == self.pushed;
-        match disk.jobs.try_send(Job::Append(message.clone(), now)) {
-            Ok(()) => self.pushed += 1,
-            Err(_) if now => return Some((None, message)),
-            Err(_) => {
-                disk.lost.add(1);
-                return None;
-            }
+        if disk.append(&message, now) {
+            self.pushed += 1;
+        } else if now {
+            return Some((None, message));
+        } else {
+            disk.lost.add(1);
+            return None;
         }
         if now {
             self.through = self.pushed;
@@ -216,6 +223,23 @@ impl Store {
     }
 }
 
+impl Disk {
+    /// Gives a message to the disk, unless too much waits for it.
+    fn append(&self, message: &Message, sent: bool) -> bool {
+        let bytes = message.bytes();
+        if self.bytes.load(Ordering::Relaxed) + bytes > KEPT_BYTES {
+            return false;
+        }
+        // Before the thread can subtract it.
+        self.bytes.fetch_add(bytes, Ordering::Relaxed);
+        let given = self.jobs.try_send(Job::Append(message.clone(), sent)).is_ok();
+        if !given {
+            self.bytes.fetch_sub(bytes, Ordering::Relaxed);
+        }
+        given
+    }
+}
+
 /// The thread that owns the files.
 struct Thread {
     dir: PathBuf,
@@ -270,8 +294,8 @@ impl Thread {
         thread
     }
 
-    /// Works until nobody sends jobs any more.
-    fn work(mut self, jobs: &Receiver<Job>) {
+    /// Works until nobody sends jobs any more; `bytes` is the size of the messages that wait.
+    fn work(mut self, jobs: &Receiver<Job>, bytes: &AtomicUsize) {
         loop {
             let mut load = None;
             let mut next = match jobs.recv_timeout(SYNC) {
@@ -282,7 +306,10 @@ impl Thread {
             let mut count = 0;
             while let Some(job) = next.take() {
                 match job {
-                    Job::Append(message, sent) => self.journal.append(message, sent),
+                    Job::Append(message, sent) => {
+                        bytes.fetch_sub(message.bytes(), Ordering::Relaxed);
+                        self.journal.append(message, sent);
+                    }
                     Job::Acknowledge(number) => self.journal.acknowledge(self.base.saturating_add_signed(number)),
                     Job::Load(most) => load = Some(most),
                     Job::Topics(topics) => self.write_topics(&topics),

@@ -1,4 +1,5 @@
 use super::*;
+use crate::sim::random::Random;
 
 const BIG: u64 = 64 << 20;
 
@@ -23,8 +24,14 @@ fn append(journal: &mut Journal, range: std::ops::Range<usize>) {
 }
 
 fn take_all(journal: &mut Journal) -> Vec<(u64, usize)> {
-    let taken = journal.take(usize::MAX);
-    taken.iter().map(|(id, message)| (*id, number(message))).collect()
+    let mut all = Vec::new();
+    loop {
+        let taken = journal.take(usize::MAX);
+        if taken.is_empty() {
+            return all;
+        }
+        all.extend(taken.iter().map(|(id, message)| (*id, number(message))));
+    }
 }
 
 fn numbers(taken: &[(u64, usize)]) -> Vec<usize> {
@@ -269,6 +276,53 @@ fn a_full_disk_gets_no_segment_after_the_first_and_what_waits_can_be_taken() {
     assert_eq!(numbers(&take_all(&mut journal)), (101..201).collect::<Vec<_>>());
 }
 
+/// Whatever the disk does: each message is taken once, in order, or counted as lost; memory is bounded.
+#[test]
+fn every_message_is_taken_or_lost_whatever_the_disk_does() {
+    let full: fn(&Path) -> io::Result<File> = |_| Err(ErrorKind::StorageFull.into());
+    for seed in 0..20 {
+        let dir = tempfile::tempdir().unwrap();
+        let mut journal = open(dir.path(), 1 << 20);
+        let real = journal.place.as_ref().unwrap().create;
+        let mut random = Random::new(seed);
+        let mut below = |most: u64| random.within(0..=most - 1) as usize;
+        let (mut appended, mut sent, mut taken, mut lost) = (0, 0, Vec::new(), 0);
+        for _ in 0..400 {
+            match below(10) {
+                0..5 => {
+                    let size = [20, 500, 4 << 10, 33 << 10][below(4)];
+                    let mut message = event(appended);
+                    message.payload.resize(size, b' ');
+                    let at_once = below(4) == 0 && journal.waiting() == 0;
+                    journal.append(message, at_once);
+                    (appended, sent) = (appended + 1, sent + usize::from(at_once));
+                }
+                5 | 6 => drop(journal.write()),
+                7 => {
+                    let next = journal.take(below(50));
+                    let bytes: usize = next.iter().rev().skip(1).map(|(_, message)| message.bytes()).sum();
+                    assert!(bytes < LOADED_BYTES, "seed {seed}");
+                    taken.extend(next.into_iter().map(|(id, message)| (id, number(&message))));
+                }
+                8 => journal.acknowledge(journal.through()),
+                _ => journal.place.as_mut().unwrap().create = [real, full][below(2)],
+            }
+            lost += journal.take_lost() as usize;
+            let kept: usize = journal.unwritten.iter().map(|(_, message)| message.bytes()).sum();
+            assert!(
+                kept == journal.unwritten_bytes && kept <= KEPT_BYTES,
+                "seed {seed}: {kept}"
+            );
+        }
+        journal.place.as_mut().unwrap().create = real;
+        journal.write().unwrap();
+        taken.extend(take_all(&mut journal));
+        lost += journal.take_lost() as usize;
+        assert_eq!(taken.len() + sent + lost, appended, "seed {seed}");
+        assert!(taken.is_sorted_by(|a, b| a.0 < b.0 && a.1 < b.1), "seed {seed}");
+    }
+}
+
 #[test]
 fn messages_beyond_the_memory_are_lost_and_counted_once() {
     let dir = tempfile::tempdir().unwrap();
@@ -289,6 +343,15 @@ fn messages_beyond_the_memory_are_lost_and_counted_once() {
     let taken = take_all(&mut journal);
     assert_eq!((taken.len() + lost, journal.take_lost()), (many, 0));
     assert!(taken.is_sorted());
+    // Arrays of the history are large.
+    for n in 0..1000 {
+        journal.append(Message::not_retained("h", format!("{n:33000}").into_bytes()), false);
+    }
+    let kept = journal.unwritten_bytes;
+    assert!((KEPT_BYTES - 40_000..=KEPT_BYTES).contains(&kept), "{kept}");
+    assert_eq!(journal.take_lost() as usize, 1000 - kept / 33_001);
+    let taken = take_all(&mut journal);
+    assert!(taken.iter().map(|(_, n)| *n).eq(1000 - kept / 33_001..1000));
 }
 
 #[test]

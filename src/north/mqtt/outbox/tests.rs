@@ -125,6 +125,21 @@ fn queues_are_bounded_and_drop_the_oldest() {
     }
     assert_eq!((outbox.waiting(), outbox.take_lost().events), (KEPT, 2));
     assert_eq!(outbox.next(1, true).unwrap().1.topic.as_ref(), "e2");
+    // Arrays of the history are large.
+    let array = |n: usize| Message::not_retained("h", format!("{n:33000}").into_bytes());
+    let mut count = 0;
+    while outbox.room(Kind::History) > 0 {
+        outbox.push(Kind::History, array(count), None);
+        count += 1;
+    }
+    assert!((30..40).contains(&count), "{count} are loaded at a time");
+    (count..2000).for_each(|n| outbox.push(Kind::History, array(n), None));
+    let queue = outbox.queue(Kind::History);
+    let (kept, bytes) = (queue.entries.len(), queue.bytes);
+    assert!((KEPT_BYTES - 40_000..=KEPT_BYTES).contains(&bytes), "{bytes}");
+    let first = &queue.entries.front().unwrap().message;
+    assert_eq!(*first, array(2000 - kept), "the newest are kept");
+    assert_eq!(outbox.take_lost().history as usize, 2000 - kept);
 }
 
 #[test]

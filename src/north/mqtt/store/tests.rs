@@ -21,6 +21,7 @@ fn stalled() -> (Store, Receiver<Job>, mpsc::Sender<Loaded>, LostCount) {
         disk: Some(Disk {
             lost: lost.clone(),
             jobs,
+            bytes: Arc::default(),
             loaded,
             ended: tokio::sync::oneshot::channel().1,
         }),
@@ -48,6 +49,24 @@ fn a_disk_that_hangs_delays_nothing() {
     assert_eq!(number, None, "sent, though nothing keeps it");
     assert_eq!((store.push(event(0), false), self::lost(&lost)), (None, 1), "counted");
     assert_eq!(todo.try_iter().count(), JOBS);
+}
+
+#[test]
+fn a_disk_that_hangs_costs_no_more_memory_than_that() {
+    let (mut store, todo, _report, lost) = stalled();
+    store.take(opened(0));
+    for n in 0..1000 {
+        store.push(Message::not_retained("h", format!("{n:33000}").into_bytes()), false);
+    }
+    let bytes: usize = todo
+        .drain()
+        .map(|job| match job {
+            Job::Append(message, _) => message.bytes(),
+            _ => 0,
+        })
+        .sum();
+    assert!((KEPT_BYTES - 40_000..=KEPT_BYTES).contains(&bytes), "{bytes}");
+    assert_eq!(self::lost(&lost) as usize, 1000 - bytes / 33_001);
 }
 
 #[test]
