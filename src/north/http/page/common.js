@@ -253,6 +253,18 @@ export function arrange(parent, wanted) {
   if (moved && focused && focused !== document.activeElement && parent.contains(focused)) focused.focus({ preventScroll: true });
 }
 
+/// Fills the body of a table with a row for each record. Rows that stay are not made anew: somebody may be on one of their links.
+export function fillRows(entries, body, records, row) {
+  const counts = new Map();
+  const named = records.map((record) => {
+    const content = JSON.stringify(record);
+    counts.set(content, (counts.get(content) ?? 0) + 1);
+    return { record, name: `${content} ${counts.get(content)}` };
+  });
+  keyed(entries, named, ({ record }) => ({ element: row(record) }), () => {});
+  arrange(body, named.map(({ name }) => entries.get(name).element));
+}
+
 /// A table with headings, that can be scrolled by itself where it is wider than the page.
 export function table(caption, ...headings) {
   const body = make("tbody");

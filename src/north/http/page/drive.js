@@ -2,7 +2,7 @@
 // well the line carries it.
 
 import {
-  age, anchor, badge, faultOf, figure, hide, hours, isOn, keyed, make, noteOf, places, section, showSpeed, showValue, size,
+  age, anchor, badge, faultOf, figure, fillRows, hide, hours, isOn, keyed, make, noteOf, places, section, showSpeed, showValue, size,
   speedBar, stamp, stateOf, table, text, titleOf, valueCell, words,
 } from "./common.js";
 import { EVENT_COLOURS, eventList } from "./events.js";
@@ -183,20 +183,16 @@ function recordingRow(record) {
     make("td", "", record.summary), make("td", "n", size(record.bytes)));
 }
 
-/// A table that is filled anew only when what it shows has changed.
 function log(id, title, none, columns, row) {
   const list = table(title, ...columns);
   const note = make("p", "note", none);
-  let shown = null;
+  const entries = new Map();
   return {
     element: section(id, title, list.element, note),
     show(records) {
-      const state = JSON.stringify(records);
       hide(list.element, records.length === 0);
       hide(note, records.length > 0);
-      if (state === shown) return;
-      shown = state;
-      list.body.replaceChildren(...records.map(row));
+      fillRows(entries, list.body, records, row);
     },
   };
 }

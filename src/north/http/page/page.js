@@ -10,6 +10,7 @@ import * as overview from "./overview.js";
 import * as recording from "./recording.js";
 
 const PERIOD_MS = 1000;
+const SOON_MS = 50;
 
 // The first word of the address, what opens its view, and the entry of the navigation that it belongs to.
 const VIEWS = {
@@ -26,6 +27,8 @@ const gateway = document.title;
 let view = null;
 let timer = null;
 let asking = false;
+// Something was chosen while an answer was under way.
+let again = false;
 // How far each place was scrolled; it grows with what a person clicks.
 const scrolled = new Map();
 
@@ -87,7 +90,17 @@ async function tick() {
   asking = false;
   const spent = performance.now() - started;
   // A view that was opened meanwhile need not wait, a slow connection gets a rest as long as its answer took.
-  if (!document.hidden) timer = setTimeout(tick, asked === view ? Math.max(200, spent, PERIOD_MS - spent) : 0);
+  const rest = again ? SOON_MS : Math.max(200, spent, PERIOD_MS - spent);
+  again = false;
+  if (!document.hidden) timer = setTimeout(tick, asked === view ? rest : 0);
+}
+
+// What somebody chose is shown at once, not with the next second.
+function soon() {
+  again = asking;
+  if (asking) return;
+  clearTimeout(timer);
+  timer = setTimeout(tick, SOON_MS);
 }
 
 function shown() {
@@ -127,6 +140,7 @@ addEventListener("pageshow", (event) => event.persisted && visible());
 addEventListener("hashchange", () => open(false));
 addEventListener("scroll", () => view && !view.fresh && scrolled.set(location.hash, window.scrollY), { passive: true });
 setInterval(() => document.hidden || watch(), 500);
+for (const kind of ["click", "input"]) $("view").addEventListener(kind, soon);
 $("skip").addEventListener("click", (event) => {
   event.preventDefault();
   $("view").focus();

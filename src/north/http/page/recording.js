@@ -1,7 +1,7 @@
 // A recording: what was read before and after a fault as plots with one cursor, states as lanes, events, commands and frames under
 // them. And the list of all recordings.
 
-import { anchor, digitsOf, draw, hide, make, places, section, size, stamp, table, text, titleOf, words } from "./common.js";
+import { anchor, digitsOf, draw, fillRows, hide, make, places, section, size, stamp, table, text, titleOf, words } from "./common.js";
 import { EVENT_COLOURS } from "./events.js";
 import { PlotGroup, reachOf, sampleAt, withGaps } from "./plot.js";
 
@@ -243,17 +243,16 @@ export function openList(root) {
   const list = table("Recordings", "Time", "Drive", "Trigger", "Summary", "Size");
   const note = make("p", "note", "There are no recordings. The gateway makes one when a drive trips, is lost, or refuses a stop.");
   root.append(make("h1", "", "Recordings"), list.element, note);
-  let state = null;
+  const entries = new Map();
+  const row = (record) => make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.drive(record.drive), "", record.drive)),
+    make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), make("td", "", record.summary), make("td", "n", size(record.bytes)));
   return {
     title: "Recordings",
     async refresh(load) {
       const records = (await load("recordings")).reverse();
       hide(note, records.length > 0);
       hide(list.element, records.length === 0);
-      if (state === JSON.stringify(records)) return;
-      state = JSON.stringify(records);
-      list.body.replaceChildren(...records.map((record) => make("tr", "", make("td", "", stamp(new Date(record.time))), make("td", "", anchor(places.drive(record.drive), "", record.drive)),
-        make("td", "", anchor(places.recording(record.id), "", words(record.trigger))), make("td", "", record.summary), make("td", "n", size(record.bytes)))));
+      fillRows(entries, list.body, records, row);
     },
   };
 }

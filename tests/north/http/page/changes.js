@@ -177,12 +177,50 @@ async function linesTellTheirDiagnosis(gateway, page) {
   assert.equal(await page.eval(seen), `Diagnosisone drive pump-2one drive is bad (likely): ${NASTY}look at its plug`);
 }
 
+async function rowsKeepTheFocus(gateway, page) {
+  const entry = (n) => ({ id: `20260302T07401${n}.118Z-pump-2`, time: `2026-03-02T07:40:1${n}.118Z`, drive: "pump-2", bus: "line1", trigger: "fault", summary: `trip ${n}`, bytes: 1000 });
+  const links = () => [...document.querySelectorAll("a[href^='#/recording/']")].map((link) => link.getAttribute("href"));
+  gateway.events = [];
+  for (const address of ["#/recordings", "#/drive/pump-2"]) {
+    gateway.recordings = { a: { entry: entry(1) } };
+    await page.open(`${gateway.url}#/lines`);
+    await page.open(`${gateway.url}${address}`);
+    await page.until(() => document.querySelectorAll("a[href^='#/recording/']").length === 1);
+    await page.eval(() => document.querySelector("a[href^='#/recording/']").focus());
+    gateway.recordings.b = { entry: entry(2) };
+    await page.until(() => document.querySelectorAll("a[href^='#/recording/']").length === 2);
+    assert.deepEqual(await page.eval(links), [2, 1].map((n) => `#/recording/${entry(n).id}`), "newest first");
+    assert.equal(await page.eval(() => document.activeElement.getAttribute("href")), `#/recording/${entry(1).id}`, `${address}: a new recording takes the focus away`);
+  }
+  gateway.recordings = {};
+}
+
+async function whatIsChosenIsShownAtOnce(gateway, page) {
+  await page.open(`${gateway.url}#/lines`);
+  await page.open(`${gateway.url}#/drive/pump-2`);
+  await page.until(() => document.querySelector(".curve")?.getAttribute("d"));
+  await page.eval(() => {
+    const real = window.setTimeout;
+    window.waits = [];
+    window.setTimeout = (work, wait, ...more) => {
+      window.waits.push(wait);
+      return real(work, wait, ...more);
+    };
+  });
+  const seen = gateway.asked.length;
+  await page.eval(() => [...document.querySelectorAll(".chip")].find((button) => button.textContent === "1 h").click());
+  await page.until(() => window.waits.includes(50));
+  await page.until(() => document.querySelector('.chip[aria-pressed="true"]').textContent === "1 h" && document.querySelector(".curve")?.getAttribute("d"));
+  assert.ok(gateway.asked.slice(seen).some((address) => address.includes("from=1h")), "the trends of an hour were asked for");
+}
+
 async function main() {
   const gateway = new FakeGateway();
   gateway.url = await gateway.start();
   const browser = new Browser();
   const page = await browser.page();
-  for (const step of [rowsFollowTheirDrives, listIsFiltered, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis]) {
+  for (const step of [rowsFollowTheirDrives, listIsFiltered, driveHasALinkOfItsOwn, cursorIsMovedByKeys, connectionIsLostAndFound, eventsAreSearched, linesTellTheirDiagnosis,
+    rowsKeepTheFocus, whatIsChosenIsShownAtOnce]) {
     try {
       await step(gateway, page);
     } catch (error) {
