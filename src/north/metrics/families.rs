@@ -86,39 +86,51 @@ pub(super) enum SeriesValue {
     Histogram(HistogramSnapshot),
 }
 
-/// Series of one name.
-#[derive(Debug)]
+/// What the series of one name have in common.
+#[derive(Debug, Clone, Copy)]
 pub(super) struct Family {
     pub(super) name: &'static str,
     pub(super) help: &'static str,
     pub(super) kind: Kind,
-    pub(super) series: Vec<(Labels, SeriesValue)>,
 }
 
-impl Family {
-    fn new(kind: Kind, name: &'static str, help: &'static str) -> Family {
-        Family {
-            name,
-            help,
-            kind,
-            series: Vec::new(),
-        }
+/// Place of a family.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord)]
+pub(super) struct FamilyId(usize);
+
+/// All series of a scrape, in one list: a list for each family would leave its place in the heap behind, scrape by scrape.
+#[derive(Debug, Default)]
+pub(super) struct Families {
+    families: Vec<Family>,
+    series: Vec<(FamilyId, Labels, SeriesValue)>,
+}
+
+impl Families {
+    fn family(&mut self, kind: Kind, name: &'static str, help: &'static str) -> FamilyId {
+        self.families.push(Family { name, help, kind });
+        FamilyId(self.families.len() - 1)
     }
 
-    fn of(kind: Kind, name: &'static str, help: &'static str, figure: SeriesValue) -> Family {
-        let mut family = Family::new(kind, name, help);
-        family.add(Labels::default(), figure);
-        family
+    fn add(&mut self, family: FamilyId, labels: Labels, figure: SeriesValue) {
+        self.series.push((family, labels, figure));
     }
 
-    fn add(&mut self, labels: Labels, figure: SeriesValue) {
-        self.series.push((labels, figure));
+    /// A family of one series without labels.
+    fn one(&mut self, kind: Kind, name: &'static str, help: &'static str, figure: SeriesValue) {
+        let family = self.family(kind, name, help);
+        self.add(family, Labels::default(), figure);
+    }
+
+    /// The families that have series, with these.
+    pub(super) fn iter(&self) -> impl Iterator<Item = (&Family, &[(FamilyId, Labels, SeriesValue)])> {
+        let chunks = self.series.chunk_by(|a, b| a.0 == b.0);
+        chunks.filter_map(|series| Some((self.families.get(series.first()?.0.0)?, series)))
     }
 }
 
-/// All families; those without a series are omitted from the text.
-pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Family> {
-    let mut all = Vec::new();
+/// All series, those of a family one after the other.
+pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Families {
+    let mut all = Families::default();
     drives(plant, now, &mut all);
     runs(plant, &mut all);
     buses(&plant.buses, &mut all);
@@ -127,53 +139,61 @@ pub(super) fn collect(plant: &Plant, stats: &NorthStats, now: Instant) -> Vec<Fa
     parameters(plant, &mut all);
     north(stats, &mut all);
     reload(stats, &mut all);
-    all.push(build(plant));
+    build(plant, &mut all);
     process(&process::read(), &mut all);
+    all.series.sort_by_key(|(family, ..)| *family);
     all
 }
 
-fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
-    let gauge = |name, help| Family::new(Kind::Gauge, name, help);
-    let mut up = gauge(
+fn drives(plant: &Plant, now: Instant, all: &mut Families) {
+    let up = all.family(
+        Kind::Gauge,
         "drivegate_drive_up",
         "Whether the drive answers: 1, else 0 (also before its first answer).",
     );
-    let mut state = gauge(
+    let state = all.family(
+        Kind::Gauge,
         "drivegate_drive_state",
         "State of the drive: 1 for the state it is in, 0 for the others; absent while it is not known.",
     );
-    let mut blocked = gauge(
+    let blocked = all.family(
+        Kind::Gauge,
         "drivegate_drive_blocked",
         "Why the motor does not run: 1 for each cause; absent while it runs.",
     );
-    let mut fault_info = gauge(
+    let fault_info = all.family(
+        Kind::Gauge,
         "drivegate_drive_fault_info",
         "Text of the active fault: 1; absent without a fault.",
     );
-    let mut age = gauge(
+    let age = all.family(
+        Kind::Gauge,
         "drivegate_drive_sample_age_seconds",
         "Age of the drive's process data; absent while it was never read.",
     );
-    let mut model: Vec<Family> = MODEL.iter().map(|(_, name, help)| gauge(name, help)).collect();
-    let mut point = gauge(
+    let model = MODEL.map(|(_, name, help)| all.family(Kind::Gauge, name, help));
+    let point = all.family(
+        Kind::Gauge,
         "drivegate_point_value",
         "Points of a drive without a metric of their own, in their unit; true is 1.",
     );
-    let mut transactions = Family::new(
+    let transactions = all.family(
         Kind::Counter,
         "drivegate_drive_transactions_total",
         "Exchanges with the drive by their outcome.",
     );
-    let mut turnaround = gauge(
+    let turnaround = all.family(
+        Kind::Gauge,
         "drivegate_drive_turnaround_seconds",
         "Time from the end of the last request to the beginning of the drive's answer.",
     );
-    let mut supervision = Family::new(
+    let supervision = all.family(
         Kind::Counter,
         "drivegate_supervision_actions_total",
         "Leases that ran out while the drive ran.",
     );
-    let mut unsupervised = gauge(
+    let unsupervised = all.family(
+        Kind::Gauge,
         "drivegate_drive_unsupervised",
         "Whether a drive with supervision runs that no client has commanded since the gateway started: 1, else 0.",
     );
@@ -181,49 +201,47 @@ fn drives(plant: &Plant, now: Instant, all: &mut Vec<Family>) {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
-        supervision.add(labels.clone(), SeriesValue::Count(image.supervisions()));
+        all.add(supervision, labels.clone(), SeriesValue::Count(image.supervisions()));
         if image.spec.supervision.is_some() {
-            unsupervised.add(labels.clone(), flag(image.is_unsupervised()));
+            all.add(unsupervised, labels.clone(), flag(image.is_unsupervised()));
         }
-        up.add(labels.clone(), flag(reading.snapshot.link.is_online()));
+        all.add(up, labels.clone(), flag(reading.snapshot.link.is_online()));
         if let Some(current) = reading.state() {
             for one in State::ALL {
-                state.add(labels.with("state", one.name()), flag(one == current));
+                all.add(state, labels.with("state", one.name()), flag(one == current));
             }
         }
         for cause in drive.why(&reading).words() {
-            blocked.add(labels.with("reason", cause), SeriesValue::Value(1.0));
+            all.add(blocked, labels.with("reason", cause), SeriesValue::Value(1.0));
         }
         let fault_text =
             Some(reading.fault_text()).filter(|text| reading.is_set(ModelPoint::Fault) && !text.is_empty());
         if let Some(text) = fault_text {
-            fault_info.add(labels.with("text", text), SeriesValue::Value(1.0));
+            all.add(fault_info, labels.with("text", text), SeriesValue::Value(1.0));
         }
         if let Some(time) = reading.age() {
-            age.add(labels.clone(), SeriesValue::Value(time.as_secs_f64()));
+            all.add(age, labels.clone(), SeriesValue::Value(time.as_secs_f64()));
         }
-        points(&reading, &labels, &mut model, &mut point);
+        points(&reading, &labels, (&model, point), all);
         for outcome in Outcome::ALL {
             let count = SeriesValue::Count(image.counted(outcome));
-            transactions.add(labels.with("outcome", outcome.name()), count);
+            all.add(transactions, labels.with("outcome", outcome.name()), count);
         }
         if let Some(time) = image.turnaround() {
-            turnaround.add(labels, SeriesValue::Value(time.as_secs_f64()));
+            all.add(turnaround, labels, SeriesValue::Value(time.as_secs_f64()));
         }
     }
-    all.extend([up, state, blocked, fault_info, age]);
-    all.append(&mut model);
-    all.extend([point, transactions, turnaround, supervision, unsupervised]);
 }
 
 /// What was counted of the drives that say whether they run.
-fn runs(plant: &Plant, all: &mut Vec<Family>) {
-    let counter = |name, help| Family::new(Kind::Counter, name, help);
-    let mut starts = counter(
+fn runs(plant: &Plant, all: &mut Families) {
+    let starts = all.family(
+        Kind::Counter,
         "drivegate_drive_starts_total",
         "Starts of the motor that were seen; kept over restarts of the gateway.",
     );
-    let mut running = counter(
+    let running = all.family(
+        Kind::Counter,
         "drivegate_drive_running_seconds_total",
         "Time that the motor was seen running; kept over restarts of the gateway.",
     );
@@ -232,15 +250,14 @@ fn runs(plant: &Plant, all: &mut Vec<Family>) {
         if spec.profile.model_index(ModelPoint::Running).is_some() {
             let totals = plant.history.totals(&spec.name);
             let labels = labels_of(&drive.image);
-            starts.add(labels.clone(), SeriesValue::Count(totals.starts));
-            running.add(labels, SeriesValue::Total(totals.running_seconds));
+            all.add(starts, labels.clone(), SeriesValue::Count(totals.starts));
+            all.add(running, labels, SeriesValue::Total(totals.running_seconds));
         }
     }
-    all.extend([starts, running]);
 }
 
 /// The good points of a drive; `model` has the families of [`MODEL`], in its order.
-fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &mut Family) {
+fn points(reading: &Reading<'_>, labels: &Labels, (model, other): (&[FamilyId], FamilyId), all: &mut Families) {
     let profile = &reading.spec.profile;
     for (index, name) in public_points(profile) {
         let Some(value) = reading
@@ -254,20 +271,20 @@ fn points(reading: &Reading<'_>, labels: &Labels, model: &mut [Family], other: &
         let point = profile.points.get(index);
         let own = point.and_then(|p| p.model).and_then(|m| {
             let place = MODEL.iter().position(|(wanted, ..)| *wanted == m)?;
-            model.get_mut(place)
+            model.get(place).copied()
         });
         match own {
-            Some(family) => family.add(labels.clone(), SeriesValue::Value(value)),
+            Some(family) => all.add(family, labels.clone(), SeriesValue::Value(value)),
             None => {
                 let unit = point.map(|p| p.unit.clone()).unwrap_or_default();
                 let labels = labels.with_both(("point", name.to_string().into()), ("unit", unit.into()));
-                other.add(labels, SeriesValue::Value(value));
+                all.add(other, labels, SeriesValue::Value(value));
             }
         }
     }
 }
 
-fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
+fn buses(handles: &[BusHandle], all: &mut Families) {
     type Of<T> = fn(&BusImage, &BusHealth) -> T;
     let gauges: [(&str, &str, Of<Option<f64>>); 2] = [
         (
@@ -286,30 +303,29 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         .map(|h| (Labels::of([("bus", &h.image.spec.name)]), h, h.image.health()))
         .collect();
     for (name, help, value) in gauges {
-        let mut family = Family::new(Kind::Gauge, name, help);
+        let family = all.family(Kind::Gauge, name, help);
         for (labels, handle, health) in &looks {
             if let Some(value) = value(&handle.image, health) {
-                family.add(labels.clone(), SeriesValue::Value(value));
+                all.add(family, labels.clone(), SeriesValue::Value(value));
             }
         }
-        all.push(family);
     }
-    let mut cycles = Family::new(
+    let cycles = all.family(
         Kind::Histogram,
         "drivegate_bus_cycle_seconds",
         "Achieved cycle: time from the start of a poll round to the start of the next, by poll class.",
     );
-    let mut transactions = Family::new(
+    let transactions = all.family(
         Kind::Histogram,
         "drivegate_bus_transaction_seconds",
         "Duration of exchanges on the bus.",
     );
-    let mut queue = Family::new(
+    let queue = all.family(
         Kind::Gauge,
         "drivegate_bus_queue_depth",
         "Commands and forwarded reads that wait for the bus.",
     );
-    let mut diagnosis = Family::new(
+    let diagnosis = all.family(
         Kind::Gauge,
         "drivegate_line_diagnosis",
         "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
@@ -319,41 +335,44 @@ fn buses(handles: &[BusHandle], all: &mut Vec<Family>) {
         for verdict in &image.diagnosis.load().verdicts {
             let drive = verdict.drive.clone().unwrap_or_default();
             let labels = labels.with_both(("drive", drive.into()), ("verdict", verdict.verdict.name().into()));
-            diagnosis.add(labels, SeriesValue::Value(1.0));
+            all.add(diagnosis, labels, SeriesValue::Value(1.0));
         }
         for (class, times) in [
             (PollClass::Fast, &image.fast_cycles),
             (PollClass::Slow, &image.slow_cycles),
         ] {
-            cycles.add(
+            all.add(
+                cycles,
                 labels.with("class", class.name()),
                 SeriesValue::Histogram(times.snapshot()),
             );
         }
-        transactions.add(labels.clone(), SeriesValue::Histogram(image.transactions.snapshot()));
-        queue.add(labels, SeriesValue::Value(handle.queue.lock().len() as f64));
+        all.add(
+            transactions,
+            labels.clone(),
+            SeriesValue::Histogram(image.transactions.snapshot()),
+        );
+        all.add(queue, labels, SeriesValue::Value(handle.queue.lock().len() as f64));
     }
-    all.extend([cycles, transactions, queue, diagnosis]);
 }
 
-fn writes(plant: &Plant, all: &mut Vec<Family>) {
-    let mut results = Family::new(
+fn writes(plant: &Plant, all: &mut Families) {
+    let results = all.family(
         Kind::Counter,
         "drivegate_writes_total",
         "Commands answered, by source and result.",
     );
     for ((source, result), count) in plant.writes.results() {
         let labels = Labels::default().with_both(("source", source.name().into()), ("result", result.into()));
-        results.add(labels, SeriesValue::Count(count));
+        all.add(results, labels, SeriesValue::Count(count));
     }
-    all.push(results);
-    all.push(Family::of(
+    all.one(
         Kind::Histogram,
         "drivegate_write_seconds",
         "Time from the acceptance of a command to its answer.",
         SeriesValue::Histogram(plant.writes.seconds()),
-    ));
-    let mut lost = Family::new(
+    );
+    let lost = all.family(
         Kind::Counter,
         "drivegate_audit_lost_total",
         "Records that the audit file lacks because the disk did not take them.",
@@ -361,14 +380,13 @@ fn writes(plant: &Plant, all: &mut Vec<Family>) {
     if let Some(file) = plant.writes.audit().file() {
         let (sent, not_sent) = file.lost();
         for (kind, count) in [("sent", sent), ("not_sent", not_sent)] {
-            lost.add(Labels::default().with("kind", kind), SeriesValue::Count(count));
+            all.add(lost, Labels::default().with("kind", kind), SeriesValue::Count(count));
         }
     }
-    all.push(lost);
 }
 
-fn recordings(plant: &Plant, all: &mut Vec<Family>) {
-    let mut made = Family::new(
+fn recordings(plant: &Plant, all: &mut Families) {
+    let made = all.family(
         Kind::Counter,
         "drivegate_recordings_total",
         "Recordings made since the start, by what made them.",
@@ -376,16 +394,16 @@ fn recordings(plant: &Plant, all: &mut Vec<Family>) {
     let counts = plant.recordings.made();
     for kind in TriggerKind::ALL {
         let count = counts.get(&kind).copied().unwrap_or_default();
-        made.add(
+        all.add(
+            made,
             Labels::default().with("trigger", kind.name()),
             SeriesValue::Count(count),
         );
     }
-    all.push(made);
 }
 
-fn parameters(plant: &Plant, all: &mut Vec<Family>) {
-    let mut changed = Family::new(
+fn parameters(plant: &Plant, all: &mut Families) {
+    let changed = all.family(
         Kind::Counter,
         "drivegate_parameters_changed_total",
         "Parameters of the drive that changed from one reading to the next and that the gateway did not write.",
@@ -394,39 +412,36 @@ fn parameters(plant: &Plant, all: &mut Vec<Family>) {
     for drive in plant.drives() {
         let key = (drive.image.spec.bus.clone(), drive.image.spec.name.clone());
         let count = counts.get(&key).copied().unwrap_or_default();
-        changed.add(labels_of(&drive.image), SeriesValue::Count(count));
+        all.add(changed, labels_of(&drive.image), SeriesValue::Count(count));
     }
-    all.push(changed);
 }
 
-fn north(stats: &NorthStats, all: &mut Vec<Family>) {
-    all.push(Family::of(
+fn north(stats: &NorthStats, all: &mut Families) {
+    all.one(
         Kind::Gauge,
         "drivegate_modbus_tcp_connections",
         "Modbus TCP clients connected now.",
         SeriesValue::Value(stats.modbus_tcp.connections() as f64),
-    ));
-    let mut requests = Family::new(
+    );
+    let requests = all.family(
         Kind::Counter,
         "drivegate_modbus_tcp_requests_total",
         "Modbus TCP requests answered, by function code and outcome.",
     );
     for (function, outcome, count) in stats.modbus_tcp.requests() {
         let labels = Labels::default().with_both(("function", function.into()), ("outcome", outcome.into()));
-        requests.add(labels, SeriesValue::Count(count));
+        all.add(requests, labels, SeriesValue::Count(count));
     }
-    all.push(requests);
-    let mut tools = Family::new(
+    let tools = all.family(
         Kind::Counter,
         "drivegate_slot_requests_total",
         "Requests of tools at the slots, by outcome.",
     );
     for (bus, outcome, count) in stats.slots.requests() {
         let labels = Labels::default().with_both(("bus", bus.into()), ("outcome", outcome.name().into()));
-        tools.add(labels, SeriesValue::Count(count));
+        all.add(tools, labels, SeriesValue::Count(count));
     }
-    all.push(tools);
-    let mut refused = Family::new(
+    let refused = all.family(
         Kind::Counter,
         "drivegate_connections_refused_total",
         "Connections refused, or closed in favour of others, by server and reason.",
@@ -435,86 +450,87 @@ fn north(stats: &NorthStats, all: &mut Vec<Family>) {
         for (reason, count) in stats.refused.of(server).filter(|(_, count)| *count > 0) {
             let labels =
                 Labels::default().with_both(("server", server.name().into()), ("reason", reason.name().into()));
-            refused.add(labels, SeriesValue::Count(count));
+            all.add(refused, labels, SeriesValue::Count(count));
         }
     }
-    all.push(refused);
     let mqtt = &stats.mqtt;
-    all.push(Family::of(
+    all.one(
         Kind::Gauge,
         "drivegate_mqtt_configured",
         "Whether an MQTT broker is configured: 1, else 0.",
         flag(mqtt.configured.load(Ordering::Relaxed)),
-    ));
-    all.push(Family::of(
+    );
+    all.one(
         Kind::Gauge,
         "drivegate_mqtt_connected",
         "Whether the gateway is connected to its MQTT broker: 1, else 0 (also without one configured).",
         flag(mqtt.connected.load(Ordering::Relaxed)),
-    ));
-    all.push(Family::of(
+    );
+    all.one(
         Kind::Counter,
         "drivegate_mqtt_published_total",
         "Messages sent to the MQTT broker; with QoS 1 those that it acknowledged.",
         SeriesValue::Count(mqtt.published.load(Ordering::Relaxed)),
-    ));
-    all.push(Family::of(
+    );
+    all.one(
         Kind::Gauge,
         "drivegate_mqtt_buffered_messages",
         "Messages that wait for the MQTT broker.",
         SeriesValue::Value(mqtt.buffered.load(Ordering::Relaxed) as f64),
-    ));
-    let mut lost = Family::new(
+    );
+    let lost = all.family(
         Kind::Counter,
         "drivegate_mqtt_lost_total",
         "Messages that MQTT lost, by kind: the buffer was full or damaged, or the broker refused them.",
     );
     for (kind, count) in mqtt.losses() {
-        lost.add(Labels::default().with("kind", kind.name()), SeriesValue::Count(count));
+        all.add(
+            lost,
+            Labels::default().with("kind", kind.name()),
+            SeriesValue::Count(count),
+        );
     }
-    all.push(lost);
 }
 
-fn reload(stats: &NorthStats, all: &mut Vec<Family>) {
+fn reload(stats: &NorthStats, all: &mut Families) {
     let (applied, at) = stats.reload.last();
     let since_epoch = at.duration_since(SystemTime::UNIX_EPOCH).unwrap_or_default();
-    all.push(Family::of(
+    all.one(
         Kind::Gauge,
         "drivegate_config_last_reload_successful",
         "Whether the last reload of the configuration was applied: 1; 0 if it was refused and the former one goes on.",
         flag(applied),
-    ));
-    all.push(Family::of(
+    );
+    all.one(
         Kind::Gauge,
         "drivegate_config_last_reload_timestamp_seconds",
         "When the last reload of the configuration ended, applied or refused; the start counts as one.",
         SeriesValue::Value((since_epoch.as_secs_f64() * 1e3).round() / 1e3),
-    ));
+    );
 }
 
-fn build(plant: &Plant) -> Family {
+fn build(plant: &Plant, all: &mut Families) {
     let labels = Labels::of([
         ("version", env!("CARGO_PKG_VERSION")),
         ("commit", super::COMMIT.unwrap_or("unknown")),
         ("gateway", &plant.gateway),
     ]);
-    let mut family = Family::new(
+    let family = all.family(
         Kind::Gauge,
         "drivegate_build_info",
         "Always 1; version and commit of the build, and the name of the gateway.",
     );
-    family.add(labels, SeriesValue::Value(1.0));
-    family
+    all.add(family, labels, SeriesValue::Value(1.0));
 }
 
-fn process(figures: &process::ProcessStats, all: &mut Vec<Family>) {
+fn process(figures: &process::ProcessStats, all: &mut Families) {
     if let Some(seconds) = figures.cpu_seconds {
-        all.push(Family::of(
+        all.one(
             Kind::Counter,
             "process_cpu_seconds_total",
             "Processor time of the process, user and system.",
             SeriesValue::Total(seconds),
-        ));
+        );
     }
     let gauges = [
         (
@@ -546,7 +562,7 @@ fn process(figures: &process::ProcessStats, all: &mut Vec<Family>) {
     ];
     for (name, help, value) in gauges {
         if let Some(value) = value {
-            all.push(Family::of(Kind::Gauge, name, help, SeriesValue::Value(value)));
+            all.one(Kind::Gauge, name, help, SeriesValue::Value(value));
         }
     }
 }

@@ -15,7 +15,7 @@ use prometheus_client::encoding::{DescriptorEncoder, MetricEncoder};
 use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 
-use self::families::{Family, Kind, SeriesValue};
+use self::families::{Families, Kind, SeriesValue};
 use super::NorthStats;
 use crate::plant::Plant;
 
@@ -91,13 +91,13 @@ pub fn encode(plant: &Plant, stats: &NorthStats, now: Instant, format: Format) -
 
 #[derive(Debug)]
 struct Scrape {
-    families: Vec<Family>,
+    families: Families,
     format: Format,
 }
 
 impl Collector for Scrape {
     fn encode(&self, mut encoder: DescriptorEncoder<'_>) -> Result<(), fmt::Error> {
-        for family in self.families.iter().filter(|f| !f.series.is_empty()) {
+        for (family, series) in self.families.iter() {
             let kind = match family.kind {
                 Kind::Gauge => MetricType::Gauge,
                 Kind::Counter => MetricType::Counter,
@@ -108,7 +108,7 @@ impl Collector for Scrape {
                 _ => family.name,
             };
             let mut metric = encoder.encode_descriptor(name, family.help, None, kind)?;
-            for (labels, figure) in &family.series {
+            for (_, labels, figure) in series {
                 if labels.is_empty() {
                     self.figure(figure, &mut metric)?;
                 } else {
