@@ -229,7 +229,8 @@ impl LineState {
             sent,
             heard_at: self.quiet_since,
             reply_time,
-            took: now.saturating_duration_since(began) + self.silence,
+            // A reply that came faster than the wire could carry it frees the line no sooner.
+            took: now.max(self.quiet_since).saturating_duration_since(began) + self.silence,
         })
     }
 

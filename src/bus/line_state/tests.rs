@@ -6,6 +6,8 @@ struct Bench {
     line: LineState,
     protocol: Protocol,
     now: Instant,
+    /// Replies are counted from the begin of the request, as if it took no time.
+    at_once: bool,
 }
 
 impl Bench {
@@ -21,6 +23,7 @@ impl Bench {
             line: LineState::new(protocol, format, silence, now),
             protocol,
             now,
+            at_once: false,
         }
     }
 
@@ -55,12 +58,19 @@ impl Bench {
         self.now += Duration::from_secs(1);
         self.line
             .send(request, frame, sending, N2LateReplies::default(), self.now);
-        let sent = self.line.quiet_since();
+        let sent = if self.at_once {
+            self.now
+        } else {
+            self.line.quiet_since()
+        };
         let exchanged = what
             .iter()
             .find_map(|(after, bytes)| self.line.heard(bytes, sent + *after));
         let over = exchanged.or_else(|| self.line.on_time(sent + Duration::from_secs(1)).ok());
-        matches!(over.expect("it is over").ended, Ended::Reply(_))
+        let over = over.expect("it is over");
+        let free = self.line.quiet_since() + Duration::from_millis(4);
+        assert!(self.now + over.took >= free, "the line was taken until {free:?}");
+        matches!(over.ended, Ended::Reply(_))
     }
 }
 
@@ -156,6 +166,19 @@ fn an_n2_line_that_doubles_replies_and_loses_others_keeps_its_protection() {
         for _ in 0..9 {
             assert!(bench.believes(REGULAR));
         }
+    }
+}
+
+/// With less, requests that go first as long as their share lasts would take the whole line.
+#[test]
+fn a_line_without_wire_time_is_taken_as_long_as_the_gateway_leaves_it_alone() {
+    for protocol in [Protocol::ModbusRtu, Protocol::N2] {
+        let mut bench = Bench::of(protocol);
+        for _ in 0..200 {
+            bench.believes(EARLY);
+        }
+        bench.at_once = true;
+        assert!(bench.believes(EARLY), "{protocol:?}");
     }
 }
 
