@@ -9,10 +9,9 @@ use crate::process_image::Reading;
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
-/// A motor whose speed fell by more than that, in percent of the speed range, is on its way to a stop. Less is ripple.
-const RIPPLE: f64 = 0.5;
-/// A motor slower than that, in percent of the speed range, has stopped as far as its speed shows.
-const NEAR_ZERO: f64 = 1.0;
+/// A motor whose speed fell by more than that, in Hz, or in percent where no frequency is read, is on its way to a stop.
+/// Less is ripple.
+const RIPPLE: f64 = 0.25;
 
 /// On a busy line the next read may come late: so many times the time for confirmation pass before that is reported.
 const UNREAD: u32 = 5;
@@ -22,7 +21,7 @@ const UNREAD: u32 = 5;
 pub enum Effect {
     /// The motor runs.
     Runs,
-    /// The motor stands, or is near zero speed.
+    /// The motor does not run, or stands.
     Stops,
     /// No fault is active.
     NoFault,
@@ -114,9 +113,10 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
         Effect::Runs => model(ModelPoint::Running).map(Value::as_bool),
         Effect::NoFault => model(ModelPoint::Fault).map(|fault| !fault.as_bool()),
         Effect::Stops => {
-            let stands = model(ModelPoint::Running).map(|running| !running.as_bool());
-            let near_zero = model(ModelPoint::ActualSpeed).map(|v| v.as_f64().abs() < NEAR_ZERO);
-            stands.into_iter().chain(near_zero).reduce(|a, b| a || b)
+            let stopped = model(ModelPoint::Running).map(|running| !running.as_bool());
+            // Not the speed: in percent of a band from a minimum frequency, 0 % is a motor that turns.
+            let stands = model(ModelPoint::OutputFrequency).map(|v| v.as_f64() == 0.0);
+            stopped.into_iter().chain(stands).reduce(|a, b| a || b)
         }
         Effect::ReadBack(index, value) => {
             let read = after(reading.sample(index))?;
@@ -130,13 +130,23 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
     }
 }
 
+/// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band
+/// does not; the percentage where the profile has nothing else.
+fn speed(reading: &Reading<'_>) -> Option<f64> {
+    let has = |point: &ModelPoint| reading.spec.profile.model_point(*point).is_some();
+    let point = [ModelPoint::OutputFrequency, ModelPoint::ActualSpeed]
+        .into_iter()
+        .find(has)?;
+    reading.model(point).good().map(|value| value.as_f64().abs())
+}
+
 /// An acknowledged command whose effect is waited for.
 #[derive(Debug)]
 struct Watch {
     effects: Vec<Effect>,
     since: Instant,
     within: Duration,
-    /// Least amount of the speed since the acknowledgement, percent, and when it last fell.
+    /// Least speed since the acknowledgement, and when it last fell.
     slowest: Option<f64>,
     fell_at: Instant,
     /// Whether the drive was read since, as far as it could show an effect.
@@ -178,8 +188,7 @@ impl Watch {
     }
 
     fn note_speed(&mut self, reading: &Reading<'_>, now: Instant) {
-        let speed = reading.model(ModelPoint::ActualSpeed);
-        let Some(speed) = speed.good().map(|v| v.as_f64().abs()) else {
+        let Some(speed) = speed(reading) else {
             return;
         };
         match self.slowest {
@@ -221,7 +230,7 @@ impl Confirmations {
             effects,
             since: now,
             within: reading.spec.profile.confirm_within,
-            slowest: reading.model(ModelPoint::ActualSpeed).good().map(|v| v.as_f64().abs()),
+            slowest: speed(reading),
             fell_at: now,
             was_read: false,
             what: receipts

@@ -36,6 +36,8 @@ pub(super) struct DriveState {
     pub(super) silent_until: Option<Instant>,
     /// It was read since its confirmations were looked at.
     pub(super) was_read: bool,
+    /// When an end of its frequency range was written last, whether or not it took it.
+    pub(super) range_written: Option<Instant>,
 }
 
 /// What the begun commands of a drive want.
@@ -66,6 +68,7 @@ impl DriveState {
             stopped: None,
             silent_until: None,
             was_read: false,
+            range_written: None,
         }
     }
 

@@ -1,6 +1,7 @@
 //! Which commands are let through: authority first, then address, then value; and why the others are not, in words.
 //! Codes and exceptions of a `Refusal` are in `command/mod.rs`. Pure.
 
+use super::frequency_range::{FrequencyRange, rests_on};
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
@@ -18,6 +19,8 @@ pub struct Admitted {
     pub urgency: Urgency,
     /// It sets references only.
     pub reference_only: bool,
+    /// Frequency ranges on which it rests.
+    pub ranges: Vec<FrequencyRange>,
 }
 
 /// Checks an order against what client and drive allow, the profile and the limits.
@@ -33,10 +36,11 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
             order: Order::Read(pdu),
             urgency: Urgency::Read,
             reference_only: false,
+            ranges: Vec::new(),
         }),
         Order::Write(pdu) => {
             authority(drive, client)?;
-            raw_write(drive, &pdu)?;
+            let ranges = raw_write(drive, &pdu)?;
             let urgency = if stops(drive, &pdu) {
                 Urgency::Stop
             } else {
@@ -48,6 +52,7 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
                     order: Order::Write(pdu),
                     urgency,
                     reference_only: false,
+                    ranges,
                 },
             )
         }
@@ -62,6 +67,7 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
                 order: Order::Parameter(order),
                 urgency: Urgency::Command,
                 reference_only: false,
+                ranges: Vec::new(),
             })
         }
     }
@@ -155,6 +161,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         ));
     }
     let mut resolved: Vec<(usize, Value)> = Vec::with_capacity(values.len());
+    let mut ranges = Vec::new();
     for (index, value) in values {
         let point = profile.points.get(index).filter(|p| p.write).ok_or_else(|| {
             let name = profile.points.get(index).map_or("?", |p| p.name.as_str());
@@ -167,7 +174,14 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         if resolved.iter().any(|(other, _)| *other == index) {
             return Err(sets_twice(profile.points.get(index).map_or("", |p| p.name.as_str())));
         }
+        ranges.extend(rests_on(drive, asked, (index, value)));
         resolved.push((index, value));
+    }
+    let set = |end: &usize| resolved.iter().any(|(index, _)| index == end);
+    if let Some(end) = ranges.iter().flat_map(FrequencyRange::ends).find(set) {
+        return Err(changes_its_range(
+            profile.points.get(end).map_or("", |p| p.name.as_str()),
+        ));
     }
     let is = |point: ModelPoint, wanted: Option<bool>| {
         resolved
@@ -183,6 +197,7 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
         order: Order::Points(resolved),
         urgency,
         reference_only: !bits,
+        ranges,
     })
 }
 
@@ -190,6 +205,13 @@ fn points(drive: &Reading<'_>, values: Vec<(usize, Value)>) -> Result<Admitted, 
 pub fn sets_twice(point: &str) -> Refusal {
     Refusal::BadValue(format!(
         "the command sets `{point}` twice; name each point once, and one reference only"
+    ))
+}
+
+fn changes_its_range(end: &str) -> Refusal {
+    Refusal::BadValue(format!(
+        "the command sets `{end}` and a reference that is converted or limited by it; send `{end}` first, and the reference \
+         when it was read; nothing was written"
     ))
 }
 
@@ -227,26 +249,14 @@ fn checked(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
 /// The limits of the points that mean the same quantity: a command in Hz keeps the limits in percent, and the other
 /// way round. `asked` was checked itself.
 fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value) -> Result<(), Refusal> {
-    let points = &drive.spec.profile.points;
-    let taken_by = |point: usize| points.get(point).and_then(|p| p.write_to).unwrap_or(point);
-    for (other, point) in points.iter().enumerate() {
-        let Some(limits) = drive
-            .spec
-            .limits
-            .get(&point.name)
-            .filter(|_| other != asked && other != index)
-        else {
+    let written = (index, as_held(drive, (index, value)));
+    for (other, point) in drive.spec.profile.points.iter().enumerate() {
+        let limits = drive.spec.limits.get(&point.name);
+        let Some(limits) = limits.filter(|_| other != asked && other != index) else {
             continue;
         };
-        let figure = match &point.source {
-            _ if point.write_to == Some(index) => Some(value),
-            Source::Derived(derived) => match derived.band().filter(|(of, ..)| taken_by(*of) == index) {
-                Some((_, minimum, maximum)) => drive
-                    .band_for_commands(minimum, maximum)
-                    .and_then(|band| derived.value([value], Some(band))),
-                None => continue,
-            },
-            Source::Raw(_) => continue,
+        let Some(figure) = becomes(drive, other, written) else {
+            continue;
         };
         let Some(figure) = figure.map(Value::as_f64) else {
             return Err(Refusal::NotKnown(format!(
@@ -256,7 +266,9 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
                 drive.parameter_age().as_secs_f64()
             )));
         };
-        if !limits.contains(&figure) {
+        // A negative zero turns the motor in reverse.
+        let reverse = figure == 0.0 && figure.is_sign_negative() && *limits.start() >= 0.0;
+        if reverse || !limits.contains(&figure) {
             let (low, high, unit) = (limits.start(), limits.end(), &point.unit);
             return Err(Refusal::BadValue(format!(
                 "`{}` would be {figure} {unit}, outside the limits {low} to {high} {unit}; nothing was written",
@@ -265,6 +277,26 @@ fn related_limits(drive: &Reading<'_>, asked: usize, index: usize, value: Value)
         }
     }
     Ok(())
+}
+
+/// What a point is once the register of another one is written: itself, or by the point that takes its commands, or by
+/// conversion. `None` where the two have nothing to do with each other, `Some(None)` where the band is not known.
+pub(super) fn becomes(drive: &Reading<'_>, point: usize, written: (usize, Value)) -> Option<Option<Value>> {
+    let (index, value) = written;
+    if point == index {
+        return Some(Some(value));
+    }
+    let entry = drive.spec.profile.points.get(point)?;
+    if let Some(target) = entry.write_to {
+        return becomes(drive, target, written);
+    }
+    let Source::Derived(derived) = &entry.source else {
+        return None;
+    };
+    let (of, minimum, maximum) = derived.band()?;
+    let of = becomes(drive, of, written)?;
+    let band = drive.band_for_commands(minimum, maximum);
+    Some(of.zip(band).and_then(|(of, band)| derived.value([of], Some(band))))
 }
 
 /// A derived point becomes the point it rests on; the value must fit the register.
@@ -296,19 +328,54 @@ fn resolve(drive: &Reading<'_>, index: usize, point: &Point, value: Value) -> Re
                     drive.parameter_age().as_secs_f64()
                 ))
             })?;
-            let base = drive.spec.profile.points.get(of);
-            let (Some(base), Some(figure)) = (base, derived.inverse(value.as_f64(), band)) else {
-                let (low, high) = band;
-                return Err(Refusal::NotWritable(format!(
-                    "the frequency range {low} to {high} Hz is empty"
-                )));
-            };
+            let base = drive
+                .spec
+                .profile
+                .points
+                .get(of)
+                .filter(|_| band.1 > band.0)
+                .ok_or_else(|| {
+                    let (low, high) = band;
+                    Refusal::NotWritable(format!("the frequency range {low} to {high} Hz is empty"))
+                })?;
+            let figure = derived
+                .inverse(value.as_f64(), band)
+                .ok_or_else(|| below_minimum(point, value, band.0))?;
             // The limits of the point itself were checked; those of the one behind it hold as well.
             let rounded = Value::Number((figure * 100.0).round() / 100.0);
-            let value = checked(drive, of, base, rounded)?;
-            resolve(drive, of, base, value)
+            let order = resolve(drive, of, base, checked(drive, of, base, rounded)?)?;
+            // At the minimum frequency the percentage is 0, which has no sign.
+            let back = derived.value([as_held(drive, order)], Some(band)).map(Value::as_f64);
+            if band.0 > 0.0 && value.as_f64() < 0.0 && back.is_some_and(|back| back > 0.0) {
+                return Err(no_sign(point, value));
+            }
+            Ok(order)
         }
     }
+}
+
+/// A drive turns no slower than its minimum frequency, so it cannot be told to.
+fn below_minimum(point: &Point, value: Value, minimum: f64) -> Refusal {
+    let (name, unit) = (&point.name, &point.unit);
+    Refusal::BadValue(format!(
+        "`{name}` = {value} {unit} is below the drive's minimum frequency {minimum} {unit}; nothing was written"
+    ))
+}
+
+/// The register would hold 0, which turns the motor forward.
+fn no_sign(point: &Point, value: Value) -> Refusal {
+    let (name, unit) = (&point.name, &point.unit);
+    Refusal::BadValue(format!(
+        "`{name}` = {value} {unit} is 0 % in reverse, and 0 % has no sign; use `reverse` for it; nothing was written"
+    ))
+}
+
+/// The value of a raw point as far as its register tells it: what is rounded to 0 has no sign.
+fn as_held(drive: &Reading<'_>, (index, value): (usize, Value)) -> Value {
+    let raw = drive.spec.profile.points.get(index).and_then(Point::raw);
+    let held = raw.and_then(|raw| raw.decode(&raw.encode(value, 0).ok()?, Kind::Number));
+    held.filter(|held| held.as_f64() == 0.0)
+        .map_or(value, |_| Value::Number(0.0))
 }
 
 /// The registers (or coils, as 0 and 1) that a raw write sets, as address and value.
@@ -332,7 +399,8 @@ pub fn written(pdu: &RequestPdu) -> Option<(Table, Vec<(u16, u16)>)> {
     }
 }
 
-fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<(), Refusal> {
+/// The frequency ranges on which a raw write rests.
+fn raw_write(drive: &Reading<'_>, pdu: &RequestPdu) -> Result<Vec<FrequencyRange>, Refusal> {
     let profile = &drive.spec.profile;
     let Some((table, items)) = written(pdu) else {
         return Err(Refusal::NotAllowed(format!(
@@ -398,8 +466,10 @@ fn one_object(table: Table, first: u16, count: usize) -> Result<(), Refusal> {
     Ok(())
 }
 
-/// The points that a raw write of `items` sets: each whole, and within its limits.
-fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<(), Refusal> {
+/// The points that a raw write of `items` sets: each whole, and within its limits; and the frequency ranges on which that
+/// rests.
+fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result<Vec<FrequencyRange>, Refusal> {
+    let mut ranges = Vec::new();
     for (index, point) in drive.spec.profile.points.iter().enumerate() {
         let Some(raw) = point.raw().filter(|raw| raw.table == table) else {
             continue;
@@ -422,6 +492,7 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
             Some(value) => {
                 let value = checked(drive, index, point, value)?;
                 related_limits(drive, index, index, value)?;
+                ranges.extend(rests_on(drive, index, (index, value)));
             }
             None => {
                 return Err(Refusal::BadValue(format!(
@@ -431,7 +502,7 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
             }
         }
     }
-    Ok(())
+    Ok(ranges)
 }
 
 /// Whether a raw write takes the run command away.

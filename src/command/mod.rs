@@ -10,6 +10,7 @@
 mod admit;
 mod audit;
 mod background;
+mod frequency_range;
 mod parameter;
 mod queue;
 mod ticket;
@@ -20,6 +21,7 @@ pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
     BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
 };
+pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
@@ -198,6 +200,8 @@ pub struct Command {
     pub urgency: Urgency,
     /// The order sets references only: a newer one of the same points replaces it.
     pub reference_only: bool,
+    /// Frequency ranges on which it rests.
+    pub ranges: Vec<FrequencyRange>,
     /// Not sent after this.
     pub expires: Instant,
     /// Answers it.
@@ -218,6 +222,7 @@ impl Command {
             order: admitted.order,
             urgency: admitted.urgency,
             reference_only: admitted.reference_only,
+            ranges: admitted.ranges,
             expires,
             ticket,
             joined: Vec::new(),

@@ -4,6 +4,9 @@ use std::time::Instant;
 
 use super::model::{Quality, Sample, Value, tidy};
 
+/// Share of the lower end of a band by which a value may miss it for the rounding of floats.
+const ROUNDING: f64 = 1e-9;
+
 /// One end of a band: another point, or a number from the manual.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Bound {
@@ -16,7 +19,8 @@ pub enum Bound {
 /// How a value is derived from other points, given by their indices in the profile. All of them are raw points.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Derived {
-    /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`.
+    /// A percentage of a band: `minimum + of / 100 * (maximum - minimum)`. A minimum above zero is that of either
+    /// direction: a negative percentage is the same magnitude in reverse.
     Band {
         /// Point in percent.
         of: usize,
@@ -25,7 +29,7 @@ pub enum Derived {
         /// Value at 100 %.
         maximum: Bound,
     },
-    /// A value within a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`.
+    /// A value within a band as a percentage: `100 * (of - minimum) / (maximum - minimum)`, in either direction as well.
     Percent {
         /// Point in the unit of the band.
         of: usize,
@@ -118,13 +122,13 @@ impl Derived {
         let mut sources = sources.into_iter();
         let first = sources.next()?;
         match self {
-            Derived::Band { .. } => {
-                let (low, high) = band?;
-                Some(Value::Number(tidy(low + first.as_f64() / 100.0 * (high - low))))
-            }
+            Derived::Band { .. } => Some(Value::Number(tidy(in_band(first.as_f64(), band?)))),
             Derived::Percent { .. } => {
-                let (low, high) = band.filter(|(low, high)| high > low)?;
-                Some(Value::Number(tidy((first.as_f64() - low) / (high - low) * 100.0)))
+                let band = band.filter(|(low, high)| high > low)?;
+                let value = first.as_f64();
+                // A drive that is asked for less turns at its minimum; a negative zero is that in reverse.
+                let percent = percentage(value, band).unwrap_or(0.0_f64.copysign(value));
+                Some(Value::Number(tidy(percent)))
             }
             Derived::Zero { within, .. } => Some(Value::Bool(first.as_f64().abs() <= *within)),
             Derived::Equal { within, .. } => {
@@ -147,13 +151,13 @@ impl Derived {
         }
     }
 
-    /// The value of the source for which this point is `value`; `None` if it cannot be commanded.
+    /// The value of the source for which this point is `value`; `None` if it cannot be commanded, as what is below a
+    /// minimum above zero.
     pub(crate) fn inverse(&self, value: f64, band: (f64, f64)) -> Option<f64> {
-        let (low, high) = band;
         match self {
-            _ if high <= low => None,
-            Derived::Band { .. } => Some((value - low) / (high - low) * 100.0),
-            Derived::Percent { .. } => Some(low + value / 100.0 * (high - low)),
+            _ if band.1 <= band.0 => None,
+            Derived::Band { .. } => percentage(value, band),
+            Derived::Percent { .. } => Some(in_band(value, band)),
             _ => None,
         }
     }
@@ -167,7 +171,7 @@ impl Derived {
             complete &= source.value.is_some();
             source.value
         });
-        let value = self.value(values, band).filter(|_| complete);
+        let value = self.value(values, band).filter(|_| complete).map(unsigned_zero);
         value.map_or(Sample::NONE, |value| Sample {
             value: Some(value),
             quality,
@@ -176,8 +180,38 @@ impl Derived {
     }
 }
 
+/// The value at `percent` of a band. A lower end above zero is the minimum of a drive that turns no slower in either
+/// direction, and a negative percentage turns it in reverse (drives.md 3.5). Any other band is a straight line.
+fn in_band(percent: f64, (low, high): (f64, f64)) -> f64 {
+    if low > 0.0 && percent < 0.0 {
+        -in_band(-percent, (low, high))
+    } else {
+        low + percent / 100.0 * (high - low)
+    }
+}
+
+/// The percentage at which a band has `value`; `None` between the minima of the two directions.
+fn percentage(value: f64, (low, high): (f64, f64)) -> Option<f64> {
+    if low <= 0.0 {
+        return Some((value - low) / (high - low) * 100.0);
+    }
+    let above = value.abs() - low;
+    let percent = above.max(0.0) / (high - low) * 100.0;
+    (above >= -low * ROUNDING).then_some(percent.copysign(value))
+}
+
+/// What people read has no negative zero.
+fn unsigned_zero(value: Value) -> Value {
+    match value {
+        Value::Number(number) => Value::Number(number + 0.0),
+        other => other,
+    }
+}
+
 #[cfg(test)]
 mod tests {
+    use proptest::prelude::*;
+
     use super::*;
 
     const BAND: Option<(f64, f64)> = Some((10.0, 50.0));
@@ -206,6 +240,79 @@ mod tests {
         assert_eq!(percent.value([Value::Number(30.0)], Some((5.0, 5.0))), None);
         assert_eq!(percent.value([Value::Number(30.0)], None), None);
         assert_eq!(band.inverse(30.0, (5.0, 5.0)), None);
+    }
+
+    /// drives.md 3.5: the sign of a reference turns the motor round, the magnitude counts from the minimum frequency.
+    #[test]
+    fn a_minimum_above_zero_is_that_of_either_direction() {
+        let ((minimum, maximum), range) = (ends(), (10.0, 50.0));
+        let band = Derived::Band {
+            of: 0,
+            minimum,
+            maximum,
+        };
+        let percent = Derived::Percent {
+            of: 0,
+            minimum,
+            maximum,
+        };
+        for (share, hertz) in [
+            (0.0, 10.0),
+            (50.0, 30.0),
+            (-50.0, -30.0),
+            (-100.0, -50.0),
+            (-25.0, -20.0),
+        ] {
+            assert_eq!(band.value([Value::Number(share)], BAND), Some(Value::Number(hertz)));
+            assert_eq!(percent.value([Value::Number(hertz)], BAND), Some(Value::Number(share)));
+            assert_eq!(band.inverse(hertz, range), Some(share));
+            assert_eq!(percent.inverse(share, range), Some(hertz));
+        }
+        for hertz in [0.0, 5.0, 9.99, -5.0, -9.99] {
+            assert_eq!(band.inverse(hertz, range), None, "{hertz} Hz");
+        }
+        for exact in [10.0, 10.0 - 1e-9, 10.0 + 1e-9] {
+            let share = band.inverse(exact, range).unwrap();
+            assert!((0.0..1e-6).contains(&share) && share.is_sign_positive(), "{share} %");
+        }
+        // It turns at its minimum. What is seen has no sign then, what is limited does.
+        let seen = |hertz: f64| {
+            let sample = Sample {
+                value: Some(Value::Number(hertz)),
+                quality: Quality::Good,
+                at: None,
+            };
+            percent.sample([sample].into_iter(), BAND).value.unwrap().as_f64()
+        };
+        assert_eq!((seen(5.0), seen(-5.0)), (0.0, 0.0));
+        assert!(seen(-5.0).is_sign_positive());
+        let limited = percent.value([Value::Number(-5.0)], BAND).unwrap().as_f64();
+        assert!(limited == 0.0 && limited.is_sign_negative());
+    }
+
+    proptest! {
+        /// What is ordered in one unit is that in the other one, and the sign stays, whatever the band.
+        #[test]
+        fn there_and_back(low in 0.01f64..100.0, width in 0.1f64..100.0, share in -100.0f64..100.0, line in any::<bool>()) {
+            let low = if line { -low } else { low };
+            let range = (low, low + width);
+            let (minimum, maximum) = ends();
+            let band = Derived::Band { of: 0, minimum, maximum };
+            let percent = Derived::Percent { of: 0, minimum, maximum };
+            prop_assume!(share != 0.0);
+            let hertz = band.value([Value::Number(share)], Some(range)).unwrap().as_f64();
+            prop_assert!(low <= 0.0 || (hertz < 0.0) == (share < 0.0));
+            prop_assert!(low <= 0.0 || (low - 1e-6..=low + width + 1e-6).contains(&hertz.abs()));
+            // As exact as a value is kept, to a millionth.
+            let near = |a: f64, b: f64, by: f64| (a - b).abs() <= by;
+            prop_assert!(near(percent.value([Value::Number(hertz)], Some(range)).unwrap().as_f64(), share, 1e-3));
+            prop_assert!(near(percent.inverse(share, range).unwrap(), hertz, 1e-6));
+            // The exact value; the one above may be rounded to below the minimum.
+            let exact = percent.inverse(share, range).unwrap();
+            let back = band.inverse(exact, range).unwrap();
+            prop_assert!(near(back, share, 1e-6));
+            prop_assert!(near(band.value([Value::Number(back)], Some(range)).unwrap().as_f64(), exact, 1e-6));
+        }
     }
 
     #[test]

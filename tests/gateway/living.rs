@@ -160,11 +160,14 @@ fn a_gateway_is_set_up_again_from_its_backup() {
     fs::create_dir_all(site.file("state/recordings")).unwrap();
     site.write("state/audit.jsonl", "{}\n");
     site.write("state/mqtt.lock", "");
+    fs::create_dir_all(site.file("state/params/pump-1")).unwrap();
+    let journal = "state/params/pump-1/restore.journal";
+    site.write(journal, "# drivegate restore 1\n");
     let file = site.path("backup.tar");
     site.write("backup.tar.partial", "left behind by a backup that was killed");
     let made = command(&site, &["backup", &file]);
     assert_eq!(made.code, 0, "{}", made.err);
-    assert!(made.out.contains("3 files"), "{}", made.out);
+    assert!(made.out.contains("4 files"), "{}", made.out);
     let again = command(&site, &["backup", &file]);
     assert!(again.code == 1 && again.err.contains("exists already"), "{}", again.err);
 
@@ -197,6 +200,11 @@ fn a_gateway_is_set_up_again_from_its_backup() {
     assert_eq!(
         fs::read_to_string(place.path().join("etc/state/audit.jsonl")).unwrap(),
         "{}\n"
+    );
+    let kept = fs::read_to_string(place.path().join("etc").join(journal)).unwrap();
+    assert_eq!(
+        kept, "# drivegate restore 1\n",
+        "what a restore of parameters left undone"
     );
     assert!(place.path().join("etc/own.toml").exists());
     let refused = restore("state", &[]);

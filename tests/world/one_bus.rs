@@ -240,6 +240,79 @@ fn a_maximum_frequency_changed_at_the_panel_is_followed() {
     rig.until_good(1, ModelPoint::SpeedReference, Value::Number(50.0));
 }
 
+/// The percentage counts from the minimum frequency, and its sign turns the motor round: what is published is what the motor
+/// does.
+#[test]
+fn a_minimum_frequency_is_that_of_either_direction() {
+    /// Minimum frequency, ID 101, 0.01 Hz; PDU address.
+    const MINIMUM_FREQUENCY: u16 = 100;
+    let mut rig = ready(&nx(38_400, 1));
+    rig.at_the_drive(1, MINIMUM_FREQUENCY, 1_000);
+    let known = |rig: &Rig| rig.value(1, "minimum_frequency") == Some(Value::Number(10.0));
+    rig.until("the minimum frequency", PATIENCE, known);
+    assert!(rig.set(1, &[("run", 1.0), ("speed_reference", 0.0)]).is_ok());
+    for hertz in [10.0, 30.0, -30.0, 50.0, -20.0] {
+        assert!(rig.set(1, &[("frequency_reference", hertz)]).is_ok(), "{hertz} Hz");
+        rig.until_good(1, ModelPoint::OutputFrequency, Value::Number(hertz));
+        rig.until_good(1, ModelPoint::FrequencyReference, Value::Number(hertz));
+    }
+    for hertz in [0.0, 5.0, -5.0, -10.0] {
+        let outcome = rig.set(1, &[("frequency_reference", hertz)]);
+        let refused = matches!(outcome, Outcome::Refused(Refusal::BadValue(_)));
+        assert!(refused, "{hertz} Hz: {outcome:?}");
+    }
+    for (percent, hertz) in [(0.0, 10.0), (-50.0, -30.0)] {
+        assert!(rig.set(1, &[("speed_reference", percent)]).is_ok(), "{percent} %");
+        rig.until_good(1, ModelPoint::FrequencyReference, Value::Number(hertz));
+        rig.until_good(1, ModelPoint::OutputFrequency, Value::Number(hertz));
+    }
+}
+
+/// A reference in Hz, or one within a limit in Hz, rests on the frequency range as the drive has it when it gets the command:
+/// neither one that the command itself changes, nor one that an earlier command changed and nobody has read since.
+#[test]
+fn no_command_rests_on_a_frequency_range_that_was_changed() {
+    let of = |profile: &'static str| Line {
+        spec: |spec| {
+            let limits = 0.0..=40.0;
+            spec.limits.insert("frequency_reference".to_string(), limits);
+        },
+        ..line(profile, Protocol::N2, 19_200, 1)
+    };
+    for (line, reference) in [
+        (of("vacon-nx-n2"), ("frequency_reference", 30.0)),
+        (of("vacon-nx-n2"), ("speed_reference", 60.0)),
+        (of("eaton-hvx-n2"), ("speed_reference", 60.0)),
+    ] {
+        let mut rig = ready(&line);
+        let known = |hertz: f64| move |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(hertz));
+        rig.until("the maximum frequency", PATIENCE, known(50.0));
+        let both = rig.set(1, &[("maximum_frequency", 90.0), reference]);
+        assert!(
+            matches!(&both, Outcome::Refused(Refusal::BadValue(why)) if why.contains("first")),
+            "{both:?}"
+        );
+        assert!(rig.set(1, &[reference]).is_ok());
+        let range = rig.points(1, &[("maximum_frequency", 90.0)]);
+        let mut range = rig.place(1, range);
+        // In the queue behind it, and while it is not read. A stop is another matter.
+        let behind = rig.points(1, &[reference]);
+        let mut behind = rig.place_as("other", 1, behind);
+        let written = rig.answered(&mut range);
+        assert!(written.is_ok(), "{written:?}");
+        let outcome = rig.answered(&mut behind);
+        assert!(matches!(outcome, Outcome::Refused(Refusal::NotKnown(_))), "{outcome:?}");
+        let again = rig.set(1, &[reference]);
+        assert!(matches!(again, Outcome::Refused(_)), "{again:?}");
+        let stop = rig.set(1, &[("run", 0.0)]);
+        assert!(stop.is_ok(), "{stop:?}");
+        rig.until("the new maximum frequency", PATIENCE, known(90.0));
+        let again = rig.set(1, &[reference]);
+        let fits = reference.0 == "frequency_reference";
+        assert_eq!(again.is_ok(), fits, "{reference:?}: {again:?}");
+    }
+}
+
 #[test]
 fn a_garbled_answer_is_told_apart_from_silence() {
     let mut rig = ready(&nx(38_400, 1));

@@ -58,6 +58,7 @@ impl Bench {
             order: Order::Points(values),
             urgency,
             reference_only: false,
+            ranges: Vec::new(),
         };
         let command = Command::new(0, admitted, expires, ticket);
         (CommandRun::new(command, &self.profile), receiver)

@@ -327,8 +327,7 @@ impl Master {
             if let Some(image) = image.filter(|_| outcome.is_ok() && table == Table::Holding) {
                 image.note_written(&items, now);
             }
-            let covers = |read: &PlannedRead| items.iter().any(|(address, _)| read.covers(table, *address));
-            self.schedule.refresh(turn.drive, covers, now);
+            self.note_write(turn.drive, table, &items, now);
         }
     }
 }

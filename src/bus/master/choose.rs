@@ -7,12 +7,16 @@ use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, Interruption, Order, Outcome, Refusal, Urgency};
+use crate::command::{Chosen, Command, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
 /// Decisions without an exchange before the rest waits for the next look: commands that end without one are answered.
 const MOST_DECISIONS: usize = 1000;
+
+/// How old a frequency range may be on which a command rests that is begun. Whether it was too old for the command was decided
+/// when that was admitted.
+const RANGE_AGE: Duration = Duration::from_secs(60);
 
 /// The ranks, the highest first.
 const RANKS: [Urgency; 3] = [Urgency::Stop, Urgency::Command, Urgency::Read];
@@ -288,6 +292,12 @@ impl Master {
             command.answer(&Outcome::Refused(Refusal::NotAllowed(why.to_string())), now);
             return;
         }
+        let reading = image.reading(now, RANGE_AGE);
+        let hold = |range: &FrequencyRange| range.holds(&reading, drive.range_written);
+        if command.urgency == Urgency::Command && !command.ranges.iter().all(hold) {
+            command.answer(&Outcome::Refused(range_changed()), now);
+            return;
+        }
         let mut run = CommandRun::new(command, &image.spec.profile);
         run.rank = rank;
         drive.begin(run);
@@ -370,6 +380,13 @@ impl Master {
 ///
 /// # Errors
 /// When it can be, if it must wait.
+fn range_changed() -> Refusal {
+    Refusal::NotKnown(
+        "the drive's frequency range was written, or changed, since the command was given; nothing was written; send it again"
+            .to_string(),
+    )
+}
+
 fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Result<bool, Instant> {
     // Behind a stop that is begun nothing goes before it is over.
     if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {

@@ -10,7 +10,7 @@ use crate::bus::schedule::{Change, Poll, Polled};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Outcome, Pace, Urgency, written};
+use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, written};
 use crate::drive::{PlannedRead, Point, Raw};
 
 /// First wait before a stop is tried again at a drive that did not answer one.
@@ -327,11 +327,28 @@ impl Master {
         }
     }
 
+    /// Registers were written, or may be: they are read back soon. What was read of the frequency range before says nothing
+    /// where an end of it was among them, and both ends are read anew.
+    pub(super) fn note_write(&mut self, index: usize, table: Table, items: &[(u16, u16)], now: Instant) {
+        let Some((drive, image)) = self.drives.get_mut(index).zip(self.bus.image.drives.get(index)) else {
+            return;
+        };
+        let is_end = |address: u16| is_range_end(&image.spec.profile, table, address);
+        let range = items.iter().any(|(address, _)| is_end(*address));
+        if range {
+            drive.range_written = Some(now);
+        }
+        let covers = |read: &PlannedRead| {
+            let ends = || (read.start..read.start.saturating_add(read.count)).any(is_end);
+            items.iter().any(|(address, _)| read.covers(table, *address)) || (range && read.table == table && ends())
+        };
+        self.schedule.refresh(index, covers, now);
+    }
+
     /// What was written is read back soon.
     fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
         if let Some((table, items)) = written(&step.pdu) {
-            let covers = |read: &PlannedRead| items.iter().any(|(a, _)| read.covers(table, *a));
-            self.schedule.refresh(index, covers, now);
+            self.note_write(index, table, &items, now);
         }
     }
 }

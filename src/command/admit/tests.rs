@@ -1,9 +1,11 @@
 use std::collections::BTreeMap;
+use std::ops::RangeInclusive;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::*;
 use crate::codec::Exception;
+use crate::drive::Profile;
 use crate::drive::RawWrites;
 use crate::drive::profile::Profiles;
 use crate::process_image::{DriveImage, DriveSpec, Link};
@@ -104,6 +106,172 @@ fn frequency_becomes_percent_of_the_band() {
     );
     let twice = set(&[("frequency_reference", 30.0), ("speed_reference", 50.0)]).unwrap_err();
     assert!(twice.to_string().contains("twice"), "{twice}");
+}
+
+/// A Vacon NX between 10 and 50 Hz with these limits; what goes into its reference register.
+fn ordered(limits: &[(&str, RangeInclusive<f64>)], name: &str, value: f64) -> Result<f64, Refusal> {
+    let mut spec = drive(Access::Control).spec;
+    spec.limits = limits
+        .iter()
+        .map(|(name, range)| (name.to_string(), range.clone()))
+        .collect();
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    image.update(|s| {
+        s.link = Link::Online(std::time::SystemTime::now());
+        s.store(Table::Holding, 100, &[1000, 5000], Instant::now());
+    });
+    let order = Order::Points(vec![(point(name), Value::Number(value))]);
+    let reading = image.reading(Instant::now(), Duration::from_secs(1));
+    match admit(order, &reading, Authority::Write)?.order {
+        Order::Points(values) => Ok(values[0].1.as_f64()),
+        other => panic!("{other:?}"),
+    }
+}
+
+#[test]
+fn no_order_in_hertz_turns_a_motor_round_below_its_minimum_frequency() {
+    for (hertz, percent) in [
+        (10.0, 0.0),
+        (10.001, 0.0),
+        (30.0, 50.0),
+        (50.0, 100.0),
+        (-30.0, -50.0),
+        (-50.0, -100.0),
+    ] {
+        assert_eq!(ordered(&[], "frequency_reference", hertz), Ok(percent), "{hertz} Hz");
+    }
+    for hertz in [0.0, 5.0, 9.99, -5.0, -9.99] {
+        let refusal = ordered(&[], "frequency_reference", hertz).unwrap_err();
+        assert_eq!(refusal.code(), "bad_value", "{hertz} Hz");
+        assert_eq!(
+            refusal.to_string(),
+            format!(
+                "`frequency_reference` = {hertz} Hz is below the drive's minimum frequency 10 Hz; nothing was written"
+            )
+        );
+    }
+    // 0 % has no sign.
+    for hertz in [-10.0, -10.001] {
+        let refusal = ordered(&[], "frequency_reference", hertz).unwrap_err();
+        assert_eq!(refusal.code(), "bad_value", "{hertz} Hz");
+        assert!(refusal.to_string().contains("0 % has no sign"), "{refusal}");
+    }
+}
+
+#[test]
+fn limits_in_hertz_hold_for_the_frequency_at_which_the_motor_turns() {
+    let asked = |limits: RangeInclusive<f64>, percent| {
+        let result = ordered(&[("frequency_reference", limits)], "speed_reference", percent);
+        result.map_err(|refusal| refusal.code())
+    };
+    let refused = Err("bad_value");
+    // 50 % of the band is 30 Hz, in either direction.
+    assert_eq!(asked(-30.0..=30.0, -50.0), Ok(-50.0));
+    assert_eq!(asked(-30.0..=30.0, -51.0), refused);
+    assert_eq!(asked(0.0..=30.0, 50.0), Ok(50.0));
+    assert_eq!(asked(0.0..=30.0, 51.0), refused);
+    for percent in [-0.01, -10.0, -25.0, -30.0] {
+        assert_eq!(asked(0.0..=30.0, percent), refused, "{percent} %");
+    }
+    // It rounds to 0 %, which is 10 Hz forward.
+    assert_eq!(asked(-30.0..=-10.0, -0.004), refused);
+}
+
+/// A drive of that profile between 10 and 50 Hz, as far as it can be told, with one limit; percent is that of the band
+/// between `minimum` and 50 Hz.
+fn limited(profile: &Arc<Profile>, name: &str, most: f64) -> DriveImage {
+    let spec = DriveSpec {
+        access: Access::Control,
+        limits: BTreeMap::from([(name.to_string(), 0.0..=most)]),
+        frequency_range: Some(10.0..=50.0),
+        raw_writes: RawWrites::All,
+        ..DriveSpec::new("d", "b", 1, Arc::clone(profile))
+    };
+    let image = DriveImage::new(spec, Duration::from_secs(1));
+    image.update(|s| s.link = Link::Online(std::time::SystemTime::now()));
+    image
+}
+
+/// Whatever a profile calls its reference, in whichever unit, and however it is written: a limit on one name holds for all.
+#[test]
+fn a_limit_on_one_name_of_a_reference_holds_for_every_way_to_write_it() {
+    const NAMES: [&str; 3] = ["speed_reference", "frequency_reference", "frequency_command"];
+    for profile in Profiles::built_in().iter() {
+        let names = NAMES.iter().filter(|name| profile.point_index(name).is_some());
+        let points: Vec<usize> = names.filter_map(|name| profile.point_index(name)).collect();
+        assert!(points.len() >= 2, "{}: percent and Hz", profile.name);
+        // 80 % of the band, in the unit of the point.
+        let minimum = |image: &DriveImage| {
+            let reading = image.reading(Instant::now(), Duration::from_secs(1));
+            let mut bands = profile.points.iter().filter_map(|p| match &p.source {
+                Source::Derived(derived) => derived.band(),
+                Source::Raw(_) => None,
+            });
+            let (_, low, high) = bands.next_back().unwrap();
+            reading.band_for_commands(low, high).unwrap().0
+        };
+        let low = minimum(&limited(profile, "speed_reference", 100.0));
+        let figure = |index: usize, percent: f64| match profile.points[index].unit.as_str() {
+            "%" => percent,
+            _ => low + percent / 100.0 * (50.0 - low),
+        };
+        for limit in &points {
+            let image = limited(profile, &profile.points[*limit].name, figure(*limit, 80.0));
+            let asked = |order: Order| {
+                let reading = image.reading(Instant::now(), Duration::from_secs(1));
+                admit(order, &reading, Authority::Write).map_err(|refusal| refusal.code())
+            };
+            for way in &points {
+                let what = format!(
+                    "{}: limit on `{}`, order of `{}`",
+                    profile.name, profile.points[*limit].name, profile.points[*way].name
+                );
+                let order = |percent| Order::Points(vec![(*way, Value::Number(figure(*way, percent)))]);
+                let admitted = asked(order(79.0)).unwrap_or_else(|code| panic!("{what}: {code}"));
+                assert_eq!(asked(order(81.0)), Err("bad_value"), "{what}");
+                let Order::Points(values) = admitted.order else {
+                    panic!("{what}");
+                };
+                let (register, _) = values[0];
+                let raw = profile.points[register].raw().unwrap();
+                let write = |percent| {
+                    let words = raw.encode(Value::Number(figure(register, percent)), 0).unwrap();
+                    Order::Write(match words.as_slice() {
+                        [value] => RequestPdu::WriteRegister {
+                            address: raw.address,
+                            value: *value,
+                        },
+                        _ => RequestPdu::WriteRegisters {
+                            start: raw.address,
+                            values: words,
+                        },
+                    })
+                };
+                assert!(asked(write(79.0)).is_ok(), "{what}, raw");
+                assert_eq!(asked(write(81.0)), Err("bad_value"), "{what}, raw");
+            }
+        }
+    }
+}
+
+/// No two writable figures of a built-in profile lie in the same register under names that know nothing of each other.
+#[test]
+fn a_register_has_one_figure_to_limit() {
+    for profile in Profiles::built_in().iter() {
+        let figures = || {
+            profile
+                .points
+                .iter()
+                .filter(|p| p.write && p.kind() != Kind::Bool && p.raw().is_some())
+        };
+        let places: Vec<(Table, u16)> = figures()
+            .filter(|p| p.write_to.is_none())
+            .filter_map(Point::raw)
+            .flat_map(|raw| raw.addresses().map(|address| (raw.table, address)))
+            .collect();
+        let unique: std::collections::HashSet<_> = places.iter().collect();
+        assert_eq!(unique.len(), places.len(), "{}", profile.name);
+    }
 }
 
 #[test]

@@ -58,6 +58,7 @@ impl Bench {
             order,
             urgency,
             reference_only,
+            ranges: Vec::new(),
         };
         let command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
         self.pending.push(command, self.now);
@@ -341,6 +342,7 @@ fn a_closed_queue_answers_at_once() {
         order: Order::Points(Vec::new()),
         urgency,
         reference_only: false,
+        ranges: Vec::new(),
     };
     let command = |urgency, ticket| Command::new(0, admitted(urgency), bench.now + Duration::from_secs(1), ticket);
     queue.submit(command(Urgency::Command, ticket_a), bench.now);
@@ -397,6 +399,7 @@ fn the_login_that_commanded_last_is_kept_until_another_client_commands() {
             order: points(&[0]),
             urgency,
             reference_only,
+            ranges: Vec::new(),
         };
         let command = Command::new(1, admitted, bench.now + EXPIRY, ticket);
         bench.pending.push(command, bench.now);
