@@ -39,6 +39,25 @@ pub struct BusHandle {
     pub queue: Arc<CommandQueue>,
 }
 
+impl BusHandle {
+    /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if name and address are.
+    pub fn take_over(&self, before: &[BusHandle]) {
+        for (index, drive) in self.image.drives.iter().enumerate() {
+            let same = |image: &Arc<DriveImage>| {
+                (&image.spec.name, image.spec.address) == (&drive.spec.name, drive.spec.address)
+            };
+            let known = before.iter().find_map(|bus| {
+                let place = bus.image.drives.iter().position(same)?;
+                let queue = bus.queue.lock();
+                Some((queue.commander(place).cloned(), queue.stops(place)))
+            });
+            if let Some((commander, stops)) = known {
+                self.queue.lock().take_over(index, commander, stops);
+            }
+        }
+    }
+}
+
 /// All buses of the gateway.
 #[derive(Debug)]
 pub struct Plant {
@@ -230,7 +249,7 @@ impl DriveHandle {
         self.image.reading(now, self.stale_after)
     }
 
-    /// Stops of the drive that were taken in since its bus was started.
+    /// Stops of the drive that were taken in since the gateway was started, or since a reload added the drive.
     pub fn stops(&self) -> u64 {
         self.bus.queue.lock().stops(self.index)
     }

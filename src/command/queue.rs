@@ -126,8 +126,13 @@ impl Pending {
         self.commanders.get(&drive)
     }
 
-    /// Keeps who commanded a drive last, which a bus that starts anew knows from the one before.
-    pub fn set_commander(&mut self, drive: usize, login: Option<Arc<str>>) {
+    /// What a bus that starts anew knows of a drive from the bus before: who commanded it last, and how many stops it got.
+    pub fn take_over(&mut self, drive: usize, commander: Option<Arc<str>>, stops: u64) {
+        self.set_commander(drive, commander);
+        self.stops.insert(drive, stops);
+    }
+
+    fn set_commander(&mut self, drive: usize, login: Option<Arc<str>>) {
         match login {
             Some(login) => self.commanders.insert(drive, login),
             None => self.commanders.remove(&drive),
@@ -319,7 +324,7 @@ impl Pending {
         }
     }
 
-    /// Stops of that drive that were taken in so far.
+    /// Stops of that drive that were taken in so far, also by the bus before a reload.
     pub fn stops(&self, drive: usize) -> u64 {
         self.stops.get(&drive).copied().unwrap_or_default()
     }

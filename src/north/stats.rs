@@ -6,7 +6,9 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::{Mutex, PoisonError};
 use std::time::SystemTime;
 
-/// Counters of all north sides.
+use super::command_json::SharedMemory;
+
+/// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
 #[derive(Debug, Default)]
 pub struct NorthStats {
     /// Of the Modbus TCP server.
@@ -21,6 +23,8 @@ pub struct NorthStats {
     pub lost_listeners: LostListeners,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
+    /// Commands that came by way of the broker in the last minutes.
+    pub(super) taken: SharedMemory,
 }
 
 /// How the last reload ended; the start counts as one.

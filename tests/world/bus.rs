@@ -182,7 +182,8 @@ impl WorldBus {
         self.handle.queue.close(drivegate::command::Outcome::ShuttingDown, now);
         let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
-        self.handle = handle(index, &self.line, &self.profile, format);
+        let stopped = std::mem::replace(&mut self.handle, handle(index, &self.line, &self.profile, format));
+        self.handle.take_over(&[stopped]);
         let (bus, options) = (self.handle.clone(), &self.options);
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {

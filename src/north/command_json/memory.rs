@@ -2,6 +2,7 @@
 
 use std::collections::{BTreeMap, HashMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
 /// Number of recent commands whose results are kept, and whose repetition is recognised by the mark of the broker.
@@ -44,6 +45,19 @@ pub(in crate::north) struct Memory<R> {
     last_of: HashMap<u64, u64>,
     /// Number of commands taken so far.
     taken: u64,
+    /// Commands up to this number get no result any more if they have none.
+    abandoned: u64,
+}
+
+/// What the clients of one broker share, also with those that a reload starts in their place: the same commands come again
+/// over a new connection. The results are payloads.
+#[derive(Debug, Clone, Default)]
+pub(in crate::north) struct SharedMemory(Arc<Mutex<Memory<Arc<[u8]>>>>);
+
+impl SharedMemory {
+    pub(in crate::north) fn lock(&self) -> MutexGuard<'_, Memory<Arc<[u8]>>> {
+        self.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 impl<R> Default for Memory<R> {
@@ -55,6 +69,7 @@ impl<R> Default for Memory<R> {
             ends: BTreeMap::new(),
             last_of: HashMap::new(),
             taken: 0,
+            abandoned: 0,
         }
     }
 }
@@ -140,7 +155,7 @@ impl<R: Clone> Memory<R> {
         let known = by_id.or_else(by_mark)?;
         let recent = self.recent.iter().find(|recent| recent.number == known.number);
         let result = recent.map(|recent| &recent.result);
-        if matches!(result, Some(None)) && known.answer_to == print.answer_to {
+        if matches!(result, Some(None)) && known.number > self.abandoned && known.answer_to == print.answer_to {
             return Some(Repetition::Pending);
         }
         if known.stops != stops {
@@ -153,8 +168,8 @@ impl<R: Clone> Memory<R> {
         }
         Some(match result {
             Some(Some(result)) => Repetition::Answered(result.clone()),
-            Some(None) => Repetition::Outdated("whose result is still to come"),
-            None => Repetition::Outdated("whose result is no longer known"),
+            Some(None) if known.number > self.abandoned => Repetition::Outdated("whose result is still to come"),
+            Some(None) | None => Repetition::Outdated("whose result is no longer known"),
         })
     }
 
@@ -209,6 +224,11 @@ impl<R: Clone> Memory<R> {
             self.last_of.insert(identity, number);
         }
         number
+    }
+
+    /// Whoever waited for the results of the commands so far has gone; they do not come any more.
+    pub(in crate::north) fn abandon(&mut self) {
+        self.abandoned = self.taken;
     }
 
     /// Keeps the result of a command.

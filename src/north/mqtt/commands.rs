@@ -13,7 +13,7 @@ use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
 use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
 use crate::drive::ModelPoint;
-use crate::north::command_json::{Id, Memory, Repetition, excerpt, unknown_drive};
+use crate::north::command_json::{Id, Repetition, SharedMemory, excerpt, unknown_drive};
 use crate::plant::{Placed, Plant};
 
 /// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
@@ -37,8 +37,7 @@ pub(super) struct Commands {
     waiting: PendingCommands,
     /// In the order of acknowledgement.
     confirming: PendingCommands,
-    /// With the payloads of their results.
-    memory: Memory<Arc<[u8]>>,
+    memory: SharedMemory,
     rules: Rules,
 }
 
@@ -71,13 +70,15 @@ pub(super) struct FinishedCommand {
 }
 
 impl Commands {
-    pub(super) fn new(topics: Topics, rules: Rules) -> Commands {
+    /// `memory` outlives this client, so that a command is recognised after a reload.
+    pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory) -> Commands {
+        memory.lock().abandon();
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
             waiting: PendingCommands::default(),
             confirming: PendingCommands::default(),
-            memory: Memory::default(),
+            memory,
             rules,
         }
     }
@@ -129,10 +130,14 @@ impl Commands {
         let run = profile.model_index(ModelPoint::Run);
         let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
         let taken = incoming.taken();
-        let print = self.memory.fingerprint(&taken, request.id.as_ref().map(Id::text));
+        let print = self
+            .memory
+            .lock()
+            .fingerprint(&taken, request.id.as_ref().map(Id::text));
         let stops = drive.stops();
         if !stop {
-            match self.memory.repeated(&taken, print, stops, now) {
+            let repeated = self.memory.lock().repeated(&taken, print, stops, now);
+            match repeated {
                 None => {}
                 Some(Repetition::Pending) => return None,
                 Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
@@ -147,7 +152,7 @@ impl Commands {
         }
         let number = match stop {
             true => 0,
-            false => self.memory.remember(&taken, print, stops, now),
+            false => self.memory.lock().remember(&taken, print, stops, now),
         };
         let pending = PendingCommand {
             number,
@@ -175,7 +180,7 @@ impl Commands {
                 "too many results wait for the broker on {topic}; wait for them; nothing was written"
             ));
         }
-        if id.is_some() && !self.memory.has_room(now) {
+        if id.is_some() && !self.memory.lock().has_room(now) {
             return Err("too many commands with an `id` within ten minutes; nothing was written".to_string());
         }
         Ok(())
@@ -232,6 +237,7 @@ impl Commands {
             .reply
             .message(finished.id, &finished.answer, finished.confirmed, time);
         self.memory
+            .lock()
             .finished(finished.number, &message.payload.as_slice().into());
         message
     }

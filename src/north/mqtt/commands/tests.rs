@@ -9,6 +9,7 @@ use crate::north::command_json::REMEMBERED;
 struct Bench {
     plant: Plant,
     commands: Commands,
+    memory: SharedMemory,
     now: Instant,
     events: tokio::sync::broadcast::Receiver<Arc<crate::event::Event>>,
 }
@@ -17,12 +18,26 @@ impl Bench {
     fn new() -> Bench {
         let plant = fixture::plant(&["p1"]);
         fixture::read(&plant, "p1", 1, 0, Instant::now());
+        let memory = SharedMemory::default();
         Bench {
             events: plant.events.subscribe(),
-            commands: Commands::new(Topics::new("drivegate", "hall"), rules(false)),
+            commands: commands(&memory),
+            memory,
             now: Instant::now(),
             plant,
         }
+    }
+
+    /// A reload starts the client anew.
+    fn reload_client(&mut self) {
+        self.commands = commands(&self.memory);
+    }
+
+    /// A reload starts the bus anew.
+    fn reload_bus(&mut self) {
+        let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
+        self.plant.buses[0].take_over(&stopped);
+        fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
     fn take(&mut self, incoming: Incoming) -> Option<Message> {
@@ -52,6 +67,10 @@ impl Bench {
         drop(self.take_order().unwrap());
         self.finished().unwrap()
     }
+}
+
+fn commands(memory: &SharedMemory) -> Commands {
+    Commands::new(Topics::new("drivegate", "hall"), rules(false), memory.clone())
 }
 
 fn rules(require_id: bool) -> Rules {
@@ -235,6 +254,28 @@ fn a_repetition_gets_the_previous_result() {
         bench.acknowledge();
     }
     assert!(bench.take(Incoming { dup: true, ..bare }).is_some());
+}
+
+#[test]
+fn a_repetition_is_known_after_a_reload() {
+    let mut bench = Bench::new();
+    let run = |id: u32| set("p1/set", &format!(r#"{{"id": {id}, "run": true}}"#));
+    assert_eq!(bench.take(run(1)), None);
+    let result = bench.acknowledge();
+    bench.reload_client();
+    assert_eq!(json(&bench.take(run(1)).unwrap()), result);
+    // The client that would have published this result has gone.
+    assert_eq!(bench.take(run(2)), None);
+    bench.reload_client();
+    assert_eq!(json(&bench.take(run(2)).unwrap())["error"]["code"], "not_allowed");
+    assert!(bench.take_order().is_some());
+    assert_eq!(bench.take(set("p1/set/run", "false")), None);
+    bench.acknowledge();
+    bench.reload_bus();
+    let refused = json(&bench.take(run(1)).unwrap());
+    assert_eq!(refused["error"]["code"], "not_allowed", "{refused}");
+    assert_eq!(bench.queued(), 0);
+    assert_eq!(bench.take(run(3)), None);
 }
 
 #[test]

@@ -1,9 +1,8 @@
 //! DCMD messages: each becomes one order, checked, audited and answered like any other. The session has no message for
 //! results, so they become metrics of the drive. Time is an argument.
 
-use std::collections::{HashSet, VecDeque};
+use std::collections::VecDeque;
 use std::future::poll_fn;
-use std::hash::{BuildHasher, RandomState};
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
@@ -16,16 +15,13 @@ use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
 use crate::command::{Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Refusal, SourceKind};
 use crate::drive::{ModelPoint, Profile, Value};
-use crate::north::command_json::{excerpt, resolve, unknown_drive};
+use crate::north::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
 use crate::plant::{Placed, Plant};
 
 /// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
 const AWAITED: usize = 4096;
 /// Metrics in a command.
 const METRICS: usize = 64;
-/// How long a command is remembered, and how many are.
-const REMEMBERED: Duration = Duration::from_secs(600);
-const MOST: usize = 1 << 16;
 
 /// The orders over Sparkplug.
 #[derive(Debug)]
@@ -33,7 +29,7 @@ pub(super) struct Orders {
     /// Everything from the connection to the broker counts as one client.
     client: Arc<str>,
     awaited: VecDeque<Awaited>,
-    memory: Memory,
+    memory: SharedMemory,
 }
 
 #[derive(Debug)]
@@ -72,11 +68,12 @@ impl Finished {
 }
 
 impl Orders {
-    pub(super) fn new() -> Orders {
+    /// `memory` outlives this client, so that an order is recognised after a reload.
+    pub(super) fn new(memory: SharedMemory) -> Orders {
         Orders {
             client: SourceKind::Sparkplug.name().into(),
             awaited: VecDeque::new(),
-            memory: Memory::default(),
+            memory,
         }
     }
 
@@ -122,7 +119,7 @@ impl Orders {
         let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
         if !stop
             && request.timestamp.is_some()
-            && let Err(why) = self.memory.take(incoming, now)
+            && let Err(why) = self.remember(incoming, now)
         {
             return refuse(Refusal::NotAllowed(why.to_string()), origin);
         }
@@ -140,6 +137,28 @@ impl Orders {
             });
         }
         None
+    }
+
+    /// A bridge that loops cannot start a motor a second time: the same payload, with its time, is not executed again.
+    fn remember(&self, incoming: &Incoming, now: Instant) -> Result<(), &'static str> {
+        let taken = Taken {
+            topic: &incoming.topic,
+            payload: &incoming.payload,
+            ..Taken::default()
+        };
+        let mut memory = self.memory.lock();
+        // The payload with its time is all that identifies it.
+        let print = memory.fingerprint(&taken, Some(""));
+        if memory.repeated(&taken, print, 0, now).is_some() {
+            return Err(
+                "it repeats an earlier command: the same payload with the same time; send it with its own time",
+            );
+        }
+        if !memory.has_room(now) {
+            return Err("too many commands within ten minutes; nothing was written");
+        }
+        memory.remember(&taken, print, 0, now);
+        Ok(())
     }
 
     /// The next order that ends; pending while there is none. Cancel safe.
@@ -278,38 +297,6 @@ fn json(metric: &Metric) -> Option<Json> {
         MetricValue::Float(value) => number(value.to_string().parse().ok()?),
         MetricValue::Double(value) => number(*value),
         MetricValue::String(_) => None,
-    }
-}
-
-/// The commands of the last minutes. A bridge that loops cannot start a motor a second time: the same payload, with its
-/// time, is not executed again.
-#[derive(Debug, Default)]
-struct Memory {
-    hasher: RandomState,
-    order: VecDeque<(Instant, u64)>,
-    known: HashSet<u64>,
-}
-
-impl Memory {
-    fn take(&mut self, incoming: &Incoming, now: Instant) -> Result<(), &'static str> {
-        while let Some((at, print)) = self.order.front()
-            && now.saturating_duration_since(*at) >= REMEMBERED
-        {
-            self.known.remove(print);
-            self.order.pop_front();
-        }
-        let print = self.hasher.hash_one((&incoming.topic, &incoming.payload));
-        if self.known.contains(&print) {
-            return Err(
-                "it repeats an earlier command: the same payload with the same time; send it with its own time",
-            );
-        }
-        if self.order.len() >= MOST {
-            return Err("too many commands within ten minutes; nothing was written");
-        }
-        self.known.insert(print);
-        self.order.push_back((now, print));
-        Ok(())
     }
 }
 
