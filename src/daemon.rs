@@ -236,14 +236,14 @@ impl Daemon {
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         self.watch(&kept);
-        let queues: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
+        let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             leases.extend(drives.zip(left.leases));
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
-        for (bus, mut task) in prepared {
-            tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
+        let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
+        for (bus, task) in prepared {
             let lease = |d: &DriveSpec| {
                 let before = leases.get(&(d.name.clone(), d.address)).copied().unwrap_or_default();
                 if d.access == Access::Control {
@@ -252,15 +252,12 @@ impl Daemon {
                     Lease::default()
                 }
             };
-            // So does a login that commanded one of them last.
-            for (index, drive) in bus.drives.iter().enumerate() {
-                let commander = queues.iter().find_map(|before| commander_of(before, drive));
-                task.handle().queue.lock().set_commander(index, commander);
-            }
-            task.begin(Handover {
+            task.handle().take_over(&stopped);
+            let handover = Handover {
                 leases: bus.drives.iter().map(lease).collect(),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
-            });
+            };
+            handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
         }
         for (bus, task) in &kept {
@@ -274,11 +271,24 @@ impl Daemon {
         }
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
-        self.watch(&kept);
+        self.show(settings, &kept);
+        // Last: whoever hears of a bus finds it in the plant.
+        for (bus, task) in &mut kept {
+            if let Some(before) = handovers.remove(&bus.spec.name) {
+                tracing::info!(bus = %bus.spec.name, port = %bus.spec.port, drives = bus.drives.len(), "starting the bus");
+                task.begin(before);
+            }
+        }
+        self.buses = kept;
+    }
+
+    /// From now on these buses are the plant.
+    fn show(&self, settings: &Settings, buses: &[(BusSettings, BusTask)]) {
+        self.watch(buses);
         self.plant.store(Arc::new(Plant {
             gateway: settings.gateway.clone(),
             stale_after: settings.stale_after,
-            buses: kept.iter().map(|(_, task)| task.handle().clone()).collect(),
+            buses: buses.iter().map(|(_, task)| task.handle().clone()).collect(),
             events: self.events.clone(),
             writes: self.writes.clone(),
             recordings: self.recordings.clone(),
@@ -286,10 +296,9 @@ impl Daemon {
             history: self.history.clone(),
         }));
         if let Some(recorder) = &self.recorder {
-            let images = kept.iter().map(|(_, task)| task.handle().image.clone());
+            let images = buses.iter().map(|(_, task)| task.handle().image.clone());
             recorder.adopt(images.collect(), settings.stale_after);
         }
-        self.buses = kept;
     }
 
     fn watch(&self, buses: &[(BusSettings, BusTask)]) {
@@ -443,14 +452,22 @@ impl Daemon {
         if before.as_ref().map(|file| file.options()) == settings.audit.as_ref() {
             return;
         }
-        // Its predecessor may have the same path.
-        audit.write_to(None);
-        if let Some(before) = before {
-            within(STOP_AUDIT, "the audit file", before.stop()).await;
-        }
-        match settings.audit.clone().map(AuditFile::start).transpose() {
-            Ok(file) => audit.write_to(file.map(Arc::new)),
-            Err(error) => tracing::error!("cannot start the thread of the audit file: {error}; free memory or threads"),
+        let started = match (settings.audit.clone(), before) {
+            (Some(options), Some(before)) => before.succeed(options),
+            (Some(options), None) => AuditFile::start(options),
+            (None, before) => {
+                audit.write_to(None);
+                if let Some(before) = before {
+                    within(STOP_AUDIT, "the audit file", before.stop()).await;
+                }
+                return;
+            }
+        };
+        match started {
+            Ok(file) => audit.write_to(Some(Arc::new(file))),
+            Err(error) => tracing::error!(
+                "cannot start the thread of the audit file: {error}; the audit stays where it was; free memory or threads"
+            ),
         }
     }
 
@@ -525,13 +542,6 @@ impl Daemon {
     }
 }
 
-/// The login that commanded that drive last, as its bus before the reload knows.
-fn commander_of(before: &BusHandle, drive: &DriveSpec) -> Option<Arc<str>> {
-    let same = |image: &Arc<DriveImage>| (&image.spec.name, image.spec.address) == (&drive.name, drive.address);
-    let index = before.image.drives.iter().position(same)?;
-    before.queue.lock().commander(index).cloned()
-}
-
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
 async fn stop_all(buses: Vec<(BusSettings, BusTask)>) -> Vec<(BusSettings, Handover)> {
     let stop = |(settings, task): (BusSettings, BusTask)| {
@@ -554,3 +564,6 @@ fn report_refusals(plant: SharedPlant) -> tokio::task::JoinHandle<()> {
         }
     })
 }
+
+#[cfg(test)]
+mod tests;

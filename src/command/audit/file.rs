@@ -1,11 +1,13 @@
 //! The audit file: a thread that writes records behind two bounded queues, one for commands that were sent. Nobody waits
-//! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost.
+//! for it: while the disk is slow, full or gone, records wait, and those beyond the queues are counted as lost. A reload
+//! that configures another file starts another thread behind the same queues, so that no record is lost in between.
 
 use std::collections::VecDeque;
 use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime};
 
 use tokio::sync::watch;
@@ -39,6 +41,8 @@ pub struct AuditFileOptions {
 pub struct AuditFile {
     options: AuditFileOptions,
     shared: Arc<Shared>,
+    /// Until a successor waits for it.
+    thread: Mutex<Option<JoinHandle<()>>>,
     ended: watch::Receiver<()>,
 }
 
@@ -54,6 +58,10 @@ struct Queues {
     unsent: VecDeque<Arc<AuditRecord>>,
     /// Since the start: sent, unsent.
     lost: (u64, u64),
+    /// Losses that the file has.
+    recorded: (u64, u64),
+    /// Threads that were started; only the newest goes on.
+    threads: u64,
     end: bool,
 }
 
@@ -75,14 +83,15 @@ impl Shared {
         queue.push_front(record);
     }
 
-    /// Waits until there is something to write, at most until `deadline`; whether the end was asked for.
-    fn wait(&self, deadline: Instant, for_records: bool) -> bool {
+    /// Waits until there is something to write, at most until `deadline`; whether that thread is to end.
+    fn wait(&self, thread: u64, deadline: Instant, for_records: bool) -> bool {
         let mut queues = self.queues();
         loop {
             let left = deadline.saturating_duration_since(Instant::now());
             let ready = for_records && !(queues.sent.is_empty() && queues.unsent.is_empty());
-            if queues.end || ready || left.is_zero() {
-                return queues.end;
+            let end = queues.end || queues.threads > thread;
+            if end || ready || left.is_zero() {
+                return end;
             }
             let waited = self.wake.wait_timeout(queues, left);
             queues = waited.map_or_else(|poisoned| poisoned.into_inner().0, |(queues, _)| queues);
@@ -96,14 +105,44 @@ impl AuditFile {
     /// # Errors
     /// The system does not provide a thread.
     pub fn start(options: AuditFileOptions) -> io::Result<AuditFile> {
-        let shared = Arc::<Shared>::default();
+        AuditFile::behind(Arc::default(), options, None)
+    }
+
+    /// Starts the thread that writes in its place from now on, with what waits and what was lost. In the same file it begins
+    /// when this one has ended.
+    ///
+    /// # Errors
+    /// The system does not provide a thread. This one goes on.
+    pub fn succeed(&self, options: AuditFileOptions) -> io::Result<AuditFile> {
+        let same = options.path == self.options.path;
+        let mut thread = self.thread.lock().unwrap_or_else(PoisonError::into_inner);
+        let before = same.then(|| thread.take()).flatten();
+        AuditFile::behind(self.shared.clone(), options, before)
+    }
+
+    fn behind(shared: Arc<Shared>, options: AuditFileOptions, before: Option<JoinHandle<()>>) -> io::Result<AuditFile> {
         let (end, ended) = watch::channel(());
-        let writer = Writer::new(options.clone(), shared.clone());
-        std::thread::Builder::new().name("audit".to_string()).spawn(move || {
+        let file = Rotated::new(options.path.clone(), options.max_bytes, FILES);
+        let mut queues = shared.queues();
+        let number = queues.threads + 1;
+        let writer = Writer::new(file, shared.clone(), number);
+        let thread = std::thread::Builder::new().name("audit".to_string()).spawn(move || {
+            if let Some(before) = before {
+                // A panic of it was logged.
+                let _ = before.join();
+            }
             writer.run();
             drop(end);
         })?;
-        Ok(AuditFile { options, shared, ended })
+        queues.threads = number;
+        drop(queues);
+        shared.wake.notify_all();
+        Ok(AuditFile {
+            options,
+            shared,
+            thread: Mutex::new(Some(thread)),
+            ended,
+        })
     }
 
     /// Where it writes.
@@ -140,7 +179,7 @@ impl AuditFile {
     /// with a limit.
     pub async fn stop(&self) {
         self.shared.queues().end = true;
-        self.shared.wake.notify_one();
+        self.shared.wake.notify_all();
         let mut ended = self.ended.clone();
         while ended.changed().await.is_ok() {}
     }
@@ -154,19 +193,19 @@ struct Writer {
     chain: Option<Chain>,
     /// Logged once, until a write succeeds.
     failing: bool,
-    /// Losses that the file has.
-    recorded: (u64, u64),
+    /// Which of the threads it is.
+    thread: u64,
     logged: (Option<Hash>, Instant),
 }
 
 impl Writer {
-    fn new(options: AuditFileOptions, shared: Arc<Shared>) -> Writer {
+    fn new(file: Rotated, shared: Arc<Shared>, thread: u64) -> Writer {
         Writer {
-            file: Rotated::new(options.path, options.max_bytes, FILES),
+            file,
             shared,
             chain: None,
             failing: false,
-            recorded: (0, 0),
+            thread,
             logged: (None, Instant::now()),
         }
     }
@@ -174,7 +213,7 @@ impl Writer {
     fn run(mut self) {
         let mut tick = Instant::now();
         loop {
-            let end = self.shared.wait(tick, !self.failing);
+            let end = self.shared.wait(self.thread, tick, !self.failing);
             let due = end || Instant::now() >= tick;
             if due {
                 tick = Instant::now() + SYNC;
@@ -206,12 +245,15 @@ impl Writer {
         if !due {
             return Ok(());
         }
-        let lost = self.shared.queues().lost;
-        let (sent, not_sent) = (lost.0 - self.recorded.0, lost.1 - self.recorded.1);
+        let (lost, recorded) = {
+            let queues = self.shared.queues();
+            (queues.lost, queues.recorded)
+        };
+        let (sent, not_sent) = (lost.0 - recorded.0, lost.1 - recorded.1);
         if sent + not_sent > 0 {
             let time = SystemTime::now();
             self.write(&Entry::Lost { time, sent, not_sent })?;
-            self.recorded = lost;
+            self.shared.queues().recorded = lost;
             tracing::warn!(
                 "audit file: {sent} records of commands that were sent and {not_sent} others were lost; the log has them"
             );
@@ -240,8 +282,8 @@ impl Writer {
                         WAITING.0
                     );
                 }
-                if end {
-                    let queues = self.shared.queues();
+                let queues = self.shared.queues();
+                if end && queues.end {
                     let (sent, others) = (queues.sent.len(), queues.unsent.len());
                     tracing::error!(
                         "audit file: {sent} records of commands that were sent and {others} others are not written"

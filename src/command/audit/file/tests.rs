@@ -13,7 +13,8 @@ fn options(dir: &Path) -> AuditFileOptions {
 
 /// A writer without its thread.
 fn writer(dir: &Path) -> Writer {
-    Writer::new(options(dir), Arc::default())
+    let AuditFileOptions { path, max_bytes } = options(dir);
+    Writer::new(Rotated::new(path, max_bytes, FILES), Arc::default(), 0)
 }
 
 impl Writer {
@@ -21,6 +22,7 @@ impl Writer {
         let file = AuditFile {
             options: options(Path::new("")),
             shared: self.shared.clone(),
+            thread: Mutex::new(None),
             ended: watch::channel(()).1,
         };
         records.for_each(|n| file.push(Arc::new(record("operator", n)), sent));
@@ -32,7 +34,10 @@ fn text(dir: &Path) -> Vec<u8> {
     let numbered = |n| dir.join(format!("audit.jsonl.{n}"));
     let mut files: Vec<PathBuf> = (1..10).rev().map(numbered).filter(|path| path.exists()).collect();
     files.push(dir.join("audit.jsonl"));
-    files.iter().flat_map(|path| fs::read(path).unwrap()).collect()
+    files
+        .iter()
+        .flat_map(|path| fs::read(path).unwrap_or_default())
+        .collect()
 }
 
 fn lines(dir: &Path) -> Vec<String> {
@@ -73,6 +78,35 @@ fn records_become_a_chain_that_a_restart_continues() {
         .collect();
     assert_eq!(commands.concat(), "230123012301", "commands that were sent come first");
     assert_eq!(values(dir.path(), "entry")[1..3], ["sent", "not_sent"]);
+}
+
+#[tokio::test]
+async fn a_reload_loses_no_record() {
+    let (one, other) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    // Another size each time, then another file as well.
+    for dirs in [[&one, &one], [&one, &other]] {
+        let at = |round: usize| AuditFileOptions {
+            max_bytes: (1 << 20) + round as u64,
+            ..options(dirs[round % 2].path())
+        };
+        let before = lines(one.path()).len() + lines(other.path()).len();
+        let mut file = AuditFile::start(at(0)).unwrap();
+        for round in 1..=50 {
+            (0..20).for_each(|n| file.push(Arc::new(record("operator", n)), true));
+            let next = file.succeed(at(round)).unwrap();
+            // Whoever has the former one still uses it.
+            file.push(Arc::new(record("operator", 20)), true);
+            file = next;
+        }
+        file.stop().await;
+        // One that writes the other file may still be at it.
+        while Arc::strong_count(&file.shared) > 1 {
+            tokio::time::sleep(Duration::from_millis(1)).await;
+        }
+        let after = lines(one.path()).len() + lines(other.path()).len();
+        assert_eq!((after - before, file.lost()), (50 * 21, (0, 0)));
+    }
+    assert_eq!(faults(one.path()), Vec::<String>::new());
 }
 
 #[test]
