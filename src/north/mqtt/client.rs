@@ -2,6 +2,7 @@
 
 mod buffering;
 mod discovery;
+mod repair;
 
 use std::sync::Arc;
 use std::sync::atomic::Ordering;
@@ -16,6 +17,7 @@ use tokio_util::sync::CancellationToken;
 
 use self::buffering::buffers;
 use self::discovery::{announcer, discovery_topics, report_refused, subscriptions};
+use self::repair::Repair;
 use super::back_off::BackOff;
 use super::commands::{Commands, FinishedCommand, Rules};
 use super::connection::{
@@ -31,6 +33,7 @@ use super::request::Incoming;
 use super::store::{Loaded, LostCount, Store};
 use super::{Buffer, History, Options, tls};
 use crate::event::{BURST, Event, EventKind};
+use crate::files::names::{MQTT_EVENTS, MQTT_HISTORY};
 use crate::north::log_throttle::LogThrottle;
 use crate::north::{MqttLoss, NorthStats};
 use crate::plant::{Plant, SharedPlant};
@@ -45,13 +48,8 @@ const LAST_RESULTS: Duration = Duration::from_millis(250);
 const LAST_WRITE: Duration = Duration::from_secs(1);
 /// Minimum time between two messages of the history, so that live values have the connection.
 const HISTORY_PACE: Duration = Duration::from_millis(50);
-/// Minimum time between two repairs of the status.
-const REPAIR: Duration = Duration::from_secs(1);
 /// Minimum time between two log lines about messages that the broker refused.
 const REFUSED_LOGGED: Duration = Duration::from_secs(60);
-/// Names of the files of the buffer.
-const EVENT_FILES: &str = "mqtt-events";
-const HISTORY_FILES: &str = "mqtt-history";
 
 /// Runs the MQTT client until `cancel`.
 pub(super) async fn run(
@@ -145,7 +143,7 @@ struct Client {
     missed: u64,
     /// How many lost messages were logged, and when.
     lost_logged: (u64, Option<Instant>),
-    repaired: Option<Instant>,
+    repair: Repair,
 }
 
 impl Client {
@@ -171,10 +169,10 @@ impl Client {
         let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
         let mut client = Client {
-            store: Store::open(events_buffer, EVENT_FILES, count(MqttLoss::Event)),
-            history: Store::open(history_buffer, HISTORY_FILES, count(MqttLoss::History)),
+            store: Store::open(events_buffer, MQTT_EVENTS, count(MqttLoss::Event)),
+            history: Store::open(history_buffer, MQTT_HISTORY, count(MqttLoss::History)),
             history_at: now,
-            commands: Commands::new(topics.clone(), rules),
+            commands: Commands::new(topics.clone(), rules, stats.taken.clone()),
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
             back_off: BackOff::default(),
@@ -182,7 +180,7 @@ impl Client {
             refused: LogThrottle::every(REFUSED_LOGGED),
             missed: 0,
             lost_logged: (0, None),
-            repaired: None,
+            repair: Repair::default(),
             options,
             plant,
             observed,
@@ -322,10 +320,9 @@ impl Client {
             );
         }
         self.outages.end();
+        self.repair.forget();
         self.publish_online();
-        for update in self.publisher.recorded() {
-            self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
-        }
+        self.keep_recorded();
         self.publisher.restart();
         if let Some(announcer) = &mut self.announcer {
             announcer.restart(limits.max_packet);
@@ -386,13 +383,20 @@ impl Client {
 
     /// Somebody else published a status in the gateway's name, such as the will of its last connection.
     fn on_status(&mut self, payload: &[u8]) {
-        let now = Instant::now();
-        let soon = |at: Instant| now.saturating_duration_since(at) < REPAIR;
-        let ready = matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }));
-        if payload != b"online" && ready && !self.repaired.is_some_and(soon) {
-            self.repaired = Some(now);
+        if payload != b"online" {
+            self.repair.ask();
+            self.repair_status(Instant::now());
+        }
+    }
+
+    fn repair_status(&mut self, now: Instant) {
+        if self.is_ready() && self.repair.take(now) {
             self.publish_online();
         }
+    }
+
+    fn is_ready(&self) -> bool {
+        matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }))
     }
 
     fn on_ended(&mut self, ended: FinishedCommand) {
@@ -403,8 +407,7 @@ impl Client {
     /// Looks at the drives that were updated.
     fn look(&mut self) {
         let (now, wall) = (Instant::now(), SystemTime::now());
-        let ready = matches!(&self.link, BrokerLink::Open(session) if matches!(session.phase, Phase::Ready { .. }));
-        let next = match (ready, self.options.telemetry.history) {
+        let next = match (self.is_ready(), self.options.telemetry.history) {
             (true, _) => {
                 for topic in self.publisher.cleared() {
                     self.outbox.put_lasting(topic, Vec::new());
@@ -451,6 +454,7 @@ impl Client {
                 _ => {}
             },
         }
+        self.repair_status(now);
         // What the disk had no room for the last time.
         self.store.acknowledge(self.outbox.oldest(Kind::Event));
         self.history.acknowledge(self.outbox.oldest(Kind::History));
@@ -463,11 +467,14 @@ impl Client {
         if Arc::ptr_eq(&plant, &self.observed) {
             return;
         }
+        // The last events of a removed bus find its drives in the plant before.
+        self.take_pending_events();
         let events = plant.events.subscribe();
         if !events.same_channel(&self.events) {
-            self.take_pending_events();
             self.events = events;
         }
+        // The publisher begins anew.
+        self.keep_recorded();
         let discovery = discovery_topics(self.announcer.as_mut(), &plant);
         self.publisher.adopt(&plant, discovery);
         self.observed = plant;
@@ -549,9 +556,7 @@ impl Client {
         }
         self.stats.mqtt.connected.store(false, Ordering::Relaxed);
         self.stats.mqtt.configured.store(false, Ordering::Relaxed);
-        for update in self.publisher.recorded() {
-            self.keep(Kind::History, Message::not_retained(update.topic, update.payload));
-        }
+        self.keep_recorded();
         let close = async { tokio::join!(self.store.close(), self.history.close()) };
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");
@@ -564,7 +569,7 @@ impl Client {
         self.announcer = None;
         self.outbox.drop_telemetry();
         let mut offline_queued = false;
-        while matches!(&self.link, BrokerLink::Open(s) if matches!(s.phase, Phase::Ready { .. })) {
+        while self.is_ready() {
             self.publish_waiting();
             let quiet = self.commands.is_idle() && self.outbox.urgent() == 0;
             if !offline_queued && (quiet || tokio::time::Instant::now() >= last_results) {

@@ -8,6 +8,7 @@ use super::outbox::Message;
 use super::payload::Topics;
 use super::reply::ResponseTopics;
 use super::request::Incoming;
+use crate::north::command_json::SharedMemory;
 use crate::plant::SharedPlant;
 
 /// A message that the gateway publishes: the result of a command.
@@ -53,7 +54,7 @@ impl Offline {
         };
         Offline {
             plant,
-            commands: Commands::new(Topics::new(base, &gateway), rules),
+            commands: Commands::new(Topics::new(base, &gateway), rules, SharedMemory::default()),
             held: VecDeque::new(),
             results: Vec::new(),
             begun: (now, time),

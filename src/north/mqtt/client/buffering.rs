@@ -49,12 +49,22 @@ impl Client {
             self.stats.mqtt.lost(MqttLoss::Event, 1);
             return;
         }
-        let (topics, payload) = payload::event(&self.topics, event, &self.observed);
+        let (topics, payload) = payload::event(&self.topics, event, &self.plant_of(event));
         for topic in topics {
             self.keep(Kind::Event, Message::not_retained(topic, payload.clone()));
         }
         if let Some((topic, payload)) = payload::recording(&self.topics, event) {
             self.keep(Kind::Event, Message::not_retained(topic, payload));
+        }
+    }
+
+    /// The plant that has the drives of an event: the newest, or the one before if a reload removed the bus.
+    fn plant_of(&self, event: &Event) -> Arc<Plant> {
+        let newest = self.plant.load_full();
+        let has_bus = |plant: &Plant| plant.buses.iter().any(|bus| bus.image.spec.name == event.bus);
+        match event.bus.is_empty() || has_bus(&newest) {
+            true => newest,
+            false => self.observed.clone(),
         }
     }
 
@@ -68,6 +78,13 @@ impl Client {
         };
         if let Some((number, message)) = store.push(message, room) {
             self.outbox.push(kind, message, number);
+        }
+    }
+
+    /// Keeps what was recorded and not kept yet.
+    pub(super) fn keep_recorded(&mut self) {
+        for Update { topic, payload } in self.publisher.recorded() {
+            self.keep(Kind::History, Message::not_retained(topic, payload));
         }
     }
 

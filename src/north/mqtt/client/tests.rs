@@ -3,6 +3,7 @@ use arc_swap::ArcSwap;
 use super::super::{Buffer, Qos, Telemetry, fixture};
 use super::*;
 use crate::event::{BURST, EventKind};
+use crate::process_image::{BusImage, BusSpec};
 
 fn options(buffer: Option<Buffer>) -> Options {
     Options {
@@ -35,9 +36,13 @@ fn options(buffer: Option<Buffer>) -> Options {
 }
 
 async fn client(buffer: Option<Buffer>) -> Client {
+    client_with(options(buffer)).await
+}
+
+async fn client_with(options: Options) -> Client {
     let plant: SharedPlant = Arc::new(ArcSwap::from_pointee(fixture::plant(&["p1"])));
     let events = plant.load().events.subscribe();
-    Client::new(options(buffer), plant, Arc::default(), events)
+    Client::new(options, plant, Arc::default(), events)
 }
 
 /// Raises events while the client is busy, then lets it receive them.
@@ -137,4 +142,60 @@ async fn refusals_push_out_no_event_of_a_drive_in_memory_or_on_disk() {
         a_fault_and_a_flood(&mut client(Some(buffer)).await, 1000).await,
         (32, 969)
     );
+}
+
+/// A reload: bus `line1` with drive `p1` is gone, `line2` with `p2` is there.
+fn reload(client: &Client) {
+    let mut plant = Plant {
+        events: client.plant.load().events.clone(),
+        ..fixture::plant(&["p2"])
+    };
+    let bus = &mut plant.buses[0];
+    let spec = BusSpec {
+        name: "line2".to_string(),
+        ..bus.image.spec.clone()
+    };
+    bus.image = Arc::new(BusImage::new(spec, bus.image.drives.clone()));
+    client.plant.store(Arc::new(plant));
+}
+
+/// The topics of what waits, in order.
+fn waiting(client: &mut Client) -> Vec<String> {
+    let next = || {
+        let (key, message) = client.outbox.next(1, true)?;
+        client.outbox.give_up(key);
+        Some(message.topic.to_string())
+    };
+    std::iter::from_fn(next).collect()
+}
+
+#[tokio::test]
+async fn events_of_a_bus_that_a_reload_removes_or_adds_go_to_its_drives() {
+    let mut client = client(None).await;
+    reload(&client);
+    for bus in ["line1", "line2"] {
+        client.plant.load().events.publish(Event {
+            bus: bus.to_string(),
+            ..Event::new(EventKind::BusDown, SystemTime::UNIX_EPOCH, String::new())
+        });
+    }
+    client.update_plant();
+    client.take_pending_events();
+    assert_eq!(
+        waiting(&mut client),
+        ["drivegate/hall/drive/p1/event", "drivegate/hall/drive/p2/event"]
+    );
+}
+
+#[tokio::test]
+async fn a_reload_while_the_broker_is_away_keeps_the_history_so_far() {
+    let mut options = options(None);
+    options.telemetry.history = History::All;
+    let mut client = client_with(options).await;
+    fixture::read(&client.plant.load(), "p1", 0x0023, 2500, Instant::now());
+    client.look();
+    assert_eq!(waiting(&mut client), [""; 0], "no array is complete");
+    reload(&client);
+    client.update_plant();
+    assert_eq!(waiting(&mut client), ["drivegate/hall/drive/p1/history"]);
 }

@@ -5,8 +5,7 @@ use std::fs::{self, File};
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
-/// Name of the file in the state directory; it holds the number that was used last.
-const FILE: &str = "sparkplug-bdseq";
+use crate::files::names::SPARKPLUG;
 
 /// Gives each connection its number, 0 to 255 in a circle.
 #[derive(Debug, Clone)]
@@ -20,9 +19,9 @@ pub(super) struct BdSeq {
 }
 
 impl BdSeq {
-    /// Goes on behind the number of the file; begins with 0 without one, or if it cannot be read.
+    /// Goes on behind the number in the file, which was used last; begins with 0 without one, or if it cannot be read.
     pub(super) fn open(dir: &Path) -> BdSeq {
-        let path = dir.join(FILE);
+        let path = dir.join(SPARKPLUG);
         let text = fs::read_to_string(&path).unwrap_or_default();
         let last: Option<u8> = text.trim().parse().ok();
         BdSeq {
@@ -107,7 +106,7 @@ mod tests {
         // Killed before or after the broker accepted the connection: the next run cannot know.
         assert_eq!(next(&mut BdSeq::open(&state)), 1);
         assert_eq!(next(&mut BdSeq::open(&state)), 2);
-        fs::write(state.join(FILE), "damaged").unwrap();
+        fs::write(state.join(SPARKPLUG), "damaged").unwrap();
         assert_eq!(next(&mut BdSeq::open(&state)), 0);
     }
 

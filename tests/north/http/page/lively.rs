@@ -291,7 +291,9 @@ fn live_through(plant: &Plant, cast: &Cast, options: &RecorderOptions) -> Record
             recorder.note("line1", Some("pump-2"), &Note { at, body });
         }
         for capture in recorder.tick(clock) {
-            store.write(&mut assemble(&capture)).expect("room on disk");
+            store
+                .write(&mut assemble(&capture), std::time::SystemTime::now())
+                .expect("room on disk");
         }
     }
     for (image, _) in cast.iter().filter(|(_, play)| *play == Play::Gone) {
