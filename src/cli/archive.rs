@@ -13,9 +13,9 @@ use tar::{Archive, Builder, EntryType, Header};
 pub(super) const FORMAT: u32 = 1;
 const MANIFEST: &str = "manifest.json";
 /// Largest manifest, bytes.
-const MOST_MANIFEST: u64 = 16 << 20;
+const MOST_MANIFEST: u64 = 64 << 20;
 /// Most members.
-const MOST_MEMBERS: usize = 10_000;
+const MOST_MEMBERS: usize = 100_000;
 /// Most bytes of all members together.
 const MOST_BYTES: u64 = 8 << 30;
 
@@ -83,9 +83,12 @@ impl Root {
         }
     }
 
-    /// The name of the member for the file at `path` below the directory.
+    /// The name of the member for the file at `path` below the directory, if it can have one.
     pub(super) fn member(self, path: &Path) -> Option<String> {
-        Some(format!("{}/{}", self.name(), path.to_str()?))
+        let parts = path.components().filter(|part| *part != Component::CurDir);
+        let path: PathBuf = parts.collect();
+        let name = format!("{}/{}", self.name(), path.to_str()?);
+        place(&name).is_ok().then_some(name)
     }
 }
 
@@ -119,7 +122,7 @@ pub(super) struct Content<R> {
 /// Writes an archive: the manifest, then each member as it is in it.
 ///
 /// # Errors
-/// It cannot be written, or a file is no longer as its member says.
+/// It cannot be written, a file is no longer as its member says, or [`read`] would not take it.
 pub(super) fn write<R: Read>(
     to: impl Write,
     manifest: &Manifest,
@@ -127,6 +130,7 @@ pub(super) fn write<R: Read>(
 ) -> io::Result<()> {
     let mut builder = Builder::new(to);
     let json = serde_json::to_vec_pretty(manifest)?;
+    parse(&json).map_err(io::Error::other)?;
     builder.append(&header(MANIFEST, json.len() as u64, 0o600)?, json.as_slice())?;
     for content in contents {
         let Content { member, reader } = content?;
@@ -204,6 +208,12 @@ fn parse(json: &[u8]) -> Result<Manifest, String> {
     #[derive(Deserialize)]
     struct Version {
         drivegate_backup: u32,
+    }
+    if json.len() as u64 > MOST_MANIFEST {
+        return Err(format!(
+            "its manifest has {} bytes, more than that of any backup",
+            json.len()
+        ));
     }
     let no_manifest = |error: serde_json::Error| format!("its manifest is damaged: {error}");
     let Version {

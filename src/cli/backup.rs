@@ -1,5 +1,6 @@
 //! `drivegate backup`: what a gateway needs to be set up again, in one file.
 
+use std::collections::BTreeSet;
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, BufWriter, Write};
 use std::os::unix::fs::{MetadataExt, OpenOptionsExt};
@@ -8,11 +9,12 @@ use std::process::ExitCode;
 use std::time::SystemTime;
 
 use super::archive::{Content, FORMAT, Hashed, LeftOut, Manifest, Member, Root, write};
+use super::restore::UNPACKED;
 use super::{ConfigFile, EXIT_CONFIG, EXIT_FAILED, report};
 use crate::config::{FileKind, NamedFile, Settings, environment, named_files};
 use crate::history::store;
 
-/// Files in the state directory that a backup does not need: locks, and what is being written.
+/// Endings of files in the state directory that a backup does not need: locks, and what is being written.
 const TRANSIENT: [&str; 2] = ["lock", "partial"];
 
 /// Writes configuration, profiles and state into one file, from which `restore` sets the gateway up again.
@@ -56,6 +58,7 @@ pub(super) fn run(args: &Args) -> ExitCode {
 #[derive(Debug, Default)]
 struct Sources {
     files: Vec<(PathBuf, Member)>,
+    names: BTreeSet<String>,
     left_out: Vec<LeftOut>,
 }
 
@@ -71,9 +74,13 @@ impl Sources {
     fn add(&mut self, root: Root, dir: &Path, below: &Path) -> io::Result<()> {
         let path = dir.join(below);
         let Some(name) = root.member(below) else {
-            self.leave_out(&path, "its name is not UTF-8");
+            self.leave_out(&path, "its name is not UTF-8, or leads out of its directory");
             return Ok(());
         };
+        // A certificate and its key may be one file.
+        if !self.names.insert(name.clone()) {
+            return Ok(());
+        }
         let shown = |error: io::Error| io::Error::new(error.kind(), format!("cannot read {}: {error}", path.display()));
         let file = File::open(&path).map_err(shown)?;
         let metadata = file.metadata()?;
@@ -96,38 +103,65 @@ impl Sources {
 fn collect(config: &Path, settings: &Settings, with_keys: bool) -> io::Result<Sources> {
     let base = config.parent().unwrap_or(Path::new(""));
     let mut sources = Sources::default();
-    for NamedFile { path, kind, .. } in named_files(config, environment()) {
+    let named = named_files(config, environment());
+    for NamedFile { path, kind, .. } in &named {
         let belongs = matches!(kind, FileKind::Configuration | FileKind::Profile);
         match path.strip_prefix(base) {
-            _ if !belongs && !with_keys => sources.leave_out(&path, "a certificate, key, password or token"),
+            _ if !belongs && !with_keys => sources.leave_out(path, "a certificate, key, password or token"),
             Ok(below) => sources.add(Root::Config, base, below)?,
-            Err(_) => sources.leave_out(&path, "it is outside the directory of the configuration"),
+            Err(_) => sources.leave_out(path, "it is outside the directory of the configuration"),
         }
     }
-    state(settings, &mut sources)?;
+    // The state directory may be that of the configuration; what was decided above stands.
+    let mut decided: Vec<PathBuf> = named.iter().map(|file| real(&file.path)).collect();
+    decided.push(real(&settings.recordings.dir));
+    state(&settings.state_dir, Path::new(""), &decided, &mut sources)?;
     Ok(sources)
 }
 
-/// The files of the state directory, without what is in directories of it but recordings, which are listed.
-fn state(settings: &Settings, sources: &mut Sources) -> io::Result<()> {
-    let dir = &settings.state_dir;
-    let mut names: Vec<PathBuf> = match fs::read_dir(dir) {
-        Ok(files) => files.map(|file| Ok(file?.path())).collect::<io::Result<_>>()?,
+fn real(path: &Path) -> PathBuf {
+    path.canonicalize()
+        .or_else(|_| std::path::absolute(path))
+        .unwrap_or_else(|_| path.to_path_buf())
+}
+
+/// The files in `dir`/`below` and in the directories there, except those that are `decided` already.
+fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -> io::Result<()> {
+    let here = dir.join(below);
+    let shown = |error: io::Error| io::Error::new(error.kind(), format!("cannot read {}: {error}", here.display()));
+    let mut found = match fs::read_dir(&here) {
+        Ok(files) => files.collect::<io::Result<Vec<_>>>().map_err(shown)?,
         Err(error) if error.kind() == io::ErrorKind::NotFound => Vec::new(),
-        Err(error) => {
-            let what = format!("cannot read {}: {error}", dir.display());
-            return Err(io::Error::new(error.kind(), what));
-        }
+        Err(error) => return Err(shown(error)),
     };
-    names.sort();
-    for path in names {
-        let is_transient = |ending| TRANSIENT.iter().any(|transient| ending == *transient);
-        let is_file = fs::symlink_metadata(&path).is_ok_and(|found| found.is_file());
-        if let (true, Some(name)) = (is_file && !path.extension().is_some_and(is_transient), path.file_name()) {
-            sources.add(Root::State, dir, Path::new(name))?;
+    found.sort_by_key(fs::DirEntry::file_name);
+    for entry in found {
+        let (path, below) = (entry.path(), below.join(entry.file_name()));
+        let kind = entry.file_type().map_err(shown)?;
+        if is_transient(&path) || decided.contains(&real(&path)) {
+            continue;
+        }
+        if kind.is_dir() {
+            state(dir, &below, decided, sources)?;
+        } else if !kind.is_file() {
+            sources.leave_out(&path, "it is no plain file");
+        } else if let Err(error) = sources.add(Root::State, dir, &below)
+            && error.kind() != io::ErrorKind::NotFound
+        {
+            // The gateway may have removed it meanwhile; any other error is one.
+            return Err(error);
         }
     }
     Ok(())
+}
+
+/// Locks, what is being written, and what a restore unpacks.
+fn is_transient(path: &Path) -> bool {
+    let name = path.file_name().unwrap_or_default().to_string_lossy();
+    name.starts_with(UNPACKED)
+        || path
+            .extension()
+            .is_some_and(|ending| TRANSIENT.iter().any(|one| ending == *one))
 }
 
 fn manifest(config: &Path, settings: &Settings, sources: &Sources) -> Manifest {
@@ -172,7 +206,8 @@ fn save(file: &Path, manifest: &Manifest, sources: &Sources) -> io::Result<()> {
         .open(&aside)
         .and_then(|open| {
             let contents = sources.files.iter().map(|(path, member)| {
-                let (member, reader) = (member.clone(), File::open(path)?);
+                let gone = |error| io::Error::other(format!("{}: {error}; try again", path.display()));
+                let (member, reader) = (member.clone(), File::open(path).map_err(gone)?);
                 Ok(Content { member, reader })
             });
             let mut to = BufWriter::new(&open);
@@ -200,4 +235,63 @@ fn summary(file: &Path, manifest: &Manifest) -> String {
         text += &format!("not in it: {} ({why})\n", path.display());
     }
     text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn all_of_the_state_is_in_it_or_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let dir = folder.path().join("state");
+        for path in [
+            "audit.jsonl",
+            "mqtt-events.lock",
+            "counters.partial",
+            "params/fan-1/20260302T074012Z.params",
+            "params/fan-1/restore.journal",
+            "params/fan-1/restore.partial",
+            "recordings/r1.dgrec",
+            ".restore-77/drivegate.toml",
+            "tls/gateway.key",
+        ] {
+            let path = dir.join(path);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, "x").unwrap();
+        }
+        std::os::unix::fs::symlink("/etc", dir.join("params/pump-1")).unwrap();
+        let decided = ["recordings", "tls/gateway.key"].map(|path| real(&dir.join(path)));
+        let mut sources = Sources::default();
+        state(&dir, Path::new(""), &decided, &mut sources).unwrap();
+        let names: Vec<&str> = sources.files.iter().map(|(_, member)| member.name.as_str()).collect();
+        let expected = [
+            "state/audit.jsonl",
+            "state/params/fan-1/20260302T074012Z.params",
+            "state/params/fan-1/restore.journal",
+        ];
+        assert_eq!(names, expected);
+        let left_out = LeftOut {
+            path: dir.join("params/pump-1"),
+            why: "it is no plain file".to_string(),
+        };
+        assert_eq!(sources.left_out, [left_out]);
+        let mut nothing = Sources::default();
+        state(&folder.path().join("none"), Path::new(""), &[], &mut nothing).unwrap();
+        assert!(nothing.files.is_empty());
+    }
+
+    #[test]
+    fn a_file_is_in_it_once_and_one_that_leads_out_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let base = folder.path().join("etc");
+        fs::create_dir(&base).unwrap();
+        fs::write(base.join("a.pem"), "x").unwrap();
+        fs::write(folder.path().join("b"), "x").unwrap();
+        let mut sources = Sources::default();
+        for below in ["a.pem", "./a.pem", "../b"] {
+            sources.add(Root::Config, &base, Path::new(below)).unwrap();
+        }
+        assert_eq!((sources.files.len(), sources.left_out.len()), (1, 1));
+    }
 }

@@ -1,9 +1,16 @@
 //! The files of tokens and users: one line for each, whose first word is its name.
 
-use std::fs::{OpenOptions, metadata, read_to_string, remove_file, rename};
-use std::io::Write;
-use std::os::unix::fs::{OpenOptionsExt, PermissionsExt};
+use std::fs::{File, Metadata, OpenOptions, Permissions, TryLockError, metadata, read_to_string, remove_file, rename};
+use std::io::{self, Write};
+use std::os::unix::fs::{MetadataExt, OpenOptionsExt, PermissionsExt, fchown};
 use std::path::{Path, PathBuf};
+use std::thread::sleep;
+use std::time::{Duration, Instant};
+
+/// How long somebody else may take to change the file.
+const PATIENCE: Duration = Duration::from_secs(10);
+/// How often that is looked for.
+const AGAIN: Duration = Duration::from_millis(20);
 
 /// A file of tokens or users.
 #[derive(Debug, Clone, Copy)]
@@ -26,60 +33,186 @@ impl CredentialsFile<'_> {
             .map_err(|error| format!("cannot read the {what} file: {error}; {shown}; check the path"))
     }
 
-    /// Its text with another line; the file need not exist yet.
+    /// Changes its text; a file that there is not yet has none. Others who change it wait meanwhile, so that no change is lost.
     ///
     /// # Errors
-    /// What is wrong with it, for the user.
-    pub(super) fn with_line(&self, line: &str) -> Result<String, String> {
+    /// That of `change`, or what the system reports; the file is as it was.
+    pub(super) fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
+        let _lock = self.lock()?;
         let text = match self.path.exists() {
             true => self.read()?,
             false => String::new(),
         };
-        let separator = if text.is_empty() || text.ends_with('\n') {
-            ""
-        } else {
-            "\n"
-        };
-        Ok(format!("{text}{separator}{line}\n"))
+        self.write(&change(&text)?)
     }
 
-    /// Removes the lines of that name.
-    ///
-    /// # Errors
-    /// The file cannot be read or written.
-    pub(super) fn remove(&self, name: &str) -> Result<(), String> {
-        let text = self.read()?;
-        let others = text.lines().filter(|line| line.split_whitespace().next() != Some(name));
-        let text: String = others.map(|line| format!("{line}\n")).collect();
-        self.write(&text)
-    }
-
-    /// Replaces the file as a whole, so that a gateway that reloads meanwhile reads the old one or the new one.
-    ///
-    /// # Errors
-    /// What the system reports.
-    pub(super) fn write(&self, text: &str) -> Result<(), String> {
+    /// The directory, locked: the file itself is replaced at each change.
+    fn lock(&self) -> Result<File, String> {
         let (what, shown) = (self.what, self.path.display());
-        let failed =
-            |error: std::io::Error| format!("cannot write the {what} file: {error}; {shown}; check the directory");
+        let failed = |error: io::Error| format!("cannot lock the {what} file: {error}; {shown}; check the directory");
+        let dir = match self.path.parent() {
+            Some(dir) if !dir.as_os_str().is_empty() => dir,
+            _ => Path::new("."),
+        };
+        let dir = File::open(dir).map_err(failed)?;
+        let until = Instant::now() + PATIENCE;
+        loop {
+            match dir.try_lock() {
+                Ok(()) => return Ok(dir),
+                Err(TryLockError::WouldBlock) if Instant::now() < until => sleep(AGAIN),
+                Err(TryLockError::WouldBlock) => {
+                    return Err(format!(
+                        "another program is changing the {what} file; {shown}; try again later"
+                    ));
+                }
+                Err(TryLockError::Error(error)) => return Err(failed(error)),
+            }
+        }
+    }
+
+    /// Replaces the file as a whole, so that a gateway that reloads meanwhile reads the old one or the new one. Owner, group
+    /// and permissions stay: they are what lets the gateway read it.
+    fn write(&self, text: &str) -> Result<(), String> {
+        let (what, shown) = (self.what, self.path.display());
+        let failed = |error: io::Error| format!("cannot write the {what} file: {error}; {shown}; check the directory");
         let mut name = self.path.as_os_str().to_owned();
         name.push(".new");
         let new = PathBuf::from(name);
-        let mode = metadata(self.path).map_or(self.mode, |metadata| metadata.permissions().mode() & 0o777);
+        // What a change that was killed left behind.
+        let _ = remove_file(&new);
+        let old = metadata(self.path).ok();
         let mut options = OpenOptions::new();
         let file = options
             .write(true)
             .create_new(true)
-            .mode(mode)
+            .mode(if old.is_some() { 0o600 } else { self.mode })
             .open(&new)
             .map_err(failed)?;
-        let written = { &file }
-            .write_all(text.as_bytes())
-            .and_then(|()| file.sync_all())
-            .and_then(|()| rename(&new, self.path));
+        let owned = old.map_or(Ok(()), |old| {
+            like(&file, &old).map_err(|error| {
+                format!(
+                    "cannot give the {what} file its owner {}:{} again: {error}; {shown}; run this as root",
+                    old.uid(),
+                    old.gid()
+                )
+            })
+        });
+        let written = owned.and_then(|()| {
+            { &file }
+                .write_all(text.as_bytes())
+                .and_then(|()| file.sync_all())
+                .and_then(|()| rename(&new, self.path))
+                .map_err(failed)
+        });
         if written.is_err() {
             let _ = remove_file(&new);
         }
-        written.map_err(failed)
+        written
+    }
+}
+
+/// Gives a file owner, group and permissions of an old one.
+fn like(file: &File, old: &Metadata) -> io::Result<()> {
+    let new = file.metadata()?;
+    if (new.uid(), new.gid()) != (old.uid(), old.gid()) {
+        fchown(file, Some(old.uid()), Some(old.gid()))?;
+    }
+    file.set_permissions(Permissions::from_mode(old.mode() & 0o777))
+}
+
+/// A text with another line.
+pub(super) fn with_line(text: &str, line: &str) -> String {
+    let separator = if text.is_empty() || text.ends_with('\n') {
+        ""
+    } else {
+        "\n"
+    };
+    format!("{text}{separator}{line}\n")
+}
+
+/// A text without the lines of that name.
+pub(super) fn without(text: &str, name: &str) -> String {
+    let others = text.lines().filter(|line| line.split_whitespace().next() != Some(name));
+    others.map(|line| format!("{line}\n")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(path: &Path) -> CredentialsFile<'_> {
+        CredentialsFile {
+            what: "token",
+            path,
+            mode: 0o640,
+        }
+    }
+
+    #[test]
+    fn changes_at_a_time_are_all_made() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        std::fs::write(folder.path().join("tokens.new"), "left behind").unwrap();
+        std::thread::scope(|scope| {
+            for n in 0..16 {
+                let path = &path;
+                scope.spawn(move || {
+                    file(path)
+                        .change(|text| Ok(with_line(text, &format!("n{n} x"))))
+                        .unwrap()
+                });
+            }
+        });
+        let text = file(&path).read().unwrap();
+        assert_eq!(text.lines().count(), 16, "{text}");
+        file(&path).change(|text| Ok(without(text, "n7"))).unwrap();
+        assert_eq!(file(&path).read().unwrap().lines().count(), 15);
+        assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn what_cannot_be_changed_is_as_it_was() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        std::fs::write(&path, "a x\n").unwrap();
+        let refused = file(&path).change(|_| Err("no".to_string()));
+        assert_eq!(refused, Err("no".to_string()));
+        assert_eq!(file(&path).read().unwrap(), "a x\n");
+        let nowhere = folder.path().join("none/tokens");
+        assert!(
+            file(&nowhere)
+                .change(|_| Ok(String::new()))
+                .unwrap_err()
+                .contains("check the directory")
+        );
+    }
+
+    /// Another group than that of new files, which this process may give away.
+    fn other_group() -> Option<u32> {
+        let own = rustix::process::getegid().as_raw();
+        if rustix::process::geteuid().is_root() {
+            return Some(own + 1);
+        }
+        let groups = rustix::process::getgroups().unwrap();
+        groups
+            .into_iter()
+            .map(|group| group.as_raw())
+            .find(|group| *group != own)
+    }
+
+    #[test]
+    fn owner_group_and_permissions_stay() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tokens");
+        file(&path).change(|_| Ok("a x\n".to_string())).unwrap();
+        let group = other_group();
+        let opened = File::open(&path).unwrap();
+        fchown(&opened, None, group).unwrap();
+        opened.set_permissions(Permissions::from_mode(0o664)).unwrap();
+        let owned = |metadata: Metadata| (metadata.uid(), metadata.gid(), metadata.mode());
+        let before = owned(metadata(&path).unwrap());
+        assert!(group.is_none_or(|group| group == before.1));
+        file(&path).change(|text| Ok(with_line(text, "b x"))).unwrap();
+        assert_eq!(owned(metadata(&path).unwrap()), before);
     }
 }

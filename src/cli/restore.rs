@@ -3,6 +3,8 @@
 
 mod staging;
 
+pub(super) use self::staging::UNPACKED;
+
 use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 
-use super::credentials_file::CredentialsFile;
+use super::credentials_file::{CredentialsFile, with_line, without};
 use super::{EXIT_FAILED, report};
 use crate::north::http::{Scope, Token, Tokens};
 
@@ -85,14 +85,16 @@ fn add(path: &Path, name: &str, scopes: &[Scope]) -> Result<String, String> {
     let shown = path.display();
     let (token, secret) =
         Token::generate(name, scopes.to_vec()).map_err(|error| format!("{error}; {shown}; choose another name"))?;
-    let text = file(path).with_line(&token.to_string())?;
-    Tokens::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; choose another name"))?;
-    file(path).write(&text)?;
+    file(path).change(|text| {
+        let text = with_line(text, &token.to_string());
+        Tokens::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; choose another name"))?;
+        Ok(text)
+    })?;
     Ok(format!("{secret}\n"))
 }
 
 fn list(path: &Path) -> Result<String, String> {
-    let tokens = tokens(path)?;
+    let tokens = tokens(path, &file(path).read()?)?;
     let mut table = report::table(["name", "scopes"]);
     for token in tokens.list() {
         let scopes: Vec<&str> = token.scopes.iter().map(|scope| scope.name()).collect();
@@ -102,17 +104,18 @@ fn list(path: &Path) -> Result<String, String> {
 }
 
 fn remove(path: &Path, name: &str) -> Result<String, String> {
-    if !tokens(path)?.list().iter().any(|token| token.name == name) {
-        return Err(format!(
+    file(path).change(|text| {
+        if tokens(path, text)?.list().iter().any(|token| token.name == name) {
+            return Ok(without(text, name));
+        }
+        Err(format!(
             "there is no token `{name}`; {}; `drivegate token list` shows them",
             path.display()
-        ));
-    }
-    file(path).remove(name)?;
+        ))
+    })?;
     Ok(String::new())
 }
 
-fn tokens(path: &Path) -> Result<Tokens, String> {
-    let text = file(path).read()?;
-    Tokens::parse(&text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
+fn tokens(path: &Path, text: &str) -> Result<Tokens, String> {
+    Tokens::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
 }

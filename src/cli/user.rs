@@ -6,7 +6,7 @@ use std::process::ExitCode;
 
 use rustix::termios::{LocalModes, OptionalActions, Termios, tcgetattr, tcsetattr};
 
-use super::credentials_file::CredentialsFile;
+use super::credentials_file::{CredentialsFile, with_line, without};
 use super::{EXIT_FAILED, report};
 use crate::north::http::{MAX_PASSWORD, User, Users};
 
@@ -83,29 +83,27 @@ fn file(path: &Path) -> CredentialsFile<'_> {
 
 fn add(path: &Path, name: &str) -> Result<String, String> {
     let shown = path.display();
-    let known = match path.exists() {
-        true => users(path)?,
-        false => Users::default(),
-    };
+    if path.exists() {
+        // Before a password is asked for.
+        users(path, &file(path).read()?)?;
+    }
     let password = password()?;
     let user = User::new(name, &password).map_err(|error| format!("{error}; {shown}; choose another"))?;
     let line = user.to_string();
-    let is_known = known.list().iter().any(|other| other.name == name);
-    let text = match is_known {
-        false => file(path).with_line(&line)?,
-        true => {
-            let text = file(path).read()?;
-            let replaced = text
-                .lines()
-                .map(|old| match old.split_whitespace().next() == Some(name) {
-                    true => format!("{line}\n"),
-                    false => format!("{old}\n"),
-                });
-            replaced.collect()
-        }
-    };
-    Users::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; remove one"))?;
-    file(path).write(&text)?;
+    let mut is_known = false;
+    file(path).change(|text| {
+        is_known = has(&users(path, text)?, name);
+        let replaced = |old: &str| match old.split_whitespace().next() == Some(name) {
+            true => format!("{line}\n"),
+            false => format!("{old}\n"),
+        };
+        let text = match is_known {
+            false => with_line(text, &line),
+            true => text.lines().map(replaced).collect(),
+        };
+        Users::parse(&text).map_err(|(_, error)| format!("{error}; {shown}; remove one"))?;
+        Ok(text)
+    })?;
     Ok(match is_known {
         true => format!("{name} has another password; reload the gateway\n"),
         false => format!("{name} was added; reload the gateway\n"),
@@ -113,25 +111,30 @@ fn add(path: &Path, name: &str) -> Result<String, String> {
 }
 
 fn list(path: &Path) -> Result<String, String> {
-    let names = users(path)?;
+    let names = users(path, &file(path).read()?)?;
     let lines = names.list().iter().map(|user| format!("{}\n", user.name));
     Ok(lines.collect())
 }
 
 fn remove(path: &Path, name: &str) -> Result<String, String> {
-    if !users(path)?.list().iter().any(|user| user.name == name) {
-        return Err(format!(
+    file(path).change(|text| {
+        if has(&users(path, text)?, name) {
+            return Ok(without(text, name));
+        }
+        Err(format!(
             "there is no user `{name}`; {}; `drivegate user list` shows them",
             path.display()
-        ));
-    }
-    file(path).remove(name)?;
+        ))
+    })?;
     Ok(format!("{name} was removed; reload the gateway\n"))
 }
 
-fn users(path: &Path) -> Result<Users, String> {
-    let text = file(path).read()?;
-    Users::parse(&text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
+fn has(users: &Users, name: &str) -> bool {
+    users.list().iter().any(|user| user.name == name)
+}
+
+fn users(path: &Path, text: &str) -> Result<Users, String> {
+    Users::parse(text).map_err(|(line, error)| format!("{error}; {}:{line}; remove the line", path.display()))
 }
 
 /// The password: typed twice without echo on a terminal, else the first line of standard input.

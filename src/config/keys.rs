@@ -588,7 +588,7 @@ keys! {
 
     /// File of all commands, in which every change shows; see [the audit file](commands.md#the-audit-file).
     AUDIT: AuditTable {
-        /// The file; a relative path is relative to `state_dir` of `[gateway]`.
+        /// The file, none of the others that the gateway keeps; a relative path is relative to `state_dir` of `[gateway]`.
         file: PathBuf = PATH, default "audit.jsonl";
         /// Size of the file and the seven older ones beside it; the oldest is removed.
         max_bytes: u64 = Parsed {

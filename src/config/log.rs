@@ -6,6 +6,7 @@ use super::keys::{AUDIT, LOG};
 use super::values;
 use crate::command::AuditFileOptions;
 use crate::document::{Finding, Reader};
+use crate::files::names;
 
 /// Format of log lines.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -39,10 +40,22 @@ pub(super) const PATTERN: &str = concat!(
     r"(,\s*([A-Za-z0-9_:-]+=)?(off|error|warn|info|debug|trace)\s*)*$"
 );
 
-/// `[audit]`; `state_dir` is that of the gateway.
-pub(super) fn read_audit(reader: &Reader<'_>, state_dir: &Path) -> AuditFileOptions {
+/// `[audit]`; in `state_dir` and in `buffer`, that of MQTT, the gateway has other files.
+pub(super) fn read_audit(reader: &Reader<'_>, state_dir: &Path, buffer: Option<&Path>) -> AuditFileOptions {
+    let path = values::resolved(state_dir, AUDIT.file.get(reader));
+    let own = [Some(state_dir), buffer].into_iter().flatten();
+    if let Some(name) = own
+        .filter_map(|dir| first_below(dir, &path))
+        .find(|name| names::is_own(name))
+    {
+        reader.problem(
+            AUDIT.file.name,
+            format!("the gateway keeps other things in `{name}`"),
+            "give the audit file another name, such as \"audit.jsonl\"",
+        );
+    }
     let options = AuditFileOptions {
-        path: values::resolved(state_dir, AUDIT.file.get(reader)),
+        path,
         max_bytes: AUDIT.max_bytes.get(reader),
     };
     reader.finish();
@@ -56,6 +69,18 @@ pub(super) fn read(reader: &Reader<'_>) -> LogSettings {
     };
     reader.finish();
     settings
+}
+
+/// The file or directory in `dir` that `path` is, or is in.
+fn first_below(dir: &Path, path: &Path) -> Option<String> {
+    let real = |path: &Path| path.canonicalize().or_else(|_| std::path::absolute(path)).ok();
+    let path = match path.canonicalize() {
+        Ok(path) => path,
+        // There is no such file yet.
+        Err(_) => real(path.parent()?)?.join(path.file_name()?),
+    };
+    let first = path.strip_prefix(real(dir)?).ok()?.components().next()?;
+    Some(first.as_os_str().to_string_lossy().into_owned())
 }
 
 /// `level` or `target=level`, joined by commas, as `tracing` reads them.

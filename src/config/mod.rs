@@ -244,10 +244,10 @@ fn read(reader: &Reader<'_>, base: &Path, profile_errors: &mut Vec<Problem>) -> 
         .table(reader)
         .map(|table| mqtt::read(&table, base, name.as_deref(), &state_dir));
     let http = ROOT.http.table(reader).map(|table| north::read_http(&table, base));
-    let audit = ROOT
-        .audit
-        .table(reader)
-        .map(|table| log::read_audit(&table, &state_dir));
+    let buffer = mqtt.as_ref().and_then(|mqtt| mqtt.as_ref()?.buffer.as_ref());
+    let buffer = buffer.map(|buffer| buffer.dir.as_path());
+    let audit = ROOT.audit.table(reader);
+    let audit = audit.map(|table| log::read_audit(&table, &state_dir, buffer));
     let recordings = ROOT.recordings.table(reader);
     let recordings = recordings.map(|table| recordings::read(&table, &state_dir));
     let params = ROOT.params.table(reader);

@@ -9,6 +9,7 @@ use super::keys::PARAMS;
 use super::values;
 use crate::document::{self, Reader};
 use crate::drive::profile::Profiles;
+use crate::files::names;
 use crate::parameters::Names;
 
 /// How parameters are read and kept.
@@ -26,7 +27,7 @@ impl ParamsSettings {
     /// Readings below that state directory, and nothing else.
     pub(super) fn below(state_dir: &Path) -> ParamsSettings {
         ParamsSettings {
-            dir: state_dir.join("params"),
+            dir: state_dir.join(names::PARAMS),
             ..ParamsSettings::default()
         }
     }

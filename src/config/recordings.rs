@@ -4,11 +4,12 @@ use std::path::Path;
 
 use super::keys::RECORDINGS;
 use crate::document::{Finding, Reader, parse_size};
+use crate::files::names::RECORDINGS as RECORDINGS_DIR;
 use crate::history::RecorderOptions;
 
 pub(super) fn read(reader: &Reader<'_>, state_dir: &Path) -> RecorderOptions {
     let options = RecorderOptions {
-        dir: state_dir.join("recordings"),
+        dir: state_dir.join(RECORDINGS_DIR),
         before: RECORDINGS.before.get(reader),
         after: RECORDINGS.after.get(reader),
         max_bytes: RECORDINGS.max_bytes.get(reader),

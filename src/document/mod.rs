@@ -17,8 +17,6 @@ use std::fmt;
 
 use serde::{Serialize, Serializer};
 
-use tree::{OverrideError, entries};
-
 pub(crate) use file::read_file;
 pub(crate) use reader::{Reader, candidates, nearest};
 pub(crate) use tree::{Entry, Node, Raw};
@@ -154,12 +152,12 @@ impl Document {
             return;
         };
         if !entries.iter().any(|(key, _, _)| key == name) {
-            entries.push((name.to_string(), None, Node::empty_table(None)));
+            entries.push((name.to_string(), None, Node::empty_table()));
         }
     }
 
     /// Lets variables `PREFIX__TABLE__KEY=value` (array elements by number, from 0) replace or add scalars.
-    /// The section must exist, tables inside it need not.
+    /// The table that the scalar is in must exist.
     pub(crate) fn overlay<I: IntoIterator<Item = (String, String)>>(&mut self, prefix: &str, variables: I) {
         let start = format!("{prefix}__");
         let mut variables: Vec<_> = variables
@@ -169,14 +167,7 @@ impl Document {
         variables.sort();
         for (name, value) in variables {
             let path: Vec<String> = name.split("__").skip(1).map(str::to_lowercase).collect();
-            let absent = path
-                .first()
-                .filter(|section| path.len() > 1 && !self.has_section(section));
-            let outcome = match absent {
-                Some(section) => Err(OverrideError::NoSection(section.clone())),
-                None => tree::set(&mut self.root, &path, &name, value),
-            };
-            if let Err(error) = outcome {
+            if let Err(error) = tree::set(&mut self.root, &path, &name, value) {
                 let finding = Finding::new(error.to_string(), error.remedy());
                 let problem = Problem::of_file(name, &path.join("."), finding);
                 self.problems.get_mut().push(problem);
@@ -230,10 +221,6 @@ impl Document {
             key: place.key.clone(),
             finding,
         }
-    }
-
-    fn has_section(&self, name: &str) -> bool {
-        entries(&self.root).iter().any(|(key, _, _)| key == name)
     }
 
     /// Every key that a reader of this document asked for, as a path without the numbers of array elements:
@@ -318,7 +305,7 @@ mod tests {
 
     #[test]
     fn environment_overrides() {
-        let mut document = Document::parse("f.toml", "[mqtt]\nport = 1\n[[bus]]\nbaud = 9600\n");
+        let mut document = Document::parse("f.toml", "[mqtt]\nport = 1\n[mqtt.publish]\n[[bus]]\nbaud = 9600\n");
         let set = |k: &str, v: &str| (k.to_string(), v.to_string());
         document.ensure_section("log");
         document.overlay(
@@ -330,6 +317,8 @@ mod tests {
                 set("DRIVEGATE__LOG__LEVEL", "debug"),
                 set("DRIVEGATE__HTTP__LISTEN", "x"),
                 set("DRIVEGATE__BUS__3__BAUD", "1"),
+                set("DRIVEGATE__BUS__0__DRIVE__0__ADDRESS", "1"),
+                set("DRIVEGATE__MQTT__SPARKPLUG__GROUP", "x"),
                 set("OTHER", "x"),
             ],
         );
@@ -359,7 +348,18 @@ mod tests {
                 "mqtt.publish.min_interval"
             ]
         );
-        let found: Vec<String> = document.into_problems().iter().map(|p| p.file.clone()).collect();
-        assert_eq!(found, ["DRIVEGATE__BUS__3__BAUD", "DRIVEGATE__HTTP__LISTEN"]);
+        let found: Vec<String> = document.into_problems().iter().map(Problem::to_string).collect();
+        let absent = |key: &str| format!("there is no `{key}` in the file to override");
+        assert_eq!(
+            found,
+            [
+                absent("bus.0.drive")
+                    + "; DRIVEGATE__BUS__0__DRIVE__0__ADDRESS, bus.0.drive.0.address; add the section to the file first",
+                "`3` is not an element of an array of 1; DRIVEGATE__BUS__3__BAUD, bus.3.baud; count from 0".to_string(),
+                absent("http") + "; DRIVEGATE__HTTP__LISTEN, http.listen; add the section to the file first",
+                absent("mqtt.sparkplug")
+                    + "; DRIVEGATE__MQTT__SPARKPLUG__GROUP, mqtt.sparkplug.group; add the section to the file first",
+            ]
+        );
     }
 }

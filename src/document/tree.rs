@@ -53,11 +53,11 @@ impl Node {
     }
 
     /// A table without keys.
-    pub(crate) fn empty_table(env: Option<String>) -> Node {
+    pub(crate) fn empty_table() -> Node {
         Node {
             value: Raw::Table(Vec::new()),
             line: None,
-            env,
+            env: None,
         }
     }
 }
@@ -250,39 +250,47 @@ pub(super) fn rename(node: &mut Node, here: String, path: &[&str], names: (&str,
     }
 }
 
-/// Puts the `text` of the variable `name` at `path` below `node`.
+/// Puts the `text` of the variable `name` at `path` below `root`, into a table that exists.
 ///
 /// # Errors
 /// The path leads nowhere.
-pub(super) fn set(node: &mut Node, path: &[String], name: &str, text: String) -> Result<(), OverrideError> {
-    let Some((key, rest)) = path.split_first() else {
-        *node = Node {
-            value: Raw::Env(text),
-            line: None,
-            env: Some(name.to_string()),
-        };
-        return Ok(());
+pub(super) fn set(root: &mut Node, path: &[String], name: &str, text: String) -> Result<(), OverrideError> {
+    let value = Node {
+        value: Raw::Env(text),
+        line: None,
+        env: Some(name.to_string()),
     };
-    match &mut node.value {
-        Raw::Table(entries) => {
-            if let Some((_, _, child)) = entries.iter_mut().find(|(k, _, _)| k == key) {
-                return set(child, rest, name, text);
-            }
-            let mut child = Node::empty_table(Some(name.to_string()));
-            set(&mut child, rest, name, text)?;
-            entries.push((key.clone(), None, child));
-            Ok(())
-        }
-        Raw::Array(items) => {
-            let count = items.len();
-            match key.parse::<usize>().ok().and_then(|i| items.get_mut(i)) {
-                Some(item) => set(item, rest, name, text),
-                None => Err(OverrideError::NoElement {
-                    key: key.clone(),
-                    count,
-                }),
-            }
-        }
-        _ => Err(OverrideError::BelowValue(key.clone())),
+    let (mut node, mut rest) = (root, path);
+    while let Some((key, below)) = rest.split_first() {
+        rest = below;
+        node = match &mut node.value {
+            Raw::Table(entries) => match entries.iter().position(|(k, ..)| k == key) {
+                None if rest.is_empty() => {
+                    entries.push((key.clone(), None, value));
+                    return Ok(());
+                }
+                place => place
+                    .and_then(|place| entries.get_mut(place))
+                    .map(|(.., child)| child)
+                    .ok_or_else(|| {
+                        let passed = path.iter().take(path.len() - rest.len()).cloned();
+                        OverrideError::NoSection(passed.collect::<Vec<_>>().join("."))
+                    })?,
+            },
+            Raw::Array(items) => element(items, key)?,
+            _ => return Err(OverrideError::BelowValue(key.clone())),
+        };
     }
+    *node = value;
+    Ok(())
+}
+
+/// The element of an array that a variable names.
+fn element<'n>(items: &'n mut [Node], key: &str) -> Result<&'n mut Node, OverrideError> {
+    let count = items.len();
+    let item = key.parse::<usize>().ok().and_then(|index| items.get_mut(index));
+    item.ok_or_else(|| OverrideError::NoElement {
+        key: key.to_string(),
+        count,
+    })
 }

@@ -1,8 +1,10 @@
 //! Files that the gateway writes while it runs: lines that are appended, and small files that are replaced.
 //!
 //! - [`rotated`]: a file of lines with older ones beside it, bounded together.
+//! - [`names`]: what the gateway calls its files.
 //! - [`replace`]: a new content in the place of the old one, never a half of either.
 
+pub mod names;
 pub mod rotated;
 
 use std::fs::{self, File};

@@ -16,6 +16,7 @@ use tokio::sync::{broadcast, watch};
 use super::counters::Totals;
 use super::drives::History;
 use crate::event::{self, Event, Events};
+use crate::files::names::{COUNTERS, EVENTS};
 use crate::files::{self, Rotated};
 
 /// Events reach the disk within that time; a disk that failed is tried again at this interval.
@@ -30,9 +31,6 @@ const WAITING: usize = 4096;
 const MOST_DRIVES: usize = 16_384;
 /// Form of the file of counters.
 const VERSION: u32 = 1;
-
-const EVENTS: &str = "events.jsonl";
-const COUNTERS: &str = "counters.json";
 
 /// The file of counters.
 #[derive(Debug, Serialize, Deserialize)]

@@ -39,8 +39,8 @@ pub struct Kept {
     pub first: bool,
 }
 
-/// The places of those that have to go, of recordings in the order of their times, so that no more than `max_bytes` and
-/// `max_count` are left. The newest stays in any case.
+/// The places of those that have to go, of recordings from the oldest to the newest, so that no more than `max_bytes` and
+/// `max_count` are left. The last one, which was just made, stays in any case.
 pub fn surplus(all: &[Kept], max_bytes: u64, max_count: usize) -> Vec<usize> {
     let mut left: Vec<(usize, Kept)> = all.iter().copied().enumerate().collect();
     let mut gone = Vec::new();

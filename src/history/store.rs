@@ -189,11 +189,11 @@ impl Store {
         &self.entries
     }
 
-    /// Writes a recording, then removes those that have to go for it.
+    /// Writes a recording at the time `now`, then removes those that have to go for it.
     ///
     /// # Errors
     /// It cannot be written, or is greater than all may be together; nothing of it is left then.
-    pub fn write(&mut self, recording: &mut Recording) -> io::Result<Arc<Entry>> {
+    pub fn write(&mut self, recording: &mut Recording, now: SystemTime) -> io::Result<Arc<Entry>> {
         let time = humantime::parse_rfc3339(&recording.header.time).unwrap_or(SystemTime::UNIX_EPOCH);
         recording.header.first = self.storm.is_first(time);
         let id = recording.header.id.clone();
@@ -219,20 +219,24 @@ impl Store {
             .entries
             .partition_point(|other| (&other.time, &other.id) <= (&entry.time, &entry.id));
         self.entries.insert(at, entry.clone());
-        self.make_room();
+        self.make_room(&entry, now);
         Ok(entry)
     }
 
-    fn make_room(&mut self) {
+    /// Removes what is too much after `written`, which stays. Those of a time that is yet to come, as after the clock was set
+    /// back, count as the oldest: nothing else would ever get older than they.
+    fn make_room(&mut self, written: &Arc<Entry>, now: SystemTime) {
+        let is_to_come = |entry: &Entry| humantime::parse_rfc3339(&entry.time).is_ok_and(|time| time > now);
+        let mut order = self.entries.clone();
+        order.sort_by_key(|entry| (Arc::ptr_eq(entry, written), !is_to_come(entry)));
         let kept = |entry: &Arc<Entry>| Kept {
             bytes: entry.bytes,
             first: entry.first,
         };
-        let all: Vec<Kept> = self.entries.iter().map(kept).collect();
-        let mut gone = surplus(&all, self.max_bytes, self.max_count);
-        gone.sort_unstable();
-        for place in gone.into_iter().rev() {
-            let entry = self.entries.remove(place);
+        let all: Vec<Kept> = order.iter().map(kept).collect();
+        let gone = surplus(&all, self.max_bytes, self.max_count);
+        for entry in gone.into_iter().filter_map(|place| order.get(place)) {
+            self.entries.retain(|other| !Arc::ptr_eq(other, entry));
             let path = path_of(&self.dir, &entry.id);
             if let Err(error) = fs::remove_file(&path)
                 && error.kind() != io::ErrorKind::NotFound

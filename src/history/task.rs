@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::mpsc::{Receiver, RecvTimeoutError, Sender, SyncSender, TrySendError, channel, sync_channel};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::JoinHandle;
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use tokio::sync::broadcast::error::TryRecvError;
 use tokio::sync::{broadcast, oneshot};
@@ -338,7 +338,7 @@ impl Writer {
     fn run(mut self, waiting: &Receiver<Capture>) {
         while let Ok(capture) = waiting.recv() {
             let mut recording = assemble(&capture);
-            let written = self.store.write(&mut recording);
+            let written = self.store.write(&mut recording, SystemTime::now());
             let header = &recording.header;
             let (bus, drive) = (header.bus.name.clone(), header.drive.name.clone());
             match written {
@@ -378,6 +378,6 @@ fn publish(events: &Events, bus: String, drive: Option<String>, text: String, re
         bus,
         drive,
         recording,
-        ..Event::new(EventKind::Recording, std::time::SystemTime::now(), text)
+        ..Event::new(EventKind::Recording, SystemTime::now(), text)
     });
 }

@@ -1,4 +1,6 @@
-//! Readings kept on disk: `DIR/DRIVE/20260302T074012Z.params`.
+//! Readings kept on disk: `DIR/DRIVE/20260302T074012Z.params`. The names are in the order in which the readings were made: one
+//! whose time is not after the newest, as after the clock was set back, has the name of that with a number,
+//! `20260302T074012Z-000002.params`.
 
 use std::fs::{self, File};
 use std::io::{self, Read as _};
@@ -45,6 +47,9 @@ impl Store {
     pub fn keep(&self, file: &ParameterFile) -> io::Result<PathBuf> {
         let dir = self.dir.join(&file.drive);
         let name: String = file.time.chars().filter(|c| c.is_ascii_alphanumeric()).collect();
+        let kept = self.of(&file.drive)?;
+        let newest = kept.last().and_then(|path| path.file_stem()).unwrap_or_default();
+        let name = name_after(&newest.to_string_lossy(), name);
         let path = dir.join(format!("{name}.{EXTENSION}"));
         files::replace(&path, file.text().as_bytes())?;
         let mut kept = self.of(&file.drive)?;
@@ -73,7 +78,7 @@ impl Store {
         let paths = entries.map(|entry| entry.map(|entry| entry.path()));
         let mut paths: Vec<PathBuf> = paths.collect::<io::Result<_>>()?;
         paths.retain(|path| path.extension().is_some_and(|end| end == EXTENSION));
-        paths.sort();
+        paths.sort_by(|a, b| a.file_stem().cmp(&b.file_stem()));
         Ok(paths)
     }
 
@@ -117,6 +122,17 @@ impl Store {
     }
 }
 
+/// The name of a reading made after that of the name `newest`: its own, if that is in order, else the next number of `newest`.
+fn name_after(newest: &str, own: String) -> String {
+    if own.as_str() > newest {
+        return own;
+    }
+    let numbered = newest.rsplit_once('-');
+    let numbered = numbered.and_then(|(name, number)| Some((name, number.parse().ok()?)));
+    let (name, number): (&str, u32) = numbered.unwrap_or((newest, 1));
+    format!("{name}-{:06}", number.saturating_add(1))
+}
+
 /// Reads a file of parameters.
 ///
 /// # Errors
@@ -153,6 +169,29 @@ mod tests {
             values: [(Id::new("102"), entry)].into(),
             ..ParameterFile::default()
         }
+    }
+
+    #[test]
+    fn after_the_clock_was_set_back_the_last_reading_is_still_the_latest() {
+        let folder = tempfile::tempdir().unwrap();
+        let store = Store::new(folder.path().join("params"));
+        let keep = |minute, value| {
+            let path = store.keep(&file(minute, value)).unwrap();
+            assert_eq!(store.latest("pump-1"), Ok(Some(file(minute, value))));
+            path.file_name().unwrap().to_string_lossy().into_owned()
+        };
+        for minute in 10..10 + KEPT as u32 {
+            keep(minute, minute as u16);
+        }
+        assert_eq!(keep(110, 7), "20260302T015012Z.params");
+        assert_eq!(keep(50, 8), "20260302T015012Z-000002.params");
+        for minute in 51..59 {
+            keep(minute, minute as u16);
+        }
+        assert_eq!(keep(50, 9), "20260302T015012Z-000011.params");
+        assert_eq!(keep(110, 10), "20260302T015012Z-000012.params");
+        assert_eq!(keep(111, 11), "20260302T015112Z.params", "the clock has caught up");
+        assert_eq!(store.list().unwrap().len(), KEPT);
     }
 
     #[test]

@@ -7,6 +7,9 @@ use std::path::{Component, Path, PathBuf};
 
 use crate::cli::archive::Root;
 
+/// First part of the name of the directory.
+pub(in crate::cli) const UNPACKED: &str = ".restore-";
+
 /// The unpacked files.
 #[derive(Debug)]
 pub(super) struct Staging {
@@ -34,7 +37,7 @@ impl Place {
         let failed = |dir: &Path, error: io::Error| format!("cannot write to {}: {error}", dir.display());
         let is_new = !to.exists();
         made(to, 0o755).map_err(|error| failed(to, error))?;
-        let aside = to.join(format!(".restore-{}", std::process::id()));
+        let aside = to.join(format!("{UNPACKED}{}", std::process::id()));
         fs::DirBuilder::new()
             .mode(0o700)
             .create(&aside)
@@ -161,9 +164,7 @@ impl Staging {
             };
             let directory = directory_of(to, path).map_err(failed)?;
             let (from, to) = (aside.join(path), to.join(path));
-            let owner = fs::metadata(&directory).map_err(failed)?;
-            // Only root may, and without it all files are the user's own.
-            let _ = chown(&from, Some(owner.uid()), Some(owner.gid()));
+            give(&from, &directory).map_err(failed)?;
             fs::rename(&from, &to).map_err(failed)?;
             let _ = File::open(&directory).and_then(|dir| dir.sync_all());
             placed.push(to);
@@ -172,10 +173,20 @@ impl Staging {
     }
 }
 
-/// The directory of the file `path` below `root`, created if necessary. A link on the way is not followed.
+/// Gives a file or directory the owner of the directory that it is for.
+fn give(path: &Path, directory: &Path) -> io::Result<()> {
+    let owner = fs::metadata(directory)?;
+    // Only root may, and without it all files are the user's own.
+    let _ = chown(path, Some(owner.uid()), Some(owner.gid()));
+    Ok(())
+}
+
+/// The directory of the file `path` below `root`, created if necessary, with the owner of the one it is in. A link on the way
+/// is not followed.
 fn directory_of(root: &Path, path: &Path) -> io::Result<PathBuf> {
     let mut directory = root.to_path_buf();
     for part in path.parent().into_iter().flat_map(Path::components) {
+        let above = directory.clone();
         directory.push(part);
         match fs::symlink_metadata(&directory) {
             Ok(found) if found.is_dir() => {}
@@ -183,7 +194,10 @@ fn directory_of(root: &Path, path: &Path) -> io::Result<PathBuf> {
                 let what = format!("{} is no directory", directory.display());
                 return Err(io::Error::new(io::ErrorKind::NotADirectory, what));
             }
-            Err(_) => fs::create_dir(&directory)?,
+            Err(_) => {
+                fs::create_dir(&directory)?;
+                give(&directory, &above)?;
+            }
         }
     }
     Ok(directory)

@@ -8,6 +8,49 @@ use std::process::Command;
 use super::listeners::{certificate, certificates};
 use super::{FULL, load};
 
+/// What the gateway keeps in its state directory and in that of the buffer is not overwritten by commands, under whatever name.
+#[test]
+fn the_audit_has_a_file_of_its_own() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = |name: &str| folder.path().join(name).display().to_string();
+    std::fs::create_dir_all(path("state/params/pump-1")).unwrap();
+    std::fs::write(path("state/events.jsonl"), "").unwrap();
+    std::os::unix::fs::symlink(path("state/events.jsonl"), path("elsewhere")).unwrap();
+    let said_of = |file: &str| {
+        let text = format!(
+            "[gateway]\nname = \"g\"\nstate_dir = \"{}\"\n[mqtt]\nurl = \"mqtt://127.0.0.1\"\n\
+             buffer = {{ dir = \"{}\" }}\n[audit]\nfile = \"{file}\"\n",
+            path("state"),
+            path("buffer")
+        );
+        let (loaded, _) = load(&text);
+        loaded.errors.iter().map(ToString::to_string).collect::<Vec<_>>()
+    };
+    for (file, name) in [
+        ("events.jsonl".to_string(), "events.jsonl"),
+        ("./counters.json".to_string(), "counters.json"),
+        ("params/../events.jsonl.1".to_string(), "events.jsonl.1"),
+        ("params/pump-1/audit.jsonl".to_string(), "params"),
+        ("mqtt-history-1.log".to_string(), "mqtt-history-1.log"),
+        (path("buffer/mqtt-events-1.log"), "mqtt-events-1.log"),
+        (path("state/sparkplug-bdseq"), "sparkplug-bdseq"),
+        (path("elsewhere"), "events.jsonl"),
+    ] {
+        let expected = format!(
+            "the gateway keeps other things in `{name}`; /etc/drivegate/t.toml:8, audit.file; give the audit file another name, such as \
+             \"audit.jsonl\""
+        );
+        assert_eq!(said_of(&file), [expected], "{file}");
+    }
+    for file in [
+        "audit.jsonl".to_string(),
+        "commands/events.jsonl".to_string(),
+        path("events.jsonl"),
+    ] {
+        assert_eq!(said_of(&file), [""; 0], "{file}");
+    }
+}
+
 /// The configuration of openssl for revocation lists.
 const BOOK: &str = "[ca]\ndefault_ca=a\n[a]\ndatabase=index\ndefault_md=sha256\n";
 /// What makes them version 2.

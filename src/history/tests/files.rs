@@ -5,7 +5,7 @@ use std::io;
 use std::os::unix::process::ExitStatusExt;
 use std::path::Path;
 use std::process::{Command, Stdio};
-use std::time::Duration;
+use std::time::{Duration, SystemTime};
 
 use super::{FAULT, RUNS, Rig, SECOND, options};
 use crate::history::recording::{Frame, RecordingError};
@@ -147,7 +147,7 @@ fn the_directory_keeps_its_limits_over_restarts() {
         // An hour apart.
         recording.header.time = format!("2026-02-{:02}T{:02}:00:00.000000Z", 1 + n / 24, n % 24);
         recording.header.id = format!("r{n:02}");
-        let entry = Store::open(&limits).write(&mut recording).unwrap();
+        let entry = Store::open(&limits).write(&mut recording, SystemTime::now()).unwrap();
         assert_eq!(entry.id, recording.header.id);
     }
     fs::write(limits.dir.join(".x.partial"), "half").unwrap();
@@ -162,20 +162,63 @@ fn the_directory_keeps_its_limits_over_restarts() {
         .collect();
     assert_eq!(files.len(), 11, "{files:?}");
     // The same id again, as after the clock was set back.
-    assert_eq!(Store::open(&limits).write(&mut recording).unwrap().id, "r29-2");
+    assert_eq!(
+        Store::open(&limits)
+            .write(&mut recording, SystemTime::now())
+            .unwrap()
+            .id,
+        "r29-2"
+    );
     let small = RecorderOptions {
         max_bytes: 100,
         ..limits
     };
-    let error = Store::open(&small).write(&mut recording).unwrap_err();
+    let error = Store::open(&small)
+        .write(&mut recording, SystemTime::now())
+        .unwrap_err();
     assert_eq!(error.kind(), io::ErrorKind::FileTooLarge);
+}
+
+#[test]
+fn after_the_clock_was_set_back_what_is_yet_to_come_goes_and_what_was_made_stays() {
+    let dir = tempfile::tempdir().unwrap();
+    let mut recording = recording();
+    let mut store = Store::open(&RecorderOptions {
+        dir: dir.path().to_path_buf(),
+        max_count: 3,
+        ..options()
+    });
+    let mut made = |id: &str, hour: u32| {
+        recording.header.time = format!("2026-02-03T{hour:02}:00:00.000000Z");
+        recording.header.id = id.to_string();
+        let now = humantime::parse_rfc3339(&recording.header.time).unwrap() + Duration::from_secs(10);
+        store.write(&mut recording, now).unwrap();
+        let (entries, _) = store::list(dir.path()).unwrap();
+        let shown: Vec<String> = store.entries().iter().map(|entry| entry.id.clone()).collect();
+        let ids: Vec<String> = entries.into_iter().map(|entry| entry.id).collect();
+        assert_eq!(shown, ids, "what is shown is what is there");
+        ids.join(" ")
+    };
+    for hour in 1..20 {
+        made(&format!("r{hour}"), hour);
+    }
+    assert_eq!(made("r20", 20), "r18 r19 r20");
+    // Two hours back.
+    assert_eq!(made("b1", 18), "b1 r18 r20");
+    assert_eq!(made("b2", 19), "b1 r18 b2");
+    assert_eq!(made("b3", 20), "r18 b2 b3");
+    // Back before all of them.
+    assert_eq!(made("c1", 1), "c1 b2 b3");
+    assert_eq!(made("c2", 2), "c1 c2 b3");
 }
 
 #[test]
 fn an_unwritable_directory_costs_the_recording_only() {
     let dir = tempfile::tempdir().unwrap();
     fs::write(dir.path().join("file"), "").unwrap();
-    let error = store_in(&dir.path().join("file")).write(&mut recording()).unwrap_err();
+    let error = store_in(&dir.path().join("file"))
+        .write(&mut recording(), SystemTime::now())
+        .unwrap_err();
     assert!(
         matches!(
             error.kind(),
@@ -184,7 +227,11 @@ fn an_unwritable_directory_costs_the_recording_only() {
         "{error}"
     );
     // A disk without room, as far as the file system goes.
-    assert!(store_in(Path::new("/proc/none")).write(&mut recording()).is_err());
+    assert!(
+        store_in(Path::new("/proc/none"))
+            .write(&mut recording(), SystemTime::now())
+            .is_err()
+    );
     assert!(store::list(Path::new("/proc/none")).unwrap().0.is_empty());
 }
 
@@ -197,7 +244,7 @@ fn a_process_that_is_killed_leaves_only_whole_recordings() {
         let (mut store, mut recording) = (store_in(Path::new(&dir)), recording());
         for n in 0.. {
             recording.header.id = format!("{}-{n}", std::process::id());
-            store.write(&mut recording).unwrap();
+            store.write(&mut recording, SystemTime::now()).unwrap();
         }
     }
     let dir = tempfile::tempdir().unwrap();

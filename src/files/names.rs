@@ -1,0 +1,74 @@
+//! The names of what the gateway keeps in its state directory and in that of the MQTT buffer.
+
+/// Events, and the older ones after it.
+pub const EVENTS: &str = "events.jsonl";
+/// Run hours and starts.
+pub const COUNTERS: &str = "counters.json";
+/// First part of the names of buffered MQTT events.
+pub const MQTT_EVENTS: &str = "mqtt-events";
+/// First part of the names of buffered MQTT history.
+pub const MQTT_HISTORY: &str = "mqtt-history";
+/// Number of the Sparkplug session.
+pub const SPARKPLUG: &str = "sparkplug-bdseq";
+/// Directory of the recordings.
+pub const RECORDINGS: &str = "recordings";
+/// Directory of the parameters.
+pub const PARAMS: &str = "params";
+
+/// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
+const OWN: [&str; 7] = [
+    EVENTS,
+    "counters",
+    MQTT_EVENTS,
+    MQTT_HISTORY,
+    SPARKPLUG,
+    RECORDINGS,
+    PARAMS,
+];
+
+/// Whether the gateway itself keeps something by that name, or may at some time.
+pub fn is_own(name: &str) -> bool {
+    let rest = |own: &&str| name.strip_prefix(*own);
+    OWN.iter()
+        .filter_map(rest)
+        .any(|rest| rest.is_empty() || rest.starts_with(['.', '-']))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn own_names_and_others() {
+        for own in [
+            EVENTS,
+            COUNTERS,
+            MQTT_EVENTS,
+            MQTT_HISTORY,
+            SPARKPLUG,
+            RECORDINGS,
+            PARAMS,
+        ] {
+            assert!(is_own(own), "{own}");
+        }
+        for own in [
+            "events.jsonl.1",
+            "counters.partial",
+            "counters.damaged-1",
+            "mqtt-events-1.log",
+            "mqtt-history-2-30.damaged",
+            "mqtt-events.lock",
+        ] {
+            assert!(is_own(own), "{own}");
+        }
+        for other in [
+            "audit.jsonl",
+            "events.log",
+            "commands.jsonl",
+            "countersigned",
+            "params2",
+        ] {
+            assert!(!is_own(other), "{other}");
+        }
+    }
+}
