@@ -94,7 +94,7 @@ class Orders:
 
 
 class Process:
-    """RSS, descriptors, threads and processor time of a process."""
+    """Memory, descriptors, threads and processor time of a process."""
 
     def __init__(self, pid):
         self.pid = pid
@@ -110,13 +110,15 @@ class Process:
         return int(fields[11]) + int(fields[12])
 
     def sample(self):
-        """RSS in MiB, descriptors, threads, percent of a core since the last sample."""
+        """RSS in MiB, that which is the process's own (no pages of files), descriptors, threads, percent of a core since the last sample."""
         status = self.status()
         ticks, now = self.cpu_ticks(), time.monotonic()
         cpu = 100.0 * (ticks - self.ticks) / os.sysconf("SC_CLK_TCK") / max(now - self.at, 0.001)
         self.ticks, self.at = ticks, now
+        mib = lambda key: int(status[key].split()[0]) / 1024.0
         return (
-            int(status["VmRSS"].split()[0]) / 1024.0,
+            mib("VmRSS"),
+            mib("RssAnon"),
             len(os.listdir(f"/proc/{self.pid}/fd")),
             int(status["Threads"]),
             cpu,

@@ -301,8 +301,8 @@ class Soak:
                 self.judge.violation(f"{program.name} ended with {program.child.returncode}; see {program.log}")
         if self.gateway.gone():
             return
-        rss, fds, threads, cpu = self.process.sample()
-        self.samples.append((number + 1, rss))
+        rss, own, fds, threads, cpu = self.process.sample()
+        self.samples.append((number + 1, rss, own))
         if cpu > CPU_LIMIT:
             self.judge.violation(f"{cpu:.1f} % of a core in a minute with {what}")
         try:
@@ -314,7 +314,7 @@ class Soak:
         if what == "calm":
             await self.calm(fds, threads)
         print(
-            f"minute {number + 1:4}  rss {rss:6.2f} MiB  fds {fds:3}  threads {threads:2}  cpu {cpu:4.1f} %  "
+            f"minute {number + 1:4}  rss {rss:6.2f} MiB  own {own:5.2f}  fds {fds:3}  threads {threads:2}  cpu {cpu:4.1f} %  "
             f"orders {self.orders.placed} open {len(self.orders.open)}  values {self.judge.values}  "
             f"violations {self.judge.violations}  ({what})",
             flush=True,
@@ -368,10 +368,11 @@ class Soak:
         return self.result()
 
     def result(self):
-        late = [(minute, rss) for minute, rss in self.samples if minute > WARM_UP]
+        late = [sample for sample in self.samples if sample[0] > WARM_UP]
         if len(late) > 1:
-            rise = slope([(minute / 60, rss) for minute, rss in late])
+            rise, of_own = (slope([(sample[0] / 60, sample[place]) for sample in late]) for place in (1, 2))
             text = f"slope of RSS after {WARM_UP} minutes: {rise:+.3f} MiB an hour over {len(late)} minutes"
+            print(f"of it pages of the process's own: {of_own:+.3f} MiB an hour; the rest are pages of program and libraries")
             if len(late) < JUDGED_FROM:
                 print(f"{text}; not judged below {JUDGED_FROM} minutes")
             else:
