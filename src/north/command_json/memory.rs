@@ -1,6 +1,6 @@
 //! Which commands were taken, so that a repetition is recognised. Time is an argument.
 
-use std::collections::{BTreeMap, HashMap, VecDeque};
+use std::collections::{BTreeMap, VecDeque};
 use std::hash::{BuildHasher, RandomState};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -37,12 +37,13 @@ pub(in crate::north) struct Memory<R> {
     hasher: RandomState,
     /// Oldest first.
     recent: VecDeque<Recent<R>>,
-    /// By topic, `id` and payload.
-    known: HashMap<u64, Known>,
+    /// By topic, `id` and payload. Trees, because entries come and go all day: a hash table doubles when removals have used up
+    /// its free places, and keeps the size that a flood needed.
+    known: BTreeMap<u64, Known>,
     /// The same by the time until which they are remembered.
     ends: BTreeMap<(Instant, u64), u64>,
     /// The last command by topic and `id`.
-    last_of: HashMap<u64, u64>,
+    last_of: BTreeMap<u64, u64>,
     /// Number of commands taken so far.
     taken: u64,
     /// Commands up to this number get no result any more if they have none.
@@ -65,9 +66,9 @@ impl<R> Default for Memory<R> {
         Memory {
             hasher: RandomState::default(),
             recent: VecDeque::new(),
-            known: HashMap::new(),
+            known: BTreeMap::new(),
             ends: BTreeMap::new(),
-            last_of: HashMap::new(),
+            last_of: BTreeMap::new(),
             taken: 0,
             abandoned: 0,
         }
