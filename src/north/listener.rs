@@ -4,9 +4,11 @@
 use std::future::Future;
 use std::io;
 use std::net::{IpAddr, SocketAddr};
+use std::os::fd::AsFd;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use rustix::net::{Shutdown, shutdown};
 use tokio::net::{TcpListener, TcpStream};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
@@ -180,6 +182,9 @@ impl<H: ConnectionHandler> Listeners<H> {
 
     /// Closes the new sockets. A listener whose socket was closed for them binds it again, now or as soon as it can.
     pub(super) fn abort(&mut self, new: NewSockets) {
+        for socket in new.wanted.iter().filter_map(|(_, socket)| socket.as_ref()) {
+            stop_listening(socket);
+        }
         drop(new.wanted);
         for index in new.released {
             let Some(mut listener) = (index < self.open.len()).then(|| self.open.remove(index)) else {
@@ -246,9 +251,9 @@ impl<H: ConnectionHandler> Listeners<H> {
         };
         let run = async move {
             // A socket belongs to the runtime that this runs on.
-            let first = socket.and_then(|socket| TcpListener::from_std(socket).ok());
+            let first = socket.and_then(|socket| ListeningSocket::new(socket).ok());
             let address = accept.address;
-            accept.run(first, move || TcpListener::from_std(bind(address)?)).await;
+            accept.run(first, move || ListeningSocket::new(bind(address)?)).await;
         };
         listener.stopped = Some(self.tasks.spawn_on(run, &listener.runtime));
     }
@@ -259,6 +264,13 @@ fn bind(address: SocketAddr) -> io::Result<std::net::TcpListener> {
     let socket = std::net::TcpListener::bind(address)?;
     socket.set_nonblocking(true)?;
     Ok(socket)
+}
+
+/// Frees the address of a socket that is about to be closed, also while a copy of the socket is open: a process that
+/// was forked has one until it executes its program.
+fn stop_listening(socket: &impl AsFd) {
+    // It fails for a socket that is lost, which listens no longer.
+    let _ = shutdown(socket, Shutdown::Both);
 }
 
 /// Accepts the connections to one socket.
@@ -347,9 +359,24 @@ trait Accept: Send {
     fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send;
 }
 
-impl Accept for TcpListener {
+/// Listens until it is dropped.
+struct ListeningSocket(TcpListener);
+
+impl ListeningSocket {
+    fn new(socket: std::net::TcpListener) -> io::Result<ListeningSocket> {
+        TcpListener::from_std(socket).map(ListeningSocket)
+    }
+}
+
+impl Drop for ListeningSocket {
+    fn drop(&mut self) {
+        stop_listening(&self.0);
+    }
+}
+
+impl Accept for ListeningSocket {
     fn accept(&mut self) -> impl Future<Output = io::Result<(TcpStream, SocketAddr)>> + Send {
-        TcpListener::accept(self)
+        self.0.accept()
     }
 }
 

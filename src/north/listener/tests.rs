@@ -226,6 +226,31 @@ async fn a_socket_that_overlaps_a_new_one_is_closed_for_it_or_comes_back() {
     bench.stop.cancel();
 }
 
+/// A process that was forked has all sockets until it executes its program, as this test has copies of them.
+#[tokio::test]
+async fn an_address_is_free_as_soon_as_its_listener_is_closed() {
+    let bench = Bench::new();
+    let (mut listeners, handler) = (bench.listeners(), bench.handler.clone());
+    let [address, other] = [(); 2].map(|()| free_address());
+    let mut copies = Vec::new();
+    for tls in [false, true, false] {
+        let spec = ListenerSpec {
+            tls,
+            ..specs(&[address]).remove(0)
+        };
+        let new = listeners.prepare(vec![spec]).await.unwrap();
+        copies.extend(new.wanted[0].1.as_ref().map(|socket| socket.try_clone().unwrap()));
+        listeners.commit(new, |_, _, _| (handler.clone(), Handle::current()));
+        TcpStream::connect(address).await.unwrap();
+    }
+    assert_eq!(copies.len(), 3, "each has a socket of its own");
+    let new = listeners.prepare(specs(&[address, other])).await.unwrap();
+    copies.extend(new.wanted[1].1.as_ref().map(|socket| socket.try_clone().unwrap()));
+    listeners.abort(new);
+    bind(other).unwrap();
+    bench.stop.cancel();
+}
+
 async fn until_closed(address: SocketAddr) {
     let deadline = Instant::now() + Duration::from_secs(60);
     while TcpStream::connect(address).await.is_ok() {
