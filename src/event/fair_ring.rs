@@ -37,15 +37,26 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
             let own = self.sources.get(&source).map_or(0, VecDeque::len);
             if let Some((share, of)) = largest {
                 let from = if own >= share { &source } else { &of };
-                self.change(from, VecDeque::pop_front);
+                self.change(from, |items| {
+                    items.pop_front();
+                    // A source that once had most of the ring gives back what it no longer needs.
+                    if items.capacity() > items.len() + 2 * spare(items) {
+                        items.shrink_to(items.len() + spare(items));
+                    }
+                });
                 self.kept -= 1;
             }
         }
-        self.change(&source, |items| items.push_back((number, item)));
+        self.change(&source, |items| {
+            if items.len() == items.capacity() {
+                items.reserve_exact(spare(items));
+            }
+            items.push_back((number, item));
+        });
         self.kept += 1;
     }
 
-    fn change<R>(&mut self, source: &K, change: impl FnOnce(&mut VecDeque<(u64, T)>) -> R) {
+    fn change(&mut self, source: &K, change: impl FnOnce(&mut VecDeque<(u64, T)>)) {
         let items = self.sources.entry(source.clone()).or_default();
         if let Some((oldest, _)) = items.front() {
             self.shares.remove(&(items.len(), Reverse(*oldest), source.clone()));
@@ -62,6 +73,11 @@ impl<K: Ord + Clone, T> FairRing<K, T> {
     pub fn iter(&self) -> impl Iterator<Item = &(u64, T)> {
         self.sources.values().flatten()
     }
+}
+
+/// Places that a source has beside those of its items. Doubling them would leave each source the most that it ever had.
+fn spare<T>(items: &VecDeque<T>) -> usize {
+    items.len() / 8 + 4
 }
 
 /// The items of two rings that are numbered together, with their numbers, in their order.
@@ -107,5 +123,21 @@ mod tests {
         kept.sort_unstable();
         assert_eq!(kept, [2, 3, 4]);
         assert_eq!(ring.sources.len(), 3, "a source without items is forgotten");
+    }
+
+    #[test]
+    fn memory_is_for_what_is_kept() {
+        let mut ring = FairRing::new(1000);
+        for n in 0..40_000 {
+            // Each of twenty sources has a time when it floods.
+            ring.push(n / 2000, n, ());
+            let places: usize = ring.sources.values().map(VecDeque::capacity).sum();
+            assert!(
+                places <= ring.kept * 5 / 4 + 8 * ring.sources.len(),
+                "{places} for {}",
+                ring.kept
+            );
+        }
+        assert_eq!((ring.kept, ring.sources.len()), (1000, 20));
     }
 }

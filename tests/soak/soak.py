@@ -18,6 +18,7 @@ import sys
 import tempfile
 import time
 
+import earlier
 from clients import Hostile, Modbus, Mqtt, http_get, read_http
 from drives import Drive, Line
 from gateway import Gateway, Program, broker_program, buses, free_port, libfaketime
@@ -30,7 +31,6 @@ SLOPE_BOUND = 0.1  # MiB an hour
 JUDGED_FROM = 80  # minutes after the warm-up from which the slope is judged
 ANSWER_LIMIT = 40.0  # seconds until an order counts as lost
 CPU_LIMIT = 15.0  # percent of a core in any minute; about 5 with the load alone
-EVENTS = 5000  # more than the gateway keeps
 
 
 class Soak:
@@ -87,7 +87,8 @@ class Soak:
             self.programs.append(self.clocked)
         else:
             self.judge.skip("clock steps: libfaketime is not installed (package faketime)")
-        self.earlier_events(state)
+        drives = [(drive.name, "remote") for drive in self.drives] + [(name, name.split("-")[0]) for name in self.simulated]
+        earlier.write_events(state / "events.jsonl", drives)
         self.broker.start()
         self.simulator.start()
         await asyncio.sleep(2)
@@ -106,27 +107,6 @@ class Soak:
         self.process = Process(self.gateway.child.pid)
         for work in (self.behave, self.read, self.intrude):
             self.tasks.append(asyncio.create_task(self.forever(work)))
-
-    def earlier_events(self, state):
-        """As many events of an earlier run as the gateway keeps: filling that list takes hours by itself and would pass for a leak."""
-        names = [(drive.name, "remote") for drive in self.drives] + [(name, name.split("-")[0]) for name in self.simulated]
-        by = "mqtt drivegate/soak/drive/{}/set"
-        texts = {
-            "started": "drive {} has started: ordered by " + by,
-            "stopped": "drive {} has stopped: ordered by " + by,
-            "refused_command": "refused write holding 33024 = 0x0001 from modbus_tcp 127.0.0.2:42239: this client may not write: its address "
-            'is not in `write`, or, with TLS, its certificate has no role that `roles` maps to "control" (19 commands of it were refused)',
-        }
-        begin = time.time() - 86400
-        with open(pathlib.Path(state) / "events.jsonl", "w", encoding="utf-8") as file:
-            for number in range(EVENTS):
-                name, bus = names[number % len(names)]
-                kind = "refused_command" if number % 8 == 7 else ("started", "stopped")[number // len(names) % 2]
-                at = time.strftime("%Y-%m-%dT%H:%M:%S.000Z", time.gmtime(begin + number))
-                event = {"id": number + 1, "boot": "00000000000050ac", "time": at, "event": kind, "bus": bus, "drive": name}
-                if kind != "refused_command":
-                    event["by"] = by.format(name)
-                file.write(json.dumps({**event, "text": texts[kind].format(name, name)}) + "\n")
 
     async def ready(self, seconds):
         """Waits until every drive was polled."""
