@@ -426,7 +426,10 @@ impl Daemon {
         if settings.gateway != self.settings.gateway {
             self.mqtt.stop().await;
         }
-        self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await
+        let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
+        // Nobody publishes what came while there was no client.
+        self.stats.mqtt.keep_unread(None);
+        applied
     }
 
     /// Opens the local socket if one is configured. The gateway runs without it if it cannot be opened; a reload tries

@@ -5,6 +5,7 @@ mod placed;
 mod why;
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use arc_swap::ArcSwap;
@@ -30,6 +31,11 @@ pub(crate) use self::why::explain;
 /// The plant as it is configured now; a reload puts a new one in its place.
 pub type SharedPlant = Arc<ArcSwap<Plant>>;
 
+/// Where the stops of the next drive are counted from that is started or added.
+static ADDED: AtomicU64 = AtomicU64::new(STOPS_OF_ONE);
+/// More stops than one drive gets.
+const STOPS_OF_ONE: u64 = 1 << 40;
+
 /// One bus: its image and its queue.
 #[derive(Debug, Clone)]
 pub struct BusHandle {
@@ -41,6 +47,8 @@ pub struct BusHandle {
 
 impl BusHandle {
     /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if name and address are.
+    /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
+    /// that name is outdated.
     pub fn take_over(&self, before: &[BusHandle]) {
         for (index, drive) in self.image.drives.iter().enumerate() {
             let same = |image: &Arc<DriveImage>| {
@@ -51,9 +59,8 @@ impl BusHandle {
                 let queue = bus.queue.lock();
                 Some((queue.commander(place).cloned(), queue.stops(place)))
             });
-            if let Some((commander, stops)) = known {
-                self.queue.lock().take_over(index, commander, stops);
-            }
+            let (commander, stops) = known.unwrap_or_else(|| (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)));
+            self.queue.lock().take_over(index, commander, stops);
         }
     }
 }
@@ -249,7 +256,8 @@ impl DriveHandle {
         self.image.reading(now, self.stale_after)
     }
 
-    /// Stops of the drive that were taken in since the gateway was started, or since a reload added the drive.
+    /// Stops of the drive that were taken in, from some number on; another one when a reload removed and added the drive, or
+    /// changed its address.
     pub fn stops(&self) -> u64 {
         self.bus.queue.lock().stops(self.index)
     }

@@ -3,10 +3,14 @@
 use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::SystemTime;
 
+use tokio::sync::broadcast::Receiver;
+
 use super::command_json::SharedMemory;
+use super::http::PostedCommands;
+use crate::event::Event;
 
 /// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
 #[derive(Debug, Default)]
@@ -23,8 +27,10 @@ pub struct NorthStats {
     pub lost_listeners: LostListeners,
     /// The last time the configuration was read.
     pub reload: ReloadStats,
-    /// Commands that came by way of the broker in the last minutes.
+    /// Commands that came by way of the broker in the last minutes, and their results as payloads.
     pub(super) taken: SharedMemory,
+    /// Commands that came over HTTP.
+    pub(super) posted: PostedCommands,
 }
 
 /// How the last reload ended; the start counts as one.
@@ -320,6 +326,8 @@ pub struct MqttStats {
     lost: [AtomicU64; MqttLoss::ALL.len()],
     /// The retained topics of the client that runs, for the one that a reload puts in its place.
     retained: Mutex<Vec<String>>,
+    /// The events that the client that has ended did not take any more, for the same one.
+    unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
 }
 
 /// What the MQTT client lost.
@@ -352,6 +360,12 @@ impl MqttStats {
     pub(crate) fn keep_retained(&self, topics: Vec<String>) -> Vec<String> {
         let mut kept = self.retained.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut kept, topics)
+    }
+
+    /// Keeps the events that a client leaves when it ends, or forgets them; returns those kept before.
+    pub(crate) fn keep_unread(&self, events: Option<Receiver<Arc<Event>>>) -> Option<Receiver<Arc<Event>>> {
+        let mut kept = self.unread_events.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, events)
     }
 
     /// Counts lost messages.

@@ -50,13 +50,25 @@ pub(in crate::north) struct Memory<R> {
     abandoned: u64,
 }
 
-/// What the clients of one broker share, also with those that a reload starts in their place: the same commands come again
-/// over a new connection. The results are payloads.
-#[derive(Debug, Clone, Default)]
-pub(in crate::north) struct SharedMemory(Arc<Mutex<Memory<Arc<[u8]>>>>);
+/// What the clients of one broker, or the connections of the HTTP server, share, also with those that a reload starts in
+/// their place: the same commands come again over a new connection. Results by way of a broker are payloads.
+#[derive(Debug)]
+pub(in crate::north) struct SharedMemory<R = Arc<[u8]>>(Arc<Mutex<Memory<R>>>);
 
-impl SharedMemory {
-    pub(in crate::north) fn lock(&self) -> MutexGuard<'_, Memory<Arc<[u8]>>> {
+impl<R> Clone for SharedMemory<R> {
+    fn clone(&self) -> SharedMemory<R> {
+        SharedMemory(self.0.clone())
+    }
+}
+
+impl<R> Default for SharedMemory<R> {
+    fn default() -> SharedMemory<R> {
+        SharedMemory(Arc::default())
+    }
+}
+
+impl<R> SharedMemory<R> {
+    pub(in crate::north) fn lock(&self) -> MutexGuard<'_, Memory<R>> {
         self.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
@@ -160,7 +172,9 @@ impl<R: Clone> Memory<R> {
             return Some(Repetition::Pending);
         }
         if known.stops != stops {
-            return Some(Repetition::Outdated("but a stop was received since"));
+            return Some(Repetition::Outdated(
+                "but the drive was stopped since, or added anew by a reload",
+            ));
         }
         if let Some(last) = self.last_of.get(&known.identity)
             && *last != known.number

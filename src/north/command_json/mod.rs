@@ -6,7 +6,7 @@ mod result;
 
 #[cfg(test)]
 pub(super) use self::memory::REMEMBERED;
-pub(super) use self::memory::{Memory, Repetition, SharedMemory, Taken};
+pub(super) use self::memory::{Repetition, SharedMemory, Taken};
 #[cfg(test)]
 pub(super) use self::request::MAX_ID;
 pub(super) use self::request::{Id, MAX_PAYLOAD, Points, check_size, excerpt, find_id, order, resolve, unknown_drive};

@@ -44,6 +44,7 @@ use tokio_util::task::TaskTracker;
 use self::hosts::Host;
 use self::in_use::InUse;
 use self::operating::Operating;
+pub(super) use self::operating::PostedCommands;
 use self::routes::Reached;
 use self::terms::{Terms, Tls};
 use super::connection_limit::{ConnectionLimit, ConnectionPermit, LimitReached, Limits, Newcomer};
@@ -238,8 +239,8 @@ pub async fn start(
         listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel),
         terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
         plant,
+        operating: Arc::new(Operating::new(stats.clone())),
         stats,
-        operating: Arc::new(Operating::new()),
         tasks,
     };
     let change = http.prepare(options).await?;

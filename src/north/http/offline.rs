@@ -42,7 +42,7 @@ impl Offline {
         let router = routes::router(
             plant,
             Default::default(),
-            Arc::new(Operating::new()),
+            Arc::new(Operating::new(Arc::default())),
             CancellationToken::new(),
         );
         let service = TowerToHyperService::new(router);

@@ -561,6 +561,8 @@ impl Client {
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");
         }
+        // A client that a reload starts goes on there.
+        self.stats.mqtt.keep_unread(Some(self.events));
     }
 
     async fn disconnect(&mut self, last_results: tokio::time::Instant) {

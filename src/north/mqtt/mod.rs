@@ -161,7 +161,7 @@ impl Buffer {
 }
 
 /// The running MQTT client.
-#[derive(Debug)]
+#[derive(Debug, Default)]
 pub struct Mqtt(Vec<JoinHandle<()>>);
 
 impl Mqtt {
@@ -177,11 +177,13 @@ impl Mqtt {
 }
 
 /// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
-/// raised from now on are published, so start it before the buses.
+/// raised from now on, or since the client before it ended, are published, so start it before the buses.
 pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
     options.buffer = options.buffer.or_else(Buffer::of_system);
-    // Subscribed here and not in the task, so that no event after this call is missed.
+    // Subscribed here and not in the task, so that no event after this call is missed, and none since the client before ended.
     let events = plant.load().events.subscribe();
+    let unread = stats.mqtt.keep_unread(None);
+    let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);
     let node = options.sparkplug.clone().map(|node| {
         let broker = options.clone();
         tokio::spawn(sparkplug::run(

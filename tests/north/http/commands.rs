@@ -427,7 +427,11 @@ async fn a_repeated_command_is_executed_once_and_has_one_result() {
     assert_eq!(rig.command(&bob, STOP).await.status, 200);
     let outdated = rig.command(&alice, body).await;
     assert_eq!(outdated.status, 403);
-    assert!(outdated.body.contains("a stop was received since"), "{}", outdated.body);
+    assert!(
+        outdated.body.contains("the drive was stopped since"),
+        "{}",
+        outdated.body
+    );
     assert_eq!(rig.bus.orders().len(), 2);
 }
 

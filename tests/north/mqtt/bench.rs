@@ -478,6 +478,21 @@ impl Gateway {
         self.runtime.block_on(stopped).expect("it stops");
     }
 
+    /// As a reload that changes the options: the client ends, `meanwhile` goes on, another client begins.
+    pub(crate) fn replace(mut self, options: Options, meanwhile: impl FnOnce(&Gateway)) -> Gateway {
+        self.cancel.cancel();
+        let idle = Mqtt::default();
+        let before = std::mem::replace(&mut self.mqtt, idle);
+        let stopped = async { tokio::time::timeout(DEADLINE, before.stopped()).await };
+        self.runtime.block_on(stopped).expect("it stops");
+        meanwhile(&self);
+        self.cancel = CancellationToken::new();
+        let guard = self.runtime.enter();
+        self.mqtt = mqtt::start(options, self.plant.clone(), self.stats.clone(), self.cancel.clone());
+        drop(guard);
+        self
+    }
+
     /// As kill -9: everything stops where it is, sockets are closed without a word.
     pub(crate) fn kill(self) {
         self.runtime.shutdown_background();

@@ -47,6 +47,27 @@ fn a_broker_that_comes_later_is_found() {
 }
 
 #[test]
+fn what_happens_while_a_reload_replaces_the_client_is_published_once() {
+    let broker = Broker::start();
+    let watcher = Watcher::new(&broker, "drivegate/#");
+    let gateway = Gateway::start(options(broker.port), plant(&["p1"]));
+    watcher.wait_payload("drivegate/hall/status", "online");
+    gateway.publish_event("p1", EventKind::Fault, "before");
+    let mut other = options(broker.port);
+    other.min_interval += Duration::from_millis(1);
+    let gateway = gateway.replace(other, |gateway| {
+        gateway.publish_event("p1", EventKind::FaultEnd, "between");
+    });
+    gateway.publish_event("p1", EventKind::Fault, "after");
+    watcher.wait("the last event", |seen| {
+        seen.topic == EVENT && seen.json()["text"] == "after"
+    });
+    gateway.stop();
+    let seen: Vec<Seen> = watcher.all().into_iter().filter(|seen| seen.topic == EVENT).collect();
+    assert_eq!(texts(&seen), ["before", "between", "after"]);
+}
+
+#[test]
 fn a_killed_broker_gets_everything_again() {
     let mut broker = Broker::start();
     let line = CutLine::to(broker.port);

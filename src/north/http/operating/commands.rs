@@ -19,20 +19,23 @@ use crate::command::{Answer, Authority, Order, Origin, Outcome, Refusal, SourceK
 use crate::drive::ModelPoint;
 use crate::drive::model::Kind;
 use crate::north::command_json::{
-    self, CommandResult, Id, MAX_PAYLOAD, Memory, Repetition, Taken, excerpt, find_id, unknown_drive,
+    self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
 };
 use crate::plant::{DriveHandle, Placed, Plant};
 use crate::process_image::Access;
 
+/// The commands that came over HTTP, also to the server that a reload starts in the place of one that ended.
+pub(in crate::north) type PostedCommands = SharedMemory<SharedReply>;
+
 /// The reply to a command.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct CommandReply {
+pub(in crate::north) struct CommandReply {
     status: StatusCode,
     body: Vec<u8>,
 }
 
 /// The reply to a command, which may be still to come, for everybody who repeats it.
-pub(super) type SharedReply = watch::Receiver<Option<CommandReply>>;
+pub(in crate::north) type SharedReply = watch::Receiver<Option<CommandReply>>;
 
 /// A command that was understood, or not.
 enum Progress {
@@ -230,8 +233,7 @@ impl Operating {
         let Some(id) = id else {
             return Ok((sender, permit));
         };
-        let mut memory = self.memory.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
-        let memory: &mut Memory<SharedReply> = &mut memory;
+        let mut memory = self.stats.posted.lock();
         let topic = format!("{}/{}", operator.user, drive.image.spec.name);
         let taken = Taken {
             topic: &topic,

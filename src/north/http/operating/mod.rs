@@ -32,9 +32,10 @@ use self::throttle::{Source, Throttle};
 use self::verifier::Verifier;
 use super::users::{MAX_PASSWORD, User, Users};
 use crate::command::Authority;
-use crate::north::command_json::Memory;
+use crate::north::NorthStats;
 use crate::north::log_throttle::LogThrottle;
 
+pub(in crate::north) use self::commands::PostedCommands;
 pub(super) use self::commands::{command, commands_of, heartbeat};
 pub(super) use self::login::{log_in, log_out, session};
 
@@ -63,7 +64,7 @@ pub(super) struct Operating {
     hasher: RandomState,
     /// For passwords in memory; `None` if the system has no random numbers: nothing is kept then.
     key: Option<hmac::Key>,
-    memory: Mutex<Memory<commands::SharedReply>>,
+    stats: Arc<NorthStats>,
     in_progress: Arc<Semaphore>,
     /// Limits the log of failed logins.
     failures: LogThrottle,
@@ -136,14 +137,14 @@ struct Credentials {
 }
 
 impl Operating {
-    pub(super) fn new() -> Operating {
+    pub(super) fn new(stats: Arc<NorthStats>) -> Operating {
         Operating {
             users: ArcSwapOption::empty(),
             state: Mutex::default(),
             verifier: Verifier::default(),
             hasher: RandomState::default(),
             key: hmac::Key::generate(hmac::HMAC_SHA256, &SystemRandom::new()).ok(),
-            memory: Mutex::default(),
+            stats,
             in_progress: Arc::new(Semaphore::new(IN_PROGRESS)),
             failures: LogThrottle::default(),
         }

@@ -114,7 +114,7 @@ async fn an_unknown_user_takes_the_time_of_a_known_one() {
     let made = User::new("alice", "correct horse").unwrap();
     let parameters = |user: &User| user.hash().split('$').nth(3).unwrap().to_string();
     assert_eq!(parameters(&nobody), parameters(&made), "also while there is no user");
-    let operating = Operating::new();
+    let operating = Operating::new(Arc::default());
     operating.set_users(Some(Users::default()));
     let given = Credentials {
         user: "alice".to_string(),
@@ -137,7 +137,7 @@ async fn an_unknown_user_takes_the_time_of_a_known_one() {
 
 #[tokio::test]
 async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
-    let operating = Operating::new();
+    let operating = Operating::new(Arc::default());
     let user = User::new("alice", "correct horse").unwrap();
     operating.set_users(Some(Users::parse(&user.to_string()).unwrap()));
     let given = |password: &str| Credentials {
@@ -177,7 +177,7 @@ async fn a_password_that_was_right_is_not_held_up_by_guesses_at_its_address() {
 
 #[test]
 fn who_did_something_keeps_its_places() {
-    let operating = Operating::new();
+    let operating = Operating::new(Arc::default());
     let user = User::new("alice", "correct horse").unwrap();
     let users = Users::parse(&user.to_string()).unwrap();
     operating.set_users(Some(users.clone()));

@@ -40,6 +40,13 @@ impl Bench {
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
+    /// One reload removes the bus, a later one adds it again.
+    fn remove_and_add(&mut self) {
+        self.plant = fixture::plant(&["p1"]);
+        self.plant.buses[0].take_over(&[]);
+        fixture::read(&self.plant, "p1", 1, 0, self.now);
+    }
+
     fn take(&mut self, incoming: Incoming) -> Option<Message> {
         self.commands
             .take(incoming, &self.plant, |_| false, self.now, SystemTime::UNIX_EPOCH)
@@ -438,6 +445,28 @@ fn a_repetition_after_a_stop_is_refused() {
     let again = json(&bench.take(Incoming { dup: true, ..run }).expect("an answer at once"));
     assert_eq!(again["error"]["code"], "not_allowed", "{again}");
     assert_eq!(bench.queued(), 0);
+}
+
+#[test]
+fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
+    let mut bench = Bench::new();
+    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
+    assert_eq!(bench.take(run.clone()), None);
+    bench.acknowledge();
+    assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
+    bench.acknowledge();
+    for _ in 0..2 {
+        bench.remove_and_add();
+        let again = json(&bench.take(run.clone()).expect("an answer at once"));
+        assert_eq!(again["error"]["code"], "not_allowed", "{again}");
+        assert_eq!(bench.queued(), 0);
+    }
+    // Also where no stop came.
+    let start = set("p1/set", r#"{"id": 3, "run": true}"#);
+    assert_eq!(bench.take(start.clone()), None);
+    bench.acknowledge();
+    bench.remove_and_add();
+    assert_eq!(json(&bench.take(start).unwrap())["error"]["code"], "not_allowed");
 }
 
 #[test]

@@ -25,7 +25,7 @@ impl Bench {
             fixture::read(&plant, drive, 0b11, 0, now);
         }
         Bench {
-            operating: Operating::new(),
+            operating: Operating::new(Arc::default()),
             plant,
             now,
         }
