@@ -8,6 +8,8 @@ pub const COUNTERS: &str = "counters.json";
 pub const MQTT_EVENTS: &str = "mqtt-events";
 /// First part of the names of buffered MQTT history.
 pub const MQTT_HISTORY: &str = "mqtt-history";
+/// Retained MQTT topics of the last run.
+pub const MQTT_TOPICS: &str = "mqtt-topics";
 /// Number of the Sparkplug session.
 pub const SPARKPLUG: &str = "sparkplug-bdseq";
 /// Directory of the recordings.
@@ -16,11 +18,12 @@ pub const RECORDINGS: &str = "recordings";
 pub const PARAMS: &str = "params";
 
 /// What the names begin with, before a `.` or `-` or their end; counters are written and set aside under other endings.
-const OWN: [&str; 7] = [
+const OWN: [&str; 8] = [
     EVENTS,
     "counters",
     MQTT_EVENTS,
     MQTT_HISTORY,
+    MQTT_TOPICS,
     SPARKPLUG,
     RECORDINGS,
     PARAMS,
@@ -45,6 +48,7 @@ mod tests {
             COUNTERS,
             MQTT_EVENTS,
             MQTT_HISTORY,
+            MQTT_TOPICS,
             SPARKPLUG,
             RECORDINGS,
             PARAMS,
@@ -58,6 +62,7 @@ mod tests {
             "mqtt-events-1.log",
             "mqtt-history-2-30.damaged",
             "mqtt-events.lock",
+            "mqtt-topics.new",
         ] {
             assert!(is_own(own), "{own}");
         }

@@ -16,6 +16,7 @@ use tokio::sync::mpsc;
 use super::Buffer;
 use super::journal::Journal;
 use super::outbox::{KEPT_BYTES, Message};
+use crate::files::names::MQTT_TOPICS;
 use crate::north::{MqttLoss, NorthStats};
 
 /// Jobs that wait for the disk: a burst of events and its acknowledgements. The size of their messages is at most
@@ -380,7 +381,7 @@ impl Thread {
     }
 
     fn topics_file(&self) -> PathBuf {
-        self.dir.join("mqtt-topics")
+        self.dir.join(MQTT_TOPICS)
     }
 
     fn read_topics(&self) -> Vec<String> {
@@ -389,7 +390,7 @@ impl Thread {
     }
 
     fn write_topics(&self, topics: &[String]) {
-        let (file, new) = (self.topics_file(), self.dir.join("mqtt-topics.new"));
+        let (file, new) = (self.topics_file(), self.dir.join(format!("{MQTT_TOPICS}.new")));
         let written = std::fs::write(&new, topics.join("\n")).and_then(|()| std::fs::rename(&new, &file));
         if let Err(error) = written {
             let file = file.display();
