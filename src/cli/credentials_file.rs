@@ -38,19 +38,21 @@ impl CredentialsFile<'_> {
     /// # Errors
     /// That of `change`, or what the system reports; the file is as it was.
     pub(super) fn change(&self, change: impl FnOnce(&str) -> Result<String, String>) -> Result<(), String> {
-        let _lock = self.lock()?;
+        // A link stays one.
+        let file = self.path.canonicalize().unwrap_or_else(|_| self.path.to_path_buf());
+        let _lock = self.lock(&file)?;
         let text = match self.path.exists() {
             true => self.read()?,
             false => String::new(),
         };
-        self.write(&change(&text)?)
+        self.write(&file, &change(&text)?)
     }
 
-    /// The directory, locked: the file itself is replaced at each change.
-    fn lock(&self) -> Result<File, String> {
+    /// The directory of the file, locked: the file itself is replaced at each change.
+    fn lock(&self, file: &Path) -> Result<File, String> {
         let (what, shown) = (self.what, self.path.display());
         let failed = |error: io::Error| format!("cannot lock the {what} file: {error}; {shown}; check the directory");
-        let dir = match self.path.parent() {
+        let dir = match file.parent() {
             Some(dir) if !dir.as_os_str().is_empty() => dir,
             _ => Path::new("."),
         };
@@ -72,15 +74,15 @@ impl CredentialsFile<'_> {
 
     /// Replaces the file as a whole, so that a gateway that reloads meanwhile reads the old one or the new one. Owner, group
     /// and permissions stay: they are what lets the gateway read it.
-    fn write(&self, text: &str) -> Result<(), String> {
+    fn write(&self, path: &Path, text: &str) -> Result<(), String> {
         let (what, shown) = (self.what, self.path.display());
         let failed = |error: io::Error| format!("cannot write the {what} file: {error}; {shown}; check the directory");
-        let mut name = self.path.as_os_str().to_owned();
+        let mut name = path.as_os_str().to_owned();
         name.push(".new");
         let new = PathBuf::from(name);
         // What a change that was killed left behind.
         let _ = remove_file(&new);
-        let old = metadata(self.path).ok();
+        let old = metadata(path).ok();
         let mut options = OpenOptions::new();
         let file = options
             .write(true)
@@ -101,7 +103,7 @@ impl CredentialsFile<'_> {
             { &file }
                 .write_all(text.as_bytes())
                 .and_then(|()| file.sync_all())
-                .and_then(|()| rename(&new, self.path))
+                .and_then(|()| rename(&new, path))
                 .map_err(failed)
         });
         if written.is_err() {
@@ -168,6 +170,17 @@ mod tests {
         file(&path).change(|text| Ok(without(text, "n7"))).unwrap();
         assert_eq!(file(&path).read().unwrap().lines().count(), 15);
         assert_eq!(std::fs::read_dir(folder.path()).unwrap().count(), 1);
+    }
+
+    #[test]
+    fn a_link_stays_one() {
+        let folder = tempfile::tempdir().unwrap();
+        let (real, link) = (folder.path().join("real"), folder.path().join("link"));
+        std::fs::write(&real, "a x\n").unwrap();
+        std::os::unix::fs::symlink("real", &link).unwrap();
+        file(&link).change(|text| Ok(with_line(text, "b x"))).unwrap();
+        assert_eq!(file(&real).read().unwrap(), "a x\nb x\n");
+        assert!(link.is_symlink());
     }
 
     #[test]
