@@ -116,7 +116,21 @@ fn collect(config: &Path, settings: &Settings, with_keys: bool) -> io::Result<So
     let mut decided: Vec<PathBuf> = named.iter().map(|file| real(&file.path)).collect();
     decided.push(real(&settings.recordings.dir));
     state(&settings.state_dir, Path::new(""), &decided, &mut sources)?;
+    let audit = settings.audit.iter().flat_map(|audit| audit.files());
+    let buffer = settings
+        .mqtt
+        .iter()
+        .filter_map(|mqtt| Some(mqtt.buffer.as_ref()?.dir.clone()));
+    elsewhere(&settings.state_dir, audit.chain(buffer), &mut sources);
     Ok(sources)
+}
+
+/// Names what the gateway keeps outside of its state directory.
+fn elsewhere(state_dir: &Path, kept: impl Iterator<Item = PathBuf>, sources: &mut Sources) {
+    let state_dir = real(state_dir);
+    for path in kept.filter(|path| path.exists() && !real(path).starts_with(&state_dir)) {
+        sources.leave_out(&path, "it is outside the state directory");
+    }
 }
 
 fn real(path: &Path) -> PathBuf {
@@ -145,6 +159,9 @@ fn state(dir: &Path, below: &Path, decided: &[PathBuf], sources: &mut Sources) -
             state(dir, &below, decided, sources)?;
         } else if !kind.is_file() {
             sources.leave_out(&path, "it is no plain file");
+        } else if path.extension().is_some_and(|ending| ending == "tar") {
+            // Else each backup would have those before it.
+            sources.leave_out(&path, "it is an archive");
         } else if let Err(error) = sources.add(Root::State, dir, &below)
             && error.kind() != io::ErrorKind::NotFound
         {
@@ -255,6 +272,7 @@ mod tests {
             "recordings/r1.dgrec",
             ".restore-77/drivegate.toml",
             "tls/gateway.key",
+            "yesterday.tar",
         ] {
             let path = dir.join(path);
             fs::create_dir_all(path.parent().unwrap()).unwrap();
@@ -271,14 +289,42 @@ mod tests {
             "state/params/fan-1/restore.journal",
         ];
         assert_eq!(names, expected);
-        let left_out = LeftOut {
-            path: dir.join("params/pump-1"),
-            why: "it is no plain file".to_string(),
+        let left_out = |path: &str, why: &str| LeftOut {
+            path: dir.join(path),
+            why: why.to_string(),
         };
-        assert_eq!(sources.left_out, [left_out]);
+        let expected = [
+            left_out("params/pump-1", "it is no plain file"),
+            left_out("yesterday.tar", "it is an archive"),
+        ];
+        assert_eq!(sources.left_out, expected);
         let mut nothing = Sources::default();
         state(&folder.path().join("none"), Path::new(""), &[], &mut nothing).unwrap();
         assert!(nothing.files.is_empty());
+    }
+
+    #[test]
+    fn what_is_kept_outside_of_the_state_directory_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let at = |path: &str| folder.path().join(path);
+        for dir in ["state/buffer", "elsewhere"] {
+            fs::create_dir_all(at(dir)).unwrap();
+        }
+        fs::write(at("audit.jsonl"), "x").unwrap();
+        fs::write(at("state/audit.jsonl"), "x").unwrap();
+        // Kept in the state directory, though written in another way.
+        std::os::unix::fs::symlink(at("state"), at("link")).unwrap();
+        let kept = [
+            "audit.jsonl",
+            "audit.jsonl.1",
+            "elsewhere",
+            "state/buffer",
+            "link/audit.jsonl",
+        ];
+        let mut sources = Sources::default();
+        elsewhere(&at("state"), kept.into_iter().map(at), &mut sources);
+        let named: Vec<PathBuf> = sources.left_out.into_iter().map(|one| one.path).collect();
+        assert_eq!(named, ["audit.jsonl", "elsewhere"].map(at));
     }
 
     #[test]

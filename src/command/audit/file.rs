@@ -36,6 +36,17 @@ pub struct AuditFileOptions {
     pub max_bytes: u64,
 }
 
+impl AuditFileOptions {
+    fn rotated(&self) -> Rotated {
+        Rotated::new(self.path.clone(), self.max_bytes, FILES)
+    }
+
+    /// All files there can be, oldest first.
+    pub fn files(&self) -> Vec<PathBuf> {
+        self.rotated().all()
+    }
+}
+
 /// The way to the thread that writes.
 #[derive(Debug)]
 pub struct AuditFile {
@@ -122,7 +133,7 @@ impl AuditFile {
 
     fn behind(shared: Arc<Shared>, options: AuditFileOptions, before: Option<JoinHandle<()>>) -> io::Result<AuditFile> {
         let (end, ended) = watch::channel(());
-        let file = Rotated::new(options.path.clone(), options.max_bytes, FILES);
+        let file = options.rotated();
         let mut queues = shared.queues();
         let number = queues.threads + 1;
         let writer = Writer::new(file, shared.clone(), number);
