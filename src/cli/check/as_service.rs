@@ -18,13 +18,19 @@ const CREDENTIALS: &str = "/run/credentials/";
 const READ: u32 = 0o4;
 const SEARCH: u32 = 0o1;
 
+/// What a unit hides with `ProtectHome=` and with `PrivateTmp=`.
+const HOMES: [&str; 3] = ["/home", "/root", "/run/user"];
+const TEMPORARY: [&str; 2] = ["/tmp", "/var/tmp"];
+
 /// Who reads the files.
 #[derive(Debug, PartialEq, Eq)]
 struct Service {
     /// The user; `None` for one that exists only while the service runs, and owns nothing.
     user: Option<u32>,
     groups: BTreeSet<u32>,
-    /// Both in words.
+    /// Directories that it does not see, or empty.
+    hidden: Vec<&'static str>,
+    /// User and groups in words.
     shown: String,
 }
 
@@ -39,9 +45,9 @@ struct Node {
 impl Service {
     /// As the system has the unit.
     fn of_unit() -> Service {
-        let asked = ["User", "DynamicUser", "Group", "SupplementaryGroups", "LoadState"];
+        let asked = "User,DynamicUser,Group,SupplementaryGroups,LoadState,ProtectHome,PrivateTmp";
         let output = Command::new("systemctl")
-            .args(["show", UNIT, &format!("--property={}", asked.join(","))])
+            .args(["show", UNIT, &format!("--property={asked}")])
             .output();
         let text = output.map(|output| String::from_utf8_lossy(&output.stdout).into_owned());
         let text = text.unwrap_or_default();
@@ -77,6 +83,11 @@ impl Service {
             [] => "no group".to_string(),
             names => format!("the groups {}", names.join(", ")),
         };
+        // What systemd implies with a dynamic user is set, too, when it is asked.
+        let hides = |key: &str, ways: &[&str]| !loaded || ways.contains(&value(key));
+        let homes = hides("ProtectHome", &["yes", "tmpfs"]).then_some(HOMES.as_slice());
+        let temporary = hides("PrivateTmp", &["yes", "disconnected"]).then_some(TEMPORARY.as_slice());
+        let hidden = homes.into_iter().chain(temporary).flatten().copied().collect();
         // The group that a user has by itself.
         let own = passwd.lines().map(|line| line.split(':').collect::<Vec<_>>());
         let own = own.filter(|fields| user.is_some() && fields.first() == Some(&name));
@@ -84,6 +95,7 @@ impl Service {
         Service {
             user,
             groups: names.iter().filter_map(|name| id(group, name)).chain(own).collect(),
+            hidden,
             shown: format!("{who} with {groups}"),
         }
     }
@@ -117,6 +129,16 @@ pub(super) fn problems(path: &Path) -> Vec<Problem> {
 fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem> {
     // A file that there is not is reported by who reads it.
     let whole = file.path.canonicalize().ok()?;
+    let shown = |finding| Some(Problem::of_file(config.display().to_string(), &file.key, finding));
+    if let Some(dir) = service.hidden.iter().find(|dir| whole.starts_with(dir)) {
+        return shown(Finding::new(
+            format!(
+                "the service could not see {}: its unit hides {dir}",
+                file.path.display()
+            ),
+            "keep the file in /etc/drivegate",
+        ));
+    }
     let steps: Vec<&Path> = whole.ancestors().collect();
     let refusing = steps.into_iter().rev().find_map(|step| {
         let meta = fs::metadata(step).ok()?;
@@ -129,24 +151,24 @@ fn problem(config: &Path, file: &NamedFile, service: &Service) -> Option<Problem
         (!service.may(node, wanted)).then(|| (step.to_path_buf(), meta))
     });
     let (step, meta) = refusing?;
-    let (shown, mode) = (step.display(), meta.mode() & 0o7777);
+    let (refusing, mode) = (step.display(), meta.mode() & 0o7777);
     let bits = if meta.is_dir() { "g+x" } else { "g+r" };
-    let finding = Finding::new(
+    shown(Finding::new(
         format!(
-            "the service could not read {}: {shown} has mode {mode:04o}, user {} and group {}, and the service runs as {}",
+            "the service could not read {}: {refusing} has mode {mode:04o}, user {} and group {}, and the service runs as {}",
             file.path.display(),
             meta.uid(),
             meta.gid(),
             service.shown
         ),
-        format!("give it a group of the service: chgrp GROUP {shown} && chmod {bits} {shown}"),
-    );
-    Some(Problem::of_file(config.display().to_string(), &file.key, finding))
+        format!("give it a group of the service: chgrp GROUP {refusing} && chmod {bits} {refusing}"),
+    ))
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::config::FileKind;
 
     const PASSWD: &str = "root:x:0:0::/root:/bin/sh\ngateway:x:990:991::/:/bin/false\n";
     const GROUP: &str = "root:x:0:\ndialout:x:20:\nkeys:x:900:a,b\ngateway:x:991:\n";
@@ -165,6 +187,15 @@ mod tests {
         for none in ["", "User=\nDynamicUser=no\nLoadState=not-found\n"] {
             let service = Service::parse(none, PASSWD, GROUP);
             assert_eq!((service.user, service.groups), (None, [20].into()));
+            assert_eq!(service.hidden, ["/home", "/root", "/run/user", "/tmp", "/var/tmp"]);
+        }
+        for (unit, hidden) in [
+            ("ProtectHome=yes\nPrivateTmp=no", &HOMES[..]),
+            ("ProtectHome=read-only\nPrivateTmp=yes", &TEMPORARY),
+            ("ProtectHome=no\nPrivateTmp=no", &[]),
+        ] {
+            let service = Service::parse(&format!("{unit}\nLoadState=loaded\n"), PASSWD, GROUP);
+            assert_eq!(service.hidden, hidden, "{unit}");
         }
     }
 
@@ -173,6 +204,7 @@ mod tests {
         let service = Service {
             user: Some(990),
             groups: [20].into(),
+            hidden: Vec::new(),
             shown: String::new(),
         };
         let may = |mode, user, group| service.may(Node { mode, user, group }, READ);
@@ -186,5 +218,52 @@ mod tests {
         ] {
             assert_eq!(may(mode, user, group), expected, "{mode:o} {user} {group}");
         }
+    }
+
+    #[test]
+    fn the_file_or_directory_in_the_way_is_named() {
+        use std::os::unix::fs::PermissionsExt;
+        let folder = tempfile::tempdir().unwrap();
+        let dir = folder.path().join("keys");
+        fs::create_dir(&dir).unwrap();
+        let (config, path) = (folder.path().join("drivegate.toml"), dir.join("gateway.key"));
+        fs::write(&path, "x").unwrap();
+        let set = |path: &Path, mode| fs::set_permissions(path, fs::Permissions::from_mode(mode)).unwrap();
+        let found = |hidden: Vec<&'static str>, is_owner: bool| {
+            let service = Service {
+                user: is_owner.then(|| fs::metadata(&path).unwrap().uid()),
+                groups: BTreeSet::new(),
+                hidden,
+                shown: "a user of its own with no group".to_string(),
+            };
+            let kind = FileKind::Secret;
+            let file = NamedFile {
+                path: path.clone(),
+                kind,
+                key: "http.tls.key".to_string(),
+            };
+            problem(&config, &file, &service).map(|problem| problem.to_string())
+        };
+        set(folder.path(), 0o755);
+        set(&dir, 0o755);
+        set(&path, 0o644);
+        assert_eq!(found(Vec::new(), false), None);
+        set(&path, 0o640);
+        let key = found(Vec::new(), false).unwrap();
+        assert!(
+            key.contains("gateway.key has mode 0640") && key.contains("chmod g+r"),
+            "{key}"
+        );
+        set(&path, 0o644);
+        set(&dir, 0o700);
+        let directory = found(Vec::new(), false).unwrap();
+        assert!(
+            directory.contains("keys has mode 0700") && directory.contains("chmod g+x"),
+            "{directory}"
+        );
+        assert_eq!(found(Vec::new(), true), None);
+        assert_eq!(found(vec!["/none"], true), None);
+        let unseen = found(vec!["/"], true).unwrap();
+        assert!(unseen.contains("its unit hides /"), "{unseen}");
     }
 }
