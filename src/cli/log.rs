@@ -16,6 +16,7 @@ use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Layer, Registry, reload};
 
 use self::journal::Journal;
+pub(super) use self::journal::reads_stderr;
 use self::line::{Form, LogLine};
 use crate::command::SENT;
 use crate::config::{LogFormat, LogSettings};

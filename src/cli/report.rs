@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use comfy_table::{CellAlignment, ContentArrangement, Table, TableComponent, presets};
 
-use super::{EXIT_FAILED, printable};
+use super::{EXIT_FAILED, log, printable};
 use crate::config::Loaded;
 use crate::document::{Finding, Problem, parse_duration};
 
@@ -72,8 +72,15 @@ pub(super) fn problems(loaded: &Loaded) {
 }
 
 fn line(kind: &str, message: &str) {
+    // Syslog: error, warning, notice.
+    let priority = match kind {
+        _ if !log::reads_stderr() => "",
+        "error" => "<3>",
+        "warning" => "<4>",
+        _ => "<5>",
+    };
     // With stderr gone there is nowhere left to report that.
-    let _ = writeln!(io::stderr().lock(), "{kind}: {}", printable::line(message));
+    let _ = writeln!(io::stderr().lock(), "{priority}{kind}: {}", printable::line(message));
 }
 
 /// Columns of a terminal that does not say how many it has.

@@ -47,11 +47,13 @@ fn run_from(path: &Path) -> io::Result<ExitCode> {
     let Some(loaded) = starting.block_on(load(path, &mut early))? else {
         return Ok(ExitCode::SUCCESS);
     };
-    report::problems(&loaded);
     let Some(settings) = loaded.settings else {
+        report::problems(&loaded);
         return Ok(ExitCode::from(EXIT_CONFIG));
     };
     let log = super::log::start(&settings.log);
+    tracing::info!(version = VERSION.as_str(), config = %path.display(), "drivegate starts");
+    loaded.warnings.iter().for_each(|problem| tracing::warn!("{problem}"));
     let runtime = Builder::new_multi_thread().enable_all().build()?;
     let mut signals = Signals::within(&runtime)?;
     // What these ones came too late for.
@@ -86,7 +88,7 @@ async fn serve(settings: Settings, path: &Path, log: &LogHandle, signals: Signal
             return ExitCode::from(EXIT_FAILED);
         }
     };
-    tracing::info!(gateway, buses, config = %path.display(), version = VERSION.as_str(), "drivegate runs");
+    tracing::info!(gateway, buses, "drivegate runs");
     notify(&[NotifyState::Ready]);
     let daemon = serving::until_stopped(daemon, orders, path, log, signals).await;
     notify(&[NotifyState::Stopping]);

@@ -25,15 +25,20 @@ pub(super) struct Journal(Arc<UnixDatagram>);
 impl Journal {
     /// The journal, if it is what standard error is connected to, as `JOURNAL_STREAM` tells.
     pub(super) fn of_stderr() -> Option<Journal> {
-        let stream = std::env::var("JOURNAL_STREAM").ok()?;
-        let stderr = std::fs::metadata("/proc/self/fd/2").ok()?;
-        if stream != format!("{}:{}", stderr.dev(), stderr.ino()) {
+        if !reads_stderr() {
             return None;
         }
         let socket = UnixDatagram::unbound().ok()?;
         socket.connect(SOCKET).ok()?;
         Some(Journal(Arc::new(socket)))
     }
+}
+
+/// Whether journald reads standard error; then it takes a priority from `<3>` at the begin of a line.
+pub(in crate::cli) fn reads_stderr() -> bool {
+    let stderr = std::fs::metadata("/proc/self/fd/2");
+    let stream = std::env::var("JOURNAL_STREAM");
+    matches!((stderr, stream), (Ok(stderr), Ok(stream)) if stream == format!("{}:{}", stderr.dev(), stderr.ino()))
 }
 
 impl Write for Journal {
