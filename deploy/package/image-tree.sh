@@ -19,8 +19,7 @@ mkdir -p "$folder"/image/etc/{drivegate,ssl/certs} "$folder"/owned/{var/lib,run}
 install -d -m 1777 "$folder/image/tmp"
 install -m 755 "$program" "$folder/image/drivegate"
 install -m 644 LICENSE-MIT LICENSE-APACHE "$folder/image/"
-[ ! -e target/package/stage/third-party-licences.txt ] ||
-    install -m 644 target/package/stage/third-party-licences.txt "$folder/image/"
+deploy/package/licences.py "$(rust_target "$architecture")" >"$folder/image/third-party-licences.txt"
 cat $certificates/*.crt >"$folder/image/etc/ssl/certs/ca-certificates.crt"
 echo 'drivegate:x:65532:65532::/:/drivegate' >"$folder/image/etc/passwd"
 echo 'drivegate:x:65532:' >"$folder/image/etc/group"

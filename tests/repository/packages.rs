@@ -140,7 +140,10 @@ fn the_image_says_what_it_is_and_whether_it_is_well() {
     // The base of the build can be named by its digest, and the compiler runs on the builder's own processor.
     assert!(text.contains("\nARG RUST_IMAGE="));
     assert!(text.contains("\nFROM --platform=$BUILDPLATFORM $RUST_IMAGE AS build\n"));
-    assert!(read("deploy/compose.yaml").contains("DRIVEGATE_COMMIT: ${DRIVEGATE_COMMIT:-unknown}"));
+    let compose = read("deploy/compose.yaml");
+    assert!(compose.contains("DRIVEGATE_COMMIT: ${DRIVEGATE_COMMIT:-unknown}"));
+    let version = format!("VERSION: \"{}\"\n", env!("CARGO_PKG_VERSION"));
+    assert!(compose.contains(&version), "{version}");
 }
 
 #[test]
@@ -154,14 +157,26 @@ fn unit_and_image_keep_memory_in_the_same_way() {
     assert_eq!(own.split_ascii_whitespace().collect::<Vec<_>>(), wanted);
 }
 
-/// Serial drivers with a fixed device number (Linux, Documentation/admin-guide/devices.txt); a container is given numbers.
-const MAJORS: [(&str, u32); 6] = [
+/// Serial drivers of the unit with a fixed device number, which a container is given: Linux, Documentation/admin-guide/devices.txt,
+/// and the sources of the drivers of WCH, Exar and Moxa (mxser).
+const MAJORS: [(&str, u32); 13] = [
     ("ttyS", 4),
-    ("ttyUSB", 188),
     ("ttyACM", 166),
+    ("ttyCH341USB", 168),
+    ("ttyCH9344USB", 168),
+    ("ttyCH343USB", 170),
+    ("ttyMI", 174),
+    ("ttyUSB", 188),
     ("ttyAMA", 204),
     ("ttySC", 204),
+    ("ttySAC", 204),
+    ("ttyUL", 204),
     ("ttymxc", 207),
+    ("ttyXRUSB", 266),
+];
+/// Those that are given a number when they are loaded.
+const WITHOUT_MAJOR: [&str; 10] = [
+    "ttyLP", "ttySTM", "ttyO", "ttyPS", "ttyAML", "ttyTHS", "ttyMSM", "ttyMAX", "ttyMUE", "ttyMXUSB",
 ];
 
 #[test]
@@ -174,5 +189,13 @@ fn the_container_may_open_the_ports_that_the_service_may() {
             compose.contains(&format!("- \"c {major}:* rw\"\n")),
             "{driver}: {major}"
         );
+    }
+    let allowed = unit
+        .lines()
+        .filter_map(|line| line.strip_prefix("DeviceAllow=char-tty"));
+    for name in allowed.filter_map(|rest| rest.strip_suffix(" rw")) {
+        let driver = format!("tty{name}");
+        let is_known = MAJORS.iter().any(|(known, _)| *known == driver) || WITHOUT_MAJOR.contains(&driver.as_str());
+        assert!(is_known, "has {driver} a fixed number?");
     }
 }

@@ -31,6 +31,7 @@ check ".config.Labels[\"org.opencontainers.image.version\"] == \"$(version)\""
 jq -r '.[0].Layers[]' "$work/archive/manifest.json" | while read -r layer; do
     tar --extract --file "$work/archive/$layer" --directory "$work/bundle/rootfs"
 done
+[ -s "$work/bundle/rootfs/third-party-licences.txt" ] || fail "the image has no licences of its crates" "$archive" "see image-tree.sh"
 shells=$(find "$work/bundle/rootfs" -type f -perm /111 ! -path "$work/bundle/rootfs/drivegate")
 [ -z "$shells" ] || fail "the image contains other programs" "$shells" "it must contain only /drivegate"
 [ "$(stat -c %u "$work/bundle/rootfs/var/lib/drivegate")" = 65532 ] || fail "the state directory is not the user's" "$archive" "see deploy/Dockerfile"
