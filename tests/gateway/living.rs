@@ -43,16 +43,23 @@ fn an_absent_drive_with_a_long_timeout_holds_up_neither_the_watchdog_nor_a_reloa
     let mut gateway = Running::spawn(&mut command);
     gateway.until_printed("20s is longer than any drive takes to begin its reply; 5s is used");
     until_notified("STATUS=1 of 1 buses up, 0 of 1 drives online");
-    until("a request", || (!line.transcript().is_empty()).then_some(()));
-    for _ in 0..4 {
-        until_notified("WATCHDOG=1");
-    }
+    // The watchdog is looked at twice a second, an exchange takes 5 s.
+    until("two requests", || (line.transcript().len() > 1).then_some(()));
+    until_notified("WATCHDOG=1");
+    let printed = gateway.output();
+    assert!(!printed.contains("stalled"), "{printed}");
     // The exchange that waits is broken off for a reload of its bus, and for a stop.
     site.change("silence = \"chars\"", "silence = \"spec\"");
     gateway.signal("HUP");
     until_notified("RELOADING=1");
     until_notified("READY=1\nSTATUS=");
     until_notified("WATCHDOG=1");
+    let sound = site.change("baud = 38400", "baud = 1");
+    gateway.signal("HUP");
+    until_notified("0 of 1 drives online; reload refused at ");
+    site.configure(&[&sound]);
+    gateway.signal("HUP");
+    until_notified("READY=1\nSTATUS=1 of 1 buses up, 0 of 1 drives online");
     until_notified("WATCHDOG=1");
     gateway.signal("TERM");
     assert!(gateway.ended().success());
