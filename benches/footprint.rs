@@ -4,15 +4,20 @@
 //! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The daemon and
 //! the simulator are processes of their own. Instructions are counted by callgrind in a run of its own, as they do not depend on how busy the
 //! machine is; the processor time of the other runs does. `--program` names another build of the daemon, such as an older one.
+//! `--emulator qemu-aarch64 --program PATH` counts the instructions of a program for ARM, under qemu-user 8 or later, of the
+//! first plant only: qemu writes its log of a million blocks a second, with which the others would not keep their rate.
 
 mod common;
 
+use std::collections::HashMap;
 use std::error::Error;
 use std::fs;
-use std::io::{Read, Write};
+use std::io::{BufRead, BufReader, Read, Write};
 use std::net::{SocketAddr, TcpListener, TcpStream};
 use std::path::{Path, PathBuf};
-use std::process::{Child, Command, ExitCode, Stdio};
+use std::process::{Child, ChildStderr, Command, ExitCode, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
 use common::gateway::Bus;
@@ -36,6 +41,10 @@ fn measure() -> Result<(), Box<dyn Error>> {
     let spin: String = option("--spin", "auto".to_string())?;
     let program: PathBuf = option("--program", PathBuf::from(PROGRAM))?;
     let counted: String = option("--instructions", "yes".to_string())?;
+    let emulator: String = option("--emulator", String::new())?;
+    if !emulator.is_empty() {
+        return emulated(&emulator, &program, &spin, time);
+    }
     println!(
         "{}, spin = \"{spin}\", {} s each; processors: {}",
         std::env::consts::ARCH,
@@ -146,6 +155,79 @@ fn instructions(program: &Path, plant: &Plant<'_>, time: Duration) -> Result<f64
     Ok(total.trim().parse::<f64>()? / exchanges)
 }
 
+/// Prints the instructions of the daemon for each exchange, counted by an emulator of another processor.
+fn emulated(emulator: &str, program: &Path, spin: &str, time: Duration) -> Result<(), Box<dyn Error>> {
+    println!("{emulator}, spin = \"{spin}\", {} s each", time.as_secs_f64());
+    println!("{:<20} {:>11} {:>23}", "", "exchanges/s", "instructions/exchange");
+    let (name, buses, drives, baud) = PLANTS[0];
+    let plant = Plant {
+        buses,
+        drives,
+        baud,
+        spin,
+    };
+    let mut command = Command::new(emulator);
+    command.args(["-d", "in_asm,exec,nochain"]).arg(program);
+    let mut site = Site::start_with(&plant, command, Stdio::piped())?;
+    let log = site.log.take().ok_or("the daemon has no standard error")?;
+    let count = Arc::new(AtomicU64::new(0));
+    let counter = count.clone();
+    std::thread::spawn(move || Blocks::default().read(BufReader::new(log), &counter));
+    wait("the daemon", || site.ready())?;
+    std::thread::sleep(Duration::from_secs(10));
+    let counts = |site: &Site| -> Result<(f64, f64), Box<dyn Error>> {
+        Ok((site.exchanges()?, count.load(Ordering::Relaxed) as f64))
+    };
+    let (before, began) = (counts(&site)?, Instant::now());
+    std::thread::sleep(time);
+    let after = counts(&site)?;
+    let exchanges = after.0 - before.0;
+    println!(
+        "{name:<20} {:>11.1} {:>23.0}",
+        exchanges / began.elapsed().as_secs_f64(),
+        (after.1 - before.1) / exchanges
+    );
+    Ok(())
+}
+
+/// Counts instructions in the log of qemu: it lists those of each block when it translates it (`0xADDRESS: ...` below `IN:`), and
+/// has a line for each time a block is executed (`Trace 0: ... [.../ADDRESS/...]`).
+#[derive(Default)]
+struct Blocks {
+    lengths: HashMap<u64, u64>,
+    listed: Option<u64>,
+}
+
+impl Blocks {
+    fn read(&mut self, mut log: impl BufRead, count: &AtomicU64) {
+        let mut line = Vec::new();
+        while log.read_until(b'\n', &mut line).is_ok_and(|bytes| bytes > 0) {
+            count.fetch_add(self.line(&line).unwrap_or_default(), Ordering::Relaxed);
+            line.clear();
+        }
+    }
+
+    /// The instructions that were executed, if the line tells of any.
+    fn line(&mut self, line: &[u8]) -> Option<u64> {
+        let address = |text: &[u8]| u64::from_str_radix(std::str::from_utf8(text).ok()?, 16).ok();
+        if line.starts_with(b"Trace") {
+            let address = address(line.split(|byte| *byte == b'/').nth(1)?)?;
+            return self.lengths.get(&address).copied();
+        }
+        if line.starts_with(b"IN:") {
+            self.listed = None;
+        } else if let Some(rest) = line.strip_prefix(b"0x") {
+            let address = address(rest.split(|byte| *byte == b':').next()?)?;
+            if self.listed.is_none() {
+                self.lengths.insert(address, 0);
+            }
+            let first = *self.listed.get_or_insert(address);
+            *self.lengths.entry(first).or_default() += 1;
+        }
+        None
+    }
+}
+
 /// The environment that the systemd unit gives the daemon; it says how memory is kept.
 fn unit_environment() -> impl Iterator<Item = (&'static str, &'static str)> {
     include_str!("../systemd/drivegate.service")
@@ -169,12 +251,21 @@ impl Drop for Process {
 struct Site {
     daemon: Process,
     http: SocketAddr,
+    /// Standard error of the daemon, if it is read.
+    log: Option<ChildStderr>,
     _simulator: Process,
     _directory: tempfile::TempDir,
 }
 
 impl Site {
-    fn start(plant: &Plant<'_>, mut program: Command) -> Result<Site, Box<dyn Error>> {
+    fn start(plant: &Plant<'_>, program: Command) -> Result<Site, Box<dyn Error>> {
+        let site = Site::start_with(plant, program, Stdio::null())?;
+        wait("the daemon", || site.ready())?;
+        Ok(site)
+    }
+
+    /// The daemon may not be ready yet.
+    fn start_with(plant: &Plant<'_>, mut program: Command, log: Stdio) -> Result<Site, Box<dyn Error>> {
         let directory = tempfile::tempdir()?;
         let config = directory.path().join("drivegate.toml");
         let http = TcpListener::bind("127.0.0.1:0")?.local_addr()?;
@@ -200,23 +291,24 @@ impl Site {
             text += &bus.toml();
         }
         fs::write(&config, text)?;
-        let quiet = |command: &mut Command| {
-            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(Stdio::null());
+        let quiet = |command: &mut Command, log: Stdio| {
+            command.stdin(Stdio::null()).stdout(Stdio::null()).stderr(log);
             command.spawn().map(Process)
         };
-        let simulator = quiet(Command::new(PROGRAM).args(["simulate", "--config"]).arg(&config))?;
+        let mut simulate = Command::new(PROGRAM);
+        let simulator = quiet(simulate.args(["simulate", "--config"]).arg(&config), Stdio::null())?;
         wait("the simulator", || {
             directory.path().join(format!("line{}", plant.buses)).exists()
         })?;
-        let daemon = quiet(program.args(["run", "--config"]).arg(&config).envs(unit_environment()))?;
-        let site = Site {
+        let run = program.args(["run", "--config"]).arg(&config).envs(unit_environment());
+        let mut daemon = quiet(run, log)?;
+        Ok(Site {
+            log: daemon.0.stderr.take(),
             daemon,
             http,
             _simulator: simulator,
             _directory: directory,
-        };
-        wait("the daemon", || site.ready())?;
-        Ok(site)
+        })
     }
 
     /// Whether each drive answers.
