@@ -72,6 +72,37 @@ systemctl enable --quiet --now drivegate
 until_true online
 edited=$(md5sum /etc/drivegate/drivegate.toml)
 
+step "the journal has version, commit, fields and priorities"
+first=$(journalctl --no-pager --unit drivegate --identifier drivegate --output cat | head -n 1)
+contains "$first" "drivegate starts version=\"$(drivegate --version | sed 's/^drivegate //')\""
+contains "$(journalctl --no-pager --unit drivegate DRIVE=pump-1)" "pump-1"
+sed -i 's/^cycle = .*/&\nresponse_timeout = "20s"/' /etc/drivegate/drivegate.toml
+systemctl restart drivegate
+until_true online
+contains "$(journalctl --no-pager --unit drivegate --priority warning)" "5s is used"
+
+step "a key that only the group of the service reads, word for word as the pages say; renewed by a reload"
+recipe=$(sed -n '/^### Certificates and keys/,/^### /p' /usr/share/doc/drivegate/installation.md | sed -n '/^```sh$/,/^```$/p' | sed '1d;$d')
+contains "$recipe" "groupadd --system drivegate-keys"
+cp gateway.crt gateway.key /etc/drivegate/
+chmod 600 /etc/drivegate/gateway.key
+printf 'certificate = "gateway.crt"\nkey = "gateway.key"\n' >>/etc/drivegate/drivegate.toml
+printed=$(drivegate check --as-service 2>&1) && false
+contains "$printed" "the service could not read /etc/drivegate/gateway.key"
+bash -euxc "$recipe"
+until_true online
+drivegate health --url https://127.0.0.1:9488 --ca /etc/drivegate/gateway.crt
+cp renewed.crt /etc/drivegate/gateway.crt
+cat renewed.key >/etc/drivegate/gateway.key
+drivegate reload
+drivegate health --url https://127.0.0.1:9488 --ca /etc/drivegate/gateway.crt
+cp drivegate.toml /etc/drivegate/drivegate.toml
+rm -r /etc/drivegate/gateway.* /etc/systemd/system/drivegate.service.d/keys.conf
+groupdel drivegate-keys
+systemctl daemon-reload
+systemctl restart drivegate
+until_true online
+
 step "a newer version takes over"
 before=$(pid)
 dpkg --install newer.deb

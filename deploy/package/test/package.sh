@@ -48,6 +48,11 @@ variant choosy "99.0.2" deploy/package/test/choosy.sh
 variant broken "99.0.3" deploy/package/test/broken.sh
 cp "$package" "$root/packages/$(basename "$package")"
 cp deploy/package/test/inside.sh deploy/package/test/drivegate.toml "$root/packages/"
+for name in gateway renewed; do
+    openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:prime256v1 -nodes -days 30 -subj "/CN=$name" \
+        -config <(printf "[req]\ndistinguished_name=dn\n[dn]\n") -addext basicConstraints=critical,CA:FALSE \
+        -addext subjectAltName=IP:127.0.0.1 -keyout "$root/packages/$name.key" -out "$root/packages/$name.crt" 2>/dev/null
+done
 cat >"$root/etc/systemd/system/package-test.service" <<'END'
 [Unit]
 Description=The test of the package
