@@ -4,8 +4,8 @@
 //! `cargo bench --bench footprint` (options: `-- --seconds 20 --spin off --program PATH --instructions no`). The daemon and
 //! the simulator are processes of their own. Instructions are counted by callgrind in a run of its own, as they do not depend on how busy the
 //! machine is; the processor time of the other runs does. `--program` names another build of the daemon, such as an older one.
-//! `--emulator qemu-aarch64 --program PATH` counts the instructions of a program for ARM, under qemu-user 8 or later, of the
-//! first plant only: qemu writes its log of a million blocks a second, with which the others would not keep their rate.
+//! `--emulator qemu-aarch64 --program PATH` counts the instructions of a program for ARM under qemu-user 8 or later. Only for the
+//! first plant: with its log, qemu executes a million blocks a second, too few for the others at their full rate.
 
 mod common;
 

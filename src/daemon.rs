@@ -427,7 +427,7 @@ impl Daemon {
             self.mqtt.stop().await;
         }
         let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
-        // Nobody publishes what came while there was no client.
+        // Events that came while no client was configured are not published later.
         self.stats.mqtt.keep_unread(None);
         applied
     }

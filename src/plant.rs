@@ -33,8 +33,8 @@ pub type SharedPlant = Arc<ArcSwap<Plant>>;
 
 /// Where the stops of the next drive are counted from that is started or added.
 static ADDED: AtomicU64 = AtomicU64::new(STOPS_OF_ONE);
-/// More stops than one drive gets.
-const STOPS_OF_ONE: u64 = 1 << 40;
+/// More stops than one drive gets. Few enough that the stops of all drives of a bus can be added, after any number of reloads.
+const STOPS_OF_ONE: u64 = 1 << 32;
 
 /// One bus: its image and its queue.
 #[derive(Debug, Clone)]

@@ -326,7 +326,7 @@ pub struct MqttStats {
     lost: [AtomicU64; MqttLoss::ALL.len()],
     /// The retained topics of the client that runs, for the one that a reload puts in its place.
     retained: Mutex<Vec<String>>,
-    /// The events that the client that has ended did not take any more, for the same one.
+    /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
     unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
 }
 

@@ -1,7 +1,9 @@
 //! The program itself: exit codes, output, help.
 
+use std::collections::BTreeSet;
 use std::fs;
 use std::io;
+use std::os::unix::fs::MetadataExt;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 use std::time::{Duration, Instant};
@@ -287,6 +289,24 @@ fn the_reports_of_bad_configurations() {
         seen += 1;
     }
     assert!(seen > 10);
+}
+
+#[test]
+fn the_journal_gets_the_priority_of_each_report() {
+    let folder = tempfile::tempdir().unwrap();
+    let (config, printed) = (folder.path().join("drivegate.toml"), folder.path().join("printed"));
+    fs::write(&config, "[gatway]\n").unwrap();
+    let stderr = fs::File::create(&printed).unwrap();
+    let metadata = stderr.metadata().unwrap();
+    let status = Command::new(BINARY)
+        .args(["run", "--config", config.to_str().unwrap()])
+        .env("JOURNAL_STREAM", format!("{}:{}", metadata.dev(), metadata.ino()))
+        .stderr(stderr)
+        .status();
+    assert_eq!(status.unwrap().code(), Some(78));
+    let text = fs::read_to_string(&printed).unwrap();
+    let starts: BTreeSet<&str> = text.lines().filter_map(|line| line.split(' ').next()).collect();
+    assert_eq!(starts, ["<3>error:", "<4>warning:"].into(), "{text}");
 }
 
 #[test]

@@ -28,7 +28,7 @@ struct Service {
     /// The user; `None` for one that exists only while the service runs, and owns nothing.
     user: Option<u32>,
     groups: BTreeSet<u32>,
-    /// Directories that it does not see, or empty.
+    /// Directories whose files it does not see.
     hidden: Vec<&'static str>,
     /// User and groups in words.
     shown: String,
@@ -83,7 +83,7 @@ impl Service {
             [] => "no group".to_string(),
             names => format!("the groups {}", names.join(", ")),
         };
-        // What systemd implies with a dynamic user is set, too, when it is asked.
+        // What `DynamicUser=` implies is in the answer of systemd, too.
         let hides = |key: &str, ways: &[&str]| !loaded || ways.contains(&value(key));
         let homes = hides("ProtectHome", &["yes", "tmpfs"]).then_some(HOMES.as_slice());
         let temporary = hides("PrivateTmp", &["yes", "disconnected"]).then_some(TEMPORARY.as_slice());

@@ -34,7 +34,7 @@ impl Journal {
     }
 }
 
-/// Whether journald reads standard error; then it takes a priority from `<3>` at the begin of a line.
+/// Whether journald reads standard error; then it takes a priority from `<3>` at the beginning of a line.
 pub(in crate::cli) fn reads_stderr() -> bool {
     let stderr = std::fs::metadata("/proc/self/fd/2");
     let stream = std::env::var("JOURNAL_STREAM");

@@ -561,7 +561,7 @@ impl Client {
         if tokio::time::timeout(LAST_WRITE, close).await.is_err() {
             tracing::warn!("the MQTT buffer is too slow: the last messages may be missing after a restart");
         }
-        // A client that a reload starts goes on there.
+        // The client that a reload puts in its place goes on with them.
         self.stats.mqtt.keep_unread(Some(self.events));
     }
 

@@ -177,10 +177,11 @@ impl Mqtt {
 }
 
 /// Starts the MQTT client; must be called within a Tokio runtime. It reconnects until it is cancelled. Events that are
-/// raised from now on, or since the client before it ended, are published, so start it before the buses.
+/// raised from now on, or were left unread by the client before, are published, so start it before the buses.
 pub fn start(mut options: Options, plant: SharedPlant, stats: Arc<NorthStats>, cancel: CancellationToken) -> Mqtt {
     options.buffer = options.buffer.or_else(Buffer::of_system);
-    // Subscribed here and not in the task, so that no event after this call is missed, and none since the client before ended.
+    // Subscribed here and not in the task, so that no event after this call is missed. What the client before this one left
+    // unread comes first.
     let events = plant.load().events.subscribe();
     let unread = stats.mqtt.keep_unread(None);
     let events = unread.filter(|unread| unread.same_channel(&events)).unwrap_or(events);

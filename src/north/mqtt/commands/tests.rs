@@ -434,14 +434,20 @@ fn a_repetition_of_what_has_no_result_yet_is_answered_with_that() {
     assert_eq!(again, None, "the first one's result is still to come");
 }
 
+/// A run, which it returns, and a stop after it.
+fn run_and_stop(bench: &mut Bench) -> Incoming {
+    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
+    for command in [run.clone(), set("p1/set", r#"{"id": 2, "run": false}"#)] {
+        assert_eq!(bench.take(command), None);
+        bench.acknowledge();
+    }
+    run
+}
+
 #[test]
 fn a_repetition_after_a_stop_is_refused() {
     let mut bench = Bench::new();
-    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
-    assert_eq!(bench.take(run.clone()), None);
-    bench.acknowledge();
-    assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
-    bench.acknowledge();
+    let run = run_and_stop(&mut bench);
     let again = json(&bench.take(Incoming { dup: true, ..run }).expect("an answer at once"));
     assert_eq!(again["error"]["code"], "not_allowed", "{again}");
     assert_eq!(bench.queued(), 0);
@@ -450,11 +456,7 @@ fn a_repetition_after_a_stop_is_refused() {
 #[test]
 fn a_repetition_after_the_drive_was_removed_and_added_is_refused() {
     let mut bench = Bench::new();
-    let run = set("p1/set", r#"{"id": 1, "run": true}"#);
-    assert_eq!(bench.take(run.clone()), None);
-    bench.acknowledge();
-    assert_eq!(bench.take(set("p1/set", r#"{"id": 2, "run": false}"#)), None);
-    bench.acknowledge();
+    let run = run_and_stop(&mut bench);
     for _ in 0..2 {
         bench.remove_and_add();
         let again = json(&bench.take(run.clone()).expect("an answer at once"));

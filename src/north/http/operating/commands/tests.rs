@@ -108,6 +108,16 @@ fn a_repetition_is_recognised_by_user_drive_and_content() {
 }
 
 #[test]
+fn a_repetition_is_known_to_the_server_that_a_reload_starts() {
+    let mut bench = Bench::new();
+    let alice = operator("alice", "alice#1");
+    let body = "{\"id\": 1, \"speed_reference\": 10}";
+    let _first = bench.take(&alice, "p1", body);
+    bench.operating = Operating::new(bench.operating.stats.clone());
+    assert!(matches!(bench.take(&alice, "p1", body), Progress::Repeated(_)));
+}
+
+#[test]
 fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
     let bench = Bench::new();
     let alice = operator("alice", "alice#1");
