@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use super::BusOptions;
 use super::line_state::{Exchanged, LineState};
-use super::master::{Handover, Master, Purpose, Turn, TurnEnd};
+use super::master::{Handover, Master, Purpose, Remains, Turn, TurnEnd};
 use super::news::News;
 use super::report::Report;
 use super::tap::Tap;
@@ -183,6 +183,11 @@ impl BusCore {
             since: now,
         });
         None
+    }
+
+    /// What is left of faults and commands.
+    pub fn remains(&self, now: Instant) -> Remains {
+        self.master.remains(now)
     }
 
     /// The turn whose exchange is on the line.

@@ -7,6 +7,7 @@ use super::confirm::Confirmations;
 use super::late_replies::LateReplies;
 use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
+use super::vain_stops::VainStops;
 use crate::codec::Reply;
 use crate::command::{Interruption, Outcome, Urgency};
 use crate::drive::ModelPoint;
@@ -32,8 +33,10 @@ pub(super) struct DriveState {
     runs: [Option<CommandRun>; 3],
     /// When a stop was acknowledged after which nothing was sent but references and more stops, acknowledged too.
     stopped: Option<Instant>,
-    /// It did not answer a command: the next one waits until it answers something, or until then.
-    pub(super) silent_until: Option<Instant>,
+    /// Stops that it did not answer.
+    pub(super) vain_stops: VainStops,
+    /// The longest that an exchange with it took lately.
+    pub(super) answers_within: Duration,
     /// It was read since its confirmations were looked at.
     pub(super) was_read: bool,
     /// When an end of its frequency range was written last, whether or not it took it.
@@ -66,10 +69,17 @@ impl DriveState {
             confirmations: Confirmations::default(),
             runs: [None, None, None],
             stopped: None,
-            silent_until: None,
+            vain_stops: VainStops::default(),
+            answers_within: Duration::ZERO,
             was_read: false,
             range_written: None,
         }
+    }
+
+    /// It answered something, in an exchange that took the line for `took`.
+    pub(super) fn exchanged(&mut self, took: Duration) {
+        self.vain_stops.answered();
+        self.answers_within = took.max(self.answers_within - self.answers_within / 64);
     }
 
     /// The begun command of that rank.
@@ -273,7 +283,7 @@ impl DriveState {
         self.confirmations.clear();
         self.words.forget();
         self.stopped = None;
-        self.silent_until = None;
+        self.vain_stops.answered();
         self.supervision.settle(now);
     }
 }

@@ -7,8 +7,14 @@
 //! same request may be sent again at once: whichever reply comes, it is true of the same registers.
 //!
 //! But the reply that comes then may be the older one, and the newer one is still to come: a drive that is always a
-//! little slower than the deadline stays one reply behind as long as the same request follows upon itself. So while a
-//! look-alike waits, that request is held back too after a while, and the drive gets the time to catch up.
+//! little slower than the deadline stays one reply behind as long as the same request follows upon itself. Until that is
+//! settled, its samples are dated by the older request. What settles it is a reply that can be none of these: a drive answers
+//! in order, so a reply to a request of another look shows that nothing asked before is still to come. The master asks for one
+//! at once ([`LateReplies::wants_proof`]), by a read of half of the block. Where no such request can be made
+//! ([`LateReplies::cannot_prove`]), the same request is held back once, for as long as the newer reply may take.
+//!
+//! Look-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
+//! held back too after a while, and the drive gets the time to catch up.
 //!
 //! A write acknowledged late proves nothing once the drive may have taken another write in between: the same
 //! write then waits as a look-alike does. A stop does not wait, so the first acknowledgement of such a stop proves nothing:
@@ -44,14 +50,32 @@ struct LateReply {
     until: Instant,
     /// How late the answer was, if it was the older reply.
     late: Duration,
+    /// When the request was sent that was answered last: if that answer was the older reply, the next one is the reply to this.
+    before: Option<Instant>,
     /// Until when the newer reply may come.
     newer: Option<Instant>,
+    /// Whether each answer may be that to the request before.
+    order: Order,
     /// Since when a look-alike waits.
     wanted: Option<Instant>,
     /// Replies that may still come.
     count: u32,
     /// How many of them are of tries before another write, which the drive may have taken.
     overtaken: u32,
+}
+
+/// Whether an answer to a request may be that to an earlier one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Order {
+    /// It may.
+    Doubtful,
+    /// It may, and that is not asked again before then: an attempt to settle it failed, as with a drive that is always a
+    /// little too slow, or is under way.
+    Behind(Instant),
+    /// It may, and no request of another look can show it: the request is held back once.
+    HeldBack,
+    /// It is its own: the drive answered something else since.
+    Settled,
 }
 
 impl LateReply {
@@ -61,7 +85,9 @@ impl LateReply {
             since: Some(began),
             until,
             late: Duration::ZERO,
+            before: None,
             newer: None,
+            order: Order::Doubtful,
             wanted: None,
             count: 1,
             overtaken: 0,
@@ -74,7 +100,8 @@ impl LateReply {
 
     fn blocks(&self, pdu: &RequestPdu, now: Instant) -> bool {
         if self.pdu == *pdu {
-            self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
+            let held_back = self.order == Order::HeldBack && self.since.is_none();
+            held_back || self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
         } else {
             look_alike(&self.pdu, pdu)
         }
@@ -91,6 +118,9 @@ impl LateReplies {
             Some(late) => {
                 late.until = until;
                 late.since.get_or_insert(began);
+                if !matches!(late.order, Order::Behind(_)) {
+                    late.order = Order::Doubtful;
+                }
                 // Reads are true in any order.
                 if pdu.is_write() {
                     late.count = (late.count + 1).min(KEPT);
@@ -104,8 +134,8 @@ impl LateReplies {
         self.expected.iter_mut().find(|late| late.pdu == *pdu)
     }
 
-    /// An answer to `pdu` came.
-    pub fn answered(&mut self, pdu: &RequestPdu, now: Instant) {
+    /// An answer to `pdu`, sent at `sent`, came.
+    pub fn answered(&mut self, pdu: &RequestPdu, sent: Instant, now: Instant) {
         self.expected.retain(|late| late.ends() > now);
         for late in &mut self.expected {
             if late.pdu == *pdu {
@@ -113,10 +143,50 @@ impl LateReplies {
                 if let Some(since) = late.since.take() {
                     late.late = now.saturating_duration_since(since).max(late.late).min(FORGOTTEN_AFTER);
                 }
-                late.newer = Some(now + late.late);
+                late.before = Some(sent);
+                if late.order != Order::Settled {
+                    late.newer = Some(now + late.late);
+                }
             }
         }
         self.overtake(pdu);
+    }
+
+    /// A reply to `pdu` came that is no exception: nothing that was asked before and looks otherwise is still to come. It
+    /// shows nothing where it may itself be the late reply to an earlier request. To be called before [`LateReplies::answered`].
+    pub fn settled_by(&mut self, pdu: &RequestPdu, now: Instant) {
+        let owed = |late: &&LateReply| late.ends() > now && look_alike(&late.pdu, pdu);
+        if self.expected.iter().any(|late| owed(&late)) {
+            return;
+        }
+        for late in &mut self.expected {
+            (late.order, late.since) = (Order::Settled, None);
+        }
+    }
+
+    /// Whether answers to `pdu` may each be that to the request before, which a request of another look would settle.
+    pub fn wants_proof(&self, pdu: &RequestPdu, now: Instant) -> bool {
+        let due = |late: &LateReply| match late.order {
+            Order::Doubtful => true,
+            Order::Behind(until) => until <= now,
+            Order::HeldBack | Order::Settled => false,
+        };
+        let answered = |late: &LateReply| late.pdu == *pdu && late.ends() > now && late.since.is_none();
+        self.expected.iter().any(|late| answered(late) && due(late))
+    }
+
+    /// What could settle the order of answers to `pdu` is asked, or was asked in vain: it is not asked again before `until`.
+    pub fn stays_behind(&mut self, pdu: &RequestPdu, until: Instant) {
+        if let Some(late) = self.of(pdu) {
+            late.order = Order::Behind(until);
+        }
+    }
+
+    /// No request of another look can settle the order of answers to `pdu`: it is held back once.
+    pub fn cannot_prove(&mut self, pdu: &RequestPdu) {
+        if let Some(late) = self.of(pdu) {
+            late.order = Order::HeldBack;
+        }
     }
 
     /// The drive may have taken `pdu`: an acknowledgement of an earlier write does not show how it is now.
@@ -153,15 +223,19 @@ impl LateReplies {
     /// When the request was sent at the latest whose reply an answer to `pdu` at `now` may be: earlier than this one while a
     /// late reply to the same request may come. To be asked before [`LateReplies::answered`].
     pub fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
-        let same = self.expected.iter().find(|late| late.pdu == *pdu && late.ends() > now);
-        same.map_or(now, |late| {
-            late.since.unwrap_or_else(|| now.checked_sub(late.late).unwrap_or(now))
-        })
+        let doubtful = |late: &LateReply| late.ends() > now && late.order != Order::Settled;
+        let same = self.expected.iter().find(|late| late.pdu == *pdu && doubtful(late));
+        same.map_or(now, |late| late.since.or(late.before).unwrap_or(now))
     }
 
     /// Until when any reply may still come.
     pub fn until(&self) -> Option<Instant> {
         self.expected.iter().map(LateReply::ends).max()
+    }
+
+    /// How many requests have replies that may still come.
+    pub(super) fn owed(&self, now: Instant) -> usize {
+        self.expected.iter().filter(|late| late.ends() > now).count()
     }
 
     /// Whether any reply may still come.

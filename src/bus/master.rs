@@ -6,12 +6,15 @@
 
 mod background;
 mod choose;
+mod remains;
 mod results;
 mod shutdown;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
+
+pub use self::remains::Remains;
 
 use self::background::Begun;
 use self::choose::Turns;
@@ -39,8 +42,8 @@ use crate::process_image::DriveImage;
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 /// Response timeouts for which an N2 reply may come late.
 const N2_LATE: u32 = 3;
-/// Time for the first byte of the reply to a probe of a drive that does not answer: probed every 10 s, it costs less than
-/// 2 % of the line by that.
+/// Time for the first byte of the reply to a probe of a drive that does not answer, or to a stop, unless it is known to be
+/// slower: probed every 10 s, it costs less than 2 % of the line by that.
 const PROBE_TIMEOUT: Duration = Duration::from_millis(160);
 /// Every so many probes of a drive one waits as long as any request: the drive may be slow.
 const PATIENT_PROBES: u32 = 6;
@@ -353,11 +356,11 @@ impl Master {
         }
         let probes = self.probes.get(turn.drive).copied().unwrap_or(0);
         let patient = probes <= self.retries || probes.is_multiple_of(PATIENT_PROBES);
-        if self.schedule.is_online(turn.drive) || patient || turn.slot().is_some() {
-            self.response_timeout
-        } else {
-            self.response_timeout.min(PROBE_TIMEOUT)
+        if self.schedule.is_online(turn.drive) || patient {
+            return self.response_timeout;
         }
+        let known = self.drives.get(turn.drive).map(|drive| 2 * drive.answers_within);
+        self.response_timeout.min(PROBE_TIMEOUT.max(known.unwrap_or_default()))
     }
 
     /// What may still come late on an N2 line, for the exchange that is about to begin.

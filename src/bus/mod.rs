@@ -36,6 +36,7 @@ pub mod schedule;
 pub mod supervision;
 mod tap;
 pub mod transaction;
+mod vain_stops;
 
 pub use line_loop::BusTask;
 

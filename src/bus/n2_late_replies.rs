@@ -52,6 +52,11 @@ impl N2LateReplies {
         }
     }
 
+    /// How many replies may still come.
+    pub(super) fn owed(&self, now: Instant) -> usize {
+        self.0.iter().filter(|late| late.until > now).count()
+    }
+
     /// Whether any reply may still come.
     pub fn may_come(&self, now: Instant) -> bool {
         self.0.iter().any(|late| late.until > now)
@@ -83,6 +88,15 @@ impl N2LateReplies {
         }
         self.0.remove(index);
         Taken::Late(used)
+    }
+
+    /// The frame was a late reply: it is not expected any more.
+    pub fn came(&mut self, frame: &[u8]) {
+        let answer = self::frame(frame).map(|(_, answer)| answer);
+        let index = answer.and_then(|answer| self.0.iter().position(|late| late.could_be(&answer)));
+        if let Some(index) = index {
+            self.0.remove(index);
+        }
     }
 
     /// The answer to `pdu` was doubtful: if it was a late one, the reply itself may still come. So may the late one, if it

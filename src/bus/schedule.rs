@@ -160,18 +160,10 @@ impl Schedule {
         cost: impl Fn(usize, &PlannedRead) -> Duration,
         now: Instant,
     ) -> Self {
-        let drives = plans.iter().enumerate().map(|(index, plan)| DriveSchedule {
-            presence: Presence::Away(now, Duration::ZERO),
-            tried: false,
-            doubted: false,
-            failures: 0,
-            garbled: 0,
-            items: plan
-                .reads
-                .iter()
-                .chain(&plan.on_fault)
-                .map(|read| Item::new(*read, *read, cost(index, read), now))
-                .collect(),
+        let drives = plans.iter().enumerate().map(|(index, plan)| {
+            let reads = plan.reads.iter().chain(&plan.on_fault);
+            let items = reads.map(|read| Item::new(*read, *read, cost(index, read), now));
+            DriveSchedule::new(items.collect(), now)
         });
         let drives: Vec<DriveSchedule> = drives.collect();
         let slow = drives.iter().flat_map(|drive| &drive.items);
@@ -308,12 +300,12 @@ impl Schedule {
         }
     }
 
-    /// A drive that is away did not answer a command, which was as good as a probe.
+    /// A drive that is away did not answer a command, which was as good as a probe: the next one does not come right behind it.
     pub fn probed_in_vain(&mut self, drive: usize, took: Duration, now: Instant) {
         if let Some(drive) = self.drives.get_mut(drive)
-            && let Presence::Away(_, pause) = drive.presence
+            && let Presence::Away(at, pause) = drive.presence
         {
-            drive.presence = drives::away(now, pause, took);
+            drive.presence = Presence::Away(at.max(now + took), pause);
         }
     }
 
@@ -417,6 +409,21 @@ impl Schedule {
         self.drives.get(drive).is_some_and(|d| d.presence == Presence::Online)
     }
 
+    /// Drives that are away, and reads of the others that are put off behind failures.
+    pub fn held(&self, now: Instant) -> (usize, usize) {
+        let online = |drive: &&DriveSchedule| drive.presence == Presence::Online;
+        let put_off = |item: &&Item| {
+            !item.refused && (item.failures > 0 || (item.read.class == PollClass::Fast && item.due > now))
+        };
+        let held = self
+            .drives
+            .iter()
+            .filter(online)
+            .flat_map(|drive| &drive.items)
+            .filter(put_off);
+        (self.drives.iter().filter(|drive| !online(drive)).count(), held.count())
+    }
+
     /// Forgets all presence: the port was lost, every drive is found anew.
     pub fn reset(&mut self, now: Instant) {
         self.round.clear();
@@ -425,6 +432,7 @@ impl Schedule {
         self.slow_started = None;
         for drive in &mut self.drives {
             drive.presence = Presence::Away(now, Duration::ZERO);
+            drive.early.found_anew();
             drive.failures = 0;
         }
     }

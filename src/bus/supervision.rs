@@ -82,6 +82,11 @@ impl Supervision {
         self.lease
     }
 
+    /// Whether the lease ran out, and its action is not acknowledged.
+    pub(super) fn owes_action(&self) -> bool {
+        self.lease.0 == State::RanOut
+    }
+
     /// Whether the drive was seen to run, and no client was heard of since the gateway started.
     pub(super) fn runs_unheard(&self) -> bool {
         self.lease.0 == State::RunsUnheard

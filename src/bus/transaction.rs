@@ -12,7 +12,8 @@ use std::ops::Range;
 use std::time::{Duration, Instant};
 
 use super::n2_late_replies::{N2LateReplies, Taken};
-use crate::codec::{Decoded, Protocol, Reply, Request, RequestPdu};
+use crate::codec::n2::Session;
+use crate::codec::{Decoded, Exception, Protocol, Reply, Request, RequestPdu};
 
 /// Most bytes looked at in one exchange: more is babble, whatever it says.
 const MOST_BYTES: usize = 1024;
@@ -74,6 +75,8 @@ pub struct Transaction {
     ignored_before: Option<Instant>,
     /// What may still come of earlier exchanges on an N2 line.
     late: N2LateReplies,
+    /// A frame that is the reply, unless another one comes until the deadline: then it was a late one.
+    unless_another: Option<(Vec<u8>, Reply)>,
 }
 
 impl Transaction {
@@ -108,6 +111,7 @@ impl Transaction {
             behind_doubted: false,
             ignored_before: None,
             late: N2LateReplies::default(),
+            unless_another: None,
         }
     }
 
@@ -178,6 +182,12 @@ impl Transaction {
             if self.strip_echo() {
                 continue;
             }
+            if !self.received.is_empty()
+                && let Some((frame, _)) = self.unless_another.take_if(|_| self.received.contains(&b'\r'))
+            {
+                self.foreign += 1;
+                self.late.came(&frame);
+            }
             match self.late.take(&self.request.pdu, &self.received, now) {
                 Taken::Reply => {}
                 Taken::Late(used) => {
@@ -187,7 +197,10 @@ impl Transaction {
                     self.garbage = None;
                     continue;
                 }
-                Taken::Doubtful => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
+                Taken::Doubtful => match self.awaits_another() {
+                    true if self.unless_another.is_none() && self.hold_doubtful() => return self.on_time(now),
+                    _ => return Step::Done(Ended::Corrupt(MAY_BE_LATE)),
+                },
             }
             match self.protocol.decode(&self.request, &self.received) {
                 Decoded::Reply { .. } if self.may_go_on() => {
@@ -230,6 +243,31 @@ impl Transaction {
                 }
             }
         }
+    }
+
+    /// Whether a doubtful frame is worth the time until the deadline: it says that the drive started anew, or who it is, without
+    /// which nothing else can be asked. If each such answer were in doubt for the one before, that would never end.
+    fn awaits_another(&self) -> bool {
+        let identifies = matches!(self.request.pdu, RequestPdu::N2(Session::Identify));
+        let restarted = matches!(
+            self.protocol.decode(&self.request, &self.received),
+            Decoded::Reply {
+                reply: Reply::Exception(Exception::N2_RESTARTED),
+                ..
+            }
+        );
+        identifies || restarted
+    }
+
+    /// Keeps the frame at the beginning as the reply, unless another one comes.
+    fn hold_doubtful(&mut self) -> bool {
+        let Decoded::Reply { used, reply } = self.protocol.decode(&self.request, &self.received) else {
+            return false;
+        };
+        let frame = self.received.drain(..used.min(self.received.len())).collect();
+        self.unless_another = Some((frame, reply));
+        self.garbage = None;
+        true
     }
 
     fn is_too_early(&mut self, reply: &Reply, now: Instant) -> bool {
@@ -308,6 +346,9 @@ impl Transaction {
         }
         if now < until {
             return Step::Wait(until);
+        }
+        if let Some((_, reply)) = self.unless_another.take().filter(|_| self.received.is_empty()) {
+            return Step::Done(Ended::Reply(reply));
         }
         let ended = match self.garbage {
             Some((why, _)) => Ended::Corrupt(why),

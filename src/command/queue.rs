@@ -294,20 +294,11 @@ impl Pending {
         });
     }
 
-    /// Answers those whose time ran out; a command goes on waiting for those who joined it and have time.
+    /// Answers those whose time ran out. A stop that was taken in is sent, however long it waits.
     fn expire(&mut self, now: Instant) {
-        for command in &mut self.waiting {
-            for (ticket, _) in command.joined.extract_if(.., |(_, expires)| *expires <= now) {
-                ticket.answer(Outcome::Expired, now);
-            }
-            if command.expires <= now
-                && let Some((ticket, expires)) = command.joined.pop()
-            {
-                std::mem::replace(&mut command.ticket, ticket).answer(Outcome::Expired, now);
-                command.expires = expires;
-            }
-        }
-        self.remove(now, &Outcome::Expired, |c| c.expires <= now);
+        self.remove(now, &Outcome::Expired, |c| {
+            c.expires <= now && c.urgency != Urgency::Stop
+        });
     }
 
     /// Answers and removes the commands that `which` names.

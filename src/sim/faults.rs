@@ -238,6 +238,15 @@ impl FaultPlan {
         self
     }
 
+    /// The same plan without random and scripted faults: what a drive refuses it goes on refusing.
+    #[must_use]
+    pub fn without_faults(self) -> FaultPlan {
+        FaultPlan {
+            refused: self.refused,
+            ..FaultPlan::default()
+        }
+    }
+
     /// Whether the drive at `address` refuses that request for what it reads.
     pub fn refuses(&self, address: u8, request: &RequestPdu) -> bool {
         let RequestPdu::Read { table, start, count } = request else {

@@ -67,6 +67,8 @@ pub struct WorldBus {
     pub late: bool,
     /// The fast cycle of the line when it is saturated with polls, as predicted.
     pub round: Duration,
+    /// The slow cycle of the line, as predicted.
+    pub slow_round: Duration,
     /// Share of what comes to the gateway in which one bit is wrong, faults of the line apart.
     pub flips: f64,
     dice: Random,
@@ -136,9 +138,8 @@ impl WorldBus {
         };
         let handle = handle(index, line, &profile, format);
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
-        let round = predict(&handle.image.spec, parts.silence, &specs)
-            .fast_cycle
-            .unwrap_or_default();
+        let predicted = predict(&handle.image.spec, parts.silence, &specs);
+        let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
         let mut rules = LineRules::of(line.protocol, format);
         rules.turnaround = line.turnaround;
         rules.delivery = parts.delivery;
@@ -166,7 +167,8 @@ impl WorldBus {
             open: true,
             ending: false,
             exchanges: 0,
-            round,
+            round: round.unwrap_or_default(),
+            slow_round: slow_round.unwrap_or_default(),
             flips: parts.flips,
             dice: Random::new(index as u64 ^ 0xF11B),
             began: now,

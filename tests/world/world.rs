@@ -3,6 +3,7 @@
 mod acts;
 mod answers;
 mod end;
+mod heal;
 mod incidents;
 mod lines;
 mod look;
@@ -37,6 +38,8 @@ use super::scenario::{Habit, Scenario};
 
 /// Time in which an order is answered behind its expiry: its last exchange, a pulse, a late reply.
 const LAST_STEPS: Duration = Duration::from_secs(6);
+/// Time that a stop has from its turn on.
+const STOP_TIME: Duration = Duration::from_secs(2);
 /// Time between a lease that ran out and its action: a round, and an exchange of another drive.
 const ACTION: Duration = Duration::from_millis(1_500);
 /// Longest pause between two requests to a drive that does not answer, with what goes before them.
@@ -112,6 +115,8 @@ pub struct World {
     answered: u64,
     figures: Figures,
     stopping: bool,
+    /// The faults are over.
+    healing: Option<heal::Healing>,
 }
 
 impl World {
@@ -168,6 +173,7 @@ impl World {
             answered: 0,
             figures: Figures::default(),
             stopping: false,
+            healing: None,
             scenario,
         }
     }
@@ -194,6 +200,7 @@ impl World {
         while self.now < end {
             self.step();
         }
+        self.heal();
         self.stop();
         self.figures.worlds = 1;
         self.figures.bus_time = (self.now - self.began) * self.buses.len() as u32;
@@ -206,10 +213,19 @@ impl World {
         self.history.note(self.now - self.began, words);
     }
 
+    /// No client gives orders any more.
+    fn is_calm(&self) -> bool {
+        self.stopping || self.healing.is_some()
+    }
+
     /// The next thing that happens anywhere.
     fn step(&mut self) {
         let wakes: Vec<Instant> = self.buses.iter().map(WorldBus::wake_at).collect();
-        let clients = self.clients.iter().filter(|_| !self.stopping).map(|client| client.next);
+        let clients = self
+            .clients
+            .iter()
+            .filter(|_| !self.is_calm())
+            .map(|client| client.next);
         let others = [self.next_incident, self.next_reload, Some(self.next_look)];
         let off = self.off.iter().map(|(_, _, until)| *until);
         let others = others.into_iter().chain(self.away.iter().copied()).flatten();
@@ -223,7 +239,7 @@ impl World {
             }
         }
         self.collect_news();
-        if !self.stopping {
+        if !self.is_calm() {
             for index in 0..self.clients.len() {
                 if self.clients[index].next <= self.now {
                     self.act(index);

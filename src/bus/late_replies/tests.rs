@@ -90,6 +90,7 @@ fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
         // What came while nobody listened is noise.
         coming.retain(|(at, _)| *at > now);
         coming.push_back((now + behind, asked.clone()));
+        let sent = now;
         let deadline = now + DEADLINE;
         match coming.front().cloned().filter(|(at, _)| *at <= deadline) {
             Some((at, of)) => {
@@ -97,7 +98,7 @@ fn a_drive_that_is_one_reply_behind_is_never_misunderstood() {
                 now = at;
                 assert_eq!(&of, asked, "after {:?}", now - start);
                 answered[usize::from(of == b)] += 1;
-                late.answered(asked, now);
+                late.answered(asked, sent, now);
             }
             None => {
                 now = deadline;
@@ -126,7 +127,7 @@ fn a_request_whose_reply_is_late_is_not_held_back_for_ever() {
         if millisecond % 12 == 0 && late.blocks(&a, now).is_none() {
             longest = longest.max(now - last_a);
             last_a = now;
-            late.answered(&a, now);
+            late.answered(&a, now, now);
         }
     }
     assert!(first_b.is_some_and(|at| at < ms(2200)), "{first_b:?}");
@@ -141,7 +142,7 @@ fn a_late_acknowledgement_does_not_stand_for_a_write_that_another_overtook() {
     let mut late = LateReplies::default();
     late.given_up(&write(1), now - DEADLINE, now);
     assert_eq!(late.blocks(&write(1), now), None, "tried again at once");
-    late.answered(&write(0), now);
+    late.answered(&write(0), now, now);
     assert_eq!(late.blocks(&write(1), now), Some(now + FORGOTTEN_AFTER));
     assert_eq!(late.blocks(&write(0), now), None);
 }
@@ -154,16 +155,16 @@ fn the_first_acknowledgement_of_a_stop_that_was_overtaken_proves_nothing() {
     let mut late = LateReplies::default();
     late.given_up(&stop, now - DEADLINE, now);
     assert!(!late.proves_nothing(&stop, now, now), "nothing came in between");
-    late.answered(&run, now);
+    late.answered(&run, now, now);
     assert!(!late.proves_nothing(&run, now, now));
     assert!(late.proves_nothing(&stop, now, now), "it may be that of the first one");
-    late.answered(&stop, now);
+    late.answered(&stop, now, now);
     assert!(!late.proves_nothing(&stop, now, now), "the second one counts");
-    late.answered(&stop, now);
+    late.answered(&stop, now, now);
     assert_eq!(late.blocks(&run, now), None);
     // Forgotten: it will not come any more.
     late.given_up(&stop, now - DEADLINE, now);
-    late.answered(&run, now);
+    late.answered(&run, now, now);
     let later = now + FORGOTTEN_AFTER;
     assert!(!late.proves_nothing(&stop, later, later));
 }
@@ -184,7 +185,7 @@ fn an_acknowledgement_that_may_be_that_of_a_look_alike_proves_nothing() {
         late.given_up(&run, now - DEADLINE, now);
         assert!(late.proves_nothing(&stop, now, now));
         assert!(!late.proves_nothing(&stop, now, now), "the second one counts");
-        late.answered(&stop, now);
+        late.answered(&stop, now, now);
         // The stop went out twice and was acknowledged once.
         assert!(late.blocks(&run, now).is_some());
         let later = now + FORGOTTEN_AFTER;
@@ -227,4 +228,73 @@ fn a_write_that_was_not_answered_may_have_been_taken_all_the_same() {
     late.given_up(&write(1), now - DEADLINE, now);
     assert!(late.proves_nothing(&write(0), now, now));
     assert!(!late.proves_nothing(&write(0), now, now));
+}
+
+/// The request every 20 ms, answered after 5 ms; one reply was lost. `settles`: what the master does about it.
+fn ages_after_a_lost_reply(settles: impl Fn(&mut LateReplies, Instant)) -> Vec<Duration> {
+    let start = Instant::now();
+    let (mut late, ms) = (LateReplies::default(), Duration::from_millis);
+    let a = read(2100, 11);
+    late.given_up(&a, start, start + DEADLINE);
+    (0..500)
+        .filter_map(|round| {
+            let sent = start + DEADLINE + ms(2) + round * ms(20);
+            let at = sent + ms(5);
+            if late.wants_proof(&a, sent) {
+                settles(&mut late, at);
+                return None;
+            }
+            late.blocks(&a, sent).is_none().then(|| {
+                let asked_by = late.asked_by(&a, at);
+                late.answered(&a, sent, at);
+                at - asked_by
+            })
+        })
+        .collect()
+}
+
+#[test]
+fn one_lost_reply_does_not_date_samples_back_for_ever() {
+    let ms = Duration::from_millis;
+    let by_half = ages_after_a_lost_reply(|late, at| late.settled_by(&read(2100, 5), at));
+    assert_eq!(
+        (by_half.len(), by_half[0]),
+        (499, ms(112)),
+        "the first may be the older reply"
+    );
+    assert!(by_half[1..].iter().all(Duration::is_zero), "{by_half:?}");
+
+    let held_back = ages_after_a_lost_reply(|late, _| late.cannot_prove(&read(2100, 11)));
+    assert!(held_back[1..].iter().all(Duration::is_zero), "{held_back:?}");
+    assert!(held_back.len() > 440, "held back once: {}", held_back.len());
+
+    let behind = ages_after_a_lost_reply(|late, at| late.stays_behind(&read(2100, 11), at + ms(60_000)));
+    assert!(
+        behind[2..].iter().all(|age| *age <= ms(25)),
+        "one request back at most: {behind:?}"
+    );
+}
+
+#[test]
+fn only_a_reply_that_can_be_no_late_one_settles_the_order() {
+    let now = Instant::now();
+    let (a, half) = (read(2100, 11), read(2100, 5));
+    let mut late = LateReplies::default();
+    late.given_up(&a, now - DEADLINE, now);
+    late.answered(&a, now, now);
+    late.settled_by(&read(0, 11), now);
+    assert!(late.wants_proof(&a, now), "it looks the same");
+    late.given_up(&half, now - DEADLINE, now);
+    late.settled_by(&half, now);
+    assert!(late.wants_proof(&a, now), "it may be late itself");
+    late.settled_by(&read(0, 3), now);
+    assert!(!late.wants_proof(&a, now));
+    assert_eq!(late.asked_by(&a, now), now);
+    assert!(
+        late.blocks(&read(0, 11), now).is_some(),
+        "look-alikes wait for their time"
+    );
+    late.given_up(&a, now, now + DEADLINE);
+    late.answered(&a, now + DEADLINE, now + DEADLINE);
+    assert!(late.wants_proof(&a, now + DEADLINE), "lost once more");
 }

@@ -297,11 +297,14 @@ impl Decoder {
     ) {
         let Some(open) = self.open.take() else { return };
         let mut asked_by = at;
-        if let (Some(request), Some(Ended::Reply(_)), None) = (&open.request, &ended, doubt)
+        if let (Some(request), Some(Ended::Reply(reply)), None) = (&open.request, &ended, doubt)
             && let Some(late) = self.late.get_mut(&request.address)
         {
+            if !matches!(reply, Reply::Exception(_)) {
+                late.settled_by(&request.pdu, at);
+            }
             asked_by = late.asked_by(&request.pdu, at);
-            late.answered(&request.pdu, at);
+            late.answered(&request.pdu, open.began, at);
         }
         heard.push(Heard::Exchange(Box::new(Exchange {
             address: open.address,

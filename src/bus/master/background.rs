@@ -306,7 +306,7 @@ impl Master {
         let proves_nothing = turn.pdu.is_write() && drive.late.proves_nothing(&turn.pdu, end.began, now);
         // The reply to an earlier try says how it was then.
         let older = drive.late.asked_by(&turn.pdu, now) < end.began;
-        drive.late.answered(&turn.pdu, now);
+        drive.late.answered(&turn.pdu, end.began, now);
         match proves_nothing || older {
             true => Outcome::Garbled,
             false => Outcome::Acknowledged(reply),

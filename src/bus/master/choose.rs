@@ -5,14 +5,19 @@ use std::time::{Duration, Instant};
 use super::{Before, Master, Purpose, Turn};
 use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
+use crate::bus::late_replies::look_alike;
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
+use crate::command::{Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
+use crate::drive::{Plan, PlannedRead, PollClass};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
 /// Decisions without an exchange before the rest waits for the next look: commands that end without one are answered.
 const MOST_DECISIONS: usize = 1000;
+
+/// Pause before it is tried again to settle whether answers are those to the request before.
+pub(super) const ASKED_IN_VAIN: Duration = Duration::from_secs(1);
 
 /// How old a frequency range may be on which a command rests that is begun. Whether it was too old for the command was decided
 /// when that was admitted.
@@ -298,6 +303,11 @@ impl Master {
             command.answer(&Outcome::Refused(range_changed()), now);
             return;
         }
+        let mut command = command;
+        if command.urgency == Urgency::Stop {
+            // It waited for its turn: its time begins now.
+            command.expires = command.expires.max(now + DEFAULT_EXPIRY);
+        }
         let mut run = CommandRun::new(command, &image.spec.profile);
         run.rank = rank;
         drive.begin(run);
@@ -329,7 +339,7 @@ impl Master {
     }
 
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
-        let pdu = poll.read.pdu();
+        let pdu = self.settling(&poll, now).unwrap_or_else(|| poll.read.pdu());
         let drive = self.drives.get_mut(poll.drive)?;
         let session = self.sessions.before(poll.drive, None, now);
         let next = session.map_or_else(|| pdu.clone(), RequestPdu::N2);
@@ -350,6 +360,34 @@ impl Master {
             },
         };
         Some(Ok(turn))
+    }
+
+    /// What is asked in place of a read whose answers may each be that to the request before: the first half of its block,
+    /// whose reply looks otherwise. Where there is no such half, another read of the drive is asked for, or the read itself
+    /// is held back.
+    fn settling(&mut self, poll: &Poll, now: Instant) -> Option<RequestPdu> {
+        let (drive, image) = (self.drives.get_mut(poll.drive)?, self.bus.image.drives.get(poll.drive)?);
+        let whole = poll.read.pdu();
+        if !drive.late.wants_proof(&whole, now) || !self.schedule.is_online(poll.drive) {
+            return None;
+        }
+        let reads = &image.plan.reads;
+        let is_fast = |read: &PlannedRead| read.class == PollClass::Fast;
+        let differs = |pdu: &RequestPdu| !look_alike(pdu, &whole);
+        let half = Plan::halves(poll.read).map(|(low, _)| low.pdu()).filter(differs);
+        match half.filter(|_| is_fast(&poll.read)) {
+            Some(half) if drive.late.blocks(&half, now).is_none() => return Some(half),
+            _ if !is_fast(&poll.read) && reads.iter().any(is_fast) => {}
+            _ => match reads.iter().find(|read| differs(&read.pdu())) {
+                Some(other) => {
+                    drive.late.stays_behind(&whole, now + ASKED_IN_VAIN);
+                    self.schedule
+                        .refresh(poll.drive, |read| read.covers(other.table, other.start), now);
+                }
+                None => drive.late.cannot_prove(&whole),
+            },
+        }
+        None
     }
 
     /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.
@@ -376,10 +414,6 @@ impl Master {
     }
 }
 
-/// Whether a queued command can be begun now.
-///
-/// # Errors
-/// When it can be, if it must wait.
 fn range_changed() -> Refusal {
     Refusal::NotKnown(
         "the drive's frequency range was written, or changed, since the command was given; nothing was written; send it again"
@@ -387,13 +421,17 @@ fn range_changed() -> Refusal {
     )
 }
 
+/// Whether a queued command can be begun now.
+///
+/// # Errors
+/// When it can be, if it must wait.
 fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Result<bool, Instant> {
     // Behind a stop that is begun nothing goes before it is over.
     if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
         return Ok(false);
     }
     if command.urgency == Urgency::Stop {
-        return match drive.silent_until.filter(|until| *until > now) {
+        return match drive.vain_stops.waits_until(now) {
             Some(until) => Err(until),
             None => Ok(true),
         };

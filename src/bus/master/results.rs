@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::choose::ASKED_IN_VAIN;
 use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
@@ -13,18 +14,13 @@ use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, written};
 use crate::drive::{PlannedRead, Point, Raw};
 
-/// First wait before a stop is tried again at a drive that did not answer one.
-const STOP_AGAIN: Duration = Duration::from_millis(500);
-/// Share of the line that stops to a drive that does not answer may take.
-const STOPS_IN_VAIN: u32 = 10;
-
 impl Master {
     /// The exchange of a turn is over; what that changes.
     pub fn done(&mut self, turn: &Turn, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         self.note_late(turn, &end, now);
         match &turn.purpose {
             Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, news),
-            Purpose::Poll(poll) => self.polled(poll, end.ended, end.took, now, news),
+            Purpose::Poll(poll) => self.polled(poll, &turn.pdu, end, now, news),
             Purpose::Background => self.background_over(turn, end, now, news),
             Purpose::Command { slot, rank, step } => {
                 let step = Step {
@@ -61,9 +57,12 @@ impl Master {
         let stranger = self.stranger(turn);
         let mut drive = self.drives.get_mut(turn.drive);
         match &end.ended {
-            Ended::Reply(_) => {
+            Ended::Reply(reply) => {
                 if let Some(drive) = &mut drive {
-                    drive.silent_until = None;
+                    drive.exchanged(end.took);
+                    if !matches!(reply, Reply::Exception(_)) {
+                        drive.late.settled_by(&turn.pdu, now);
+                    }
                 }
                 if let Some(probes) = self.probes.get_mut(turn.drive) {
                     *probes = 0;
@@ -123,13 +122,14 @@ impl Master {
             // It has failed, whatever was answered.
             Ended::Silent | Ended::Reply(_) => Ended::Silent,
         };
+        let end = TurnEnd { ended, ..end };
         match before {
-            Before::Poll(poll) if failed => self.polled(poll, ended, end.took, now, news),
+            Before::Poll(poll) if failed => self.polled(poll, &poll.read.pdu(), end, now, news),
             Before::Poll(_) => self.schedule.session_done(),
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
                 if failed {
-                    self.step_failed(drive, *slot, &unheard(step), &ended, end.took, now);
+                    self.step_failed(drive, *slot, &unheard(step), &end.ended, end.took, now);
                 }
             }
         }
@@ -144,18 +144,26 @@ impl Master {
         news.push(News::Restarted(drive));
     }
 
-    /// What a poll that is over says of the drive.
-    fn polled(&mut self, poll: &Poll, ended: Ended, took: Duration, now: Instant, news: &mut Vec<News>) {
+    /// What a poll that is over says of the drive. `pdu` was asked: the read of the plan, or a half of it.
+    fn polled(&mut self, poll: &Poll, pdu: &RequestPdu, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         // Of a step before the poll this is known already.
-        let heard = self.sessions.heard(poll.drive, &ended);
+        let heard = self.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
         }
-        let polled = match ended {
+        let (read, took) = (poll.read.as_asked(pdu), end.took);
+        let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
+            // What only was to settle the order of its answers says nothing of the block.
+            Ended::Reply(Reply::Exception(_)) | Ended::Silent | Ended::Corrupt(_) if read != poll.read => {
+                if let Some(drive) = self.drives.get_mut(poll.drive) {
+                    drive.late.stays_behind(&poll.read.pdu(), now + ASKED_IN_VAIN);
+                }
+                Polled::Ok
+            }
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) => {
-                self.read(poll, reply, now, news);
+                self.read(poll.drive, read, reply, end.began, now, news);
                 Polled::Ok
             }
             Ended::Silent => Polled::Failed,
@@ -190,16 +198,24 @@ impl Master {
         news.push(News::Offline(index));
     }
 
-    /// The drive answered a read of the plan.
-    fn read(&mut self, poll: &Poll, reply: Reply, now: Instant, news: &mut Vec<News>) {
-        let (read, pdu) = (poll.read, poll.read.pdu());
-        let Some(drive) = self.drives.get_mut(poll.drive) else {
+    /// The drive answered a read that was sent at `sent`.
+    fn read(
+        &mut self,
+        index: usize,
+        read: PlannedRead,
+        reply: Reply,
+        sent: Instant,
+        now: Instant,
+        news: &mut Vec<News>,
+    ) {
+        let pdu = read.pdu();
+        let Some(drive) = self.drives.get_mut(index) else {
             return;
         };
         let at = drive.late.asked_by(&pdu, now);
-        drive.late.answered(&pdu, now);
+        drive.late.answered(&pdu, sent, now);
         if let Some(words) = reply.into_words() {
-            self.learn(poll.drive, read, words, at, news);
+            self.learn(index, read, words, at, news);
         }
     }
 
@@ -275,7 +291,7 @@ impl Master {
         };
         if !matches!(reply, Reply::Exception(_)) {
             let believed = !drive.late.proves_nothing(&step.pdu, end.began, now);
-            drive.late.answered(&step.pdu, now);
+            drive.late.answered(&step.pdu, end.began, now);
             if !believed {
                 if let Some(run) = drive.run(slot).filter(|_| step.pdu.is_write()) {
                     run.doubted();
@@ -295,7 +311,7 @@ impl Master {
         self.read_back(index, step, now);
     }
 
-    /// A step got no believable answer. A drive that does not answer a stop is left alone for a while, so that repeated
+    /// A step got no believable answer. The next stop to a drive that does not answer waits a little, so that repeated
     /// stops do not take the line from the others.
     fn step_failed(&mut self, index: usize, slot: Urgency, step: &Step, ended: &Ended, took: Duration, now: Instant) {
         let online = self.schedule.is_online(index);
@@ -313,12 +329,15 @@ impl Master {
             Ended::Corrupt(_) => Outcome::Garbled,
             _ => Outcome::TimedOut,
         };
+        if slot == Urgency::Stop && *ended == Ended::Silent {
+            drive.vain_stops.not_answered(took);
+        }
         let retries = if online { self.retries } else { 0 };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
             if *ended == Ended::Silent {
-                drive.silent_until = Some(now + STOP_AGAIN.max(took * STOPS_IN_VAIN));
+                drive.vain_stops.in_vain(now);
                 self.schedule.doubted(index);
             }
         }

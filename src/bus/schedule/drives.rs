@@ -11,6 +11,13 @@ use crate::drive::{Plan, PlannedRead, PollClass};
 const DEAD_SHARE: f64 = 0.016;
 /// First and longest pause between two probes of a drive that does not answer.
 const PROBE_PAUSE: (Duration, Duration) = (Duration::from_millis(500), Duration::from_secs(10));
+/// When a drive that went away is probed first, whatever that costs: most outages are short. A drive that answers saves up
+/// for it, out of the same share.
+const EARLY_PROBES: [Duration; 3] = [
+    Duration::from_millis(500),
+    Duration::from_millis(1_000),
+    Duration::from_millis(2_000),
+];
 /// First and longest pause before a request that the drive refused is tried again: a drive that is starting may refuse what
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
@@ -46,26 +53,63 @@ pub(super) enum Presence {
 #[derive(Debug)]
 pub(super) struct DriveSchedule {
     pub(super) presence: Presence,
+    pub(super) early: EarlyProbes,
     pub(super) tried: bool,
     /// It did not answer a command: a fast poll shows whether it is there, before anything else is read.
     pub(super) doubted: bool,
     pub(super) failures: u32,
     pub(super) garbled: u32,
+    /// When process data was last asked for in vain.
+    pub(super) troubled: Option<Instant>,
     pub(super) items: Vec<Item>,
 }
 
-/// The next probe: the pause doubles, and the probe's cost stays within its share of the line. The first one comes sooner: a
-/// drive that was silent for a moment must not be without its stop for seconds. The others have been waiting for its
-/// tries; they get four times of what it takes first.
-pub(super) fn away(now: Instant, pause: Duration, took: Duration) -> Presence {
-    let (first, longest) = PROBE_PAUSE;
-    if pause.is_zero() {
-        // What is on the line then, and what goes before it, is within the longest pause too.
-        return Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first);
+/// The probes of a drive soon after it went away.
+#[derive(Debug)]
+pub(super) struct EarlyProbes {
+    /// How many it has saved up.
+    saved: u32,
+    /// Online since; saves up.
+    online_since: Option<Instant>,
+    /// When it went away, and how many of them it had since.
+    outage: Option<(Instant, usize)>,
+}
+
+impl Default for EarlyProbes {
+    fn default() -> Self {
+        EarlyProbes {
+            saved: EARLY_PROBES.len() as u32,
+            online_since: None,
+            outage: None,
+        }
     }
-    let doubled = (pause * 2).min(longest);
-    let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
-    Presence::Away(now + doubled.max(affordable), doubled)
+}
+
+impl EarlyProbes {
+    /// The drive answers again.
+    pub(super) fn came(&mut self, now: Instant) {
+        (self.online_since, self.outage) = (Some(now), None);
+    }
+
+    /// The drive is to be found anew: if it does not answer, it goes away then.
+    pub(super) fn found_anew(&mut self) {
+        self.outage = None;
+    }
+
+    /// When the next one comes, after a request in vain that took the line for `took`; none when they are used up.
+    fn next(&mut self, now: Instant, took: Duration) -> Option<Instant> {
+        if let Some(since) = self.online_since.take() {
+            let share = now.saturating_duration_since(since).mul_f64(DEAD_SHARE);
+            let earned = share.as_nanos() / took.as_nanos().max(1);
+            let most = EARLY_PROBES.len() as u32;
+            self.saved = most.min(self.saved.saturating_add(u32::try_from(earned).unwrap_or(most)));
+        }
+        let (since, used) = self.outage.get_or_insert((now, 0));
+        let at = *since + *EARLY_PROBES.get(*used).filter(|_| self.saved > 0)?;
+        (*used, self.saved) = (*used + 1, self.saved - 1);
+        // The others have as much of the line in between.
+        Some(at.max(now + took))
+    }
 }
 
 impl Item {
@@ -95,6 +139,42 @@ impl Item {
 }
 
 impl DriveSchedule {
+    /// A drive that was not asked yet.
+    pub(super) fn new(items: Vec<Item>, now: Instant) -> DriveSchedule {
+        DriveSchedule {
+            presence: Presence::Away(now, Duration::ZERO),
+            early: EarlyProbes::default(),
+            tried: false,
+            doubted: false,
+            failures: 0,
+            garbled: 0,
+            troubled: None,
+            items,
+        }
+    }
+
+    /// It does not answer; the last request took the line for `took`. When it is probed next: the first probes come soon, then
+    /// the pause doubles, and the probe's cost stays within its share of the line.
+    pub(super) fn is_away(&mut self, now: Instant, took: Duration) {
+        let pause = match self.presence {
+            Presence::Online => Duration::ZERO,
+            Presence::Away(_, pause) => pause,
+        };
+        let (first, longest) = PROBE_PAUSE;
+        if let Some(at) = self.early.next(now, took) {
+            self.presence = Presence::Away(at, (pause * 2).max(first));
+            return;
+        }
+        self.presence = if pause.is_zero() {
+            // What is on the line then, and what goes before it, is within the longest pause too.
+            Presence::Away(now + (took * 4).clamp(first, longest.mul_f64(0.9)), first)
+        } else {
+            let doubled = (pause * 2).min(longest);
+            let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
+            Presence::Away(now + doubled.max(affordable), doubled)
+        };
+    }
+
     /// Whether something of a drive that answers was never read, the process data apart.
     pub(super) fn has_unread(&self) -> bool {
         let unread = |item: &Item| item.unread && !item.refused && item.failures == 0 && item.is_slow();

@@ -3,7 +3,7 @@
 
 use std::time::{Duration, Instant};
 
-use super::drives::{Presence, away};
+use super::drives::Presence;
 use super::{Change, Poll, Polled, Schedule};
 use crate::drive::PollClass;
 
@@ -25,6 +25,7 @@ impl Schedule {
         let came = drive.presence != Presence::Online;
         if came {
             drive.presence = Presence::Online;
+            drive.early.came(now);
             if self.round_started.is_none() {
                 self.round_due = self.round_due.min(now);
             }
@@ -69,14 +70,20 @@ impl Schedule {
             }
             let first = !drive.tried;
             drive.tried = true;
-            drive.presence = away(now, pause, took);
+            drive.is_away(now, took);
             return if first { Change::Offline } else { Change::None };
         }
         let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
         if !presence_counts {
             // A request that is never answered must not take the drive away while its process data comes.
+            let troubled = drive.troubled.take();
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
+                if troubled.is_some_and(|at| at >= item.due) {
+                    // The line is to blame, not the request: the pause stays short.
+                    item.failures = item.failures.min(retries + 1);
+                    drive.troubled = troubled;
+                }
                 item.due = match item.failures.checked_sub(retries + 1) {
                     Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
                     None => now,
@@ -85,6 +92,7 @@ impl Schedule {
             return Change::None;
         }
         drive.failures += 1;
+        drive.troubled = Some(now);
         // While it is tried again, nothing else is asked of it; what was garbled shows that something is there.
         drive.doubted &= drive.failures <= retries && poll.read.class == PollClass::Fast;
         if drive.failures <= retries {
@@ -93,7 +101,7 @@ impl Schedule {
             }
             return Change::None;
         }
-        drive.presence = away(now, Duration::ZERO, took);
+        drive.is_away(now, took);
         drive.failures = 0;
         drive.garbled = 0;
         self.round.retain(|(index, _)| *index != poll.drive);
@@ -111,6 +119,7 @@ impl Schedule {
         }
         drive.garbled += 1;
         drive.doubted = false;
+        drive.troubled = Some(now);
         if poll.read.class == PollClass::Fast {
             if drive.garbled <= retries {
                 self.round.push_front((poll.drive, poll.read));

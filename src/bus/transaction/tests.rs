@@ -5,6 +5,7 @@ use crate::codec::{Table, rtu};
 
 mod ascii;
 mod chance;
+mod n2;
 
 fn request() -> (Request, Vec<u8>) {
     let pdu = RequestPdu::Read {

@@ -268,7 +268,7 @@ impl World {
     }
 
     /// A message by way of the broker, to which the gateway loses its connection now and then.
-    fn by_broker(&mut self, client: usize, bus: usize, drive: usize) {
+    pub(super) fn by_broker(&mut self, client: usize, bus: usize, drive: usize) {
         let now = self.now;
         let lost = self.scenario.incidents.is_some() && self.dice.chance(0.02);
         let until = now + Duration::from_millis(self.dice.within(100..=5_000));

@@ -229,7 +229,10 @@ impl World {
                 now - *at
             );
         }
-        assert!(now < record.expires, "an expired order goes out: {record:?}");
+        assert!(
+            now < record.expires || record.wish.is_stop(),
+            "an expired order goes out: {record:?}"
+        );
         let first = record.sent.is_none();
         record.sent.get_or_insert(now);
         if first && !record.wish.is_stop() {
@@ -282,6 +285,14 @@ impl World {
             Duration::ZERO
         };
         let from = at.min(asked.at).checked_sub(slack).unwrap_or(at);
+        let settled = self.healing.is_some_and(|healing| asked.at > healing.settled);
+        assert!(
+            !settled || at >= asked.at,
+            "drive {} at {table} {start}: the answer to a request of {:?} ago is dated {:?} back",
+            asked.drive + 1,
+            self.now - asked.at,
+            self.now - at
+        );
         let truth = &self.truths[bus][asked.drive];
         // The drive may have said it in answer to an earlier try; the image dates it back then.
         let said = |did: &RequestPdu, words: Option<&Vec<u16>>| *did == asked.pdu && words == Some(&stored);

@@ -76,10 +76,15 @@ impl World {
             // The end of a reset pulse is tried until the drive takes it.
             let noisy = self.buses[record.bus].line.is_noisy();
             let most = if noisy { 3 * most } else { most };
+            // A stop does not expire: its time begins when it has its turn.
+            let expires = match record.wish.is_stop() {
+                true => record.expires.max(record.accepted + 2 * STOP_TIME),
+                false => record.expires,
+            };
             assert!(
-                self.now < record.expires + most,
+                self.now < expires + most,
                 "order {id} has no answer {:?} after its time: {record:?}",
-                self.now - record.expires
+                self.now - expires
             );
         }
     }

@@ -1,0 +1,54 @@
+//! What is left of faults and commands on a bus: nothing, on a line that has been sound for a while. Pure.
+
+use std::time::Instant;
+
+use super::Master;
+use crate::bus::drive_state::DriveState;
+
+/// What a bus still keeps of exchanges that failed and of commands that were begun. On a sound line on which nobody commands
+/// everything of it ends by itself: its `Default`.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Remains {
+    /// Requests whose reply may still come late.
+    pub late_replies: usize,
+    /// Addresses without a configured drive from which one may.
+    pub strangers: usize,
+    /// Commands that were begun and are not over.
+    pub begun: usize,
+    /// Commands and forwarded reads that wait; one more where background requests do.
+    pub waiting: usize,
+    /// Acknowledged commands whose effect is waited for.
+    pub unconfirmed: usize,
+    /// Drives to which the next stop waits.
+    pub held_stops: usize,
+    /// Leases that ran out and whose action is not acknowledged.
+    pub owed_actions: usize,
+    /// Drives that do not answer.
+    pub away: usize,
+    /// Reads that wait behind failures: not answered, or not done since something asked for them.
+    pub held_reads: usize,
+}
+
+impl Master {
+    /// What is left at `now`.
+    pub fn remains(&self, now: Instant) -> Remains {
+        let (away, held_reads) = self.schedule.held(now);
+        let late = self.drives.iter().map(|drive| drive.late.owed(now));
+        let sum = |of: fn(&DriveState) -> bool| self.drives.iter().filter(|drive| of(drive)).count();
+        Remains {
+            late_replies: late.sum::<usize>() + self.n2_late.owed(now),
+            strangers: self.strangers.values().filter(|late| late.may_come(now)).count(),
+            begun: sum(DriveState::has_runs) + usize::from(self.background.is_some()),
+            waiting: self.bus.queue.lock().len() + usize::from(!self.bus.queue.background().is_empty()),
+            unconfirmed: sum(|drive| !drive.confirmations.is_empty()),
+            held_stops: self
+                .drives
+                .iter()
+                .filter(|drive| drive.vain_stops.waits_until(now).is_some())
+                .count(),
+            owed_actions: sum(|drive| drive.supervision.owes_action()),
+            away,
+            held_reads,
+        }
+    }
+}

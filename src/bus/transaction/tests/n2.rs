@@ -1,0 +1,77 @@
+//! Answers on an N2 line that may be late ones.
+
+use super::*;
+use crate::bus::n2_late_replies::N2LateReplies;
+use crate::codec::Table;
+
+const WINDOW: Duration = Duration::from_millis(750);
+
+fn state(start: u16) -> RequestPdu {
+    RequestPdu::Read {
+        table: Table::DiscreteInput,
+        start,
+        count: 1,
+    }
+}
+
+/// An exchange that begins while the reply to the read of a state may still come.
+fn behind_late_state(pdu: RequestPdu, now: Instant) -> Transaction {
+    let request = Request::new(1, pdu);
+    let mut frame = Vec::new();
+    Protocol::N2.encode(&request, &mut frame);
+    let mut late = N2LateReplies::default();
+    late.given_up(&state(3), 0x10, WINDOW, now);
+    let mut transaction = Transaction::new(
+        Protocol::N2,
+        request,
+        frame,
+        now,
+        Duration::from_millis(250),
+        Duration::from_millis(15),
+        false,
+    );
+    transaction.expect_late(late);
+    transaction
+}
+
+#[test]
+fn a_drive_that_started_anew_is_believed_unless_another_answer_comes() {
+    let now = Instant::now();
+    let soon = now + Duration::from_millis(20);
+    let float = RequestPdu::Read {
+        table: Table::Input,
+        start: 0,
+        count: 2,
+    };
+    let mut alone = behind_late_state(float.clone(), now);
+    let Step::Wait(until) = alone.on_bytes(soon, b"N00\r") else {
+        panic!("it may be a late one")
+    };
+    assert_eq!(until, alone.deadline());
+    let restarted = Reply::Exception(Exception::N2_RESTARTED);
+    assert_eq!(alone.on_time(until), Step::Done(Ended::Reply(restarted)));
+
+    let mut with_own = behind_late_state(float.clone(), now);
+    assert!(matches!(with_own.on_bytes(soon, b"N00\r"), Step::Wait(_)));
+    let own = with_own.on_bytes(soon, b"A4248000092\r");
+    assert!(matches!(own, Step::Done(Ended::Reply(Reply::Registers(_)))), "{own:?}");
+    assert!(!with_own.take_late().may_come(soon), "the late one came");
+
+    let mut other = behind_late_state(float, now);
+    let refused = other.on_bytes(soon, b"N11\r");
+    assert_eq!(
+        refused,
+        Step::Done(Ended::Corrupt(MAY_BE_LATE)),
+        "nothing is refused by chance"
+    );
+}
+
+#[test]
+fn an_identity_that_could_be_a_state_is_believed_unless_another_answer_comes() {
+    let now = Instant::now();
+    let mut transaction = behind_late_state(RequestPdu::N2(Session::Identify), now);
+    let Step::Wait(until) = transaction.on_bytes(now, b"A1061\r") else {
+        panic!("it may be a late state")
+    };
+    assert!(matches!(transaction.on_time(until), Step::Done(Ended::Reply(_))));
+}

@@ -1,0 +1,94 @@
+//! Stops to a drive that does not answer: when the next one may go out. Pure: time is an argument.
+//!
+//! A person presses the button again, and the drive may listen again at any moment: the next stop goes out after the others
+//! had the line for as long as the last one took it. Stops without end must not take half of the line: beyond a few in a row
+//! they get a tenth.
+
+use std::time::{Duration, Instant};
+
+/// Stops in a row that go out in turn with the rest.
+const IN_TURN: f64 = 8.0;
+/// Beyond that the pause is so many times what the last one took, and no longer than that.
+const PAUSE: (u32, Duration) = (10, Duration::from_secs(2));
+
+/// The stops that one drive did not answer.
+#[derive(Debug, Default)]
+pub(super) struct VainStops {
+    /// How many in a row; one less for each pause.
+    count: f64,
+    /// What the exchanges of the present one took so far.
+    took: Duration,
+    last: Option<Instant>,
+    until: Option<Instant>,
+}
+
+impl VainStops {
+    /// An exchange of a stop was not answered; it took the line for `took`.
+    pub(super) fn not_answered(&mut self, took: Duration) {
+        self.took += took;
+    }
+
+    /// A stop failed, none of its exchanges being answered.
+    pub(super) fn in_vain(&mut self, now: Instant) {
+        let took = std::mem::take(&mut self.took);
+        let pause = (took * PAUSE.0).min(PAUSE.1).max(took);
+        if let Some(last) = self.last.replace(now) {
+            let paid = now.saturating_duration_since(last).as_secs_f64() / pause.as_secs_f64().max(1e-6);
+            self.count = (self.count - paid).max(0.0);
+        }
+        self.count += 1.0;
+        self.until = Some(now + if self.count <= IN_TURN { took } else { pause });
+    }
+
+    /// The drive answered something.
+    pub(super) fn answered(&mut self) {
+        *self = VainStops::default();
+    }
+
+    /// Until when the next one waits.
+    pub(super) fn waits_until(&self, now: Instant) -> Option<Instant> {
+        self.until.filter(|until| *until > now)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stop_pressed_again_goes_out_in_turn_and_a_flood_gets_a_tenth() {
+        let ms = Duration::from_millis;
+        for took in [ms(60), ms(1000)] {
+            let (mut stops, mut now) = (VainStops::default(), Instant::now());
+            let mut pauses = Vec::new();
+            for _ in 0..40 {
+                now += took;
+                stops.not_answered(took);
+                stops.in_vain(now);
+                let until = stops.waits_until(now).unwrap();
+                pauses.push(until - now);
+                now = until;
+                assert_eq!(stops.waits_until(now), None);
+            }
+            assert!(pauses[..8].iter().all(|pause| *pause == took), "{pauses:?}");
+            let last: Duration = pauses[20..].iter().sum();
+            assert!(last >= took * 20 * 3 / 2, "a flood has the line to itself: {pauses:?}");
+            assert!(pauses.iter().all(|pause| *pause <= PAUSE.1), "{pauses:?}");
+            stops.answered();
+            stops.not_answered(took);
+            stops.in_vain(now);
+            assert_eq!(stops.waits_until(now), Some(now + took));
+        }
+    }
+
+    #[test]
+    fn a_stop_a_second_is_never_held_up() {
+        let (mut stops, mut now) = (VainStops::default(), Instant::now());
+        for _ in 0..1000 {
+            stops.not_answered(Duration::from_millis(100));
+            stops.in_vain(now);
+            now += Duration::from_secs(1);
+            assert_eq!(stops.waits_until(now), None);
+        }
+    }
+}

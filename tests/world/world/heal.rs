@@ -1,0 +1,307 @@
+//! The second half of a world: every fault ends, and after a computed time all is as good as in a world that never had one.
+
+use drivegate::bus::master::Remains;
+use drivegate::codec::Table;
+use drivegate::drive::PollClass;
+
+use super::*;
+use crate::bus::Parts;
+
+/// A late reply may come for so long; what could be mistaken for it waits.
+const FORGOTTEN: Duration = Duration::from_secs(1);
+/// A slow request that was not answered on a troubled line is tried again after that.
+const MUTE: Duration = Duration::from_secs(2);
+/// The time of a lease, at most, and of a confirmation that is still waited for.
+const COMMANDED: Duration = Duration::from_secs(9);
+/// Granularity of what is measured.
+const STEP: Duration = Duration::from_millis(10);
+
+/// The oldest values of each read of a drive in a time of observation.
+type Ages = Vec<Vec<((Table, u16, PollClass), Option<Duration>)>>;
+
+/// How the second half goes.
+#[derive(Debug, Clone, Copy)]
+pub struct Healing {
+    /// When the last fault ended.
+    since: Instant,
+    /// From then on no reply can be outstanding that the gateway may take for another.
+    pub settled: Instant,
+}
+
+impl World {
+    /// Every fault ends; nothing may stay wrong.
+    pub(super) fn heal(&mut self) {
+        let online = self.end_faults();
+        let stops = self.stop_at_once();
+        let longest = (0..self.buses.len())
+            .map(|bus| self.rounds(bus))
+            .max()
+            .unwrap_or_default();
+        self.look_until(self.now + longest, |world| world.check_stops(&stops));
+        self.check_back(&online, "drives that answered go on");
+        let slow = self
+            .buses
+            .iter()
+            .map(|bus| 2 * bus.slow_round)
+            .max()
+            .unwrap_or_default();
+        let away = PROBED + longest + COMMANDED.max(slow);
+        self.look_until(self.now + away, |_| {});
+        let all: Vec<_> = self.drives_that_answer().collect();
+        self.check_back(&all, "every drive is back");
+        self.check_remains();
+        self.check_as_good_as_new();
+    }
+
+    /// The time in which a drive that answers is as before: what may come late, what is tried again, three rounds.
+    fn rounds(&self, bus: usize) -> Duration {
+        let bus = &self.buses[bus];
+        let round = bus.round.max(bus.line.cycle);
+        let late = match bus.line.protocol {
+            Protocol::N2 => 4 * bus.line.response_timeout,
+            Protocol::ModbusRtu | Protocol::ModbusAscii => 2 * FORGOTTEN,
+        };
+        late + MUTE + 3 * round + self.exchange(bus)
+    }
+
+    /// The longest exchange on a line.
+    fn exchange(&self, bus: &WorldBus) -> Duration {
+        let report = if bus.line.protocol == Protocol::N2 { 2 } else { 1 };
+        report * bus.line.response_timeout + bus.handle.image.spec.format.chars(160)
+    }
+
+    /// Drives, ports, lines, clients and brokers are sound from now on. The drives that the gateway has online.
+    fn end_faults(&mut self) -> Vec<(usize, usize)> {
+        let now = self.now;
+        self.note(|| "every fault ends".to_string());
+        (self.next_incident, self.next_reload) = (None, None);
+        for until in &mut self.off {
+            until.2 = now;
+        }
+        for until in self.away.iter_mut().flatten() {
+            *until = now;
+        }
+        self.incidents();
+        let sim = now - self.began;
+        for bus in &mut self.buses {
+            let parts = Parts::of(bus.index, &bus.line, 0);
+            bus.wire.set_faults(parts.faults.without_faults());
+            bus.flips = 0.0;
+            for address in 1..=bus.line.drives {
+                if let Some(drive) = bus.wire.slaves().drive(address) {
+                    drive.advance(sim);
+                    drive.set_alive(true);
+                }
+            }
+        }
+        for client in 0..self.clients.len() {
+            if let Way::Mqtt(_, broker) = &mut self.clients[client].way
+                && broker.away_until.is_some()
+            {
+                broker.away_until = Some(now);
+                self.by_broker(client, 0, 0);
+            }
+        }
+        let settled = (0..self.buses.len()).map(|bus| self.rounds(bus)).max();
+        self.healing = Some(Healing {
+            since: now,
+            settled: now + settled.unwrap_or_default(),
+        });
+        let online = |(bus, drive): &(usize, usize)| {
+            let image = &self.buses[*bus].handle.image.drives[*drive];
+            image.snapshot().link.is_online()
+        };
+        self.drives_that_answer().filter(online).collect()
+    }
+
+    fn drives_that_answer(&self) -> impl Iterator<Item = (usize, usize)> + '_ {
+        let drives =
+            |(bus, line): (usize, &WorldBus)| (0..usize::from(line.line.drives)).map(move |drive| (bus, drive));
+        let all = self.buses.iter().enumerate().flat_map(drives);
+        all.filter(|(bus, drive)| self.is_alive(*bus, *drive))
+    }
+
+    /// One drive of each line is stopped: whatever came before, the stop is on the wire soon.
+    fn stop_at_once(&mut self) -> Vec<(usize, usize, Instant)> {
+        let mut stops = Vec::new();
+        let client = self.clients.len();
+        self.clients.push(Client {
+            habit: Habit::Plain,
+            next: self.now,
+            way: Way::Plain(Vec::new()),
+            open: 0,
+            silent_until: self.now,
+            burst: (0, 0, 0),
+        });
+        for bus in 0..self.buses.len() {
+            let drive = self.dice.within(0..=u64::from(self.buses[bus].line.drives) - 1) as usize;
+            if self.is_alive(bus, drive) {
+                self.plain(client, bus, drive, Wish::Stop, Duration::from_millis(400));
+                // Where a slow acknowledgement is waited for, it stands for this stop.
+                let waiting = self
+                    .open
+                    .values()
+                    .flatten()
+                    .filter(|id| self.records[**id].wish.is_stop());
+                let others = waiting.count() as u32;
+                let within = self.exchange(&self.buses[bus]) * (3 + others);
+                stops.push((bus, drive, self.now + within));
+            }
+        }
+        stops
+    }
+
+    fn check_stops(&self, stops: &[(usize, usize, Instant)]) {
+        let since = self.healing.map_or(self.now, |healing| healing.since);
+        for (bus, drive, due) in stops {
+            let truth = &self.truths[*bus][*drive];
+            let profile = &self.buses[*bus].profile;
+            let stop = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
+            // On N2 an output is written on change only.
+            let reached = truth.did(since, stop) || !truth.run;
+            assert!(
+                reached || self.now < *due,
+                "line{bus} drive {}: its stop is not on the wire {:?} after it listens again",
+                drive + 1,
+                self.now - since
+            );
+        }
+    }
+
+    fn look_until(&mut self, end: Instant, check: impl Fn(&World)) {
+        while self.now < end {
+            self.step();
+            check(self);
+        }
+    }
+
+    /// The drives answer, their process data is fresh, their state is known.
+    fn check_back(&mut self, drives: &[(usize, usize)], what: &str) {
+        for (bus, drive) in drives {
+            let bus = &self.buses[*bus];
+            let image = &bus.handle.image.drives[*drive];
+            let snapshot = image.snapshot();
+            let name = &image.spec.name;
+            assert!(snapshot.link.is_online(), "{what}: {name} is away");
+            let age = snapshot.fast_at.map(|at| self.now - at);
+            let most = 2 * bus.round.max(bus.line.cycle) + self.exchange(bus);
+            assert!(
+                age.is_some_and(|age| age <= most),
+                "{what}: the process data of {name} is {age:?} old, {most:?} at most"
+            );
+            let refuses = *drive == 0 && bus.line.refuses.is_some();
+            let reading = image.reading(self.now, most.max(Duration::from_secs(1)));
+            assert!(
+                refuses || reading.state().is_some(),
+                "{what}: the state of {name} is unknown"
+            );
+        }
+    }
+
+    /// Nothing is left of faults and commands.
+    fn check_remains(&mut self) {
+        self.collect();
+        let open: Vec<usize> = self.open.values().flatten().copied().collect();
+        assert!(
+            open.is_empty(),
+            "orders without an answer long after the last fault: {open:?}"
+        );
+        for bus in &self.buses {
+            let remains = bus.core.remains(self.now);
+            let wanted = Remains {
+                away: bus.line.dead.len(),
+                // Of probes.
+                late_replies: if bus.line.dead.is_empty() {
+                    0
+                } else {
+                    remains.late_replies
+                },
+                ..Remains::default()
+            };
+            assert_eq!(remains, wanted, "line{}: left long after the last fault", bus.index);
+        }
+    }
+
+    /// Process data comes as often as on the same line without a past, slow values as often as predicted.
+    fn check_as_good_as_new(&mut self) {
+        let window = self.buses.iter().map(|bus| 4 * bus.round.max(bus.line.cycle)).max();
+        let window = window.unwrap_or_default();
+        let began = self.now;
+        let mut healed: Vec<Ages> = self.buses.iter().map(|bus| ages_of(&bus.handle)).collect();
+        while self.now < began + window {
+            let next = self.now + STEP;
+            self.look_until(next, |_| {});
+            for (ages, bus) in healed.iter_mut().zip(&self.buses) {
+                note_ages(ages, &bus.handle, self.now);
+            }
+        }
+        for (bus, healed) in self.buses.iter().zip(&healed) {
+            let sound = sound_ages(bus, window);
+            let round = bus.round.max(bus.line.cycle);
+            for ((drive, healed), sound) in healed.iter().enumerate().zip(&sound) {
+                if !self.is_alive(bus.index, drive) {
+                    continue;
+                }
+                for ((read, age), (_, best)) in healed.iter().zip(sound) {
+                    let Some(best) = best else { continue };
+                    let most = match read.2 {
+                        PollClass::Fast => *best + round + self.exchange(bus) / 2 + STEP,
+                        _ => 2 * bus.slow_round.max(bus.line.slow_cycle) + 2 * round,
+                    };
+                    assert!(
+                        age.is_some_and(|age| age <= most),
+                        "line{} drive {}: {read:?} is up to {age:?} old, {most:?} at most",
+                        bus.index,
+                        drive + 1
+                    );
+                }
+            }
+        }
+    }
+}
+
+fn ages_of(handle: &drivegate::plant::BusHandle) -> Ages {
+    let reads = |image: &Arc<drivegate::process_image::DriveImage>| {
+        let reads = image.plan.reads.iter().map(|read| (read.table, read.start, read.class));
+        let polled = reads.filter(|(.., class)| matches!(class, PollClass::Fast | PollClass::Slow));
+        polled.map(|read| (read, Some(Duration::ZERO))).collect()
+    };
+    handle.image.drives.iter().map(reads).collect()
+}
+
+/// Takes note of how old each value is; one that was never read has no age.
+fn note_ages(ages: &mut Ages, handle: &drivegate::plant::BusHandle, now: Instant) {
+    for (ages, image) in ages.iter_mut().zip(&handle.image.drives) {
+        let snapshot = image.snapshot();
+        for ((table, start, _), oldest) in ages {
+            let at = snapshot.read_at(*table, *start);
+            *oldest = oldest.zip(at).map(|(oldest, at)| oldest.max(now - at));
+        }
+    }
+}
+
+/// The same on a line of the same drives that never had a fault.
+fn sound_ages(bus: &WorldBus, window: Duration) -> Ages {
+    let line = crate::scenario::Line {
+        faults: String::new(),
+        flips: 0.0,
+        ..bus.line.clone()
+    };
+    let (events, writes, mut now) = (Events::default(), Arc::new(WriteStats::default()), Instant::now());
+    let parts = Parts::of(bus.index, &line, 0);
+    let mut twin = WorldBus::new(bus.index, &line, parts, &events, &writes, now);
+    let warm = now + PROBED;
+    let mut ages = ages_of(&twin.handle);
+    while now < warm + window {
+        let until = now + STEP;
+        while twin.wake_at() <= until {
+            now = twin.wake_at().max(now);
+            twin.step(now, &mut Vec::new());
+        }
+        now = until;
+        if now >= warm {
+            note_ages(&mut ages, &twin.handle, now);
+        }
+    }
+    ages
+}
