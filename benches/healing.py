@@ -97,7 +97,7 @@ class Line:
                 await asyncio.sleep((len(frame) + len(reply)) * self.wire)
                 writer.write(reply)
                 await writer.drain()
-        except (asyncio.IncompleteReadError, ConnectionError):
+        except (asyncio.IncompleteReadError, ConnectionError, asyncio.CancelledError):
             writer.close()
 
 

@@ -8,10 +8,9 @@
 //!
 //! But the reply that comes then may be the older one, and the newer one is still to come: a drive that is always a
 //! little slower than the deadline stays one reply behind as long as the same request follows upon itself. Until that is
-//! settled, its samples are dated by the older request. What settles it is a reply that can be none of these: a drive answers
+//! settled, samples are dated by the request before. What settles it is a reply that can be none of these: a drive answers
 //! in order, so a reply to a request of another look shows that nothing asked before is still to come. The master asks for one
-//! at once ([`LateReplies::wants_proof`]), by a read of half of the block. Where no such request can be made
-//! ([`LateReplies::cannot_prove`]), the same request is held back once, for as long as the newer reply may take.
+//! ([`LateReplies::wants_proof`]).
 //!
 //! Look-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
 //! held back too after a while, and the drive gets the time to catch up.
@@ -64,16 +63,11 @@ struct LateReply {
     overtaken: u32,
 }
 
-/// Whether an answer to a request may be that to an earlier one.
+/// Whether an answer to a request may be that to the request before.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Order {
-    /// It may.
-    Doubtful,
-    /// It may, and that is not asked again before then: an attempt to settle it failed, as with a drive that is always a
-    /// little too slow, or is under way.
-    Behind(Instant),
-    /// It may, and no request of another look can show it: the request is held back once.
-    HeldBack,
+    /// It may; what would show it was asked, and is not asked again before then.
+    Doubtful(Option<Instant>),
     /// It is its own: the drive answered something else since.
     Settled,
 }
@@ -87,7 +81,7 @@ impl LateReply {
             late: Duration::ZERO,
             before: None,
             newer: None,
-            order: Order::Doubtful,
+            order: Order::Doubtful(None),
             wanted: None,
             count: 1,
             overtaken: 0,
@@ -100,8 +94,7 @@ impl LateReply {
 
     fn blocks(&self, pdu: &RequestPdu, now: Instant) -> bool {
         if self.pdu == *pdu {
-            let held_back = self.order == Order::HeldBack && self.since.is_none();
-            held_back || self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
+            self.overtaken > 0 || self.wanted.is_some_and(|since| now >= since + PATIENCE)
         } else {
             look_alike(&self.pdu, pdu)
         }
@@ -118,8 +111,8 @@ impl LateReplies {
             Some(late) => {
                 late.until = until;
                 late.since.get_or_insert(began);
-                if !matches!(late.order, Order::Behind(_)) {
-                    late.order = Order::Doubtful;
+                if late.order == Order::Settled {
+                    late.order = Order::Doubtful(None);
                 }
                 // Reads are true in any order.
                 if pdu.is_write() {
@@ -164,28 +157,21 @@ impl LateReplies {
         }
     }
 
-    /// Whether answers to `pdu` may each be that to the request before, which a request of another look would settle.
+    /// Whether answers to `pdu` may each be that to the request before, and nothing was asked that settles it.
     pub fn wants_proof(&self, pdu: &RequestPdu, now: Instant) -> bool {
         let due = |late: &LateReply| match late.order {
-            Order::Doubtful => true,
-            Order::Behind(until) => until <= now,
-            Order::HeldBack | Order::Settled => false,
+            Order::Doubtful(asked_until) => asked_until.is_none_or(|until| until <= now),
+            Order::Settled => false,
         };
         let answered = |late: &LateReply| late.pdu == *pdu && late.ends() > now && late.since.is_none();
         self.expected.iter().any(|late| answered(late) && due(late))
     }
 
-    /// What could settle the order of answers to `pdu` is asked, or was asked in vain: it is not asked again before `until`.
-    pub fn stays_behind(&mut self, pdu: &RequestPdu, until: Instant) {
+    /// What settles the order of answers to `pdu` is asked; not again before `until`, since a drive that is always a little too
+    /// slow would fall back by it.
+    pub fn proof_is_asked(&mut self, pdu: &RequestPdu, until: Instant) {
         if let Some(late) = self.of(pdu) {
-            late.order = Order::Behind(until);
-        }
-    }
-
-    /// No request of another look can settle the order of answers to `pdu`: it is held back once.
-    pub fn cannot_prove(&mut self, pdu: &RequestPdu) {
-        if let Some(late) = self.of(pdu) {
-            late.order = Order::HeldBack;
+            late.order = Order::Doubtful(Some(until));
         }
     }
 

@@ -213,9 +213,17 @@ impl Pending {
         self.expire(now);
         // Drives whose later commands wait: behind an older one, or behind a stop.
         let mut behind: Vec<usize> = self.drives_of(Urgency::Stop);
+        let mut stopped: Vec<usize> = Vec::new();
         let mut best = None;
         for (index, command) in self.waiting.iter().enumerate() {
             let drive = command.drive;
+            if command.urgency == Urgency::Stop {
+                // Of the stops of a drive the oldest goes first, whoever else its client commands.
+                if stopped.contains(&drive) {
+                    continue;
+                }
+                stopped.push(drive);
+            }
             let own = match command.urgency {
                 Urgency::Command if behind.contains(&drive) => continue,
                 Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,

@@ -22,18 +22,6 @@ pub struct PlannedRead {
 }
 
 impl PlannedRead {
-    /// This read as far as `pdu` asks for it, which may be the first half only.
-    pub(crate) fn as_asked(self, pdu: &RequestPdu) -> PlannedRead {
-        match *pdu {
-            RequestPdu::Read { count, .. } if count < self.count => PlannedRead {
-                count,
-                wide: self.wide & low_bits(count),
-                ..self
-            },
-            _ => self,
-        }
-    }
-
     /// The request.
     pub fn pdu(&self) -> RequestPdu {
         RequestPdu::Read {

@@ -9,7 +9,7 @@ use crate::bus::late_replies::look_alike;
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
 use crate::command::{Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
-use crate::drive::{Plan, PlannedRead, PollClass};
+use crate::drive::{PlannedRead, PollClass};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
@@ -17,7 +17,7 @@ const IN_A_ROW: u32 = 8;
 const MOST_DECISIONS: usize = 1000;
 
 /// Pause before it is tried again to settle whether answers are those to the request before.
-pub(super) const ASKED_IN_VAIN: Duration = Duration::from_secs(1);
+const ASKED_IN_VAIN: Duration = Duration::from_secs(10);
 
 /// How old a frequency range may be on which a command rests that is begun. Whether it was too old for the command was decided
 /// when that was admitted.
@@ -339,7 +339,8 @@ impl Master {
     }
 
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
-        let pdu = self.settling(&poll, now).unwrap_or_else(|| poll.read.pdu());
+        self.settle(&poll, now);
+        let pdu = poll.read.pdu();
         let drive = self.drives.get_mut(poll.drive)?;
         let session = self.sessions.before(poll.drive, None, now);
         let next = session.map_or_else(|| pdu.clone(), RequestPdu::N2);
@@ -362,32 +363,26 @@ impl Master {
         Some(Ok(turn))
     }
 
-    /// What is asked in place of a read whose answers may each be that to the request before: the first half of its block,
-    /// whose reply looks otherwise. Where there is no such half, another read of the drive is asked for, or the read itself
-    /// is held back.
-    fn settling(&mut self, poll: &Poll, now: Instant) -> Option<RequestPdu> {
-        let (drive, image) = (self.drives.get_mut(poll.drive)?, self.bus.image.drives.get(poll.drive)?);
+    /// The answers to a read of process data may each be that to the request before: another read of the drive, whose reply
+    /// looks otherwise, settles it. Where the plan has none, they are dated by the request before.
+    fn settle(&mut self, poll: &Poll, now: Instant) {
         let whole = poll.read.pdu();
-        if !drive.late.wants_proof(&whole, now) || !self.schedule.is_online(poll.drive) {
-            return None;
+        let Some((drive, image)) = self
+            .drives
+            .get_mut(poll.drive)
+            .zip(self.bus.image.drives.get(poll.drive))
+        else {
+            return;
+        };
+        if poll.read.class != PollClass::Fast || !drive.late.wants_proof(&whole, now) {
+            return;
         }
-        let reads = &image.plan.reads;
-        let is_fast = |read: &PlannedRead| read.class == PollClass::Fast;
-        let differs = |pdu: &RequestPdu| !look_alike(pdu, &whole);
-        let half = Plan::halves(poll.read).map(|(low, _)| low.pdu()).filter(differs);
-        match half.filter(|_| is_fast(&poll.read)) {
-            Some(half) if drive.late.blocks(&half, now).is_none() => return Some(half),
-            _ if !is_fast(&poll.read) && reads.iter().any(is_fast) => {}
-            _ => match reads.iter().find(|read| differs(&read.pdu())) {
-                Some(other) => {
-                    drive.late.stays_behind(&whole, now + ASKED_IN_VAIN);
-                    self.schedule
-                        .refresh(poll.drive, |read| read.covers(other.table, other.start), now);
-                }
-                None => drive.late.cannot_prove(&whole),
-            },
+        drive.late.proof_is_asked(&whole, now + ASKED_IN_VAIN);
+        let other = image.plan.reads.iter().find(|read| !look_alike(&read.pdu(), &whole));
+        if let Some(other) = other {
+            let covers = |read: &PlannedRead| read.covers(other.table, other.start);
+            self.schedule.refresh(poll.drive, covers, now);
         }
-        None
     }
 
     /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.

@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use super::choose::ASKED_IN_VAIN;
 use super::{Before, Master, Purpose, Turn, TurnEnd};
 use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
@@ -20,7 +19,7 @@ impl Master {
         self.note_late(turn, &end, now);
         match &turn.purpose {
             Purpose::Session(step, before) => self.session_went_on(turn.drive, *step, before, end, now, news),
-            Purpose::Poll(poll) => self.polled(poll, &turn.pdu, end, now, news),
+            Purpose::Poll(poll) => self.polled(poll, end, now, news),
             Purpose::Background => self.background_over(turn, end, now, news),
             Purpose::Command { slot, rank, step } => {
                 let step = Step {
@@ -124,7 +123,7 @@ impl Master {
         };
         let end = TurnEnd { ended, ..end };
         match before {
-            Before::Poll(poll) if failed => self.polled(poll, &poll.read.pdu(), end, now, news),
+            Before::Poll(poll) if failed => self.polled(poll, end, now, news),
             Before::Poll(_) => self.schedule.session_done(),
             Before::Command(slot, rank) => {
                 self.schedule.command_done(*rank, end.took);
@@ -144,26 +143,19 @@ impl Master {
         news.push(News::Restarted(drive));
     }
 
-    /// What a poll that is over says of the drive. `pdu` was asked: the read of the plan, or a half of it.
-    fn polled(&mut self, poll: &Poll, pdu: &RequestPdu, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
+    /// What a poll that is over says of the drive.
+    fn polled(&mut self, poll: &Poll, end: TurnEnd, now: Instant, news: &mut Vec<News>) {
         // Of a step before the poll this is known already.
         let heard = self.sessions.heard(poll.drive, &end.ended);
         if heard == Progress::Restarted {
             self.restarted(poll.drive, now, news);
         }
-        let (read, took) = (poll.read.as_asked(pdu), end.took);
+        let took = end.took;
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
-            // What only was to settle the order of its answers says nothing of the block.
-            Ended::Reply(Reply::Exception(_)) | Ended::Silent | Ended::Corrupt(_) if read != poll.read => {
-                if let Some(drive) = self.drives.get_mut(poll.drive) {
-                    drive.late.stays_behind(&poll.read.pdu(), now + ASKED_IN_VAIN);
-                }
-                Polled::Ok
-            }
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) => {
-                self.read(poll.drive, read, reply, end.began, now, news);
+                self.read(poll.drive, poll.read, reply, end.began, now, news);
                 Polled::Ok
             }
             Ended::Silent => Polled::Failed,

@@ -136,9 +136,9 @@ impl Schedule {
 
     fn due_slow(&self, now: Instant) -> Option<(Instant, Poll, Duration)> {
         // What is read once when a drive comes online goes first: commands in percent rest on its frequencies.
-        let rank = |item: &Item| {
+        let rank = |due: Instant, item: &Item| {
             let first = item.read.class == PollClass::Once && item.failures == 0 && !item.refused;
-            (!first, item.due)
+            (!first, due)
         };
         let (mut least, mut best) = (None, None);
         for (index, drive) in self
@@ -147,15 +147,16 @@ impl Schedule {
             .enumerate()
             .filter(|(_, d)| d.presence == Presence::Online)
         {
-            for item in drive.items.iter().filter(|i| i.is_slow() && i.due <= now) {
-                if least.is_none_or(|least| rank(item) < least) {
+            let slow = drive.items.iter().filter(|item| item.is_slow());
+            for (due, item) in slow.map(|item| (drive.due(item), item)).filter(|(due, _)| *due <= now) {
+                if least.is_none_or(|least| rank(due, item) < least) {
                     let poll = Poll {
                         drive: index,
                         read: item.read,
                         probe: false,
                     };
-                    least = Some(rank(item));
-                    best = Some((item.due, poll, item.cost));
+                    least = Some(rank(due, item));
+                    best = Some((due, poll, item.cost));
                 }
             }
         }
@@ -170,7 +171,7 @@ impl Schedule {
                 Presence::Away(_, _) if drive.items.is_empty() => None,
                 Presence::Away(at, _) => Some(at),
                 Presence::Online => {
-                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| i.due);
+                    let slow = drive.items.iter().filter(|i| i.is_slow()).map(|i| drive.due(i));
                     let asked = drive.items.iter().filter_map(|i| i.asked);
                     slow.chain(asked).filter(|due| *due > now).min()
                 }

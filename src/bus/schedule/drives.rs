@@ -22,6 +22,9 @@ const EARLY_PROBES: [Duration; 3] = [
 /// it soon has, one that never has it must not take time from others.
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
+/// Process data without a fault for that long shows that the line is sound.
+const SOUND_FOR: Duration = Duration::from_secs(2);
+
 #[derive(Debug, Clone)]
 pub(super) struct Item {
     pub(super) read: PlannedRead,
@@ -33,6 +36,8 @@ pub(super) struct Item {
     /// How often in a row.
     pub(super) refusals: u32,
     pub(super) failures: u32,
+    /// When it was last asked for in vain.
+    pub(super) failed_at: Option<Instant>,
     /// A read of the once class, or one that a fault asks for, that is still to be done.
     pub(super) wanted: bool,
     /// Never answered so far.
@@ -122,6 +127,7 @@ impl Item {
             refused: false,
             refusals: 0,
             failures: 0,
+            failed_at: None,
             wanted: read.class != PollClass::Fault,
             unread: read.class != PollClass::Fault,
             asked: None,
@@ -173,6 +179,19 @@ impl DriveSchedule {
             let affordable = took.mul_f64(1.0 / DEAD_SHARE).min(longest);
             Presence::Away(now + doubled.max(affordable), doubled)
         };
+    }
+
+    /// When a slow read is due. One that is put off for long and was not answered while process data was not either has the
+    /// line to blame: it is due once process data came without a fault for a while.
+    pub(super) fn due(&self, item: &Item) -> Instant {
+        let Some((failed_at, troubled)) = item.failed_at.zip(self.troubled).filter(|_| item.failures > 0) else {
+            return item.due;
+        };
+        let sound = troubled + SOUND_FOR;
+        match failed_at <= sound && item.due > failed_at + 2 * SOUND_FOR {
+            true => item.due.min(sound),
+            false => item.due,
+        }
     }
 
     /// Whether something of a drive that answers was never read, the process data apart.

@@ -76,14 +76,9 @@ impl Schedule {
         let presence_counts = poll.read.class == PollClass::Fast || !drive.has_fast();
         if !presence_counts {
             // A request that is never answered must not take the drive away while its process data comes.
-            let troubled = drive.troubled.take();
             if let Some(item) = drive.items.iter_mut().find(|i| i.read == poll.read) {
                 item.failures += 1;
-                if troubled.is_some_and(|at| at >= item.due) {
-                    // The line is to blame, not the request: the pause stays short.
-                    item.failures = item.failures.min(retries + 1);
-                    drive.troubled = troubled;
-                }
+                item.failed_at = Some(now);
                 item.due = match item.failures.checked_sub(retries + 1) {
                     Some(vain) => now + (MUTE_PAUSE.0 * (1 << vain.min(5))).min(MUTE_PAUSE.1),
                     None => now,

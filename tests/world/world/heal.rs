@@ -10,9 +10,11 @@ use crate::bus::Parts;
 /// A late reply may come for so long; what could be mistaken for it waits.
 const FORGOTTEN: Duration = Duration::from_secs(1);
 /// A slow request that was not answered on a troubled line is tried again after that.
-const MUTE: Duration = Duration::from_secs(2);
+const MUTE: Duration = Duration::from_secs(4);
 /// The time of a lease, at most, and of a confirmation that is still waited for.
 const COMMANDED: Duration = Duration::from_secs(9);
+/// Longest pause between two stops of a flood to a drive that does not answer.
+const FLOODED: Duration = Duration::from_secs(2);
 /// Granularity of what is measured.
 const STEP: Duration = Duration::from_millis(10);
 
@@ -102,7 +104,10 @@ impl World {
                 self.by_broker(client, 0, 0);
             }
         }
-        let settled = (0..self.buses.len()).map(|bus| self.rounds(bus)).max();
+        // A slow read of another look settles whether answers are those to the request before.
+        let settled = (0..self.buses.len())
+            .map(|bus| self.rounds(bus) + 2 * self.buses[bus].slow_round)
+            .max();
         self.healing = Some(Healing {
             since: now,
             settled: now + settled.unwrap_or_default(),
@@ -144,7 +149,11 @@ impl World {
                     .flatten()
                     .filter(|id| self.records[**id].wish.is_stop());
                 let others = waiting.count() as u32;
-                let within = self.exchange(&self.buses[bus]) * (3 + others);
+                let flooded = match self.buses[bus].core.remains(self.now).held_stops {
+                    0 => Duration::ZERO,
+                    _ => FLOODED,
+                };
+                let within = self.exchange(&self.buses[bus]) * (3 + others) + flooded;
                 stops.push((bus, drive, self.now + within));
             }
         }
