@@ -9,8 +9,8 @@
 //! But the reply that comes then may be the older one, and the newer one is still to come: a drive that is always a
 //! little slower than the deadline stays one reply behind as long as the same request follows upon itself. Until that is
 //! settled, samples are dated by the request before. What settles it is a reply that can be none of these: a drive answers
-//! in order, so a reply to a request of another look shows that nothing asked before is still to come. The master asks for one
-//! ([`LateReplies::wants_proof`]).
+//! in order, so a reply to a request of another look shows that nothing asked before is still to come. A plan has such requests:
+//! its slow reads.
 //!
 //! Look-alikes do not rely on that order: for them only time counts. While one waits, the request whose reply is late is
 //! held back too after a while, and the drive gets the time to catch up.
@@ -53,23 +53,14 @@ struct LateReply {
     before: Option<Instant>,
     /// Until when the newer reply may come.
     newer: Option<Instant>,
-    /// Whether each answer may be that to the request before.
-    order: Order,
+    /// Each answer is that to its own request: the drive answered something else since.
+    settled: bool,
     /// Since when a look-alike waits.
     wanted: Option<Instant>,
     /// Replies that may still come.
     count: u32,
     /// How many of them are of tries before another write, which the drive may have taken.
     overtaken: u32,
-}
-
-/// Whether an answer to a request may be that to the request before.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Order {
-    /// It may; what would show it was asked, and is not asked again before then.
-    Doubtful(Option<Instant>),
-    /// It is its own: the drive answered something else since.
-    Settled,
 }
 
 impl LateReply {
@@ -81,7 +72,7 @@ impl LateReply {
             late: Duration::ZERO,
             before: None,
             newer: None,
-            order: Order::Doubtful(None),
+            settled: false,
             wanted: None,
             count: 1,
             overtaken: 0,
@@ -111,9 +102,7 @@ impl LateReplies {
             Some(late) => {
                 late.until = until;
                 late.since.get_or_insert(began);
-                if late.order == Order::Settled {
-                    late.order = Order::Doubtful(None);
-                }
+                late.settled = false;
                 // Reads are true in any order.
                 if pdu.is_write() {
                     late.count = (late.count + 1).min(KEPT);
@@ -137,7 +126,7 @@ impl LateReplies {
                     late.late = now.saturating_duration_since(since).max(late.late).min(FORGOTTEN_AFTER);
                 }
                 late.before = Some(sent);
-                if late.order != Order::Settled {
+                if !late.settled {
                     late.newer = Some(now + late.late);
                 }
             }
@@ -153,25 +142,7 @@ impl LateReplies {
             return;
         }
         for late in &mut self.expected {
-            (late.order, late.since) = (Order::Settled, None);
-        }
-    }
-
-    /// Whether answers to `pdu` may each be that to the request before, and nothing was asked that settles it.
-    pub fn wants_proof(&self, pdu: &RequestPdu, now: Instant) -> bool {
-        let due = |late: &LateReply| match late.order {
-            Order::Doubtful(asked_until) => asked_until.is_none_or(|until| until <= now),
-            Order::Settled => false,
-        };
-        let answered = |late: &LateReply| late.pdu == *pdu && late.ends() > now && late.since.is_none();
-        self.expected.iter().any(|late| answered(late) && due(late))
-    }
-
-    /// What settles the order of answers to `pdu` is asked; not again before `until`, since a drive that is always a little too
-    /// slow would fall back by it.
-    pub fn proof_is_asked(&mut self, pdu: &RequestPdu, until: Instant) {
-        if let Some(late) = self.of(pdu) {
-            late.order = Order::Doubtful(Some(until));
+            (late.settled, late.since) = (true, None);
         }
     }
 
@@ -209,7 +180,7 @@ impl LateReplies {
     /// When the request was sent at the latest whose reply an answer to `pdu` at `now` may be: earlier than this one while a
     /// late reply to the same request may come. To be asked before [`LateReplies::answered`].
     pub fn asked_by(&self, pdu: &RequestPdu, now: Instant) -> Instant {
-        let doubtful = |late: &LateReply| late.ends() > now && late.order != Order::Settled;
+        let doubtful = |late: &LateReply| late.ends() > now && !late.settled;
         let same = self.expected.iter().find(|late| late.pdu == *pdu && doubtful(late));
         same.map_or(now, |late| late.since.or(late.before).unwrap_or(now))
     }

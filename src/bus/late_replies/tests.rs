@@ -230,9 +230,9 @@ fn a_write_that_was_not_answered_may_have_been_taken_all_the_same() {
     assert!(!late.proves_nothing(&write(0), now, now));
 }
 
-/// The ages of the samples of a request every 20 ms, answered after 5 ms, of which one reply was lost; `asked` is what the
-/// master does to settle which answer is whose.
-fn ages_after_a_lost_reply(asked: impl Fn(&mut LateReplies, Instant)) -> Vec<Duration> {
+/// The ages of the samples of a request every 20 ms, answered after 5 ms, of which one reply was lost. Every so many rounds
+/// something else is read.
+fn ages_after_a_lost_reply(other: u32) -> Vec<Duration> {
     let start = Instant::now();
     let (mut late, ms) = (LateReplies::default(), Duration::from_millis);
     let a = read(2100, 11);
@@ -242,8 +242,8 @@ fn ages_after_a_lost_reply(asked: impl Fn(&mut LateReplies, Instant)) -> Vec<Dur
         let at = sent + ms(5);
         let asked_by = late.asked_by(&a, at);
         late.answered(&a, sent, at);
-        if late.wants_proof(&a, at) {
-            asked(&mut late, at);
+        if (round + 1).is_multiple_of(other) {
+            late.settled_by(&read(2000, 3), at);
         }
         at - asked_by
     };
@@ -253,10 +253,17 @@ fn ages_after_a_lost_reply(asked: impl Fn(&mut LateReplies, Instant)) -> Vec<Dur
 #[test]
 fn one_lost_reply_does_not_date_samples_back_for_ever() {
     let ms = Duration::from_millis;
-    let settled = ages_after_a_lost_reply(|late, at| late.settled_by(&read(2000, 3), at));
-    assert_eq!(settled[0], ms(112), "it may be the older reply");
-    assert!(settled[1..].iter().all(Duration::is_zero), "{settled:?}");
-    let never = ages_after_a_lost_reply(|late, at| late.proof_is_asked(&read(2100, 11), at + ms(60_000)));
+    for other in [1, 50] {
+        let ages = ages_after_a_lost_reply(other);
+        let (doubtful, settled) = ages.split_at(other as usize);
+        assert_eq!(ages[0], ms(112), "it may be the older reply");
+        assert!(
+            doubtful[1..].iter().all(|age| *age == ms(25)),
+            "one request back: {ages:?}"
+        );
+        assert!(settled.iter().all(Duration::is_zero), "{ages:?}");
+    }
+    let never = ages_after_a_lost_reply(1_000);
     assert!(
         never[1..].iter().all(|age| *age == ms(25)),
         "one request back: {never:?}"
@@ -266,23 +273,22 @@ fn one_lost_reply_does_not_date_samples_back_for_ever() {
 #[test]
 fn only_a_reply_that_can_be_no_late_one_settles_the_order() {
     let now = Instant::now();
+    let later = now + Duration::from_millis(20);
     let (a, half) = (read(2100, 11), read(2100, 5));
     let mut late = LateReplies::default();
     late.given_up(&a, now - DEADLINE, now);
     late.answered(&a, now, now);
     late.settled_by(&read(0, 11), now);
-    assert!(late.wants_proof(&a, now), "it looks the same");
+    assert_eq!(late.asked_by(&a, later), now, "it looks the same");
     late.given_up(&half, now - DEADLINE, now);
     late.settled_by(&half, now);
-    assert!(late.wants_proof(&a, now), "it may be late itself");
+    assert_eq!(late.asked_by(&a, later), now, "it may be late itself");
     late.settled_by(&read(0, 3), now);
-    assert!(!late.wants_proof(&a, now));
-    assert_eq!(late.asked_by(&a, now), now);
+    assert_eq!(late.asked_by(&a, later), later);
     assert!(
         late.blocks(&read(0, 11), now).is_some(),
         "look-alikes wait for their time"
     );
-    late.given_up(&a, now, now + DEADLINE);
-    late.answered(&a, now + DEADLINE, now + DEADLINE);
-    assert!(late.wants_proof(&a, now + DEADLINE), "lost once more");
+    late.given_up(&a, now, later);
+    assert_eq!(late.asked_by(&a, later), now, "lost once more");
 }

@@ -5,19 +5,14 @@ use std::time::{Duration, Instant};
 use super::{Before, Master, Purpose, Turn};
 use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
-use crate::bus::late_replies::look_alike;
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
 use crate::command::{Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
-use crate::drive::{PlannedRead, PollClass};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
 /// Decisions without an exchange before the rest waits for the next look: commands that end without one are answered.
 const MOST_DECISIONS: usize = 1000;
-
-/// Pause before it is tried again to settle whether answers are those to the request before.
-const ASKED_IN_VAIN: Duration = Duration::from_secs(10);
 
 /// How old a frequency range may be on which a command rests that is begun. Whether it was too old for the command was decided
 /// when that was admitted.
@@ -339,7 +334,6 @@ impl Master {
     }
 
     fn poll(&mut self, poll: Poll, now: Instant) -> Option<Result<Turn, Instant>> {
-        self.settle(&poll, now);
         let pdu = poll.read.pdu();
         let drive = self.drives.get_mut(poll.drive)?;
         let session = self.sessions.before(poll.drive, None, now);
@@ -361,28 +355,6 @@ impl Master {
             },
         };
         Some(Ok(turn))
-    }
-
-    /// The answers to a read of process data may each be that to the request before: another read of the drive, whose reply
-    /// looks otherwise, settles it. Where the plan has none, they are dated by the request before.
-    fn settle(&mut self, poll: &Poll, now: Instant) {
-        let whole = poll.read.pdu();
-        let Some((drive, image)) = self
-            .drives
-            .get_mut(poll.drive)
-            .zip(self.bus.image.drives.get(poll.drive))
-        else {
-            return;
-        };
-        if poll.read.class != PollClass::Fast || !drive.late.wants_proof(&whole, now) {
-            return;
-        }
-        drive.late.proof_is_asked(&whole, now + ASKED_IN_VAIN);
-        let other = image.plan.reads.iter().find(|read| !look_alike(&read.pdu(), &whole));
-        if let Some(other) = other {
-            let covers = |read: &PlannedRead| read.covers(other.table, other.start);
-            self.schedule.refresh(poll.drive, covers, now);
-        }
     }
 
     /// Whether a turn that was chosen earlier may still go out at `now`: the time of its command has not run out.
