@@ -221,9 +221,10 @@ impl Vault {
         self.lock().looked_for.insert(drive.clone())
     }
 
-    /// Whether nobody was told of that orphaned journal; from now on somebody was.
-    pub fn is_news(&self, journal: &JournalFile) -> bool {
-        self.lock().orphans.insert(journal.path())
+    /// These journals belong to no drive now; those of which that is new.
+    pub fn new_orphans(&self, orphans: BTreeSet<PathBuf>) -> BTreeSet<PathBuf> {
+        let before = std::mem::replace(&mut self.lock().orphans, orphans.clone());
+        orphans.difference(&before).cloned().collect()
     }
 
     /// How far the last restore of that drive is, if there was one since the gateway started.

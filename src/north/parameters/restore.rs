@@ -473,8 +473,12 @@ impl Run {
             _ => {}
         }
         if let Some(why) = &held {
-            let event = unfinished_event(&self.restoration.journal().of.bus, Some(name), why.clone());
-            self.plant.load().events.publish(event);
+            let plant = self.plant.load();
+            // Where it is not configured any more, an event told whose journal is left.
+            if let Some(drive) = plant.drive_at(&self.machine) {
+                let spec = &drive.image.spec;
+                drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
+            }
         }
         self.vault.hold(&self.machine).set(held);
         self.vault.update_restore(&self.machine, |restore| {

@@ -250,13 +250,13 @@ fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
             None => vault.hold(&drive.machine).set(None),
         }
     }
-    for orphan in claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan)) {
-        if vault.is_news(&orphan.0) {
-            let (path, what, remedy) = orphaned(orphan);
-            let text = format!("{what}; {}; {remedy}", path.display());
-            tracing::error!("{text}");
-            events.publish(unfinished_event("", None, text));
-        }
+    let orphans = claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan));
+    let orphans: Vec<_> = orphans.map(orphaned).collect();
+    let news = vault.new_orphans(orphans.iter().map(|(path, ..)| path.clone()).collect());
+    for (path, what, remedy) in orphans.into_iter().filter(|(path, ..)| news.contains(path)) {
+        let text = format!("{what}; {}; {remedy}", path.display());
+        tracing::error!("{text}");
+        events.publish(unfinished_event("", None, text));
     }
 }
 
