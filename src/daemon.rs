@@ -2,20 +2,21 @@
 
 mod changes;
 mod file_limit;
+mod leases;
 mod pulse;
 mod server;
 
 use std::collections::BTreeMap;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use arc_swap::ArcSwap;
 
+use self::leases::Leases;
 pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
-use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
@@ -25,7 +26,7 @@ use crate::north::parameters::{hold_unfinished, keep_reading};
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::parameters::{Store, Vault};
 use crate::plant::{BusHandle, Plant, SharedPlant};
-use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, OnShutdown};
+use crate::process_image::{Access, BusImage, DriveImage, DriveSpec, Machine, OnShutdown};
 
 /// Additional time for a bus to report the result of its stop commands at shutdown.
 const STOP_SLACK: Duration = Duration::from_millis(300);
@@ -207,12 +208,12 @@ impl Daemon {
             self.abort_servers(servers).await;
             return Err(error);
         }
+        self.apply_params(&settings);
         self.hold_unfinished(&settings).await;
         self.commit_servers(servers).await;
         self.replace_buses(&settings, prepared).await;
         self.apply_mqtt(&settings).await?;
         self.apply_local(&settings).await;
-        self.apply_params(&settings);
         self.apply_audit(&settings).await;
         self.apply_keeper(&settings).await;
         let changes = changes::between(&self.settings, &settings);
@@ -233,32 +234,26 @@ impl Daemon {
             .into_iter()
             .partition(|(before, _)| settings.buses.contains(before));
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
-        let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
+        let mut leases = Leases::default();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
-            let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
-            leases.extend(drives.zip(left.leases));
+            leases.left(&before, left.leases);
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
         for (bus, task) in prepared {
-            let lease = |d: &DriveSpec| {
-                let before = leases.get(&(d.name.clone(), d.address)).copied().unwrap_or_default();
-                if d.access == Access::Control {
-                    before
-                } else {
-                    Lease::default()
-                }
-            };
             task.handle().take_over(&stopped);
             let handover = Handover {
-                leases: bus.drives.iter().map(lease).collect(),
+                leases: leases.of(&bus),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
+        }
+        for event in leases.ended(SystemTime::now()) {
+            self.events.publish(event);
         }
         for (bus, task) in &kept {
             // Without a configured `stale_after`, data as old as three rounds of a slow bus is not stale.
@@ -269,6 +264,19 @@ impl Daemon {
             let drives = &task.handle().image.drives;
             drives.iter().for_each(|drive| drive.set_stale_floor(floor));
         }
+        let machines = |handles: &mut dyn Iterator<Item = &BusHandle>| -> BTreeMap<String, Machine> {
+            let of_bus = |bus: &BusHandle| {
+                let image = bus.image.clone();
+                let named = |drive: &Arc<DriveImage>| (drive.spec.name.clone(), image.spec.machine(&drive.spec));
+                image.drives.iter().map(named).collect::<Vec<_>>()
+            };
+            handles.flat_map(of_bus).collect()
+        };
+        let before = machines(&mut self.plant.load().buses.iter());
+        let after = machines(&mut kept.iter().map(|(_, task)| task.handle()));
+        self.writes
+            .audit()
+            .keep_orders_of(|name| before.get(name) == after.get(name));
         let order = |name: &str| settings.buses.iter().position(|b| b.spec.name == name);
         kept.sort_by_key(|(bus, _)| order(&bus.spec.name));
         self.show(settings, &kept);
@@ -309,7 +317,7 @@ impl Daemon {
     fn prepare_bus(&self, bus: &BusSettings) -> Result<BusTask, StartError> {
         let failed = |error| StartError::Bus(bus.spec.name.clone(), error);
         let (_, slow_cycle) = bus.achievable();
-        let hold = |spec: &DriveSpec| self.vault.hold(&spec.name);
+        let hold = |spec: &DriveSpec| self.vault.hold(&bus.spec.machine(spec));
         let image = |spec: &DriveSpec| Arc::new(DriveImage::new(spec.clone(), slow_cycle).with_hold(hold(spec)));
         let drives = bus.drives.iter().map(image).collect();
         let image = Arc::new(BusImage::new(bus.spec.clone(), drives));
@@ -344,6 +352,7 @@ impl Daemon {
         let params = &settings.params;
         self.vault
             .configure(Some(Store::new(params.dir.clone())), params.names.clone());
+        self.vault.set_others(params.others.clone());
         if self.reader.is_some() && self.settings.params.every == params.every {
             return;
         }
@@ -356,7 +365,11 @@ impl Daemon {
 
     /// New drives whose parameters may be half restored take no orders but stops, before their bus starts.
     async fn hold_unfinished(&self, settings: &Settings) {
-        hold_unfinished(&self.vault, settings.buses.iter().flat_map(|bus| &bus.drives)).await;
+        let drives = settings
+            .buses
+            .iter()
+            .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
+        hold_unfinished(&self.vault, &self.events, drives).await;
     }
 
     /// Keeps events and counters in the configured directory. The gateway runs on without that if there is no thread for it.
@@ -428,7 +441,7 @@ impl Daemon {
         }
         let applied = self.mqtt.apply(settings.mqtt.as_ref(), &self.plant, &self.stats).await;
         // Events that came while no client was configured are not published later.
-        self.stats.mqtt.keep_unread(None);
+        self.stats.mqtt.forget_what_is_left();
         applied
     }
 

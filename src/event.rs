@@ -73,13 +73,15 @@ pub enum EventKind {
     ForeignCommand,
     /// Parameters changed that the gateway did not write.
     ParametersChanged,
+    /// A restore of parameters did not come to its end, or its journal belongs to no drive that is configured.
+    RestoreUnfinished,
     /// A verdict about a line came, became firmer, or went.
     Diagnosis,
 }
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 22] = [
+    pub const ALL: [EventKind; 23] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -101,6 +103,7 @@ impl EventKind {
         EventKind::ReloadRefused,
         EventKind::ForeignCommand,
         EventKind::ParametersChanged,
+        EventKind::RestoreUnfinished,
         EventKind::Diagnosis,
     ];
 
@@ -116,6 +119,7 @@ impl EventKind {
             | EventKind::NotConfirmed
             | EventKind::BusDown
             | EventKind::Diagnosis
+            | EventKind::RestoreUnfinished
             | EventKind::ReloadRefused => true,
             EventKind::Online
             | EventKind::FaultEnd
@@ -156,6 +160,7 @@ impl EventKind {
             EventKind::ReloadRefused => "reload_refused",
             EventKind::ForeignCommand => "foreign_command",
             EventKind::ParametersChanged => "parameters_changed",
+            EventKind::RestoreUnfinished => "restore_unfinished",
             EventKind::Diagnosis => "diagnosis",
         }
     }
@@ -464,7 +469,7 @@ mod tests {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
                 | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
                 | BusDown | Recording | ReloadRefused | ForeignCommand => false,
-                ParametersChanged => false,
+                ParametersChanged | RestoreUnfinished => false,
                 Diagnosis => true,
             };
             assert_eq!(kind as usize, place);

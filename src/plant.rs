@@ -22,7 +22,7 @@ use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, Events, RefusedCommand};
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
-use crate::process_image::{BusImage, DriveImage, Reading};
+use crate::process_image::{BusImage, DriveImage, Machine, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::Placed;
@@ -46,16 +46,17 @@ pub struct BusHandle {
 }
 
 impl BusHandle {
-    /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if name and address are.
+    /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if it is the same machine,
+    /// whatever its name.
     /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
     /// that name is outdated.
     pub fn take_over(&self, before: &[BusHandle]) {
         for (index, drive) in self.image.drives.iter().enumerate() {
-            let same = |image: &Arc<DriveImage>| {
-                (&image.spec.name, image.spec.address) == (&drive.spec.name, drive.spec.address)
-            };
+            let machine = self.image.spec.machine(&drive.spec);
             let known = before.iter().find_map(|bus| {
+                let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
                 let place = bus.image.drives.iter().position(same)?;
+                drive.take_over(bus.image.drives.get(place)?);
                 let queue = bus.queue.lock();
                 Some((queue.commander(place).cloned(), queue.stops(place)))
             });
@@ -238,6 +239,11 @@ impl Plant {
         })
     }
 
+    /// The drive that is that machine.
+    pub fn drive_at(&self, machine: &Machine) -> Option<DriveHandle> {
+        self.drives().find(|drive| drive.machine() == *machine)
+    }
+
     fn handle(&self, bus: &BusHandle, index: usize, image: &Arc<DriveImage>) -> DriveHandle {
         DriveHandle {
             bus: bus.clone(),
@@ -251,6 +257,11 @@ impl Plant {
 }
 
 impl DriveHandle {
+    /// Which machine it is, whatever its name.
+    pub fn machine(&self) -> Machine {
+        self.bus.image.spec.machine(&self.image.spec)
+    }
+
     /// The drive as it looks at `now`.
     pub fn reading(&self, now: Instant) -> Reading<'_> {
         self.image.reading(now, self.stale_after)

@@ -9,7 +9,7 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
-use crate::command::{Interruption, Outcome, Urgency};
+use crate::command::{Interruption, LastWritten, Outcome, Urgency};
 use crate::drive::ModelPoint;
 use crate::process_image::{DriveImage, Reading};
 
@@ -39,8 +39,8 @@ pub(super) struct DriveState {
     pub(super) answers_within: Duration,
     /// It was read since its confirmations were looked at.
     pub(super) was_read: bool,
-    /// When an end of its frequency range was written last, whether or not it took it.
-    pub(super) range_written: Option<Instant>,
+    /// When its reference, and an end of its frequency range, were written last, whether or not it took that.
+    pub(super) written: LastWritten,
 }
 
 /// What the begun commands of a drive want.
@@ -72,7 +72,7 @@ impl DriveState {
             vain_stops: VainStops::default(),
             answers_within: Duration::ZERO,
             was_read: false,
-            range_written: None,
+            written: LastWritten::default(),
         }
     }
 

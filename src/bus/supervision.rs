@@ -40,6 +40,23 @@ enum State {
     Ended,
 }
 
+impl Lease {
+    /// One that runs since then.
+    #[cfg(test)]
+    pub(crate) fn held(since: Instant) -> Lease {
+        Lease(State::Held(since))
+    }
+
+    /// What ends with it where no drive goes on with it, in words; nothing of one that has ended, or never began.
+    pub fn ends(self) -> Option<&'static str> {
+        match self.0 {
+            State::Unheard | State::RunsUnheard | State::Ended => None,
+            State::Held(_) => Some("nobody stops it any more when its client falls silent"),
+            State::RanOut => Some("its action, which the drive has not acknowledged, is not written any more"),
+        }
+    }
+}
+
 /// What supervision sees of a drive beside its process data.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Orders {

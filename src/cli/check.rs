@@ -12,17 +12,18 @@ use serde::Serialize;
 use super::{ConfigFile, EXIT_CONFIG, report};
 use crate::bus::predict::{PredictedRequest, Prediction};
 use crate::config::{BusSettings, Loaded, Settings, environment};
-use crate::document::Problem;
+use crate::document::{Finding, Problem};
 use crate::drive::raw_writes;
 use crate::history::RecorderOptions;
 use crate::history::budget::Budget;
 use crate::history::{line, trend};
+use crate::north::parameters::orphans;
 use crate::north::slot::Slot;
 use crate::process_image::{Access, DriveSpec};
 
 /// Checks a configuration and predicts wire times, cycles and load of each bus.
 ///
-/// Opens only the files that the configuration names. Errors and warnings go to stderr, with --json to
+/// Opens only the files that the configuration names, and the journals of restores in the state directory. Errors and warnings go to stderr, with --json to
 /// stdout with all the rest.
 #[derive(Debug, clap::Args)]
 #[command(
@@ -95,6 +96,9 @@ pub(super) fn run(args: &Args) -> ExitCode {
         loaded.errors.extend(as_service::problems(path));
         loaded.settings = loaded.settings.filter(|_| loaded.errors.is_empty());
     }
+    if let Some(settings) = &loaded.settings {
+        loaded.warnings.extend(orphaned_journals(settings));
+    }
     let printed = if args.json {
         report::print(&json(&loaded))
     } else {
@@ -108,6 +112,20 @@ pub(super) fn run(args: &Args) -> ExitCode {
         Some(_) => printed,
         None => ExitCode::from(EXIT_CONFIG),
     }
+}
+
+/// Restores of parameters that were cut off and belong to no drive of this configuration. A state directory that only the gateway may
+/// read is no fault of the configuration.
+fn orphaned_journals(settings: &Settings) -> Vec<Problem> {
+    let drives = settings
+        .buses
+        .iter()
+        .flat_map(|bus| bus.drives.iter().map(|drive| (&bus.spec, drive)));
+    let orphans = orphans(&settings.params.dir, drives).unwrap_or_default().into_iter();
+    let problem = |(path, what, remedy): (PathBuf, String, &str)| {
+        Problem::of_file(path.display().to_string(), "", Finding::new(what, remedy))
+    };
+    orphans.map(problem).collect()
 }
 
 fn json(loaded: &Loaded) -> String {

@@ -2,6 +2,7 @@
 //! Codes and exceptions of a `Refusal` are in `command/mod.rs`. Pure.
 
 use super::frequency_range::{FrequencyRange, rests_on};
+use super::standing::keeps_limits;
 use super::{Authority, Order, ParameterOrder, Refusal, Urgency};
 use crate::codec::n2::Object;
 use crate::codec::{Protocol, RequestPdu, Table};
@@ -46,10 +47,12 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
             } else {
                 Urgency::Command
             };
+            let order = Order::Write(pdu);
+            keeps_limits(drive, &order)?;
             not_held(
                 drive,
                 Admitted {
-                    order: Order::Write(pdu),
+                    order,
                     urgency,
                     reference_only: false,
                     ranges,
@@ -58,7 +61,9 @@ pub fn admit(order: Order, drive: &Reading<'_>, client: Authority) -> Result<Adm
         }
         Order::Points(values) => {
             authority(drive, client)?;
-            not_held(drive, points(drive, values)?)
+            let admitted = points(drive, values)?;
+            keeps_limits(drive, &admitted.order)?;
+            not_held(drive, admitted)
         }
         Order::Parameter(order) => {
             authority(drive, client)?;

@@ -294,6 +294,14 @@ impl Audit {
         self.records().runs.get(drive).cloned()
     }
 
+    /// A reload gave names to other drives: what the drives of those for which `is_same` does not hold were ordered last was ordered
+    /// to others.
+    pub(crate) fn keep_orders_of(&self, is_same: impl Fn(&str) -> bool) {
+        let records = &mut *self.records();
+        records.runs.retain(|drive, _| is_same(drive));
+        records.ordered.retain(|drive, _| is_same(drive));
+    }
+
     /// All that are kept, oldest first, each as JSON; with `drive` those to that drive.
     pub fn recent(&self, drive: Option<&str>) -> Vec<Arc<str>> {
         #[derive(Deserialize)]

@@ -13,6 +13,7 @@ mod background;
 mod frequency_range;
 mod parameter;
 mod queue;
+mod standing;
 mod ticket;
 
 pub use admit::{Admitted, admit, may_restore, sets_twice, written};
@@ -24,6 +25,7 @@ pub use background::{
 pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
+pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
 use std::fmt;

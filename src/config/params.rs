@@ -11,6 +11,7 @@ use crate::document::{self, Reader};
 use crate::drive::profile::Profiles;
 use crate::files::names;
 use crate::parameters::Names;
+use crate::process_image::Machine;
 
 /// How parameters are read and kept.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -21,6 +22,8 @@ pub struct ParamsSettings {
     pub every: Option<Duration>,
     /// Names that go before those of the profiles, by profile.
     pub names: BTreeMap<String, Arc<Names>>,
+    /// Drives of the configuration that this process does not serve, with their names; none of a gateway.
+    pub others: Vec<(Machine, String)>,
 }
 
 impl ParamsSettings {

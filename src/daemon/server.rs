@@ -8,6 +8,9 @@ use tokio_util::sync::CancellationToken;
 use crate::north::{NorthStats, ServerError, http, local, modbus_tcp, mqtt, slot};
 use crate::plant::SharedPlant;
 
+/// Time for what the clients of a server have begun that a reload takes away, longer than any order waits for its bus; and how often it
+/// is looked whether that is over.
+const RETIRE: (Duration, Duration) = (Duration::from_secs(60), Duration::from_millis(20));
 /// Time limit for a server to stop.
 const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 
@@ -15,6 +18,8 @@ const STOP_TIMEOUT: Duration = Duration::from_secs(2);
 pub(super) trait Server: Sized + std::fmt::Debug {
     /// Name in messages.
     const NAME: &'static str;
+    /// Time limit for it to stop.
+    const STOP_TIMEOUT: Duration = STOP_TIMEOUT;
     /// What it is configured by.
     type Options: Clone + PartialEq + std::fmt::Debug;
 
@@ -43,6 +48,12 @@ pub(super) trait Reconfigure: Server {
 
     /// Forgets what was prepared.
     fn abort(&mut self, change: Self::Change);
+
+    /// Takes no more from any client; what was begun is answered.
+    async fn retire(&mut self);
+
+    /// Whether everybody was answered and has gone, after it retired.
+    fn is_drained(&self) -> bool;
 }
 
 /// What [`ServerSlot::prepare`] has prepared.
@@ -126,11 +137,34 @@ impl<S: Server> Running<S> {
 
     async fn stop(self) {
         self.cancel.cancel();
-        within(STOP_TIMEOUT, S::NAME, self.server.stopped()).await;
+        within(S::STOP_TIMEOUT, S::NAME, self.server.stopped()).await;
     }
 }
 
-impl<S: Reconfigure> ServerSlot<S> {
+impl<S: Reconfigure + Send + 'static> Running<S>
+where
+    S::Options: Send + Sync,
+{
+    /// Stops it behind what its clients have begun, which nobody waits for.
+    async fn retire(mut self) {
+        self.server.retire().await;
+        if self.server.is_drained() {
+            return self.stop().await;
+        }
+        tokio::spawn(async move {
+            let until = tokio::time::Instant::now() + RETIRE.0;
+            while !self.server.is_drained() && tokio::time::Instant::now() < until {
+                tokio::time::sleep(RETIRE.1).await;
+            }
+            self.cancel.cancel();
+        });
+    }
+}
+
+impl<S: Reconfigure + Send + 'static> ServerSlot<S>
+where
+    S::Options: Send + Sync,
+{
     /// Prepares the server to run as configured. [`ServerSlot::commit`] cannot fail after that.
     ///
     /// # Errors
@@ -156,7 +190,11 @@ impl<S: Reconfigure> ServerSlot<S> {
     /// Makes the server run as prepared.
     pub(super) async fn commit(&mut self, prepared: Prepared<S>) {
         match (prepared, &mut self.0) {
-            (Prepared::Stop, _) => self.stop().await,
+            (Prepared::Stop, slot) => {
+                if let Some(running) = slot.take() {
+                    running.retire().await;
+                }
+            }
             (Prepared::Started(running), slot) => *slot = Some(running),
             (Prepared::Changed(options, change), Some(running)) => {
                 running.server.commit(change);
@@ -215,6 +253,14 @@ impl Reconfigure for modbus_tcp::Server {
     fn abort(&mut self, change: Self::Change) {
         modbus_tcp::Server::abort(self, change);
     }
+
+    async fn retire(&mut self) {
+        modbus_tcp::Server::retire(self).await;
+    }
+
+    fn is_drained(&self) -> bool {
+        modbus_tcp::Server::is_drained(self)
+    }
 }
 
 impl Server for slot::Server {
@@ -248,6 +294,14 @@ impl Reconfigure for slot::Server {
 
     fn abort(&mut self, change: Self::Change) {
         slot::Server::abort(self, change);
+    }
+
+    async fn retire(&mut self) {
+        slot::Server::retire(self).await;
+    }
+
+    fn is_drained(&self) -> bool {
+        slot::Server::is_drained(self)
     }
 }
 
@@ -303,10 +357,20 @@ impl Reconfigure for http::Http {
     fn abort(&mut self, change: Self::Change) {
         http::Http::abort(self, change);
     }
+
+    async fn retire(&mut self) {
+        http::Http::retire(self).await;
+    }
+
+    fn is_drained(&self) -> bool {
+        http::Http::is_drained(self)
+    }
 }
 
 impl Server for mqtt::Mqtt {
     const NAME: &'static str = "MQTT";
+    // Orders that are under way come first: its successor would be another client at the broker.
+    const STOP_TIMEOUT: Duration = Duration::from_secs(6);
     type Options = mqtt::Options;
 
     async fn start(
@@ -381,6 +445,14 @@ mod tests {
         fn abort(&mut self, name: Self::Change) {
             log(format!("abort {name}"));
         }
+
+        async fn retire(&mut self) {
+            log("retired".to_string());
+        }
+
+        fn is_drained(&self) -> bool {
+            true
+        }
     }
 
     fn possible(name: &'static str) -> Result<&'static str, ServerError> {
@@ -436,7 +508,7 @@ mod tests {
             (Some("taken"), true, &["prepare taken"], Some("a")),
             (Some("b"), true, &["prepare b", "commit b"], Some("b")),
             (None, false, &[], Some("b")),
-            (None, true, &["stopped"], None),
+            (None, true, &["retired", "stopped"], None),
             (Some("taken"), true, &["start taken"], None),
         ] {
             match slot.prepare(configured.as_ref(), &plant, &stats).await {

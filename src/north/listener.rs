@@ -239,6 +239,19 @@ impl<H: ConnectionHandler> Listeners<H> {
         }
     }
 
+    /// Closes all listeners; what their connections have begun is answered as if a reload closed each of them.
+    pub(super) async fn close(&mut self) {
+        for mut listener in std::mem::take(&mut self.open) {
+            tracing::info!(address = %listener.bound, "{}: no longer listening", self.server.title());
+            listener.stop.cancel();
+            listener.cancel.cancel();
+            if let Some(stopped) = listener.stopped.take() {
+                // A task that panicked has closed its socket too.
+                let _ = stopped.await;
+            }
+        }
+    }
+
     /// Starts the accept loop of a listener; without a socket, it binds one as soon as it can.
     fn accept(&self, listener: &mut OpenListener<H>, socket: Option<std::net::TcpListener>) {
         let accept = AcceptLoop {

@@ -10,6 +10,7 @@ use tokio::sync::broadcast::Receiver;
 
 use super::command_json::SharedMemory;
 use super::http::PostedCommands;
+use super::mqtt::{NodeOrdersLeft, OrdersLeft};
 use crate::event::Event;
 
 /// What outlives the servers that a reload replaces: counters of all north sides, and which commands were taken.
@@ -328,6 +329,10 @@ pub struct MqttStats {
     retained: Mutex<Vec<String>>,
     /// The events that the last client left unread when it ended, for the one that a reload puts in its place.
     unread_events: Mutex<Option<Receiver<Arc<Event>>>>,
+    /// The orders whose results the last client still owed when it ended, for the one that a reload puts in its place.
+    orders: Mutex<Option<OrdersLeft>>,
+    /// Those of the last edge node.
+    node_orders: Mutex<Option<NodeOrdersLeft>>,
 }
 
 /// What the MQTT client lost.
@@ -366,6 +371,27 @@ impl MqttStats {
     pub(crate) fn keep_unread(&self, events: Option<Receiver<Arc<Event>>>) -> Option<Receiver<Arc<Event>>> {
         let mut kept = self.unread_events.lock().unwrap_or_else(PoisonError::into_inner);
         std::mem::replace(&mut kept, events)
+    }
+
+    /// Keeps the orders whose results a client owes when it ends, or forgets them; returns those kept before.
+    pub(in crate::north) fn keep_orders(&self, orders: Option<OrdersLeft>) -> Option<OrdersLeft> {
+        let mut kept = self.orders.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, orders)
+    }
+
+    /// As [`MqttStats::keep_orders`], of an edge node.
+    pub(in crate::north) fn keep_node_orders(&self, orders: Option<NodeOrdersLeft>) -> Option<NodeOrdersLeft> {
+        let mut kept = self.node_orders.lock().unwrap_or_else(PoisonError::into_inner);
+        std::mem::replace(&mut kept, orders)
+    }
+
+    /// There is no client that goes on with what the last one left.
+    pub(crate) fn forget_what_is_left(&self) {
+        drop((
+            self.keep_unread(None),
+            self.keep_orders(None),
+            self.keep_node_orders(None),
+        ));
     }
 
     /// Counts lost messages.

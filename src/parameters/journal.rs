@@ -2,9 +2,13 @@
 //! written, so that a restore that was cut off can be resumed or taken back.
 //!
 //! ```text
-//! # drivegate restore 1
+//! # drivegate restore 2
 //! drive: pump-1
+//! bus: line1
+//! port: /dev/ttyUSB0
+//! address: 1
 //! family: vacon-nx
+//! identification: none
 //! begun: 2026-03-02T07:40:12Z
 //! by: local_socket uid 0
 //! phase: writing
@@ -30,9 +34,12 @@ use super::file::{self, CHECKSUM, Id, MOST_BYTES};
 use super::plan::{Handling, Need, ParameterWrite, Plan};
 use crate::drive::Profile;
 use crate::files;
+use crate::process_image::Machine;
 
 /// The first line.
-const HEAD: &str = "# drivegate restore 1";
+const HEAD: &str = "# drivegate restore 2";
+/// The first line of journals that say of the drive's place nothing but its name.
+const HEAD_WITHOUT_PLACE: &str = "# drivegate restore 1";
 /// Name of the file, in the directory of the drive's readings.
 const NAME: &str = "restore.journal";
 /// Name of one that was set aside.
@@ -68,13 +75,100 @@ impl Phase {
     }
 }
 
+/// To which machine a journal belongs. The names are those of the time when the restore began, and for people.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Owner {
+    /// Name of the drive.
+    pub drive: String,
+    /// Name of its bus; empty in journals of earlier versions.
+    pub bus: String,
+    /// Name of its profile.
+    pub family: String,
+    /// The machine; none in journals of earlier versions, which know a name only.
+    pub machine: Option<Machine>,
+    /// What the machine said of itself.
+    pub identification: String,
+}
+
+impl Owner {
+    /// The head of a journal, whether or not the rest of it is understood.
+    ///
+    /// # Errors
+    /// What is wrong.
+    pub fn parse(text: &str) -> Result<Owner, String> {
+        owner(&mut body_of(text)?.lines())
+    }
+
+    /// Where it is, for people.
+    pub fn place(&self) -> String {
+        match &self.machine {
+            Some(machine) => format!("`{}` at {machine}", self.drive),
+            None => format!("`{}`, profile `{}`", self.drive, self.family),
+        }
+    }
+}
+
+/// The text of a journal without its checksum, which fits.
+fn body_of(text: &str) -> Result<String, String> {
+    let body = text.trim_end_matches('\n');
+    let (body, sum) = body.rsplit_once('\n').ok_or("it is empty, or its end is missing")?;
+    let body = format!("{body}\n");
+    if ![HEAD, HEAD_WITHOUT_PLACE]
+        .iter()
+        .any(|head| body.starts_with(&format!("{head}\n")))
+    {
+        return Err(format!("its first line is not `{HEAD}`"));
+    }
+    if sum.strip_prefix("checksum: ") != Some(checksum(&body).as_str()) {
+        return Err("it does not fit its checksum: it is damaged, or was edited".to_string());
+    }
+    Ok(body)
+}
+
+/// What the next line says of `key`.
+fn header<'a>(lines: &mut impl Iterator<Item = &'a str>, key: &str) -> Result<String, String> {
+    let line = lines.next().unwrap_or_default();
+    let value = line.strip_prefix(key).and_then(|rest| rest.strip_prefix(": "));
+    let value = value.map(str::to_string);
+    value.ok_or_else(|| format!("expected `{key}: …`, there is `{line}`"))
+}
+
+fn owner<'a>(lines: &mut impl Iterator<Item = &'a str>) -> Result<Owner, String> {
+    let has_place = lines.next() == Some(HEAD);
+    let drive = header(lines, "drive")?;
+    if !has_place {
+        return Ok(Owner {
+            drive,
+            bus: String::new(),
+            family: header(lines, "family")?,
+            machine: None,
+            identification: NO_IDENTIFICATION.to_string(),
+        });
+    }
+    let (bus, port) = (header(lines, "bus")?, header(lines, "port")?);
+    let address = header(lines, "address")?.parse();
+    let family = header(lines, "family")?;
+    Ok(Owner {
+        drive,
+        bus,
+        machine: Some(Machine {
+            port,
+            address: address.map_err(|_| "`address` is not a number")?,
+            profile: family.clone(),
+        }),
+        family,
+        identification: header(lines, "identification")?,
+    })
+}
+
+/// What stands for an identification where the family has none.
+pub const NO_IDENTIFICATION: &str = "none";
+
 /// The journal of a restore.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Journal {
-    /// Name of the drive.
-    pub drive: String,
-    /// Name of its profile.
-    pub family: String,
+    /// To which machine it belongs.
+    pub of: Owner,
     /// When the restore began, RFC 3339.
     pub begun: String,
     /// Who began it.
@@ -101,10 +195,21 @@ impl Journal {
             format!("{point} {} {code} {}", yes(need.value), file::one_line(&need.remedy))
         });
         let none = || "none".to_string();
+        let of = &self.of;
+        let place = of.machine.as_ref().map(|machine| {
+            let (port, address) = (file::one_line(&machine.port), machine.address);
+            format!("bus: {}\nport: {port}\naddress: {address}\n", of.bus)
+        });
+        let identification = place
+            .as_ref()
+            .map(|_| format!("identification: {}\n", file::one_line(&of.identification)));
         let mut text = format!(
-            "{HEAD}\ndrive: {}\nfamily: {}\nbegun: {}\nby: {}\nphase: {}\ndone: {}\nsaved: {}\nsave: {}\nneed: {}\n\n",
-            self.drive,
-            self.family,
+            "{}\ndrive: {}\n{}family: {}\n{}begun: {}\nby: {}\nphase: {}\ndone: {}\nsaved: {}\nsave: {}\nneed: {}\n\n",
+            if place.is_some() { HEAD } else { HEAD_WITHOUT_PLACE },
+            of.drive,
+            place.unwrap_or_default(),
+            of.family,
+            identification.unwrap_or_default(),
             self.begun,
             file::one_line(&self.by),
             self.phase.name(),
@@ -130,30 +235,17 @@ impl Journal {
     /// # Errors
     /// What is wrong.
     pub fn parse(text: &str, profile: &Profile) -> Result<Journal, String> {
-        let body = text.trim_end_matches('\n');
-        let (body, sum) = body.rsplit_once('\n').ok_or("it is empty, or its end is missing")?;
-        let body = format!("{body}\n");
-        if !body.starts_with(&format!("{HEAD}\n")) {
-            return Err(format!("its first line is not `{HEAD}`"));
-        }
-        if sum.strip_prefix("checksum: ") != Some(checksum(&body).as_str()) {
-            return Err("it does not fit its checksum: it is damaged, or was edited".to_string());
-        }
-        let mut lines = body.lines().skip(1);
-        let mut header = |key: &str| {
-            let line = lines.next().unwrap_or_default();
-            let value = line.strip_prefix(key).and_then(|rest| rest.strip_prefix(": "));
-            value
-                .map(str::to_string)
-                .ok_or_else(|| format!("expected `{key}: …`, there is `{line}`"))
-        };
-        let (drive, family, begun, by) = (header("drive")?, header("family")?, header("begun")?, header("by")?);
-        if family != profile.name {
+        let body = body_of(text)?;
+        let mut lines = body.lines();
+        let of = owner(&mut lines)?;
+        if of.family != profile.name {
             return Err(format!(
-                "it is of a drive of family {family}, and the drive is configured as {}",
-                profile.name
+                "it is of a drive of family {}, and the drive is configured as {}",
+                of.family, profile.name
             ));
         }
+        let mut header = |key: &str| header(&mut lines, key);
+        let (begun, by) = (header("begun")?, header("by")?);
         let phase = header("phase")?;
         let phase = Phase::ALL
             .iter()
@@ -175,8 +267,7 @@ impl Journal {
             .map(|line| row(line).ok_or_else(|| format!("`{line}` is not a parameter with its values")))
             .collect();
         Ok(Journal {
-            drive,
-            family,
+            of,
             begun,
             by,
             phase,
@@ -261,17 +352,60 @@ impl JournalFile {
         }
     }
 
+    /// All that are below that directory, in the order of their names.
+    ///
+    /// # Errors
+    /// The directory cannot be read.
+    pub fn all(params: &Path) -> io::Result<Vec<JournalFile>> {
+        let entries = match fs::read_dir(params) {
+            Err(error) if is_absent(&error) => return Ok(Vec::new()),
+            entries => entries?,
+        };
+        let mut all = Vec::new();
+        for entry in entries {
+            let file = JournalFile { dir: entry?.path() };
+            // What cannot be looked at may be one.
+            if file.path().try_exists().unwrap_or(true) && file.dir.is_dir() {
+                all.push(file);
+            }
+        }
+        all.sort_by(|a, b| a.dir.cmp(&b.dir));
+        Ok(all)
+    }
+
+    /// Name of its directory: that of the drive when the restore began.
+    pub fn drive(&self) -> String {
+        let name = self.dir.file_name().unwrap_or_default();
+        name.to_string_lossy().into_owned()
+    }
+
+    /// The journal that is there must not be that of another machine than `of`.
+    fn is_free(&self, of: &Owner) -> io::Result<()> {
+        let there = self.read()?.and_then(|text| Owner::parse(&text).ok());
+        let is_same = |there: &Owner| there.machine == of.machine;
+        match there.filter(|there| !is_same(there)) {
+            None => Ok(()),
+            Some(there) => Err(io::Error::other(format!(
+                "there is the journal of a restore of {}, which did not come to its end; resume or undo it, or set it aside by \
+                 `drivegate params restore --release {}`",
+                there.place(),
+                self.drive()
+            ))),
+        }
+    }
+
     /// Its path.
     pub fn path(&self) -> PathBuf {
         self.dir.join(NAME)
     }
 
     /// Puts a journal on disk: when this returns it is there after a power failure too, and one that was there before is either
-    /// whole or replaced.
+    /// whole or replaced. The journal of another machine is left.
     ///
     /// # Errors
     /// It is not certain to be there.
-    pub fn write(&self, text: &str) -> io::Result<()> {
+    pub fn write(&self, of: &Owner, text: &str) -> io::Result<()> {
+        self.is_free(of)?;
         files::replace(&self.path(), text.as_bytes())?;
         // The entry of the file, and those of directories that may be new.
         self.dir.ancestors().take(3).try_for_each(sync)
@@ -291,11 +425,14 @@ impl JournalFile {
         Ok(Some(String::from_utf8_lossy(&bytes).into_owned()))
     }
 
-    /// The restore is over: there is no journal any more.
+    /// The restore is over: there is no journal of it any more. That of another machine is left.
     ///
     /// # Errors
     /// It may still be there.
-    pub fn remove(&self) -> io::Result<()> {
+    pub fn remove(&self, of: &Owner) -> io::Result<()> {
+        if self.is_free(of).is_err() {
+            return Ok(());
+        }
         match fs::remove_file(self.path()) {
             Err(error) if is_absent(&error) => Ok(()),
             Err(error) => Err(error),
@@ -352,10 +489,23 @@ pub(super) mod tests {
         }
     }
 
+    pub(crate) fn owner_at(address: u8) -> Owner {
+        Owner {
+            drive: "pump-1".to_string(),
+            bus: "line1".to_string(),
+            family: "vacon-nx".to_string(),
+            machine: Some(Machine {
+                port: "/dev/ttyUSB0".to_string(),
+                address,
+                profile: "vacon-nx".to_string(),
+            }),
+            identification: NO_IDENTIFICATION.to_string(),
+        }
+    }
+
     pub(crate) fn journal(writes: Vec<ParameterWrite>) -> Journal {
         Journal {
-            drive: "pump-1".to_string(),
-            family: "vacon-nx".to_string(),
+            of: owner_at(1),
             begun: "2026-03-02T07:40:12Z".to_string(),
             by: "local_socket uid 0".to_string(),
             phase: Phase::Writing,
@@ -386,8 +536,39 @@ pub(super) mod tests {
         let why = |text: &str| Journal::parse(text, &profile).unwrap_err();
         assert!(why(&text.replace("5000", "5001")).contains("checksum"));
         assert!(why("").contains("empty"));
-        journal.family = "vacon-cx".to_string();
+        journal.of.family = "vacon-cx".to_string();
         assert!(why(&journal.text(&profile)).contains("family vacon-cx"));
+    }
+
+    #[test]
+    fn one_of_an_earlier_version_knows_a_name_only() {
+        let profile = profile();
+        let mut journal = journal(vec![write(102, 5000, 10_000)]);
+        (journal.of.machine, journal.of.bus) = (None, String::new());
+        let text = journal.text(&profile);
+        assert!(
+            text.starts_with("# drivegate restore 1\ndrive: pump-1\nfamily: vacon-nx\nbegun: "),
+            "{text}"
+        );
+        assert_eq!(Journal::parse(&text, &profile), Ok(journal.clone()));
+        assert_eq!(Owner::parse(&text), Ok(journal.of));
+    }
+
+    #[test]
+    fn the_journal_of_another_machine_is_neither_replaced_nor_removed() {
+        let profile = profile();
+        let folder = tempfile::tempdir().unwrap();
+        let file = JournalFile::new(folder.path(), "pump-1");
+        let own = journal(vec![write(102, 5000, 10_000)]);
+        file.write(&own.of, &own.text(&profile)).unwrap();
+        let other = owner_at(2);
+        let why = file.write(&other, "two").unwrap_err().to_string();
+        assert!(why.contains("`pump-1` at address 1 on /dev/ttyUSB0"), "{why}");
+        file.remove(&other).unwrap();
+        assert_eq!(file.read().unwrap(), Some(own.text(&profile)));
+        assert_eq!(JournalFile::all(folder.path()).unwrap(), [file.clone()]);
+        file.remove(&own.of).unwrap();
+        assert_eq!(JournalFile::all(folder.path()).unwrap(), []);
     }
 
     #[test]
@@ -395,13 +576,14 @@ pub(super) mod tests {
         let folder = tempfile::tempdir().unwrap();
         let file = JournalFile::new(&folder.path().join("state/params"), "pump-1");
         assert_eq!(file.read().unwrap(), None);
-        file.write("one").unwrap();
-        file.write("two").unwrap();
+        let of = owner_at(1);
+        file.write(&of, "one").unwrap();
+        file.write(&of, "two").unwrap();
         assert_eq!(file.read().unwrap().as_deref(), Some("two"));
-        file.remove().unwrap();
-        file.remove().unwrap();
+        file.remove(&of).unwrap();
+        file.remove(&of).unwrap();
         assert_eq!(file.read().unwrap(), None);
-        file.write("three").unwrap();
+        file.write(&of, "three").unwrap();
         let aside = file.release().unwrap();
         assert_eq!(
             (file.read().unwrap(), fs::read(aside).unwrap()),
@@ -410,7 +592,7 @@ pub(super) mod tests {
         fs::write(folder.path().join("state/params/file"), "").unwrap();
         let below_a_file = JournalFile::new(&folder.path().join("state/params/file"), "x");
         assert_eq!(below_a_file.read().unwrap(), None);
-        assert!(below_a_file.write("x").is_err());
+        assert!(below_a_file.write(&of, "x").is_err());
     }
 
     proptest! {

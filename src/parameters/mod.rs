@@ -2,6 +2,7 @@
 //! writes next, files and differences are pure; `store` and `journal` have the files on disk, `vault` the readings and
 //! restores that go on; `north::parameters` does them.
 
+mod claims;
 mod difference;
 mod file;
 mod journal;
@@ -12,11 +13,12 @@ mod restoration;
 mod store;
 mod vault;
 
+pub use claims::{Claim, Claims, claims};
 pub use difference::{Difference, differences};
 pub use file::{Entry, FileError, Id, ParameterFile};
-pub use journal::{Journal, JournalFile, Phase};
+pub use journal::{Journal, JournalFile, NO_IDENTIFICATION, Owner, Phase};
 pub use names::Names;
-pub use plan::{Handling, Need, ParameterWrite, Plan, Risk, Wishes, plan};
+pub use plan::{Handling, NOT_KNOWN, Need, ParameterWrite, Plan, Risk, Wishes, plan};
 pub use reading::{Next, Reading};
 pub use restoration::{End, Restoration, Then, Wanted};
 pub use store::{Kept, Store, read};

@@ -10,6 +10,7 @@ use super::file::{Id, ParameterFile};
 use crate::drive::Profile;
 use crate::drive::parameters::RawValue;
 use making::Making;
+pub use making::NOT_KNOWN;
 
 /// One parameter to write.
 #[derive(Debug, Clone, PartialEq)]

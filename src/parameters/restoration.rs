@@ -225,6 +225,11 @@ impl Restoration {
         }
     }
 
+    /// The present order is not given to the bus yet, for a reason that may pass.
+    pub fn put_off(&mut self, why: &str, now: Instant) -> Then {
+        self.pause(PAUSE, why, now)
+    }
+
     /// It cannot go on: somebody stops it from outside.
     pub fn give_up(&mut self, why: String) {
         self.state = match self.touched {

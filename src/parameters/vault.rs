@@ -1,6 +1,7 @@
 //! What readings and restores go on, one of each a drive at a time, and what came of the last ones.
 
 use std::collections::{BTreeMap, BTreeSet};
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
@@ -9,7 +10,7 @@ use super::journal::JournalFile;
 use super::names::Names;
 use super::plan::Plan;
 use super::store::Store;
-use crate::process_image::Hold;
+use crate::process_image::{Hold, Machine};
 
 /// How far the reading of a drive is.
 #[derive(Debug, Clone, PartialEq)]
@@ -79,16 +80,20 @@ impl RestoreStatus {
 #[derive(Debug, Default)]
 struct State {
     numbered: u64,
-    restores: BTreeMap<String, RestoreStatus>,
-    holds: BTreeMap<String, Arc<Hold>>,
-    /// Drives whose journal was looked for.
-    looked_for: BTreeSet<String>,
-    readings: BTreeMap<String, Status>,
+    restores: BTreeMap<Machine, RestoreStatus>,
+    holds: BTreeMap<Machine, Arc<Hold>>,
+    /// Machines whose journal was looked for.
+    looked_for: BTreeSet<Machine>,
+    /// Journals that belong to no drive, of which an event told.
+    orphans: BTreeSet<PathBuf>,
+    readings: BTreeMap<Machine, Status>,
     /// The last reading of each drive since the gateway started, whether the disk took it or not.
-    last: BTreeMap<String, Arc<ParameterFile>>,
+    last: BTreeMap<Machine, Arc<ParameterFile>>,
     changed: BTreeMap<(String, String), u64>,
     names: BTreeMap<String, Arc<Names>>,
     store: Option<Store>,
+    /// Drives of the configuration that this process does not serve, with their names: a journal may belong to one of them.
+    others: Vec<(Machine, String)>,
 }
 
 /// The readings of all drives of the gateway.
@@ -104,6 +109,16 @@ impl Vault {
     pub fn configure(&self, store: Option<Store>, names: BTreeMap<String, Arc<Names>>) {
         let mut state = self.lock();
         (state.store, state.names) = (store, names);
+    }
+
+    /// Drives of the configuration that this process does not serve: none of a gateway.
+    pub fn set_others(&self, others: Vec<(Machine, String)>) {
+        self.lock().others = others;
+    }
+
+    /// Those drives.
+    pub fn others(&self) -> Vec<(Machine, String)> {
+        self.lock().others.clone()
     }
 
     /// Where readings are kept.
@@ -131,17 +146,17 @@ impl Vault {
     }
 
     /// How far the last reading of that drive is, if there was one since the gateway started.
-    pub fn status(&self, drive: &str) -> Option<Status> {
+    pub fn status(&self, drive: &Machine) -> Option<Status> {
         self.lock().readings.get(drive).cloned()
     }
 
     /// The last reading of that drive that succeeded since the gateway started.
-    pub fn last(&self, drive: &str) -> Option<Arc<ParameterFile>> {
+    pub fn last(&self, drive: &Machine) -> Option<Arc<ParameterFile>> {
         self.lock().last.get(drive).cloned()
     }
 
     /// Whether a reading goes on.
-    pub fn is_reading(&self, drive: &str) -> bool {
+    pub fn is_reading(&self, drive: &Machine) -> bool {
         self.lock()
             .readings
             .get(drive)
@@ -152,7 +167,7 @@ impl Vault {
     ///
     /// # Errors
     /// The number of the one that goes on already.
-    pub fn begin(&self, drive: &str) -> Result<u64, u64> {
+    pub fn begin(&self, drive: &Machine) -> Result<u64, u64> {
         let mut state = self.lock();
         if let Some(reading) = state.readings.get(drive).filter(|reading| reading.result.is_none()) {
             return Err(reading.number);
@@ -166,16 +181,16 @@ impl Vault {
             waits: None,
             result: None,
         };
-        state.readings.insert(drive.to_string(), begun);
+        state.readings.insert(drive.clone(), begun);
         Ok(number)
     }
 
     /// The reading of that drive is over.
-    pub fn end(&self, drive: &str, result: Result<ParameterFile, String>) {
+    pub fn end(&self, drive: &Machine, result: Result<ParameterFile, String>) {
         let mut state = self.lock();
         let result = result.map(Arc::new);
         if let Ok(file) = &result {
-            state.last.insert(drive.to_string(), file.clone());
+            state.last.insert(drive.clone(), file.clone());
         }
         if let Some(reading) = state.readings.get_mut(drive) {
             (reading.waits, reading.remaining) = (None, None);
@@ -184,31 +199,36 @@ impl Vault {
     }
 
     /// Something is new of the reading of that drive.
-    pub fn update(&self, drive: &str, change: impl FnOnce(&mut Status)) {
+    pub fn update(&self, drive: &Machine, change: impl FnOnce(&mut Status)) {
         if let Some(reading) = self.lock().readings.get_mut(drive) {
             change(reading);
         }
     }
 
     /// What keeps orders from that drive, the same under whatever configuration.
-    pub fn hold(&self, drive: &str) -> Arc<Hold> {
-        self.lock().holds.entry(drive.to_string()).or_default().clone()
+    pub fn hold(&self, drive: &Machine) -> Arc<Hold> {
+        self.lock().holds.entry(drive.clone()).or_default().clone()
     }
 
-    /// Where the journal of that drive is; none without a store.
+    /// Where the journal of a restore that begins is, by the name of the drive; none without a store.
     pub fn journal(&self, drive: &str) -> Option<JournalFile> {
         let state = self.lock();
         Some(JournalFile::new(state.store.as_ref()?.dir(), drive))
     }
 
-    /// Of these drives those whose journal nobody has looked for; from now on somebody has.
-    pub fn not_looked_for(&self, drives: impl Iterator<Item = String>) -> Vec<String> {
-        let mut state = self.lock();
-        drives.filter(|drive| state.looked_for.insert(drive.clone())).collect()
+    /// Whether nobody has looked for a journal of that machine; from now on somebody has.
+    pub fn is_new(&self, drive: &Machine) -> bool {
+        self.lock().looked_for.insert(drive.clone())
+    }
+
+    /// These journals belong to no drive now; those of which that is new.
+    pub fn new_orphans(&self, orphans: BTreeSet<PathBuf>) -> BTreeSet<PathBuf> {
+        let before = std::mem::replace(&mut self.lock().orphans, orphans.clone());
+        orphans.difference(&before).cloned().collect()
     }
 
     /// How far the last restore of that drive is, if there was one since the gateway started.
-    pub fn restore(&self, drive: &str) -> Option<RestoreStatus> {
+    pub fn restore(&self, drive: &Machine) -> Option<RestoreStatus> {
         self.lock().restores.get(drive).cloned()
     }
 
@@ -216,10 +236,10 @@ impl Vault {
     ///
     /// # Errors
     /// Another one goes on.
-    pub fn begin_restore(&self, drive: &str, stage: RestoreStage) -> Result<u64, String> {
+    pub fn begin_restore(&self, drive: &Machine, name: &str, stage: RestoreStage) -> Result<u64, String> {
         let mut state = self.lock();
         if state.restores.get(drive).is_some_and(RestoreStatus::goes_on) {
-            return Err(format!("a restore of the parameters of `{drive}` goes on already"));
+            return Err(format!("a restore of the parameters of `{name}` goes on already"));
         }
         state.numbered += 1;
         let begun = RestoreStatus {
@@ -231,7 +251,7 @@ impl Vault {
             is_unwanted: false,
         };
         let number = begun.number;
-        state.restores.insert(drive.to_string(), begun);
+        state.restores.insert(drive.clone(), begun);
         Ok(number)
     }
 
@@ -239,18 +259,18 @@ impl Vault {
     ///
     /// # Errors
     /// It is not the last one, or not prepared.
-    pub fn carry_out(&self, drive: &str, number: u64) -> Result<Arc<Prepared>, String> {
+    pub fn carry_out(&self, drive: &Machine, name: &str, number: u64) -> Result<Arc<Prepared>, String> {
         let mut state = self.lock();
         let restore = state.restores.get_mut(drive).filter(|restore| restore.number == number);
         let restore = restore.filter(|restore| restore.stage == RestoreStage::Prepared);
-        let restore = restore.ok_or_else(|| format!("that restore of `{drive}` is not prepared any more"))?;
+        let restore = restore.ok_or_else(|| format!("that restore of `{name}` is not prepared any more"))?;
         restore.stage = RestoreStage::Working;
         restore.progress = (0, restore.prepared.plan.writes.len());
         Ok(restore.prepared.clone())
     }
 
     /// Something is new of the restore of that drive.
-    pub fn update_restore(&self, drive: &str, change: impl FnOnce(&mut RestoreStatus)) {
+    pub fn update_restore(&self, drive: &Machine, change: impl FnOnce(&mut RestoreStatus)) {
         if let Some(restore) = self.lock().restores.get_mut(drive) {
             change(restore);
         }

@@ -154,6 +154,36 @@ pub struct BusSpec {
     pub slow_cycle: Duration,
 }
 
+/// Which machine a drive is, as far as the configuration says: what a lease, a hold or a journal of it belongs to. The name of
+/// a drive, and that of its bus, may come to mean another one.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Machine {
+    /// The port of its bus.
+    pub port: String,
+    /// Its address there.
+    pub address: u8,
+    /// The name of its profile.
+    pub profile: String,
+}
+
+impl std::fmt::Display for Machine {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        let Machine { port, address, profile } = self;
+        write!(f, "address {address} on {port}, profile `{profile}`")
+    }
+}
+
+impl BusSpec {
+    /// The machine that a drive of this bus is.
+    pub fn machine(&self, drive: &DriveSpec) -> Machine {
+        Machine {
+            port: self.port.clone(),
+            address: drive.address,
+            profile: drive.profile.name.clone(),
+        }
+    }
+}
+
 /// The image of one drive.
 #[derive(Debug)]
 pub struct DriveImage {
@@ -220,6 +250,12 @@ impl DriveImage {
         let mut written = self.written.lock().unwrap_or_else(PoisonError::into_inner);
         let parameters = items.iter().filter(|(address, _)| is_parameter(*address));
         written.extend(parameters.map(|(address, value)| (*address, (*value, now))));
+    }
+
+    /// The image of the same drive before a reload: what was written since the parameters were read last is not forgotten.
+    pub(crate) fn take_over(&self, before: &DriveImage) {
+        let before = before.written.lock().unwrap_or_else(PoisonError::into_inner).clone();
+        *self.written.lock().unwrap_or_else(PoisonError::into_inner) = before;
     }
 
     /// The value that the gateway wrote to that parameter since the parameters were read last, and when.

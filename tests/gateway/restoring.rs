@@ -9,7 +9,7 @@ use std::time::Duration;
 use drivegate::sim::wire::SimulatedBus;
 
 use super::parameters::few;
-use crate::support::process::{Running, api, drivegate, until, write_registers};
+use crate::support::process::{Running, api, drivegate, get, until, write_registers};
 use crate::support::site::{HTTP, LINE1, MODBUS_TCP, Site};
 
 struct Plant {
@@ -283,4 +283,62 @@ fn without_a_gateway_the_command_restores_by_itself() {
     }
     let (code, _, said) = plant.ran(&["restore", "--resume", "pump-1"]);
     assert_eq!((code, said.contains("nothing to take up")), (Some(1), true), "{said}");
+}
+
+/// A reload that gives the names of two drives to each other ends the restore; the drive that is half restored is held under its new
+/// name, and the other one is neither held nor written to.
+#[test]
+fn a_restore_does_not_go_on_at_another_machine() {
+    let plant = plant(WRITABLE);
+    let _gateway = plant.site.run_ready();
+    let (before, wanted) = (plant.file("pump-1"), plant.file("pump-2"));
+    let config = plant.site.config();
+    let command = [
+        "params", "restore", &wanted, "pump-1", "--force", "--yes", "--config", &config,
+    ];
+    let mut restore = Running::drivegate(&command);
+    let journal = plant.site.file("state/params/pump-1/restore.journal");
+    until("a parameter", || {
+        let writes = plant.line.with_drive(1, |drive, _| drive.parameter_writes()).unwrap();
+        (!writes.is_empty()).then_some(())
+    });
+    let reload = || {
+        let reloaded = drivegate(&["reload", "--config", &config]).output().unwrap();
+        assert!(reloaded.status.success(), "{reloaded:?}");
+    };
+    for (from, to) in [("pump-1", "pump-x"), ("pump-2", "pump-1"), ("pump-x", "pump-2")] {
+        plant.site.change(&format!("\"{from}\""), &format!("\"{to}\""));
+    }
+    reload();
+    restore.ended();
+    let held = until("the restore is over", || {
+        let held = api(plant.site.http, "pump-2")["held"].as_str()?.to_string();
+        held.contains("--undo pump-2").then_some(held)
+    });
+    assert!(held.contains("`pump-1` at address 1 on "), "{held}");
+    assert!(journal.exists());
+    assert!(
+        api(plant.site.http, "pump-1")["held"].is_null(),
+        "another machine has the name"
+    );
+    let others = plant.line.with_drive(2, |drive, _| drive.parameter_writes()).unwrap();
+    assert!(others.is_empty(), "{others:?}");
+
+    // Where the drive is not configured any more its journal is an orphan.
+    let there = "name = \"pump-2\"\naddress = 1\n";
+    plant.site.change(there, "name = \"pump-2\"\naddress = 3\n");
+    let check = drivegate(&["check", "--config", &config]).output().unwrap();
+    let said = String::from_utf8(check.stderr).unwrap();
+    assert!(said.contains("belongs to `pump-1` at address 1 on "), "{said}");
+    reload();
+    let (_, events) = get(plant.site.http, "/api/v1/events/log?kind=restore_unfinished").unwrap();
+    assert!(events.contains("no such drive is configured"), "{events}");
+    plant.site.change("name = \"pump-2\"\naddress = 3\n", there);
+    reload();
+    until("the drive is read again", || {
+        (api(plant.site.http, "pump-2")["online"] == true).then_some(())
+    });
+    plant.well(&["restore", "--undo", "pump-2"]);
+    assert!(!journal.exists() && api(plant.site.http, "pump-2")["held"].is_null());
+    assert_eq!(plant.differences(&before, "pump-2"), Vec::<String>::new());
 }

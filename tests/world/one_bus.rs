@@ -2,8 +2,8 @@
 
 use std::time::Duration;
 
-use drivegate::codec::{Exception, Protocol};
-use drivegate::command::{Outcome, Refusal};
+use drivegate::codec::{Exception, Protocol, RequestPdu};
+use drivegate::command::{Order, Outcome, Refusal};
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
 use drivegate::process_image::{Access, LeaseAction, Supervision};
@@ -287,13 +287,14 @@ fn no_command_rests_on_a_frequency_range_that_was_changed() {
         let mut rig = ready(&line);
         let known = |hertz: f64| move |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(hertz));
         rig.until("the maximum frequency", PATIENCE, known(50.0));
-        let both = rig.set(1, &[("maximum_frequency", 90.0), reference]);
+        let both = rig.set(1, &[("maximum_frequency", 60.0), reference]);
         assert!(
             matches!(&both, Outcome::Refused(Refusal::BadValue(why)) if why.contains("first")),
             "{both:?}"
         );
         assert!(rig.set(1, &[reference]).is_ok());
-        let range = rig.points(1, &[("maximum_frequency", 90.0)]);
+        rig.until_good(1, ModelPoint::SpeedReference, Value::Number(60.0));
+        let range = rig.points(1, &[("maximum_frequency", 60.0)]);
         let mut range = rig.place(1, range);
         // In the queue behind it, and while it is not read. A stop is another matter.
         let behind = rig.points(1, &[reference]);
@@ -306,10 +307,55 @@ fn no_command_rests_on_a_frequency_range_that_was_changed() {
         assert!(matches!(again, Outcome::Refused(_)), "{again:?}");
         let stop = rig.set(1, &[("run", 0.0)]);
         assert!(stop.is_ok(), "{stop:?}");
-        rig.until("the new maximum frequency", PATIENCE, known(90.0));
+        rig.until("the new maximum frequency", PATIENCE, known(60.0));
         let again = rig.set(1, &[reference]);
-        let fits = reference.0 == "frequency_reference";
-        assert_eq!(again.is_ok(), fits, "{reference:?}: {again:?}");
+        assert!(again.is_ok(), "{reference:?}: {again:?}");
+        let above = rig.set(1, &[("speed_reference", 70.0)]);
+        assert!(
+            matches!(above, Outcome::Refused(Refusal::BadValue(_))),
+            "42 Hz: {above:?}"
+        );
+    }
+}
+
+/// 80 % of 50 Hz are within a limit of 40 Hz; of 100 Hz they are not. Whatever is asked for, in whatever order, the drive is never told
+/// to turn faster than the limit.
+#[test]
+fn the_reference_that_stands_keeps_its_limit_when_the_frequency_range_changes() {
+    let of = |profile: &'static str| Line {
+        spec: |spec| {
+            spec.limits.insert("frequency_reference".to_string(), 0.0..=40.0);
+        },
+        ..line(profile, Protocol::N2, 19_200, 1)
+    };
+    for profile in ["vacon-nx-n2", "eaton-hvx-n2"] {
+        let mut rig = ready(&of(profile));
+        let known = |hertz: f64| move |rig: &Rig| rig.value(1, "maximum_frequency") == Some(Value::Number(hertz));
+        rig.until("the maximum frequency", PATIENCE, known(50.0));
+        rig.until_good(1, ModelPoint::SpeedReference, Value::Number(0.0));
+        // Both in the queue: when the range has its turn, the reference that was read is not the one that stands.
+        let reference = rig.points(1, &[("speed_reference", 80.0)]);
+        let mut reference = rig.place(1, reference);
+        let range = rig.points(1, &[("maximum_frequency", 100.0)]);
+        let mut range = rig.place_as("other", 1, range);
+        assert!(rig.answered(&mut reference).is_ok());
+        let outcome = rig.answered(&mut range);
+        assert!(matches!(outcome, Outcome::Refused(Refusal::NotKnown(_))), "{outcome:?}");
+        rig.until_good(1, ModelPoint::SpeedReference, Value::Number(80.0));
+        let outcome = rig.set(1, &[("maximum_frequency", 100.0)]);
+        assert!(
+            matches!(&outcome, Outcome::Refused(Refusal::BadValue(why)) if why.contains("80 Hz")),
+            "{outcome:?}"
+        );
+        let pdu = RequestPdu::WriteRegisters {
+            start: 6,
+            values: vec![0x42C8, 0],
+        };
+        let outcome = rig.ordered(1, Order::Write(pdu));
+        assert!(matches!(outcome, Outcome::Refused(Refusal::BadValue(_))), "{outcome:?}");
+        assert!(rig.set(1, &[("speed_reference", 40.0)]).is_ok());
+        rig.until_good(1, ModelPoint::SpeedReference, Value::Number(40.0));
+        assert!(rig.set(1, &[("maximum_frequency", 100.0)]).is_ok());
     }
 }
 

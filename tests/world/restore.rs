@@ -9,8 +9,8 @@ use drivegate::codec::{Protocol, Reply, RequestPdu};
 use drivegate::command::{Authority, Order, Origin, Outcome, ParameterOrder, SourceKind};
 use drivegate::drive::ModelPoint;
 use drivegate::parameters::{
-    End, Journal, Names, Next, ParameterFile, Phase, Plan, Reading, Restoration, Then, Wanted, Wishes, differences,
-    plan,
+    End, Journal, NO_IDENTIFICATION, Names, Next, Owner, ParameterFile, Phase, Plan, Reading, Restoration, Then,
+    Wanted, Wishes, differences, plan,
 };
 use drivegate::plant::Placed;
 use drivegate::process_image::ParamsAccess;
@@ -143,10 +143,16 @@ impl Bench {
     }
 
     fn journal(&self) -> Journal {
-        let spec = &self.rig.drive(DRIVE).image.spec;
+        let drive = self.rig.drive(DRIVE);
+        let spec = &drive.image.spec;
         Journal {
-            drive: spec.name.clone(),
-            family: spec.profile.name.clone(),
+            of: Owner {
+                drive: spec.name.clone(),
+                bus: spec.bus.clone(),
+                family: spec.profile.name.clone(),
+                machine: Some(drive.machine()),
+                identification: NO_IDENTIFICATION.to_string(),
+            },
             begun: "2026-03-02T07:40:12Z".to_string(),
             by: "test".to_string(),
             phase: Phase::Writing,

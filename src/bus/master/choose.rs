@@ -7,7 +7,9 @@ use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
-use crate::command::{Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency};
+use crate::command::{
+    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency, still_keeps_limits,
+};
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
 const IN_A_ROW: u32 = 8;
@@ -293,9 +295,15 @@ impl Master {
             return;
         }
         let reading = image.reading(now, RANGE_AGE);
-        let hold = |range: &FrequencyRange| range.holds(&reading, drive.range_written);
+        let hold = |range: &FrequencyRange| range.holds(&reading, drive.written.range);
         if command.urgency == Urgency::Command && !command.ranges.iter().all(hold) {
             command.answer(&Outcome::Refused(range_changed()), now);
+            return;
+        }
+        if command.urgency == Urgency::Command
+            && let Err(refusal) = still_keeps_limits(&reading, &command.order, drive.written)
+        {
+            command.answer(&Outcome::Refused(refusal), now);
             return;
         }
         let mut command = command;

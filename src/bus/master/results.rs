@@ -10,7 +10,7 @@ use crate::bus::schedule::{Change, Poll, Polled};
 use crate::bus::transaction::{Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, written};
+use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
 use crate::drive::{PlannedRead, Point, Raw};
 
 impl Master {
@@ -347,7 +347,13 @@ impl Master {
         let is_end = |address: u16| is_range_end(&image.spec.profile, table, address);
         let range = items.iter().any(|(address, _)| is_end(*address));
         if range {
-            drive.range_written = Some(now);
+            drive.written.range = Some(now);
+        }
+        if items
+            .iter()
+            .any(|(address, _)| is_reference(&image.spec.profile, table, *address))
+        {
+            drive.written.reference = Some(now);
         }
         let covers = |read: &PlannedRead| {
             let ends = || (read.start..read.start.saturating_add(read.count)).any(is_end);

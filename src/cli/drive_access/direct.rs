@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use super::Target;
 use super::gateway::NotFound;
 use crate::command::{Origin, SourceKind};
-use crate::config::{BusSettings, Settings};
+use crate::config::{BusSettings, ParamsSettings, Settings};
 use crate::daemon::Daemon;
 use crate::drive::{Point, PollClass, Profile, Quality, Source};
 use crate::north::local::protocol::{Outcome, Request, Word};
@@ -39,7 +39,18 @@ impl Direct {
         spec.on_shutdown = OnShutdown::Hold;
         spec.supervision = None;
         let name = spec.name.clone();
+        let all = target.settings.buses.iter();
+        let all = all.flat_map(|bus| {
+            bus.drives
+                .iter()
+                .map(|drive| (bus.spec.machine(drive), drive.name.clone()))
+        });
+        let params = ParamsSettings {
+            others: all.filter(|(_, other)| *other != name).collect(),
+            ..target.settings.params.clone()
+        };
         let settings = Settings {
+            params,
             buses: vec![BusSettings {
                 drives: vec![spec],
                 ..target.bus.clone()

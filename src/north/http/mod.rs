@@ -92,8 +92,11 @@ const USER_TIMEOUT: Duration = Duration::from_secs(30);
 /// Time limit of a TLS handshake.
 const HANDSHAKE: Duration = Duration::from_secs(10);
 
-/// Time for pending replies when the gateway stops.
+/// Time for pending replies when the gateway stops, and for streams when a reload ends their connection.
 const GRACE: Duration = Duration::from_millis(500);
+
+/// Time for the replies to commands when a reload ends their connection: longer than any of them waits for the bus.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(60);
 
 /// Configuration of the HTTP server.
 #[derive(Debug, Clone, PartialEq)]
@@ -154,6 +157,8 @@ pub struct Http {
     stats: Arc<NorthStats>,
     operating: Arc<Operating>,
     tasks: TaskTracker,
+    /// Cancelled when the server ends.
+    stopping: CancellationToken,
 }
 
 /// What [`Http::commit`] needs to apply new options: all that can fail is done.
@@ -194,8 +199,8 @@ impl Http {
         self.listeners.abort(change.sockets);
     }
 
-    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another; new
-    /// certificates are for new connections.
+    /// Applies prepared options. Connections and streams end if hosts or tokens change, or the listener is another, those with a
+    /// command behind its reply; new certificates are for new connections.
     pub fn commit(&mut self, change: Change) {
         let Change {
             options,
@@ -205,14 +210,28 @@ impl Http {
         terms.replace(&self.terms);
         self.operating.set_users(options.users.clone());
         let (plant, stats, terms, operating) = (&self.plant, &self.stats, &self.terms, &self.operating);
+        let stopping = &self.stopping;
         self.listeners.commit(sockets, |_, open, cancel| {
             let handler = match open {
                 Some(handler) => handler.clone(),
-                None => Arc::new(HttpConnections::new(&options, plant, stats, terms, operating, cancel)),
+                None => {
+                    let tokens = (cancel, stopping);
+                    Arc::new(HttpConnections::new(&options, plant, stats, terms, operating, tokens))
+                }
             };
             handler.limit.set_limits(options.limits());
             (handler, Handle::current())
         });
+    }
+
+    /// Closes the listener and its connections, those with a command behind its reply.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+    }
+
+    /// Whether no connection is left after [`Http::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
     }
 
     /// Waits until the server has stopped: at most half a second after the token was cancelled.
@@ -236,7 +255,8 @@ pub async fn start(
     tasks.spawn(cancel.clone().cancelled_owned());
     tasks.close();
     let mut http = Http {
-        listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel),
+        listeners: Listeners::new(ServerKind::Http, stats.clone(), tasks.clone(), cancel.clone()),
+        stopping: cancel,
         terms: Arc::new(ArcSwap::from_pointee(Terms::new(&options)?)),
         plant,
         operating: Arc::new(Operating::new(stats.clone())),
@@ -260,6 +280,7 @@ struct HttpConnections {
     no_access: Arc<LogThrottle>,
     operating: Arc<Operating>,
     cancel: CancellationToken,
+    stopping: CancellationToken,
 }
 
 /// The place of a connection, and what it is for.
@@ -293,7 +314,7 @@ impl HttpConnections {
         stats: &Arc<NorthStats>,
         terms: &Arc<ArcSwap<Terms>>,
         operating: &Arc<Operating>,
-        cancel: &CancellationToken,
+        (cancel, stopping): (&CancellationToken, &CancellationToken),
     ) -> HttpConnections {
         HttpConnections {
             router: routes::router(plant.clone(), stats.clone(), operating.clone(), cancel.clone()),
@@ -304,6 +325,7 @@ impl HttpConnections {
             refusals: Refusals::new(ServerKind::Http, stats.clone()),
             no_access: Arc::default(),
             cancel: cancel.clone(),
+            stopping: stopping.clone(),
         }
     }
 }
@@ -353,7 +375,8 @@ impl ConnectionHandler for HttpConnections {
 
 impl HttpConnections {
     /// Answers the requests of a client that connected to the address `local` of this machine. After the cancellation,
-    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply.
+    /// or when the terms are replaced, the connection has [`GRACE`] to finish its reply; that to a command comes first, unless
+    /// the whole server ends.
     async fn serve_requests(
         &self,
         stream: impl AsyncRead + AsyncWrite + Unpin,
@@ -375,6 +398,8 @@ impl HttpConnections {
             address: peer.ip(),
             coverage,
         };
+        // One token for each command whose reply is to come.
+        let commands = TaskTracker::new();
         let router = TowerToHyperService::new(self.router.clone());
         let service = service_fn(|mut request: hyper::Request<Incoming>| {
             let in_use = InUse::new(place.clone());
@@ -384,11 +409,14 @@ impl HttpConnections {
                 .set(self.operating.authority_at(peer.ip(), Instant::now()));
             request.extensions_mut().insert(client);
             request.extensions_mut().insert(reached.clone());
+            let command = (request.method() == hyper::Method::POST).then(|| commands.token());
             let reply = router.call(request);
             async move {
                 // Other clients have a turn between two pipelined requests.
                 tokio::task::yield_now().await;
-                reply.await.map(|reply| reply.map(|body| in_use.until_end_of(body)))
+                let reply = reply.await;
+                drop(command);
+                reply.map(|reply| reply.map(|body| in_use.until_end_of(body)))
             }
         });
         let mut connection = pin!(
@@ -404,7 +432,17 @@ impl HttpConnections {
             () = ended(place.closing(), &terms.replaced) => match place.is_in_use() {
                 true => {
                     connection.as_mut().graceful_shutdown();
-                    timeout(GRACE, connection).await.unwrap_or(Ok(()))
+                    commands.close();
+                    let last = async {
+                        let answered = timeout(ANSWERED_WITHIN, commands.wait());
+                        // Whichever it was that ended the wait.
+                        let _ = self.stopping.run_until_cancelled(answered).await;
+                        tokio::time::sleep(GRACE).await;
+                    };
+                    tokio::select! {
+                        ended = connection => ended,
+                        () = last => Ok(()),
+                    }
                 }
                 // There is no reply to finish.
                 false => Ok(()),

@@ -285,18 +285,18 @@ async fn drive(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Re
 /// The last reading of the parameters of a drive, and the one that goes on.
 async fn params(State(app): State<Arc<AppState>>, Path(name): Path<String>) -> Response {
     let plant = app.plant.load_full();
-    if plant.drive(&name).is_none() {
+    let Some(machine) = plant.drive(&name).map(|drive| drive.machine()) else {
         return no_drive(&plant, &name);
-    }
-    let status = plant.parameters.status(&name);
-    let last = match plant.parameters.last(&name) {
+    };
+    let status = plant.parameters.status(&machine);
+    let last = match plant.parameters.last(&machine) {
         Some(file) => Some(file),
         None => match stored_params(&app, &plant, &name).await {
             Ok(file) => file.map(Arc::new),
             Err(response) => return response,
         },
     };
-    let restore = plant.parameters.restore(&name);
+    let restore = plant.parameters.restore(&machine);
     Json(Parameters::new(
         &name,
         last.as_deref(),

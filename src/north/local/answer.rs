@@ -311,7 +311,7 @@ async fn record(request: &RecordRequest, plant: &Plant, origin: &Origin) -> Resu
 
 fn params(request: &ParamsRequest, plant: &Plant, origin: Origin) -> Result<ParamsOutcome, Failure> {
     let drive = drive_of(plant, &request.drive, request.expect.as_ref())?;
-    let vault = &plant.parameters;
+    let (vault, machine) = (&plant.parameters, drive.machine());
     let fail = |why: String| Failure::new(FailureCode::NoParameters, why);
     if request.begin {
         let how = How {
@@ -320,7 +320,7 @@ fn params(request: &ParamsRequest, plant: &Plant, origin: Origin) -> Result<Para
         };
         begin_reading(vault, drive, origin, how).map_err(fail)?;
     }
-    let status = vault.status(&request.drive);
+    let status = vault.status(&machine);
     let status = status.ok_or_else(|| fail(format!("the parameters of `{}` were not read yet", request.drive)))?;
     Ok(ParamsOutcome::new(&status))
 }
@@ -328,7 +328,7 @@ fn params(request: &ParamsRequest, plant: &Plant, origin: Origin) -> Result<Para
 async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin) -> Result<RestoreOutcome, Failure> {
     let plant = shared.load_full();
     let drive = drive_of(&plant, &request.drive, request.expect.as_ref())?;
-    let vault = &plant.parameters;
+    let (vault, machine) = (&plant.parameters, drive.machine());
     let fail = |why: String| Failure::new(FailureCode::NotRestored, why);
     match &request.act {
         RestoreAct::Prepare { file, only, force } => {
@@ -346,7 +346,7 @@ async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin)
         RestoreAct::Release => release(shared, &drive, &origin).await.map_err(fail)?,
         RestoreAct::Look => {}
     }
-    let status = vault.restore(&request.drive);
+    let status = vault.restore(&machine);
     let none = || {
         fail(format!(
             "no parameters of `{}` were restored since the gateway started",

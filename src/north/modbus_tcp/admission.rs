@@ -208,7 +208,7 @@ impl Admission {
         let client = Client::new(peer, name, permit.place().rights().clone());
         let session = ClientSession::new(self.state.clone(), self.view.clone(), client);
         let idle_timeout = self.state.options.load().idle_timeout;
-        connection::serve(stream, session, idle_timeout, permit.place()).await;
+        connection::serve(stream, session, idle_timeout, permit.place(), &self.state.stopping).await;
     }
 
     fn acquire(

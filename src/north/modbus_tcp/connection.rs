@@ -9,6 +9,7 @@ use futures_util::FutureExt;
 use futures_util::stream::StreamExt;
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::{Instant, Sleep};
+use tokio_util::sync::CancellationToken;
 
 use super::dialogue::{Consumed, Dialogue};
 use super::forwarded_request::AnsweredRequest;
@@ -22,6 +23,8 @@ const FRAME_TIMEOUT: Duration = Duration::from_secs(10);
 const WRITE_TIMEOUT: Duration = Duration::from_secs(10);
 /// Time for pending requests when the gateway stops, and for closing the connection.
 const CLOSE_TIMEOUT: Duration = Duration::from_millis(500);
+/// Time for pending requests when a reload ends the connection: longer than any of them waits for the bus.
+const ANSWERED_WITHIN: Duration = Duration::from_secs(30);
 /// Maximum number of bytes that are read and discarded before a connection is closed.
 const MAX_DISCARDED: usize = 64 * 1024;
 /// Number of requests after which a client that sends without pause yields to the others.
@@ -48,12 +51,14 @@ enum End {
     Lost(#[from] io::Error),
 }
 
-/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`.
+/// Serves a client until it disconnects, violates the protocol, is idle for `idle_timeout`, or must yield its `place`. Requests that
+/// wait for the bus are answered then, unless the whole server is `stopping`.
 pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     stream: S,
     session: ClientSession,
     idle_timeout: Option<Duration>,
     place: &Place,
+    stopping: &CancellationToken,
 ) {
     tracing::debug!(client = session.who(), "Modbus TCP: connected");
     let now = Instant::now();
@@ -70,7 +75,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
         Err(end) => end,
     };
     if matches!(end, End::Stopping | End::Closed(_)) {
-        connection.finish_pending().await;
+        connection.finish_pending(stopping).await;
     }
     // With TLS, a close notification distinguishes the end from a truncation.
     if !matches!(end, End::Lost(_) | End::NotReading) {
@@ -227,18 +232,28 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         }
     }
 
-    /// Gives pending requests a last chance to be answered.
-    async fn finish_pending(&mut self) {
+    /// Pending requests are answered: each was accepted, and its answer comes within its expiry. When the server stops they have
+    /// half a second.
+    async fn finish_pending(&mut self, stopping: &CancellationToken) {
+        // A client that is too slow for its answers is not waited for.
+        let within = |flushed: Result<Result<(), End>, _>| flushed.unwrap_or(Err(End::NotReading));
         let answered = async {
-            flush(&mut self.stream, &mut self.dialogue).await?;
+            within(tokio::time::timeout(CLOSE_TIMEOUT, flush(&mut self.stream, &mut self.dialogue)).await)?;
             while let Some(answered) = self.dialogue.parts().1.next().await {
                 self.dialogue.finish(answered, Instant::now().into_std());
-                flush(&mut self.stream, &mut self.dialogue).await?;
+                within(tokio::time::timeout(CLOSE_TIMEOUT, flush(&mut self.stream, &mut self.dialogue)).await)?;
             }
             Ok::<(), End>(())
         };
-        // A client that is too slow for this is not waited for.
-        let _ = tokio::time::timeout(CLOSE_TIMEOUT, answered).await;
+        let stops = async {
+            stopping.cancelled().await;
+            tokio::time::sleep(CLOSE_TIMEOUT).await;
+        };
+        tokio::select! {
+            biased;
+            _ = tokio::time::timeout(ANSWERED_WITHIN, answered) => {}
+            () = stops => {}
+        }
     }
 }
 

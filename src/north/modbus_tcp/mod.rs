@@ -268,6 +268,16 @@ impl Server {
         });
     }
 
+    /// Closes all listeners and their connections; requests that wait for the bus are answered.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+    }
+
+    /// Whether no connection is left after [`Server::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
+    }
+
     /// Waits until all listeners and connections have ended, after the cancellation.
     pub async fn stopped(&self) {
         self.tasks.wait().await;
@@ -284,11 +294,14 @@ struct ServerState {
     /// TLS connections before they are admitted.
     handshakes: Arc<ConnectionLimit>,
     refusals: Refusals,
+    /// Cancelled when the server ends: its clients are not waited for any longer.
+    stopping: CancellationToken,
 }
 
 impl ServerState {
-    fn new(options: Options, stats: Arc<NorthStats>) -> ServerState {
+    fn new(options: Options, stats: Arc<NorthStats>, stopping: CancellationToken) -> ServerState {
         ServerState {
+            stopping,
             connections: ConnectionLimit::new(options.limits()),
             handshakes: ConnectionLimit::new(options.handshakes()),
             refusals: Refusals::new(ServerKind::ModbusTcp, stats.clone()),
@@ -317,7 +330,7 @@ pub async fn start(
     let mut server = Server {
         listeners: Listeners::new(ServerKind::ModbusTcp, stats.clone(), tasks.clone(), cancel.clone()),
         authenticator: None,
-        state: Arc::new(ServerState::new(options.clone(), stats)),
+        state: Arc::new(ServerState::new(options.clone(), stats, cancel.clone())),
         plant,
         own,
         opened: 0,

@@ -4,6 +4,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Instant;
 
+use tokio_util::sync::CancellationToken;
+
 use super::client::Client;
 use super::dialogue::Dialogue;
 use super::routes::PlantView;
@@ -31,7 +33,10 @@ impl Offline {
         peer: SocketAddr,
         authority: Authority,
     ) -> Offline {
-        let (state, view) = (ServerState::new(options, stats), PlantView::new(plant, None));
+        let (state, view) = (
+            ServerState::new(options, stats, CancellationToken::new()),
+            PlantView::new(plant, None),
+        );
         let client = Client::new(peer, None, authority);
         Offline::of(ClientSession::new(Arc::new(state), Arc::new(view), client))
     }

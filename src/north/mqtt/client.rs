@@ -44,6 +44,8 @@ const CHECK: Duration = Duration::from_millis(25);
 const DISCONNECT_TIMEOUT: Duration = Duration::from_millis(500);
 /// Part of it for the results of pending commands.
 const LAST_RESULTS: Duration = Duration::from_millis(250);
+/// Time for the commands that are under way when a reload ends the client. When the gateway stops they have ended before.
+const LAST_COMMANDS: Duration = Duration::from_secs(3);
 /// Time for the disk to take the last messages.
 const LAST_WRITE: Duration = Duration::from_secs(1);
 /// Minimum time between two messages of the history, so that live values have the connection.
@@ -168,11 +170,19 @@ impl Client {
         let has_buffer = events_buffer.is_some();
         let count = |kind| LostCount(stats.clone(), kind);
         let now = Instant::now();
+        let (topics_of_commands, memory) = (topics.clone(), stats.taken.clone());
+        let (commands, results) = match stats.mqtt.keep_orders(None) {
+            Some(mut left) => {
+                let results = std::mem::take(&mut left.results);
+                (Commands::after(topics_of_commands, rules, memory, left), results)
+            }
+            None => (Commands::new(topics_of_commands, rules, memory), Vec::new()),
+        };
         let mut client = Client {
             store: Store::open(events_buffer, MQTT_EVENTS, count(MqttLoss::Event)),
             history: Store::open(history_buffer, MQTT_HISTORY, count(MqttLoss::History)),
             history_at: now,
-            commands: Commands::new(topics.clone(), rules, stats.taken.clone()),
+            commands,
             outbox: Outbox::new(delivery),
             link: BrokerLink::Disconnected { retry_at: now },
             back_off: BackOff::default(),
@@ -196,6 +206,7 @@ impl Client {
             check_at: now,
         };
         client.take_over();
+        results.into_iter().for_each(|result| client.outbox.push_result(result));
         client
     }
 
@@ -545,9 +556,13 @@ impl Client {
         }
     }
 
-    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second.
+    /// Sends what is waiting, publishes `offline` and disconnects, all within half a second once the commands that are under way have
+    /// ended. Whoever is owed a result then has it from the client that comes after.
     async fn shut_down(mut self) {
         self.take_pending_events();
+        self.announcer = None;
+        self.outbox.drop_telemetry();
+        self.end_commands(tokio::time::Instant::now() + LAST_COMMANDS).await;
         let begun = tokio::time::Instant::now();
         // After that time the connection is closed, and the broker publishes the last will.
         let in_time = tokio::time::timeout_at(begun + DISCONNECT_TIMEOUT, self.disconnect(begun + LAST_RESULTS)).await;
@@ -563,13 +578,26 @@ impl Client {
         }
         // The client that a reload puts in its place goes on with them.
         self.stats.mqtt.keep_unread(Some(self.events));
+        let orders = self.commands.leave(self.outbox.into_results());
+        self.stats.mqtt.keep_orders(Some(orders));
+    }
+
+    /// Waits for the commands that are under way; what comes in meanwhile is taken as ever.
+    async fn end_commands(&mut self, until: tokio::time::Instant) {
+        while self.is_ready() && !self.commands.is_idle() {
+            self.publish_waiting();
+            tokio::select! {
+                event = next(&mut self.link), if self.receives() => self.on_connection_event(event),
+                event = self.events.recv() => self.on_event(event),
+                ended = self.commands.finished() => self.on_ended(ended),
+                loaded = self.store.next() => self.on_loaded(Kind::Event, loaded),
+                () = tokio::time::sleep_until(until) => return,
+            }
+        }
     }
 
     async fn disconnect(&mut self, last_results: tokio::time::Instant) {
         let status = self.topics.status();
-        self.options.commands = false;
-        self.announcer = None;
-        self.outbox.drop_telemetry();
         let mut offline_queued = false;
         while self.is_ready() {
             self.publish_waiting();
@@ -594,7 +622,14 @@ impl Client {
             && !matches!(session.phase, Phase::Connecting)
             && session.connection.disconnect()
         {
-            while !matches!(session.connection.next().await, ConnectionEvent::Lost(_)) {}
+            // The broker counts what is still under way from it as delivered.
+            loop {
+                match next(&mut self.link).await {
+                    ConnectionEvent::Lost(_) => break,
+                    ConnectionEvent::Message(message) => self.on_message(*message),
+                    _ => {}
+                }
+            }
         }
     }
 }

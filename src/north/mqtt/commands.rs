@@ -50,6 +50,15 @@ pub(super) struct Rules {
     pub(super) require_id: bool,
 }
 
+/// What a client leaves to its successor: who is owed a result has it from that.
+#[derive(Debug, Default)]
+pub(in crate::north) struct OrdersLeft {
+    waiting: PendingCommands,
+    confirming: PendingCommands,
+    /// Those that the broker has not acknowledged.
+    pub(super) results: Vec<Message>,
+}
+
 /// A command that is not finished.
 #[derive(Debug)]
 struct PendingCommand {
@@ -73,13 +82,27 @@ impl Commands {
     /// `memory` outlives this client, so that a command is recognised after a reload.
     pub(super) fn new(topics: Topics, rules: Rules, memory: SharedMemory) -> Commands {
         memory.lock().abandon();
+        Commands::after(topics, rules, memory, OrdersLeft::default())
+    }
+
+    /// Goes on with the commands that the client before has left.
+    pub(super) fn after(topics: Topics, rules: Rules, memory: SharedMemory, left: OrdersLeft) -> Commands {
         Commands {
             topics,
             client: SourceKind::Mqtt.name().into(),
-            waiting: PendingCommands::default(),
-            confirming: PendingCommands::default(),
+            waiting: left.waiting,
+            confirming: left.confirming,
             memory,
             rules,
+        }
+    }
+
+    /// What the client that comes after goes on with, beside these results.
+    pub(super) fn leave(self, results: Vec<Message>) -> OrdersLeft {
+        OrdersLeft {
+            waiting: self.waiting,
+            confirming: self.confirming,
+            results,
         }
     }
 

@@ -46,9 +46,11 @@ use tokio_util::sync::CancellationToken;
 use super::NorthStats;
 use crate::plant::SharedPlant;
 
+pub(in crate::north) use self::commands::OrdersLeft;
 pub use self::offline::{Offline, Published};
 pub use self::record::whole_records;
 pub use self::request::Incoming;
+pub(in crate::north) use self::sparkplug::NodeOrdersLeft;
 
 /// A secret that is not printed in logs.
 #[derive(Clone, PartialEq, Eq)]

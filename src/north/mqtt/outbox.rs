@@ -206,6 +206,11 @@ impl Outbox {
         self.push(Kind::Result, message, None);
     }
 
+    /// The results that the broker has not acknowledged, in order.
+    pub(super) fn into_results(self) -> Vec<Message> {
+        self.results.entries.into_iter().map(|entry| entry.message).collect()
+    }
+
     /// Adds an event or history, with its number if it is on disk; if too many wait, the oldest is dropped.
     pub(super) fn push(&mut self, kind: Kind, message: Message, number: Option<Number>) {
         let message = match (kind, self.delivery.events) {

@@ -1,18 +1,22 @@
 //! Parameters of drives: read by background exchanges, on demand of a client and every so often, and restored (`restore`).
 
 mod restore;
+mod unfinished;
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-pub use self::restore::{Again, carry_out, hold_unfinished, prepare, release, take_up};
+pub use self::restore::{Again, carry_out, prepare, release, take_up};
+pub use self::unfinished::{hold_unfinished, orphans};
 use crate::command::{Origin, Pace, SourceKind};
 use crate::drive::parameters::RawValue;
 use crate::event::{Event, EventKind};
-use crate::parameters::{Difference, Names, Next, ParameterFile, Reading, Store, Vault, differences};
+use crate::parameters::{
+    Difference, NO_IDENTIFICATION, NOT_KNOWN, Names, Next, ParameterFile, Reading, Store, Vault, differences,
+};
 use crate::plant::{DriveHandle, SharedPlant};
-use crate::process_image::Access;
+use crate::process_image::{Access, Machine};
 
 /// A request waits no longer than that for its turn; then it is asked anew.
 const EXPIRY: Duration = Duration::from_secs(60);
@@ -45,7 +49,7 @@ pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how
     if spec.access == Access::Listen {
         return Err(format!("bus `{}` only listens: nothing is asked on it", spec.bus));
     }
-    match vault.begin(&spec.name) {
+    match vault.begin(&drive.machine()) {
         Err(number) => Ok(number),
         Ok(number) => {
             tokio::spawn(run(vault.clone(), drive, origin, how));
@@ -55,11 +59,11 @@ pub fn begin_reading(vault: &Arc<Vault>, drive: DriveHandle, origin: Origin, how
 }
 
 async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
-    let name = drive.image.spec.name.clone();
+    let (machine, name) = (drive.machine(), drive.image.spec.name.clone());
     let store = vault.store();
     // What the disk did not take is known all the same.
-    let last = match vault.last(&name) {
-        None => latest(store.clone(), name.clone()).await.map(Arc::new),
+    let last = match vault.last(&machine) {
+        None => latest(store.clone(), name).await.map(Arc::new),
         last => last,
     };
     let names = vault.names(&drive.image.spec.profile.name);
@@ -72,7 +76,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
         .map(|last| Reading::addresses_of(&spec.profile, last))
         .unwrap_or_default();
     let result = read(&drive, origin, known, (how.pace, &names), |looks| {
-        vault.update(&name, |job| {
+        vault.update(&machine, |job| {
             job.waits = looks.waits;
             if job.waits.is_none() {
                 (job.progress, job.remaining) = (looks.progress, remaining(looks.progress, looks.worked));
@@ -89,7 +93,7 @@ async fn run(vault: Arc<Vault>, drive: DriveHandle, origin: Origin, how: How) {
             keep(store, file.clone()).await;
         }
     }
-    vault.end(&name, result);
+    vault.end(&machine, result);
 }
 
 /// How far a reading is.
@@ -204,12 +208,12 @@ fn identification(drive: &DriveHandle) -> String {
             let name = &profile.points.get(*index)?.name;
             Some(match reading.sample(*index).good() {
                 Some(value) => format!("{name} {value}"),
-                None => format!("{name} not known"),
+                None => format!("{name} {NOT_KNOWN}"),
             })
         })
         .collect();
     if parts.is_empty() {
-        "none".to_string()
+        NO_IDENTIFICATION.to_string()
     } else {
         parts.join(", ")
     }
@@ -239,7 +243,7 @@ const LOOK: Duration = Duration::from_secs(10);
 
 /// Reads the parameters of all drives every so often, for ever: of each bus one drive at a time.
 pub async fn keep_reading(plant: SharedPlant, every: Duration) {
-    let mut begun: BTreeMap<String, SystemTime> = BTreeMap::new();
+    let mut begun: BTreeMap<Machine, SystemTime> = BTreeMap::new();
     loop {
         let plant_now = plant.load_full();
         let vault = plant_now.parameters.clone();
@@ -250,24 +254,24 @@ pub async fn keep_reading(plant: SharedPlant, every: Duration) {
                 .filter(|drive| !drive.image.spec.profile.parameters.is_empty())
                 .filter(|drive| drive.image.spec.access != Access::Listen)
                 .collect();
-            if of_bus.iter().any(|drive| vault.is_reading(&drive.image.spec.name)) {
+            if of_bus.iter().any(|drive| vault.is_reading(&drive.machine())) {
                 continue;
             }
             for drive in of_bus {
-                let name = drive.image.spec.name.clone();
+                let (machine, name) = (drive.machine(), drive.image.spec.name.clone());
                 let online = drive.image.snapshot().link.is_online();
-                if !begun.contains_key(&name) {
-                    let last = latest(vault.store(), name.clone()).await;
-                    begun.extend(read_at(last.as_ref()).map(|at| (name.clone(), at)));
+                if !begun.contains_key(&machine) {
+                    let last = latest(vault.store(), name).await;
+                    begun.extend(read_at(last.as_ref()).map(|at| (machine.clone(), at)));
                 }
-                let failed = matches!(vault.status(&name).and_then(|status| status.result), Some(Err(_)));
+                let failed = matches!(vault.status(&machine).and_then(|status| status.result), Some(Err(_)));
                 let pause = if failed { every.min(AGAIN) } else { every };
                 // A clock that was set back leaves the next reading to the time it has lost.
                 let is_due = |at: &SystemTime| at.elapsed().is_ok_and(|age| age >= pause);
-                let is_due = begun.get(&name).is_none_or(is_due);
+                let is_due = begun.get(&machine).is_none_or(is_due);
                 if is_due && online {
                     let origin = Origin::new(SourceKind::Schedule, "every");
-                    begun.insert(name, SystemTime::now());
+                    begun.insert(machine, SystemTime::now());
                     // It has parameters, and its line is the gateway's.
                     let how = How {
                         afresh: false,

@@ -7,24 +7,23 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::{Looks, read};
+use super::unfinished::{concerning, held_unfinished, not_understood, unfinished_event};
+use super::{Looks, identification, read};
 use crate::codec::RequestPdu;
-use crate::command::{Authority, Order, Origin, Pace, ParameterOrder, may_restore, written};
+use crate::command::{Authority, Order, Origin, Pace, ParameterOrder, limits_passed, may_restore, written};
 use crate::drive::Profile;
 use crate::drive::plan::WireTime;
 use crate::parameters::{
-    End, Journal, JournalFile, ParameterFile, Phase, Prepared, Reading, Restoration, RestoreStage, Then, Vault, Wanted,
-    Wishes, plan,
+    End, Journal, JournalFile, NO_IDENTIFICATION, NOT_KNOWN, Owner, ParameterFile, Phase, Plan, Prepared, Reading,
+    Restoration, RestoreStage, Then, Vault, Wanted, Wishes, plan,
 };
-use crate::plant::{DriveHandle, SharedPlant};
-use crate::process_image::{Access, DriveSpec};
+use crate::plant::{DriveHandle, Plant, SharedPlant};
+use crate::process_image::Machine;
 
 /// An order of a restore waits no longer than that for its turn; then it is given anew.
 const EXPIRY: Duration = Duration::from_secs(30);
 /// Share of the time of a line that the writes of a restore take at most: one part in so many.
 const SHARE: u32 = 5;
-/// Time for the journals to be read at the start; on a slow disk the drives are held until they are.
-const LOOK: Duration = Duration::from_secs(5);
 
 /// What is done with a restore that was cut off.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,7 +54,7 @@ pub fn prepare(
             spec.profile.name
         ));
     }
-    let number = vault.begin_restore(&spec.name, RestoreStage::Reading)?;
+    let number = vault.begin_restore(&drive.machine(), &spec.name, RestoreStage::Reading)?;
     tokio::spawn(find_out(vault.clone(), drive, wanted, wishes, origin));
     Ok(number)
 }
@@ -69,7 +68,7 @@ fn not_held(drive: &DriveHandle) -> Result<(), String> {
 
 async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, wishes: Wishes, origin: Origin) {
     let spec = &drive.image.spec;
-    let name = &spec.name;
+    let (name, machine) = (&spec.name, &drive.machine());
     let names = vault.names(&spec.profile.name);
     // What the file does not have is not written, so it need not be read, unless the drive has another application.
     let known = match wanted.family == spec.profile.name {
@@ -77,7 +76,7 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
         false => Default::default(),
     };
     let seen = |looks: Looks| {
-        vault.update_restore(name, |restore| {
+        vault.update_restore(machine, |restore| {
             (restore.progress, restore.waits) = (looks.progress, looks.waits);
         });
     };
@@ -88,14 +87,28 @@ async fn find_out(vault: Arc<Vault>, drive: DriveHandle, wanted: ParameterFile, 
         Ok(present) => match plan(&spec.profile, &wanted.named(&spec.profile, &names), &present, &wishes) {
             Err(reasons) => RestoreStage::Refused(reasons),
             Ok((plan, risks)) => {
-                let risks = risks.into_iter().map(|risk| risk.0).collect();
+                let passed = passes(&drive, &plan);
+                if !passed.is_empty() && !wishes.force {
+                    let refused =
+                        |what| format!("{what}; restore the others with --only, or take the risk with --force");
+                    let stage = RestoreStage::Refused(passed.into_iter().map(refused).collect());
+                    vault.update_restore(machine, |restore| (restore.stage, restore.waits) = (stage, None));
+                    return;
+                }
+                let risks = risks.into_iter().map(|risk| risk.0).chain(passed).collect();
                 let prepared = Arc::new(Prepared { plan, risks });
-                vault.update_restore(name, |restore| restore.prepared = prepared);
+                vault.update_restore(machine, |restore| restore.prepared = prepared);
                 RestoreStage::Prepared
             }
         },
     };
-    vault.update_restore(name, |restore| (restore.stage, restore.waits) = (stage, None));
+    vault.update_restore(machine, |restore| (restore.stage, restore.waits) = (stage, None));
+}
+
+/// The limits of the drive that carrying out a plan passes, in words.
+fn passes(drive: &DriveHandle, plan: &Plan) -> Vec<String> {
+    let writes = plan.writes.iter().map(|write| (write.address, write.to));
+    limits_passed(&drive.reading(Instant::now()), writes)
 }
 
 /// Begins to write what the restore of that number found out.
@@ -107,10 +120,25 @@ pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: 
     may_restore(spec)?;
     not_held(drive)?;
     let vault = plant.load().parameters.clone();
-    let prepared = vault.carry_out(&spec.name, number)?;
+    let machine = drive.machine();
+    let prepared = vault.carry_out(&machine, &spec.name, number)?;
+    // The reference that stands may be another one than when it was prepared.
+    if let Some(new) = passes(drive, &prepared.plan)
+        .into_iter()
+        .find(|passed| !prepared.risks.contains(passed))
+    {
+        let why = format!("{new}; this was not so when the restore was prepared: prepare it anew");
+        vault.update_restore(&machine, |restore| restore.stage = RestoreStage::Failed(why));
+        return Ok(());
+    }
     let journal = Journal {
-        drive: spec.name.clone(),
-        family: spec.profile.name.clone(),
+        of: Owner {
+            drive: spec.name.clone(),
+            bus: spec.bus.clone(),
+            family: spec.profile.name.clone(),
+            machine: Some(machine.clone()),
+            identification: identification(drive),
+        },
         begun: humantime::format_rfc3339_seconds(SystemTime::now()).to_string(),
         by: format!("{} {}", origin.kind.name(), origin.who),
         phase: Phase::Writing,
@@ -119,16 +147,17 @@ pub fn carry_out(plant: &SharedPlant, drive: &DriveHandle, number: u64, origin: 
         plan: prepared.plan.clone(),
     };
     if let Some(why) = unmet_need(drive, &journal) {
-        vault.update_restore(&spec.name, |restore| restore.stage = RestoreStage::Failed(why));
+        vault.update_restore(&machine, |restore| restore.stage = RestoreStage::Failed(why));
         return Ok(());
     }
     if prepared.plan.writes.is_empty() {
         let text = format!("`{}` has all of these values; nothing was written", spec.name);
-        vault.update_restore(&spec.name, |restore| restore.stage = RestoreStage::Ended(text));
+        vault.update_restore(&machine, |restore| restore.stage = RestoreStage::Ended(text));
         return Ok(());
     }
+    let file = vault.journal(&spec.name).ok_or_else(no_store)?;
     let restoration = Restoration::begin(journal, Instant::now());
-    start(plant.clone(), vault, drive, restoration, origin);
+    start(plant.clone(), vault, drive, (file, restoration), origin);
     Ok(())
 }
 
@@ -147,17 +176,29 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
     let spec = &drive.image.spec;
     may_restore(spec)?;
     let vault = plant.load().parameters.clone();
-    let file = journal_of(&vault, spec)?;
-    let text = blocking(move || file.read()).await?;
-    let text = text.ok_or_else(|| format!("no restore of `{}` was cut off: there is nothing to take up", spec.name))?;
-    let journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&vault, spec, &why))?;
-    vault.begin_restore(&spec.name, RestoreStage::Working)?;
+    let nothing = || format!("no restore of `{}` was cut off: there is nothing to take up", spec.name);
+    let concerned = concerning(&vault, plant, drive).await?.ok_or_else(nothing)?;
+    let (file, text) = concerned.own(drive)?;
+    let mut journal = Journal::parse(&text, &spec.profile).map_err(|why| not_understood(&file, &spec.name, &why))?;
+    if journal.of.machine.is_none() {
+        // Of an earlier version: from now on it says where it belongs.
+        journal.of = Owner {
+            drive: journal.of.drive,
+            bus: spec.bus.clone(),
+            machine: Some(drive.machine()),
+            ..journal.of
+        };
+    }
+    if let Identified::Other(why) = identified(drive, &journal.of) {
+        return Err(why);
+    }
+    vault.begin_restore(&drive.machine(), &spec.name, RestoreStage::Working)?;
     let now = Instant::now();
     let restoration = match again {
         Again::Resume => Restoration::resume(journal, now),
         Again::Undo => Restoration::undo(journal, now),
     };
-    start(plant.clone(), vault, drive, restoration, origin);
+    start(plant.clone(), vault, drive, (file, restoration), origin);
     Ok(())
 }
 
@@ -168,18 +209,18 @@ pub async fn take_up(plant: &SharedPlant, drive: &DriveHandle, again: Again, ori
 /// Why not.
 pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) -> Result<(), String> {
     let spec = &drive.image.spec;
-    let vault = plant.load().parameters.clone();
-    if vault.restore(&spec.name).is_some_and(|restore| restore.goes_on()) {
-        vault.update_restore(&spec.name, |restore| restore.is_unwanted = true);
+    let (vault, machine) = (plant.load().parameters.clone(), drive.machine());
+    if vault.restore(&machine).is_some_and(|restore| restore.goes_on()) {
+        vault.update_restore(&machine, |restore| restore.is_unwanted = true);
         return Ok(());
     }
-    let file = journal_of(&vault, spec)?;
-    vault.begin_restore(&spec.name, RestoreStage::Working)?;
-    let released = blocking(move || match file.read()? {
-        Some(_) => file.release().map(Some),
+    let concerned = concerning(&vault, plant, drive).await?;
+    vault.begin_restore(&machine, &spec.name, RestoreStage::Working)?;
+    let released = match concerned {
+        Some(concerned) => blocking(move || concerned.file.release()).await.map(Some),
         None => Ok(None),
-    });
-    let stage = match released.await {
+    };
+    let stage = match released {
         Err(why) => RestoreStage::Failed(why),
         Ok(None) if drive.image.hold.why().is_none() => {
             RestoreStage::Failed(format!("no restore of `{}` was cut off: nothing is held", spec.name))
@@ -204,20 +245,44 @@ pub async fn release(plant: &SharedPlant, drive: &DriveHandle, origin: &Origin) 
             ))
         }
     };
-    vault.update_restore(&spec.name, |restore| restore.stage = stage);
+    vault.update_restore(&machine, |restore| restore.stage = stage);
     Ok(())
 }
 
-fn journal_of(vault: &Vault, spec: &DriveSpec) -> Result<JournalFile, String> {
-    let file = vault.journal(&spec.name);
-    file.ok_or_else(|| "the gateway keeps no readings, so there is no place for a journal".to_string())
+fn no_store() -> String {
+    "the gateway keeps no readings, so there is no place for a journal".to_string()
 }
 
 /// Something with the disk, by a thread that may wait for it.
-async fn blocking<T: Send + 'static>(work: impl FnOnce() -> std::io::Result<T> + Send + 'static) -> Result<T, String> {
+pub(super) async fn blocking<T: Send + 'static>(
+    work: impl FnOnce() -> std::io::Result<T> + Send + 'static,
+) -> Result<T, String> {
     match tokio::task::spawn_blocking(work).await {
         Ok(done) => done.map_err(|error| error.to_string()),
         Err(_) => Err("the gateway stops".to_string()),
+    }
+}
+
+/// Whether a machine is the one to which a restore belongs, by what both said of themselves.
+enum Identified {
+    Same,
+    /// It has not been read yet since the drive came back.
+    NotYet(String),
+    Other(String),
+}
+
+fn identified(drive: &DriveHandle, of: &Owner) -> Identified {
+    let (then, now) = (&of.identification, identification(drive));
+    let name = &drive.image.spec.name;
+    if *then == now || then == NO_IDENTIFICATION || then.contains(NOT_KNOWN) {
+        Identified::Same
+    } else if now.contains(NOT_KNOWN) {
+        Identified::NotYet(format!("`{name}` has not said yet which drive it is"))
+    } else {
+        Identified::Other(format!(
+            "`{name}` is another drive than that of the restore: it says `{now}` of itself, and the journal belongs to one that says \
+             `{then}`; put that back, or set the journal aside by `drivegate params restore --release {name}`"
+        ))
     }
 }
 
@@ -226,30 +291,19 @@ fn held_while_written(name: &str) -> String {
     format!("the parameters of `{name}` are being restored: until that is over the drive takes no orders but stops")
 }
 
-/// Why it takes none when that did not come to its end.
-fn held_unfinished(name: &str, why: &str) -> String {
-    format!(
-        "the parameters of `{name}` may be half restored ({why}): the drive takes no orders but stops until \
-         `drivegate params restore --resume {name}` has written the rest, --undo {name} the former values, or --release {name} \
-         leaves them as they are"
-    )
-}
-
-fn not_understood(vault: &Vault, spec: &DriveSpec, why: &str) -> String {
-    let path = vault.journal(&spec.name).map(|file| file.path().display().to_string());
-    format!(
-        "the journal of a restore, {}, is not understood: {why}; look at it, then set it aside by `drivegate params restore \
-         --release {}`",
-        path.unwrap_or_default(),
-        spec.name
-    )
-}
-
-fn start(plant: SharedPlant, vault: Arc<Vault>, drive: &DriveHandle, restoration: Restoration, origin: Origin) {
-    let spec = &drive.image.spec;
-    vault.hold(&spec.name).set(Some(held_while_written(&spec.name)));
+fn start(
+    plant: SharedPlant,
+    vault: Arc<Vault>,
+    drive: &DriveHandle,
+    (file, restoration): (JournalFile, Restoration),
+    origin: Origin,
+) {
+    let (spec, machine) = (&drive.image.spec, drive.machine());
+    vault.hold(&machine).set(Some(held_while_written(&spec.name)));
     let run = Run {
         name: spec.name.clone(),
+        machine,
+        file,
         profile: spec.profile.clone(),
         plant,
         vault,
@@ -261,7 +315,10 @@ fn start(plant: SharedPlant, vault: Arc<Vault>, drive: &DriveHandle, restoration
 
 /// A restore that is carried out.
 struct Run {
+    /// What the machine is called now.
     name: String,
+    machine: Machine,
+    file: JournalFile,
     profile: Arc<Profile>,
     plant: SharedPlant,
     vault: Arc<Vault>,
@@ -278,7 +335,7 @@ impl Run {
         loop {
             if self
                 .vault
-                .restore(&self.name)
+                .restore(&self.machine)
                 .is_some_and(|restore| restore.is_unwanted)
                 && self.restoration.end().is_none()
             {
@@ -286,13 +343,15 @@ impl Run {
             }
             match self.restoration.wanted() {
                 Wanted::Record => {
-                    let text = self.restoration.journal().text(&self.profile);
-                    let done = self.with_journal(move |file| file.write(&text)).await;
+                    let journal = self.restoration.journal();
+                    let (text, of) = (journal.text(&self.profile), journal.of.clone());
+                    let done = self.with_journal(move |file| file.write(&of, &text)).await;
                     self.restoration.recorded(done, Instant::now());
                 }
                 Wanted::Set(order) => self.set(order).await,
                 Wanted::Remove => {
-                    let done = self.with_journal(|file| file.remove()).await;
+                    let of = self.restoration.journal().of.clone();
+                    let done = self.with_journal(move |file| file.remove(&of)).await;
                     self.restoration.removed(done);
                 }
                 Wanted::Nothing => break,
@@ -305,20 +364,49 @@ impl Run {
         &self,
         work: impl FnOnce(JournalFile) -> std::io::Result<()> + Send + 'static,
     ) -> Result<(), String> {
-        let file = self.vault.journal(&self.name).ok_or("there is no place for it")?;
+        let file = self.file.clone();
         let path = file.path();
         let done = blocking(move || work(file)).await;
         done.map_err(|why| format!("{}: {why}; free space or mend its permissions", path.display()))
     }
 
+    /// The machine as it is configured now, whatever it is called.
+    ///
+    /// # Errors
+    /// It is not, or what the restore was asked for by that name is another machine now.
+    fn bound(&mut self, plant: &Plant) -> Result<DriveHandle, String> {
+        let of = self.restoration.journal().of.place();
+        let drive = plant.drive_at(&self.machine).ok_or_else(|| {
+            format!("a new configuration has no drive there any more: the restore, and its journal, are of {of}")
+        })?;
+        let name = &drive.image.spec.name;
+        if *name != self.name {
+            if plant.drive(&self.name).is_some() {
+                return Err(format!(
+                    "in a new configuration `{}` is another drive: the restore, and its journal, are of {of}, which is `{name}` now",
+                    self.name
+                ));
+            }
+            self.name.clone_from(name);
+        }
+        Ok(drive)
+    }
+
     /// Gives an order to the drive as it is configured now.
     async fn set(&mut self, order: ParameterOrder) {
-        let drive = self.plant.load().drive(&self.name);
-        let Some(drive) = drive.filter(|drive| drive.image.spec.profile.name == self.profile.name) else {
-            self.restoration
-                .give_up("the drive is not configured any more as it was when the restore began".to_string());
-            return;
+        let plant = self.plant.load_full();
+        let drive = match self.bound(&plant) {
+            Ok(drive) => drive,
+            Err(why) => return self.restoration.give_up(why),
         };
+        match identified(&drive, &self.restoration.journal().of) {
+            Identified::Same => {}
+            Identified::Other(why) => return self.restoration.give_up(why),
+            Identified::NotYet(why) => {
+                let then = self.restoration.put_off(&why, Instant::now());
+                return self.rest(then, Duration::ZERO).await;
+            }
+        }
         let (now, write) = (Instant::now(), order.write());
         let pause = pause_after(&drive, &order);
         let mut placed = drive.place(
@@ -332,12 +420,18 @@ impl Run {
         if outcome.is_ok() {
             note_written(&drive, &write, now);
         }
-        let (waits, pause) = match self.restoration.answered(&outcome, Instant::now()) {
+        let then = self.restoration.answered(&outcome, Instant::now());
+        self.rest(then, pause).await;
+    }
+
+    /// Waits before what comes next.
+    async fn rest(&self, then: Then, pause: Duration) {
+        let (waits, pause) = match then {
             Then::Go => (None, pause),
             Then::Pause(pause, why) => (Some(why), pause),
         };
         let progress = self.restoration.progress();
-        self.vault.update_restore(&self.name, |restore| {
+        self.vault.update_restore(&self.machine, |restore| {
             (restore.progress, restore.waits) = (progress, waits);
         });
         tokio::time::sleep(pause).await;
@@ -378,8 +472,16 @@ impl Run {
             RestoreStage::Ended(text) => tracing::warn!(drive = %name, "the restore of its parameters is over: {text}"),
             _ => {}
         }
-        self.vault.hold(name).set(held);
-        self.vault.update_restore(name, |restore| {
+        if let Some(why) = &held {
+            let plant = self.plant.load();
+            // Where it is not configured any more, an event told whose journal is left.
+            if let Some(drive) = plant.drive_at(&self.machine) {
+                let spec = &drive.image.spec;
+                drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
+            }
+        }
+        self.vault.hold(&self.machine).set(held);
+        self.vault.update_restore(&self.machine, |restore| {
             (restore.stage, restore.waits) = (stage, None);
         });
     }
@@ -399,62 +501,4 @@ fn pause_after(drive: &DriveHandle, order: &ParameterOrder) -> Duration {
     let time =
         |pdu: &RequestPdu| WireTime::of(line.protocol, &line.format, pdu).total(drive.image.spec.turnaround, silence);
     (SHARE - 1) * (3 * time(&order.read()) + time(&order.write()))
-}
-
-/// Holds the drives whose journal tells of a restore that did not come to its end, before anybody can command them. A drive is
-/// looked at once; it is held until that is done, however slow the disk.
-pub async fn hold_unfinished(vault: &Arc<Vault>, specs: impl Iterator<Item = &DriveSpec>) {
-    let specs: Vec<DriveSpec> = specs.filter(|spec| spec.access != Access::Listen).cloned().collect();
-    let names = vault.not_looked_for(specs.iter().map(|spec| spec.name.clone()));
-    let specs: Vec<DriveSpec> = specs.into_iter().filter(|spec| names.contains(&spec.name)).collect();
-    if specs.is_empty() {
-        return;
-    }
-    for spec in &specs {
-        vault.hold(&spec.name).set(Some(format!(
-            "whether a restore of the parameters of `{}` was cut off is not known before its journal is read: until then the drive takes \
-             no orders but stops",
-            spec.name
-        )));
-    }
-    let vault = vault.clone();
-    let looked = tokio::task::spawn_blocking(move || {
-        for spec in &specs {
-            let why = unfinished(&vault, spec);
-            if let Some(why) = &why {
-                tracing::error!(bus = %spec.bus, drive = %spec.name, "{why}");
-            }
-            vault.hold(&spec.name).set(why);
-        }
-    });
-    if tokio::time::timeout(LOOK, looked).await.is_err() {
-        tracing::warn!(
-            "the disk is slow: the drives take no orders but stops before the journals of restores are read"
-        );
-    }
-}
-
-/// Why a drive is held, by its journal.
-fn unfinished(vault: &Vault, spec: &DriveSpec) -> Option<String> {
-    let text = match vault.journal(&spec.name)?.read() {
-        Ok(text) => text?,
-        Err(error) => {
-            return Some(held_unfinished(
-                &spec.name,
-                &not_understood(vault, spec, &error.to_string()),
-            ));
-        }
-    };
-    let why = match Journal::parse(&text, &spec.profile) {
-        Ok(journal) => format!(
-            "begun {} by {}, cut off {}, {} of {} parameters done",
-            journal.begun,
-            journal.by,
-            journal.phase.name(),
-            journal.done,
-            journal.plan.writes.len()
-        ),
-        Err(why) => not_understood(vault, spec, &why),
-    };
-    Some(held_unfinished(&spec.name, &why))
 }

@@ -7,6 +7,7 @@ use std::time::Duration;
 
 use tokio::io::{AsyncRead, AsyncReadExt, AsyncWrite, AsyncWriteExt};
 use tokio::time::Instant;
+use tokio_util::sync::CancellationToken;
 
 use super::dialogue::Dialogue;
 use super::terms::Tool;
@@ -61,16 +62,27 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<S> {
     }
 
     /// Serves the tool until it goes, is idle for `idle_timeout`, or must yield its `place`.
-    pub(super) async fn serve(mut self, idle_timeout: Option<Duration>, place: &Place) {
+    /// What it has asked is answered then, unless the gateway is `stopping`.
+    pub(super) async fn serve(mut self, idle_timeout: Option<Duration>, place: &Place, stopping: &CancellationToken) {
         tracing::info!(tool = self.dialogue.who(), "tool slot: connected");
         let end = loop {
             if let Err(end) = self.turn(idle_timeout, place).await {
                 break end;
             }
         };
+        if matches!(end, End::Stopping | End::Closed(_)) {
+            // A tool that takes no answer is not waited for.
+            let _ = stopping.run_until_cancelled(self.finish()).await;
+        }
         self.dialogue.ended();
         let _ = tokio::time::timeout(CLOSE_TIMEOUT, self.stream.shutdown()).await;
         tracing::info!(tool = self.dialogue.who(), "tool slot: {end}");
+    }
+
+    /// Waits for the answer to what the tool asked last, which comes within a second or not at all.
+    async fn finish(&mut self) -> Result<(), End> {
+        self.dialogue.finished().await;
+        self.flush().await
     }
 
     /// Waits for one thing and does it.

@@ -3,6 +3,7 @@
 //! A line has one request at a time: a tool that asks again has given the request before up, whose answer is dropped, however it
 //! ends. What was accepted for the bus is done all the same.
 
+use std::future::poll_fn;
 use std::sync::Arc;
 use std::task::{Context, Poll};
 use std::time::{Duration, Instant};
@@ -124,6 +125,24 @@ impl Dialogue {
             .into_iter()
             .flatten()
             .min()
+    }
+
+    /// Waits until nothing is due any more: the answer to what was asked last is in the output, or its time is over.
+    pub(super) async fn finished(&mut self) {
+        while self.is_waiting() {
+            let wake_at = self.wake_at().map(tokio::time::Instant::from_std);
+            let timer = async {
+                match wake_at {
+                    Some(at) => tokio::time::sleep_until(at).await,
+                    None => std::future::pending().await,
+                }
+            };
+            tokio::select! {
+                biased;
+                () = poll_fn(|cx| self.poll(cx, Instant::now())) => {}
+                () = timer => drop(self.on_time(Instant::now())),
+            }
+        }
     }
 
     /// The tool is not there any more.

@@ -41,6 +41,8 @@ pub(super) struct SlotListener {
     limit: Arc<ConnectionLimit>,
     refusals: Arc<Refusals>,
     cancel: CancellationToken,
+    /// Cancelled when the gateway stops.
+    stopping: CancellationToken,
 }
 
 impl SlotListener {
@@ -48,7 +50,7 @@ impl SlotListener {
         number: usize,
         served: Option<Served>,
         refusals: Arc<Refusals>,
-        cancel: CancellationToken,
+        (cancel, stopping): (CancellationToken, CancellationToken),
     ) -> SlotListener {
         SlotListener {
             number,
@@ -56,6 +58,7 @@ impl SlotListener {
             limit: ConnectionLimit::new(limits()),
             refusals,
             cancel,
+            stopping,
         }
     }
 
@@ -98,7 +101,9 @@ impl ConnectionHandler for SlotListener {
         };
         let tool = Tool::new(served.terms.clone(), &peer.to_string(), &peer.ip().to_string());
         let connection = connection::Connection::new(stream, Arc::new(tool), port, greeting);
-        connection.serve(slot.idle_timeout, permit.place()).await;
+        connection
+            .serve(slot.idle_timeout, permit.place(), &self.stopping)
+            .await;
     }
 }
 

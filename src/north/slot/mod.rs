@@ -203,7 +203,7 @@ impl Server {
                 telnet,
             })
         });
-        let (opened, refusals) = (&mut self.opened, &self.refusals);
+        let (opened, refusals, stopping) = (&mut self.opened, &self.refusals, &self.cancel);
         let mut first = None;
         self.listeners.commit(sockets, |_, open, cancel| {
             let served = served.next().or_else(|| first.clone());
@@ -216,7 +216,12 @@ impl Server {
                 (Some(listener), None) => listener.clone(),
                 (None, served) => {
                     *opened += 1;
-                    Arc::new(SlotListener::new(*opened, served, refusals.clone(), cancel.clone()))
+                    Arc::new(SlotListener::new(
+                        *opened,
+                        served,
+                        refusals.clone(),
+                        (cancel.clone(), stopping.clone()),
+                    ))
                 }
             };
             (listener, Handle::current())
@@ -239,12 +244,24 @@ impl Server {
                 continue;
             }
             let cancel = self.cancel.child_token();
-            self.tasks.spawn(pty::serve(path, terms.clone(), cancel.clone()));
+            self.tasks
+                .spawn(pty::serve(path, terms.clone(), cancel.clone(), self.cancel.clone()));
             self.ptys.push(RunningPty {
                 slot: terms.slot.clone(),
                 cancel,
             });
         }
+    }
+
+    /// Closes all slots; what tools have asked is answered.
+    pub async fn retire(&mut self) {
+        self.listeners.close().await;
+        self.ptys.drain(..).for_each(|pty| pty.cancel.cancel());
+    }
+
+    /// Whether no tool is left after [`Server::retire`].
+    pub fn is_drained(&self) -> bool {
+        self.tasks.len() <= 1
     }
 
     /// Waits until all listeners, connections and pseudo-terminals have ended, after the cancellation.

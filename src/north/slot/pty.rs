@@ -24,7 +24,8 @@ const RESTS: Duration = Duration::from_secs(2);
 
 /// Serves the pseudo-terminal whose link is `path` until `cancel`. Where it cannot be opened the slot does without, says so
 /// once for each reason, and tries again.
-pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: CancellationToken) {
+/// What a program has asked is answered then, unless the gateway is `stopping`.
+pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: CancellationToken, stopping: CancellationToken) {
     let bus = terms.slot.bus.clone();
     let mut told = String::new();
     loop {
@@ -34,8 +35,11 @@ pub(super) async fn serve(path: PathBuf, terms: Arc<Terms>, cancel: Cancellation
                 told.clear();
                 let tool = Tool::new(terms.clone(), &path.display().to_string(), "pty");
                 match Port::new(pty, Arc::new(tool)) {
-                    Ok(port) => match cancel.run_until_cancelled(port.serve()).await {
-                        None => return,
+                    Ok(mut port) => match cancel.run_until_cancelled(port.serve()).await {
+                        None => {
+                            stopping.run_until_cancelled(port.finish()).await;
+                            return;
+                        }
                         Some(error) => error,
                     },
                     Err(error) => error,
@@ -81,7 +85,7 @@ impl Port {
     }
 
     /// Serves until the system reports an error.
-    async fn serve(mut self) -> io::Error {
+    async fn serve(&mut self) -> io::Error {
         loop {
             if let Err(error) = self.turn().await {
                 return error;
@@ -118,6 +122,12 @@ impl Port {
         }
         self.write();
         Ok(())
+    }
+
+    /// Waits for the answer to what the program asked last.
+    async fn finish(&mut self) {
+        self.dialogue.finished().await;
+        self.write();
     }
 
     /// A serial port does not wait for whoever does not read: what finds no room is lost.

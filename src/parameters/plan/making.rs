@@ -21,7 +21,7 @@ pub(super) struct Making<'a> {
 }
 
 /// How an identification ends of which a point was not read.
-const NOT_KNOWN: &str = "not known";
+pub const NOT_KNOWN: &str = "not known";
 
 /// A parameter once the plan is carried out.
 struct End {

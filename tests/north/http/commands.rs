@@ -678,6 +678,32 @@ async fn a_reload_in_between_loses_no_command() {
     assert_eq!(rig.command(&alice, STOP).await.status, 200, "and the session goes on");
 }
 
+/// A reload that ends the connection leaves it until the command is answered, however long that takes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_reload_of_hosts_or_of_the_address_loses_no_reply() {
+    let all = users(&["alice"]);
+    let other_hosts = |options: &mut Options| options.hosts = vec!["gateway.example".to_string()];
+    let other_address = |options: &mut Options| options.listen = SocketAddr::from(([127, 0, 0, 2], 0));
+    let changes: [fn(&mut Options); 2] = [other_hosts, other_address];
+    for change in changes {
+        let mut rig = Rig::with(options(Some(all.clone()))).await;
+        let alice = rig.log_in("alice").await;
+        rig.bus.pause(true);
+        let address = rig.address();
+        let under_way = tokio::spawn(async move { post(address, PUMP, &alice, STOP).await });
+        while rig.bus.waiting() == 0 {
+            tokio::task::yield_now().await;
+        }
+        let mut changed = options(Some(all.clone()));
+        change(&mut changed);
+        rig.server.reload(changed).await;
+        // Longer than a connection without a command is left.
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        rig.bus.pause(false);
+        assert_eq!(timeout(PATIENCE, under_way).await.unwrap().unwrap().status, 200);
+    }
+}
+
 #[tokio::test(flavor = "multi_thread", worker_threads = 2)]
 async fn users_read_where_tokens_are_required() {
     let (token, secret) = Token::generate("scraper", vec![Scope::Metrics]).unwrap();

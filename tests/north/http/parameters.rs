@@ -44,6 +44,7 @@ async fn the_last_reading_and_the_present_one_are_served() {
     let mut plant = plant::mixed();
     let vault = Arc::new(Vault::default());
     plant.parameters = vault.clone();
+    let machine = plant.drive("pump-1").unwrap().machine();
     let server = Server::of(plant).await;
     let nothing = json!({"drive": "pump-1", "last": null, "reading": null, "error": null});
     assert_eq!(json_of(&server).await, nothing, "nothing is kept anywhere");
@@ -62,8 +63,8 @@ async fn the_last_reading_and_the_present_one_are_served() {
     });
     assert_eq!(json_of(&server).await["last"], last, "from the disk");
 
-    vault.begin("pump-1").unwrap();
-    vault.update("pump-1", |job| {
+    vault.begin(&machine).unwrap();
+    vault.update(&machine, |job| {
         (job.progress, job.remaining) = ((30, 90), Some(Duration::from_secs(2)));
         job.waits = Some("the drive is offline".to_string());
     });
@@ -71,19 +72,19 @@ async fn the_last_reading_and_the_present_one_are_served() {
     let present = json!({"done": 30, "total": 90, "remaining_s": 2.0, "waits": "the drive is offline"});
     assert_eq!((&goes_on["reading"], &goes_on["last"]), (&present, &last));
 
-    vault.end("pump-1", Err("the bus is gone".to_string()));
+    vault.end(&machine, Err("the bus is gone".to_string()));
     let failed = json_of(&server).await;
     assert_eq!(failed["error"], "the bus is gone");
     assert_eq!((&failed["reading"], &failed["last"]), (&Value::Null, &last));
 
     let mut newer = file.clone();
     newer.time = "2026-03-02T08:00:00Z".to_string();
-    vault.end("pump-1", Ok(newer));
+    vault.end(&machine, Ok(newer));
     let done = json_of(&server).await;
     assert_eq!(done["last"]["time"], "2026-03-02T08:00:00Z");
     assert_eq!(done["error"], Value::Null);
     // While the next one goes on it stays, though the disk has an older one.
-    vault.begin("pump-1").unwrap();
+    vault.begin(&machine).unwrap();
     assert_eq!(json_of(&server).await["last"]["time"], "2026-03-02T08:00:00Z");
 }
 

@@ -2,6 +2,7 @@
 
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use arc_swap::ArcSwap;
 use drivegate::north::modbus_tcp::{self, Uncached};
@@ -302,5 +303,25 @@ async fn a_reload_that_cannot_bind_changes_nothing() {
     assert!(client.is_closed().await);
     assert!(tokio::net::TcpStream::connect(address).await.is_err());
     assert!(may_write(&mut rig.client().await).await);
+    rig.end().await;
+}
+
+/// A listener that a reload takes away answers what was asked, however long that takes.
+#[tokio::test(flavor = "multi_thread", worker_threads = 2)]
+async fn a_write_under_way_is_answered_after_its_listener_was_closed() {
+    let mut rig = Rig::new().await;
+    let mut client = rig.client().await;
+    rig.buses[0].pause(true);
+    let transaction = client.request(1, &words(6, &[2000, 0])).await;
+    until("the write is queued", || rig.buses[0].waiting() > 0).await;
+    let mut moved = options();
+    moved.listeners[0].listen = vec![([127, 0, 0, 2], 0).into()];
+    rig.reload(moved).await.unwrap();
+    // Longer than a gateway that stops waits.
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    rig.buses[0].pause(false);
+    let (answered, unit, pdu) = client.answer().await.expect("an answer");
+    assert_eq!((answered, unit, pdu), (transaction, 1, words(6, &[2000, 0])));
+    assert!(client.is_closed().await);
     rig.end().await;
 }

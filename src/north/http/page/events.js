@@ -4,13 +4,13 @@ import { anchor, arrange, hide, keyed, make, places, stamp, words } from "./comm
 
 export const EVENT_COLOURS = { fault: "red", offline: "red", bus_down: "red", warning: "amber", supervision: "amber", unsupervised: "amber",
   refused_command: "amber", restarted: "amber", unlike_profile: "amber", not_confirmed: "amber", reload_refused: "amber",
-  foreign_command: "amber", parameters_changed: "amber", diagnosis: "amber", fault_end: "green", warning_end: "green", online: "green", bus_up: "green",
+  foreign_command: "amber", parameters_changed: "amber", restore_unfinished: "amber", diagnosis: "amber", fault_end: "green", warning_end: "green", online: "green", bus_up: "green",
   started: "blue", stopped: "blue", recording: "blue" };
 
 // All that the gateway knows; it refuses to search for others.
 const KINDS = [
   "fault", "fault_end", "warning", "warning_end", "online", "offline", "started", "stopped", "control_place", "supervision", "unsupervised",
-  "refused_command", "not_confirmed", "restarted", "unlike_profile", "foreign_command", "parameters_changed", "recording", "bus_up",
+  "refused_command", "not_confirmed", "restarted", "unlike_profile", "foreign_command", "parameters_changed", "restore_unfinished", "recording", "bus_up",
   "bus_down", "diagnosis", "reload_refused",
 ];
 const PAGE = 100;

@@ -51,7 +51,7 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         history: Default::default(),
     };
     let stats = Arc::new(NorthStats::default());
-    let state = ServerState::new(options, stats.clone());
+    let state = ServerState::new(options, stats.clone(), CancellationToken::new());
     let view = PlantView::new(Arc::new(ArcSwap::from_pointee(plant)), None);
     let client = Client::new(([127, 0, 0, 1], 502).into(), None, Authority::ReadOnly);
     let session = ClientSession::new(Arc::new(state), Arc::new(view), client);
@@ -67,7 +67,8 @@ fn bench_with(pipe: usize, idle_timeout: Option<Duration>) -> Bench {
         .acquire(newcomer, Instant::now().into_std(), || Some(Authority::ReadOnly))
         .unwrap();
     let place = permit.place().clone();
-    let server = tokio::spawn(async move { serve(end, session, idle_timeout, permit.place()).await });
+    let server =
+        tokio::spawn(async move { serve(end, session, idle_timeout, permit.place(), &CancellationToken::new()).await });
     Bench {
         client,
         server,

@@ -33,6 +33,16 @@ impl Bench {
         self.commands = commands(&self.memory);
     }
 
+    /// A reload starts the client anew, which goes on with what the one before has left.
+    fn succeed_client(&mut self) {
+        let after = |left| {
+            let topics = Topics::new("drivegate", "hall");
+            Commands::after(topics, rules(false), self.memory.clone(), left)
+        };
+        let before = std::mem::replace(&mut self.commands, after(OrdersLeft::default()));
+        self.commands = after(before.leave(Vec::new()));
+    }
+
     /// A reload starts the bus anew.
     fn reload_bus(&mut self) {
         let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
@@ -283,6 +293,27 @@ fn a_repetition_is_known_after_a_reload() {
     assert_eq!(refused["error"]["code"], "not_allowed", "{refused}");
     assert_eq!(bench.queued(), 0);
     assert_eq!(bench.take(run(3)), None);
+}
+
+#[test]
+fn a_command_that_waits_over_a_reload_is_answered_once_by_the_client_that_comes_after() {
+    let mut bench = Bench::new();
+    let run = |id: u32| set("p1/set", &format!(r#"{{"id": {id}, "run": true}}"#));
+    assert_eq!(bench.take(run(1)), None);
+    bench.succeed_client();
+    assert_eq!(bench.take(run(1)), None, "it is still to come");
+    assert_eq!(bench.queued(), 1);
+    let result = bench.acknowledge();
+    assert_eq!((&result["id"], &result["ok"]), (&1.into(), &true.into()));
+    assert_eq!(bench.finished(), None);
+    assert_eq!(json(&bench.take(run(1)).unwrap()), result, "and remembered");
+    // One that was acknowledged, and whose effect has not been read yet.
+    assert_eq!(bench.take(run(2)), None);
+    let confirmation = bench.take_order().unwrap();
+    assert!(bench.commands.try_finished().is_none());
+    bench.succeed_client();
+    drop(confirmation);
+    assert_eq!(bench.finished().unwrap()["id"], 2);
 }
 
 #[test]

@@ -39,9 +39,10 @@ const LOOK: Duration = Duration::from_millis(250);
 /// Drives looked at, and messages published, before other events have their turn.
 const DRIVES: usize = 32;
 const MESSAGES: usize = 64;
-/// Time for the orderly end of a connection, and the part of it for the results of orders.
+/// Time for the orderly end of a connection.
 const END: Duration = Duration::from_millis(500);
-const LAST_RESULTS: Duration = Duration::from_millis(250);
+/// Time for the orders that are under way when a reload ends the node. When the gateway stops they have ended before.
+const LAST_ORDERS: Duration = Duration::from_secs(3);
 /// Longest wait for the file with the number of the session.
 const FILE: Duration = Duration::from_secs(1);
 /// Least time between two log lines of one kind.
@@ -156,7 +157,7 @@ impl Client {
             broker,
             plant,
             observed,
-            orders: Orders::new(stats.taken.clone()),
+            orders: Orders::new(stats.taken.clone(), stats.mqtt.keep_node_orders(None)),
             stats,
             session: Session::new(rules),
             drives: Vec::new(),
@@ -399,6 +400,13 @@ impl Client {
                 Err(why) => self.not_understood(&message.topic, &why),
             },
             Some(Received::NodeCommand) if !message.retain => self.on_node_command(message),
+            Some(Received::DeviceCommand(_)) => self.on_device_command(message),
+            _ => {}
+        }
+    }
+
+    fn on_device_command(&mut self, message: &Incoming) {
+        match self.topics.parse(&message.topic) {
             Some(Received::DeviceCommand(device)) if self.broker.commands => {
                 let drives = self.drives.iter().map(|drive| &drive.metrics);
                 let place = drives
@@ -567,34 +575,51 @@ impl Client {
                 up.unacknowledged = limits.acknowledges;
                 break;
             }
-            if let ConnectionEvent::Lost(_) = up.connection.next().await {
+            if self.is_lost_next().await {
                 return;
             }
         }
-        let Link::Up(up) = &mut self.link else { return };
-        while up.unacknowledged {
-            match up.connection.next().await {
-                ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => up.unacknowledged = false,
-                ConnectionEvent::Lost(_) => return,
-                _ => {}
+        while matches!(&self.link, Link::Up(up) if up.unacknowledged) {
+            if self.is_lost_next().await {
+                return;
             }
         }
-        if up.connection.disconnect() {
-            while !matches!(up.connection.next().await, ConnectionEvent::Lost(_)) {}
+        if matches!(&self.link, Link::Up(up) if up.connection.disconnect()) {
+            while !self.is_lost_next().await {}
         }
     }
 
-    /// Publishes the results of pending orders and the death of the node.
+    /// Waits for the next event of a connection that ends: whether it is lost. The broker counts a command that comes meanwhile as
+    /// delivered, so it is carried out.
+    async fn is_lost_next(&mut self) -> bool {
+        match next(&mut self.link).await {
+            ConnectionEvent::Lost(_) => return true,
+            ConnectionEvent::Message(message) => self.on_device_command(&message),
+            ConnectionEvent::Acked(_) | ConnectionEvent::Refused(..) => {
+                if let Link::Up(up) = &mut self.link {
+                    up.unacknowledged = false;
+                }
+            }
+            _ => {}
+        }
+        false
+    }
+
+    /// Publishes the results of pending orders and the death of the node. What is still to come is published by the node that comes
+    /// after.
     async fn shut_down(mut self) {
-        self.broker.commands = false;
-        let until = tokio::time::Instant::now() + LAST_RESULTS;
-        while !self.orders.is_idle() && self.session.is_alive() {
-            let finished = tokio::time::timeout_at(until, self.orders.finished()).await;
-            let Ok(finished) = finished else { break };
-            self.on_finished(finished);
+        let until = tokio::time::Instant::now() + LAST_ORDERS;
+        while !self.orders.is_idle() && self.session.is_alive() && tokio::time::Instant::now() < until {
+            tokio::select! {
+                event = next(&mut self.link) => self.on_event(event).await,
+                finished = self.orders.finished() => self.on_finished(finished),
+                () = tokio::time::sleep_until(until) => {}
+            }
+            self.publish();
         }
         self.publish();
         self.end_connection().await;
+        self.stats.mqtt.keep_node_orders(Some(self.orders.leave()));
     }
 }
 

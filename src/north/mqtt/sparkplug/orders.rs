@@ -32,6 +32,10 @@ pub(super) struct Orders {
     memory: SharedMemory,
 }
 
+/// Orders whose results a node leaves to its successor.
+#[derive(Debug)]
+pub(in crate::north) struct NodeOrdersLeft(VecDeque<Awaited>);
+
 #[derive(Debug)]
 struct Awaited {
     drive: String,
@@ -68,13 +72,18 @@ impl Finished {
 }
 
 impl Orders {
-    /// `memory` outlives this client, so that an order is recognised after a reload.
-    pub(super) fn new(memory: SharedMemory) -> Orders {
+    /// `memory` outlives this client, so that an order is recognised after a reload; `left` are those of the client before.
+    pub(super) fn new(memory: SharedMemory, left: Option<NodeOrdersLeft>) -> Orders {
         Orders {
             client: SourceKind::Sparkplug.name().into(),
-            awaited: VecDeque::new(),
+            awaited: left.map(|left| left.0).unwrap_or_default(),
             memory,
         }
+    }
+
+    /// What the client that comes after goes on with.
+    pub(super) fn leave(self) -> NodeOrdersLeft {
+        NodeOrdersLeft(self.awaited)
     }
 
     /// Takes a command for the device of that name. When this returns, its order is in the queue of the bus, or the result

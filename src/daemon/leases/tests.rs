@@ -1,0 +1,75 @@
+use std::time::Instant;
+
+use super::*;
+use crate::bus::supervision::Lease;
+use crate::config::Settings;
+
+/// One bus at that port with these drives: name, address and access.
+fn bus(port: &str, drives: &[(&str, u8, &str)]) -> BusSettings {
+    let drive = |(name, address, access): &(&str, u8, &str)| {
+        format!(
+            "[[bus.drive]]\nname = \"{name}\"\naddress = {address}\nprofile = \"vacon-nx\"\naccess = \"{access}\"\n"
+        )
+    };
+    let text = format!("[gateway]\nname = \"g\"\n[[bus]]\nname = \"line1\"\nport = \"{port}\"\n")
+        + &drives.iter().map(drive).collect::<String>();
+    let loaded = Settings::parse("t.toml", &text, std::iter::empty());
+    loaded
+        .settings
+        .unwrap_or_else(|| panic!("{:?}", loaded.errors))
+        .buses
+        .remove(0)
+}
+
+/// The leases with which `after` goes on when the first drive of `before` had one and the second had none, and what is told.
+fn reloaded(before: &BusSettings, after: &BusSettings) -> (Vec<bool>, Vec<String>) {
+    let mut leases = Leases::default();
+    leases.left(before, vec![Lease::held(Instant::now()), Lease::default()]);
+    let of = leases
+        .of(after)
+        .into_iter()
+        .map(|lease| lease.ends().is_some())
+        .collect();
+    let told = leases.ended(SystemTime::now()).map(|event| {
+        assert_eq!(event.kind, EventKind::Supervision);
+        format!("{}: {}", event.drive.unwrap_or_default(), event.text)
+    });
+    (of, told.collect())
+}
+
+#[test]
+fn a_lease_goes_with_the_machine_and_where_it_ends_that_is_told() {
+    let two = [("pump-1", 1, "control"), ("pump-2", 2, "control")];
+    let before = bus("/dev/ttyUSB0", &two);
+    for (after, held) in [
+        (&two[..], vec![true, false]),
+        (&[("fan", 1, "control"), ("pump-2", 2, "control")], vec![true, false]),
+        (&[("pump-1", 2, "control"), ("pump-2", 1, "control")], vec![false, true]),
+        (&[("pump-2", 2, "control"), ("pump-1", 1, "control")], vec![false, true]),
+    ] {
+        assert_eq!(
+            reloaded(&before, &bus("/dev/ttyUSB0", after)),
+            (held, Vec::new()),
+            "{after:?}"
+        );
+    }
+    for (port, after) in [
+        (
+            "/dev/ttyUSB0",
+            &[("pump-1", 3, "control"), ("pump-2", 2, "control")][..],
+        ),
+        ("/dev/ttyUSB1", &two),
+        ("/dev/ttyUSB0", &[("pump-1", 1, "monitor"), ("pump-2", 2, "control")]),
+        ("/dev/ttyUSB0", &[("pump-1", 2, "control")]),
+    ] {
+        let (held, told) = reloaded(&before, &bus(port, after));
+        assert!(held.iter().all(|held| !held), "{after:?}");
+        assert_eq!(told.len(), 1, "{told:?}");
+        assert!(
+            told[0].starts_with(
+                "pump-1: the reload ended the lease of pump-1 (address 1 on /dev/ttyUSB0, profile `vacon-nx`)"
+            ),
+            "{told:?}"
+        );
+    }
+}

@@ -1,0 +1,294 @@
+//! Restores that did not come to their end: whose journal is on disk. The machine of such a journal takes no orders but stops. A
+//! journal whose machine is not configured any more is told of by an event, and by `drivegate check`.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::time::{Duration, SystemTime};
+
+use super::restore::blocking;
+use crate::event::{Event, EventKind, Events};
+use crate::parameters::{Claim, Journal, JournalFile, Owner, Vault, claims};
+use crate::plant::{DriveHandle, SharedPlant};
+use crate::process_image::{Access, BusSpec, DriveSpec, Machine};
+
+/// Time for the journals to be read at the start; on a slow disk the drives are held until they are.
+const LOOK: Duration = Duration::from_secs(5);
+
+/// A journal, and what it says of its owner.
+type Found = (JournalFile, Result<Owner, String>);
+
+/// A journal that concerns a drive.
+pub(super) struct Concerning {
+    pub(super) file: JournalFile,
+    owner: Result<Owner, String>,
+    claim: Claim,
+    text: std::io::Result<Option<String>>,
+}
+
+impl Concerning {
+    /// The journal, if it belongs to that machine.
+    ///
+    /// # Errors
+    /// It belongs to another one, or cannot be read.
+    pub(super) fn own(self, drive: &DriveHandle) -> Result<(JournalFile, String), String> {
+        let spec = &drive.image.spec;
+        if let (Claim::Place | Claim::Name, Ok(owner)) = (self.claim, &self.owner) {
+            return Err(belongs_elsewhere(&spec.name, &spec.profile.name, self.claim, owner));
+        }
+        match self.text {
+            Ok(Some(text)) => Ok((self.file, text)),
+            Ok(None) => Err(format!(
+                "no restore of `{}` was cut off: there is nothing to take up",
+                spec.name
+            )),
+            Err(error) => Err(not_understood(&self.file, &spec.name, &error.to_string())),
+        }
+    }
+}
+
+/// The journal that concerns a drive, as the gateway is configured now.
+///
+/// # Errors
+/// The journals cannot be looked for.
+pub(super) async fn concerning(
+    vault: &Vault,
+    plant: &SharedPlant,
+    drive: &DriveHandle,
+) -> Result<Option<Concerning>, String> {
+    let store = vault.store();
+    let store = store.ok_or("the gateway keeps no readings, so there is no place for a journal")?;
+    let plant = plant.load_full();
+    let (machine, others) = (drive.machine(), vault.others());
+    blocking(move || {
+        let journals = found(store.dir())?;
+        let drives: Vec<(Machine, String)> = plant
+            .drives()
+            .map(|drive| (drive.machine(), drive.image.spec.name.clone()))
+            .chain(others)
+            .collect();
+        let named: Vec<(Machine, &str)> = drives
+            .iter()
+            .map(|(machine, name)| (machine.clone(), name.as_str()))
+            .collect();
+        let place = drives.iter().position(|(other, _)| *other == machine);
+        let claimed = place.and_then(|place| claims(&journals, &named).drives.get(place).copied().flatten());
+        let concerned = claimed.and_then(|(journal, claim)| {
+            let (file, owner) = journals.get(journal)?.clone();
+            let text = file.read();
+            Some(Concerning {
+                file,
+                owner,
+                claim,
+                text,
+            })
+        });
+        Ok(concerned)
+    })
+    .await
+}
+
+/// All journals below a directory of readings.
+fn found(params: &Path) -> std::io::Result<Vec<Found>> {
+    let files = JournalFile::all(params)?.into_iter();
+    let owner = |file: &JournalFile| match file.read() {
+        Ok(Some(text)) => Some(Owner::parse(&text)),
+        Ok(None) => None,
+        Err(error) => Some(Err(error.to_string())),
+    };
+    Ok(files
+        .filter_map(|file| owner(&file).map(|owner| (file, owner)))
+        .collect())
+}
+
+/// The journals below a directory of readings that belong to no configured drive: each with what is wrong and what to do.
+///
+/// # Errors
+/// The directory cannot be read.
+pub fn orphans<'a>(
+    params: &Path,
+    drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,
+) -> std::io::Result<Vec<(PathBuf, String, &'static str)>> {
+    let journals = found(params)?;
+    let drives: Vec<(Machine, &str)> = drives
+        .map(|(bus, drive)| (bus.machine(drive), drive.name.as_str()))
+        .collect();
+    let orphans = claims(&journals, &drives).orphans.into_iter();
+    Ok(orphans
+        .filter_map(|orphan| journals.get(orphan))
+        .map(orphaned)
+        .collect())
+}
+
+/// What is said of a journal that belongs to no drive.
+fn orphaned((file, owner): &Found) -> (PathBuf, String, &'static str) {
+    match owner {
+        Ok(owner) => (
+            file.path(),
+            format!(
+                "a restore of parameters did not come to its end: this is its journal, it belongs to {}, and no such drive is configured; \
+                 that drive may be half restored",
+                owner.place()
+            ),
+            "configure the drive so again and resume or undo the restore, or move the journal away",
+        ),
+        Err(why) => (
+            file.path(),
+            format!("the journal of a restore of parameters is not understood: {why}"),
+            "look at it, then move it away",
+        ),
+    }
+}
+
+/// Why a drive is held when a restore of it did not come to its end.
+pub(super) fn held_unfinished(name: &str, why: &str) -> String {
+    format!(
+        "the parameters of `{name}` may be half restored ({why}): the drive takes no orders but stops until \
+         `drivegate params restore --resume {name}` has written the rest, --undo {name} the former values, or --release {name} \
+         leaves them as they are"
+    )
+}
+
+/// Why a drive is held by a journal that belongs to a machine which is not configured any more, and why it is not taken up.
+fn belongs_elsewhere(name: &str, profile: &str, claim: Claim, owner: &Owner) -> String {
+    let but = match claim {
+        Claim::Own | Claim::Name => "where no drive is configured any more".to_string(),
+        Claim::Place => format!("and the drive there is configured with profile `{profile}` now"),
+    };
+    format!(
+        "a restore of parameters did not come to its end, and its journal belongs to {}, {but}: whether `{name}` is the drive that may be \
+         half restored is not known; it takes no orders but stops until that drive is configured as it was, or `drivegate params restore \
+         --release {name}` sets the journal aside",
+        owner.place()
+    )
+}
+
+pub(super) fn not_understood(file: &JournalFile, name: &str, why: &str) -> String {
+    format!(
+        "the journal of a restore, {}, is not understood: {why}; look at it, then set it aside by `drivegate params restore \
+         --release {name}`",
+        file.path().display()
+    )
+}
+
+pub(super) fn unfinished_event(bus: &str, drive: Option<&str>, text: String) -> Event {
+    Event {
+        bus: bus.to_string(),
+        drive: drive.map(str::to_string),
+        ..Event::new(EventKind::RestoreUnfinished, SystemTime::now(), text)
+    }
+}
+
+/// A drive as it is configured.
+struct Configured {
+    machine: Machine,
+    spec: DriveSpec,
+    /// Its journal was not looked for yet.
+    is_new: bool,
+}
+
+/// Holds the drives whose journal tells of a restore that did not come to its end, before anybody can command them, and tells of
+/// journals that belong to none of them. A machine is looked at once; it is held until that is done, however slow the disk.
+pub async fn hold_unfinished<'a>(
+    vault: &Arc<Vault>,
+    events: &Events,
+    drives: impl Iterator<Item = (&'a BusSpec, &'a DriveSpec)>,
+) {
+    let configured = |(bus, spec): (&BusSpec, &DriveSpec)| {
+        let machine = bus.machine(spec);
+        Configured {
+            is_new: vault.is_new(&machine),
+            spec: spec.clone(),
+            machine,
+        }
+    };
+    let drives = drives.filter(|(_, spec)| spec.access != Access::Listen);
+    let drives: Vec<Configured> = drives.map(configured).collect();
+    let Some(store) = vault.store() else { return };
+    for drive in drives.iter().filter(|drive| drive.is_new) {
+        vault.hold(&drive.machine).set(Some(format!(
+            "whether a restore of the parameters of `{}` was cut off is not known before its journal is read: until then the drive takes \
+             no orders but stops",
+            drive.spec.name
+        )));
+    }
+    let (vault, events) = (vault.clone(), events.clone());
+    let looked = tokio::task::spawn_blocking(move || look(&vault, &events, store.dir(), &drives));
+    if tokio::time::timeout(LOOK, looked).await.is_err() {
+        tracing::warn!(
+            "the disk is slow: the drives take no orders but stops before the journals of restores are read"
+        );
+    }
+}
+
+fn look(vault: &Vault, events: &Events, params: &Path, drives: &[Configured]) {
+    let journals = match found(params) {
+        Ok(journals) => journals,
+        Err(error) => {
+            for drive in drives.iter().filter(|drive| drive.is_new) {
+                let name = &drive.spec.name;
+                let why = format!(
+                    "the journals of restores in {} cannot be looked for: {error}",
+                    params.display()
+                );
+                hold(vault, events, drive, held_unfinished(name, &why));
+            }
+            return;
+        }
+    };
+    let others = vault.others();
+    let others = others.iter().map(|(machine, name)| (machine.clone(), name.as_str()));
+    let named: Vec<(Machine, &str)> = drives
+        .iter()
+        .map(|drive| (drive.machine.clone(), drive.spec.name.as_str()))
+        .chain(others)
+        .collect();
+    let claims = claims(&journals, &named);
+    for (drive, claim) in drives.iter().zip(claims.drives).filter(|(drive, _)| drive.is_new) {
+        let claimed = claim.and_then(|(journal, claim)| Some((journals.get(journal)?, claim)));
+        match claimed {
+            Some((journal, claim)) => hold(vault, events, drive, why_held(&drive.spec, journal, claim)),
+            None => vault.hold(&drive.machine).set(None),
+        }
+    }
+    let orphans = claims.orphans.into_iter().filter_map(|orphan| journals.get(orphan));
+    let orphans: Vec<_> = orphans.map(orphaned).collect();
+    let news = vault.new_orphans(orphans.iter().map(|(path, ..)| path.clone()).collect());
+    for (path, what, remedy) in orphans.into_iter().filter(|(path, ..)| news.contains(path)) {
+        let text = format!("{what}; {}; {remedy}", path.display());
+        tracing::error!("{text}");
+        events.publish(unfinished_event("", None, text));
+    }
+}
+
+fn hold(vault: &Vault, events: &Events, drive: &Configured, why: String) {
+    let spec = &drive.spec;
+    tracing::error!(bus = %spec.bus, drive = %spec.name, "{why}");
+    events.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
+    vault.hold(&drive.machine).set(Some(why));
+}
+
+/// Why a drive is held, by the journal that concerns it.
+fn why_held(spec: &DriveSpec, (file, owner): &Found, claim: Claim) -> String {
+    let name = &spec.name;
+    if let (Claim::Place | Claim::Name, Ok(owner)) = (claim, owner) {
+        return belongs_elsewhere(name, &spec.profile.name, claim, owner);
+    }
+    let parsed = match file.read() {
+        Ok(Some(text)) => Journal::parse(&text, &spec.profile),
+        Ok(None) => Err("it is gone".to_string()),
+        Err(error) => Err(error.to_string()),
+    };
+    let why = match parsed {
+        Ok(journal) => format!(
+            "begun {} by {}, cut off {}, {} of {} parameters done; the journal belongs to {}",
+            journal.begun,
+            journal.by,
+            journal.phase.name(),
+            journal.done,
+            journal.plan.writes.len(),
+            journal.of.place()
+        ),
+        Err(why) => not_understood(file, name, &why),
+    };
+    held_unfinished(name, &why)
+}
