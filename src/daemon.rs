@@ -17,9 +17,9 @@ pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
-use crate::command::{AuditFile, CommandQueue, WriteStats};
+use crate::command::{AuditFile, CommandQueue, NotStopped, WriteStats};
 use crate::config::{BusSettings, Settings};
-use crate::event::Events;
+use crate::event::{Event, EventKind, Events};
 use crate::history::{History, Keeper, RecorderTask, Recordings};
 use crate::north::local::Control;
 use crate::north::parameters::{hold_unfinished, keep_reading};
@@ -535,16 +535,21 @@ impl Daemon {
             async move {
                 // A bus whose port is closed does not report.
                 let missing = tokio::time::timeout(time + STOP_SLACK, missing).await;
-                missing.ok().and_then(Result::ok).unwrap_or_else(|| {
+                let missing: Vec<NotStopped> = missing.ok().and_then(Result::ok).unwrap_or_else(|| {
                     let stop = |d: &&DriveSpec| d.on_shutdown == OnShutdown::Stop && d.access == Access::Control;
                     let wanted = settings.drives.iter().filter(stop);
                     wanted
-                        .map(|d| format!("`{}` was not sent its stop command", d.name))
+                        .map(|d| NotStopped {
+                            drive: d.name.clone(),
+                            why: "was not sent its stop command: its bus is down".to_string(),
+                        })
                         .collect()
-                })
+                });
+                missing.iter().for_each(|one| self.stop_failed(task.handle(), one));
+                missing
             }
         });
-        let missing: Vec<String> = futures_util::future::join_all(stops)
+        let missing: Vec<NotStopped> = futures_util::future::join_all(stops)
             .await
             .into_iter()
             .flatten()
@@ -552,9 +557,22 @@ impl Daemon {
         if !missing.is_empty() {
             tracing::error!(
                 "not every drive acknowledged its stop command in time; shutting down anyway: {}",
-                missing.join(", ")
+                missing.iter().map(NotStopped::to_string).collect::<Vec<_>>().join(", ")
             );
         }
+    }
+
+    /// Publishes that a drive was not stopped, and counts it.
+    fn stop_failed(&self, bus: &BusHandle, missing: &NotStopped) {
+        let NotStopped { drive, why } = missing;
+        let image = bus.image.drives.iter().find(|image| image.spec.name == *drive);
+        image.into_iter().for_each(|image| image.count_supervision_failure());
+        let text = format!("the gateway ends, and drive {drive} {why}; nothing stops it any more");
+        self.events.publish(Event {
+            bus: bus.image.spec.name.clone(),
+            drive: Some(drive.clone()),
+            ..Event::new(EventKind::SupervisionFailed, SystemTime::now(), text)
+        });
     }
 }
 

@@ -53,8 +53,10 @@ pub enum EventKind {
     Restarted,
     /// A drive says that it is another device than its profile expects.
     UnlikeProfile,
-    /// A lease ran out and its action was taken.
+    /// A lease ran out, and its action begins.
     Supervision,
+    /// The action of a lease, or the stop of a shutdown, failed.
+    SupervisionFailed,
     /// A drive that takes commands has neither a lease nor a response of its own to a silent master.
     Unsupervised,
     /// A command was refused.
@@ -81,7 +83,7 @@ pub enum EventKind {
 
 impl EventKind {
     /// All kinds.
-    pub const ALL: [EventKind; 23] = [
+    pub const ALL: [EventKind; 24] = [
         EventKind::Online,
         EventKind::Offline,
         EventKind::Fault,
@@ -94,6 +96,7 @@ impl EventKind {
         EventKind::Restarted,
         EventKind::UnlikeProfile,
         EventKind::Supervision,
+        EventKind::SupervisionFailed,
         EventKind::Unsupervised,
         EventKind::RefusedCommand,
         EventKind::NotConfirmed,
@@ -115,6 +118,7 @@ impl EventKind {
             | EventKind::Warning
             | EventKind::UnlikeProfile
             | EventKind::Supervision
+            | EventKind::SupervisionFailed
             | EventKind::Unsupervised
             | EventKind::NotConfirmed
             | EventKind::BusDown
@@ -151,6 +155,7 @@ impl EventKind {
             EventKind::Restarted => "restarted",
             EventKind::UnlikeProfile => "unlike_profile",
             EventKind::Supervision => "supervision",
+            EventKind::SupervisionFailed => "supervision_failed",
             EventKind::Unsupervised => "unsupervised",
             EventKind::RefusedCommand => "refused_command",
             EventKind::NotConfirmed => "not_confirmed",
@@ -467,8 +472,8 @@ mod tests {
         for (place, kind) in EventKind::ALL.into_iter().enumerate() {
             let last = match kind {
                 Online | Offline | Fault | FaultEnd | Started | Stopped | Warning | WarningEnd | ControlPlace
-                | Restarted | UnlikeProfile | Supervision | Unsupervised | RefusedCommand | NotConfirmed | BusUp
-                | BusDown | Recording | ReloadRefused | ForeignCommand => false,
+                | Restarted | UnlikeProfile | Supervision | SupervisionFailed | Unsupervised | RefusedCommand
+                | NotConfirmed | BusUp | BusDown | Recording | ReloadRefused | ForeignCommand => false,
                 ParametersChanged | RestoreUnfinished => false,
                 Diagnosis => true,
             };

@@ -25,7 +25,7 @@ use crate::parameters::Vault;
 use crate::process_image::{BusImage, DriveImage, Machine, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
-pub use self::placed::Placed;
+pub use self::placed::{Placed, Shown};
 pub(crate) use self::why::explain;
 
 /// The plant as it is configured now; a reload puts a new one in its place.

@@ -19,6 +19,10 @@ use crate::drive::Profile;
 
 /// Pause before a parameter is read back once more.
 const LOOK_AGAIN: Duration = Duration::from_millis(100);
+/// First and longest pause before a step that the drive was too busy for is tried again.
+const BUSY_PAUSE: (Duration, Duration) = (Duration::from_millis(50), Duration::from_millis(500));
+/// Tries in a row of the end of a pulse, which has no other end.
+const MOST_BUSY: u32 = 10;
 /// Stops to a drive that go before the end of a pulse that was begun.
 const MOST_STOPS: u32 = 8;
 
@@ -48,10 +52,15 @@ struct Scope {
 #[derive(Debug)]
 struct Tries {
     failures: u32,
-    /// How the last try without an answer failed: [`Outcome::TimedOut`] or [`Outcome::Garbled`].
+    /// How the last try without an answer that says anything failed: [`Outcome::TimedOut`], [`Outcome::Garbled`] or
+    /// [`Outcome::Unknown`].
     unanswered: Outcome,
     /// A write was sent and not answered: whether the drive took it is not known.
     in_doubt: bool,
+    /// Answers in a row by which the drive was busy.
+    busy: u32,
+    /// It is tried again after that time.
+    pause: Option<Duration>,
 }
 
 /// A command that the bus has begun.
@@ -150,6 +159,8 @@ impl CommandRun {
                 failures: 0,
                 unanswered: Outcome::TimedOut,
                 in_doubt: false,
+                busy: 0,
+                pause: None,
             },
             cut: unsendable.map(Outcome::Refused),
             only_ends: false,
@@ -210,10 +221,16 @@ impl CommandRun {
         if self.is_late(now) {
             let outcome = if self.tries.failures > 0 || self.tries.in_doubt {
                 self.tries.unanswered.clone()
+            } else if self.tries.busy > 0 {
+                Outcome::Exception(Exception::BUSY)
             } else {
                 self.unless_begun(Outcome::Expired, Interruption::Expired)
             };
             self.cut_off(outcome);
+        }
+        if let Some(pause) = self.tries.pause.take() {
+            let end = if self.only_ends { now + pause } else { self.expires };
+            self.not_before = Some((now + pause).min(end));
         }
         if let Some(at) = self.not_before {
             if now < at {
@@ -248,6 +265,19 @@ impl CommandRun {
                     }
                 }
             }
+        }
+    }
+
+    /// Whether it is still owed: nothing of it was on the wire, or the drive said each time that it was too busy.
+    pub fn is_owed(&self) -> bool {
+        !self.begun || (self.tries.busy > 0 && !self.tries.in_doubt)
+    }
+
+    /// How it ends when it is taken back while it is owed.
+    pub fn taken_back(&self) -> Outcome {
+        match self.begun {
+            true => Outcome::Exception(Exception::BUSY),
+            false => Outcome::Withdrawn,
         }
     }
 
@@ -374,6 +404,10 @@ impl CommandRun {
         if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
             self.tries.in_doubt = false;
         }
+        if self.waits_while_busy(step, &reply) {
+            return None;
+        }
+        self.tries.busy = 0;
         match (step.purpose, reply) {
             (StepPurpose::Release, Reply::Exception(code)) => self.not_released(&code.to_string()),
             (StepPurpose::Compare, reply) => {
@@ -398,6 +432,32 @@ impl CommandRun {
                 self.actions.is_empty().then(|| self.success())
             }
         }
+    }
+
+    /// Whether the drive is too busy for the step, which is tried again: of a command as long as its time is not over. Nobody
+    /// waits for it at a read that a stop can do without, or that only spares a write; whoever reads waits as he likes.
+    fn waits_while_busy(&mut self, step: &Step, reply: &Reply) -> bool {
+        let waits = match step.purpose {
+            StepPurpose::Execute => self.urgency != Urgency::Read,
+            StepPurpose::ReadWord => self.urgency != Urgency::Stop && !self.ends_pulse(),
+            _ => false,
+        };
+        let is_busy = matches!(reply, Reply::Exception(code) if code.is_busy());
+        if !(is_busy && waits) || (self.only_ends && self.tries.busy >= MOST_BUSY) {
+            return false;
+        }
+        let (first, longest) = BUSY_PAUSE;
+        self.tries.pause = Some((first * (1 << self.tries.busy.min(5))).min(longest));
+        self.tries.busy = self.tries.busy.saturating_add(1);
+        if self.check == Check::Read {
+            // By the next try it may have changed again.
+            self.check = Check::NotYet;
+        }
+        true
+    }
+
+    fn ends_pulse(&self) -> bool {
+        matches!(self.actions.front(), Some(Action::PulseEnd { .. }))
     }
 
     fn parameter_answered(&mut self, step: &Step, reply: &Reply, words: &mut KnownWords) -> Option<Outcome> {
@@ -496,8 +556,7 @@ impl CommandRun {
     /// The word was asked for in vain. Whether the command goes on with what is known all the same: where the drive never
     /// reports it (`unreadable`), and at the end of a pulse, which no read stands in the way of.
     fn goes_on(&mut self, unreadable: bool) -> bool {
-        let ends = matches!(self.actions.front(), Some(Action::PulseEnd { .. }));
-        let goes_on = self.check == Check::NotYet && (unreadable || ends);
+        let goes_on = self.check == Check::NotYet && (unreadable || self.ends_pulse());
         if goes_on {
             self.check = Check::InVain;
             self.tries.failures = 0;
@@ -539,6 +598,7 @@ impl CommandRun {
             self.actions.clear();
         }
         self.only_ends = true;
+        self.tries.pause = None;
         if before != self.actions.len() {
             self.cut = Some(outcome);
             self.tries.failures = 0;

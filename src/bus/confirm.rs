@@ -5,13 +5,16 @@ use std::time::{Duration, Instant};
 use crate::command::{Order, Receipt, written};
 use crate::drive::profile::Form;
 use crate::drive::{ModelPoint, PollClass, Profile, Value};
-use crate::process_image::Reading;
+use crate::process_image::{Reading, Unavailable};
 
 /// Commands to one drive that are watched at one time; beyond that the oldest stays "acknowledged".
 const WATCHED: usize = 8;
 /// A motor whose speed fell by more than that, in Hz, or in percent where no frequency is read, is on its way to a stop.
 /// Less is ripple.
 const RIPPLE: f64 = 0.25;
+
+/// Causes (`blocks` of a point in the profile) by which a motor may turn whatever the drive does with it.
+const FED_OTHERWISE: [&str; 2] = ["bypass", "fire_mode"];
 
 /// On a busy line the next read may come late: so many times the time for confirmation pass before that is reported.
 const UNREAD: u32 = 5;
@@ -130,6 +133,33 @@ fn shows(effect: Effect, reading: &Reading<'_>, since: Instant) -> Option<bool> 
     }
 }
 
+/// Why a motor may turn though the drive stands: the point that says so, or does not say otherwise yet. One that the drive
+/// refuses, or that is not polled, says nothing.
+fn may_turn(reading: &Reading<'_>) -> Option<String> {
+    let points = (0..).zip(&reading.spec.profile.points);
+    let reasons = points.filter_map(|(index, point)| {
+        let blocks = point.blocks.as_ref()?;
+        if !FED_OTHERWISE.contains(&blocks.cause.as_str()) {
+            return None;
+        }
+        match reading.sample(index).good() {
+            Some(value) if value.as_bool() == blocks.when => {
+                let state = if value.as_bool() { "on" } else { "off" };
+                Some(format!("`{}` is {state}: {}", point.name, blocks.remedy))
+            }
+            Some(_) => None,
+            None => {
+                let raw = point.raw()?;
+                let is_awaited = reading.words(raw.table, raw.address, raw.form.items()) == Err(Unavailable::Stale);
+                is_awaited.then(|| format!("`{}` is not known", point.name))
+            }
+        }
+    });
+    let reasons: Vec<String> = reasons.collect();
+    let motor = "the motor may turn though the drive stands";
+    (!reasons.is_empty()).then(|| format!("{motor}, {}", reasons.join(", ")))
+}
+
 /// How fast the motor turns, whatever the direction: its output frequency, which falls to zero, as a percentage of a band
 /// does not; the percentage where the profile has nothing else.
 fn speed(reading: &Reading<'_>) -> Option<f64> {
@@ -153,6 +183,10 @@ struct Watch {
     was_read: bool,
     /// What it was, for people.
     what: String,
+    /// Why its effect cannot be seen, as it was last.
+    unseen: Option<String>,
+    /// Supervision wanted it, or the gateway that stops.
+    own: bool,
     /// Of those who wait for the effect; none once its time is over while nothing can be said of it yet.
     receipts: Vec<Receipt>,
 }
@@ -182,9 +216,22 @@ impl Watch {
                 "acknowledged {what} but was not read within {within:?}; whether it took effect is unknown"
             );
         }
+        if let Some(unseen) = &self.unseen {
+            return format!("acknowledged {what}, and whether it took effect is not known: {unseen}");
+        }
         let missing: Vec<String> = self.effects.iter().map(|e| e.missing(profile)).collect();
         let missing = missing.join(", ");
         format!("acknowledged {what} but did not show it within {within:?}: {missing}")
+    }
+
+    /// Nobody waits for it any longer: they learn why it was not seen, where that is known.
+    fn let_go(&mut self) {
+        for receipt in self.receipts.drain(..) {
+            match &self.unseen {
+                Some(unseen) => receipt.cannot_be_seen(unseen),
+                None => drop(receipt),
+            }
+        }
     }
 
     fn note_speed(&mut self, reading: &Reading<'_>, now: Instant) {
@@ -206,6 +253,8 @@ pub struct Unconfirmed {
     pub text: String,
     /// The motor was to run, and does not.
     pub does_not_run: bool,
+    /// It was the action of a lease.
+    pub own: bool,
 }
 
 /// The acknowledged commands of a drive that may still be confirmed.
@@ -237,6 +286,8 @@ impl Confirmations {
                 .first()
                 .map(|receipt| receipt.what().to_string())
                 .unwrap_or_default(),
+            unseen: None,
+            own: receipts.iter().any(|receipt| receipt.is_of_gateway()),
             receipts,
         });
     }
@@ -249,15 +300,18 @@ impl Confirmations {
             watch.note_speed(reading, now);
             if !watch.is_over(now) || watch.is_open(now) {
                 let was_read = &mut watch.was_read;
+                let stops = watch.effects.contains(&Effect::Stops);
+                watch.unseen = stops.then(|| may_turn(reading)).flatten();
+                let unseen = watch.unseen.is_some();
                 watch.effects.retain(|effect| {
                     let shown = shows(*effect, reading, since);
                     *was_read |= shown.is_some();
-                    shown != Some(true)
+                    shown != Some(true) || (unseen && *effect == Effect::Stops)
                 });
             }
             if watch.is_over(now) {
                 // Shown too late for those who waited.
-                watch.receipts.clear();
+                watch.let_go();
             }
             if watch.effects.is_empty() {
                 let receipts = self.0.remove(index).receipts;
@@ -276,13 +330,14 @@ impl Confirmations {
             if !watch.is_over(now) {
                 return true;
             }
+            watch.let_go();
             if watch.is_open(now) {
-                watch.receipts.clear();
                 return true;
             }
             late.push(Unconfirmed {
                 text: watch.report(profile),
                 does_not_run: watch.was_read && watch.effects.contains(&Effect::Runs),
+                own: watch.own,
             });
             false
         });

@@ -246,8 +246,9 @@ impl DriveState {
     /// What supervision wants and was begun, but not sent, is taken back: a client commands the drive again.
     pub(super) fn withdraw_supervision(&mut self, now: Instant) {
         for run in &mut self.runs {
-            if let Some(run) = run.take_if(|run| run.is_of_supervision() && !run.has_begun()) {
-                run.finish(&Outcome::Withdrawn, now);
+            if let Some(run) = run.take_if(|run| run.is_of_supervision() && run.is_owed()) {
+                let outcome = run.taken_back();
+                run.finish(&outcome, now);
             }
         }
     }

@@ -186,6 +186,8 @@ impl LineDiagnosis {
 
 fn end(ended: &Ended) -> End {
     match ended {
+        // A gateway in between answered, and the drive did not.
+        Ended::Reply(Reply::Exception(code)) if code.is_no_answer() => End::Silent,
         Ended::Reply(_) => End::Answered,
         Ended::Silent => End::Silent,
         Ended::Corrupt(why) if *why == MAY_BE_LATE => End::Doubtful,

@@ -48,9 +48,23 @@ pub enum News {
         /// Why not.
         refusal: Refusal,
     },
+    /// The action of a lease that ran out was tried, and failed; why, unless that was told before.
+    ActionFailed {
+        /// Which drive.
+        drive: usize,
+        /// Why, for people.
+        why: Option<String>,
+    },
+    /// The action of a lease that ran out was acknowledged after so many tries that failed.
+    ActionTaken {
+        /// Which drive.
+        drive: usize,
+        /// How many.
+        failures: u32,
+    },
     /// A drive whose lease ran out does not say whether it runs.
     RunningUnknown(usize),
-    /// A supervised drive runs, and no client was heard of since the gateway started; whether its lease starts by that.
+    /// A supervised drive runs, and no client is known to have commanded it; whether its lease starts by that.
     RunsUnsupervised(usize, Adopted),
 }
 

@@ -32,6 +32,8 @@ pub struct Answer {
     pub bytes: usize,
     /// What they look like.
     pub shape: Shape,
+    /// A gateway in between said that nobody answers at the address, which is silence.
+    pub no_way: bool,
 }
 
 impl Answer {
@@ -52,7 +54,11 @@ impl Answer {
             echoed,
             bytes: seen.len() - if echoed { sent.len() } else { 0 },
             shape: signature.shape,
-            ended: exchanged.ended,
+            no_way: matches!(exchanged.ended, Ended::Reply(Reply::Exception(code)) if code.is_no_answer()),
+            ended: match exchanged.ended {
+                Ended::Reply(Reply::Exception(code)) if code.is_no_answer() => Ended::Silent,
+                ended => ended,
+            },
         }
     }
 }

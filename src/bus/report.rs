@@ -45,7 +45,8 @@ pub(super) struct Report {
     /// What is wrong with the line.
     pub(super) diagnosis: LineDiagnosis,
     up: bool,
-    reason: String,
+    /// It was reported that the bus is down, and it is still.
+    down_reported: bool,
 }
 
 impl Report {
@@ -69,7 +70,7 @@ impl Report {
             watched: vec![[Watched::default(); WATCHED.len()]; faults.len()],
             faults,
             up: false,
-            reason: String::new(),
+            down_reported: false,
         }
     }
 
@@ -87,11 +88,27 @@ impl Report {
             News::NotConfirmed(drive, late) => self.not_confirmed(*drive, late, now),
             News::LeaseRanOut(drive) => self.lease_ran_out(*drive),
             News::ActionRefused { drive, what, refusal } => {
-                self.drive_event(*drive, EventKind::Supervision, None, |name| {
-                    format!(
+                self.action_failed(*drive, |name| {
+                    Some(format!(
                         "the lease of {name} ran out, and {what} cannot be written: {refusal}; it is tried again every \
                          second, until a client commands the drive"
-                    )
+                    ))
+                });
+            }
+            News::ActionFailed { drive, why } => {
+                let action = self.action_of(*drive);
+                self.action_failed(*drive, |name| {
+                    let why = why.as_ref()?;
+                    Some(format!(
+                        "the lease of {name} ran out, and {action} failed: {why}; it is tried again every second, until the \
+                         drive acknowledges it or a client commands it"
+                    ))
+                });
+            }
+            News::ActionTaken { drive, failures } => {
+                let action = self.action_of(*drive);
+                self.drive_event(*drive, EventKind::Supervision, None, |name| {
+                    format!("drive {name} acknowledged {action} of its lease, after {failures} tries that failed")
                 });
             }
             News::RunningUnknown(drive) => {
@@ -164,20 +181,48 @@ impl Report {
         });
     }
 
+    /// An action of supervision failed: counted, and told where `text` has words for it.
+    fn action_failed(&self, index: usize, text: impl FnOnce(&str) -> Option<String>) {
+        let Some(drive) = self.image.drives.get(index) else {
+            return;
+        };
+        drive.count_supervision_failure();
+        if let Some(text) = text(&drive.spec.name) {
+            self.drive_event(index, EventKind::SupervisionFailed, None, |_| text);
+        }
+    }
+
+    /// The action of the lease of a drive, in words.
+    fn action_of(&self, index: usize) -> &'static str {
+        let drive = self.image.drives.get(index);
+        match drive
+            .and_then(|drive| drive.spec.supervision.as_ref())
+            .map(|s| &s.action)
+        {
+            Some(LeaseAction::SpeedReference(_)) => "the speed reference",
+            _ => "the stop",
+        }
+    }
+
     /// A motor that was to run and does not: with the causes that are known.
     fn not_confirmed(&self, index: usize, late: &Unconfirmed, now: Instant) {
+        if late.own {
+            self.action_failed(index, |name| {
+                Some(format!(
+                    "the action of the lease of {name} shows no effect: the drive {}",
+                    late.text
+                ))
+            });
+        }
         let Some(drive) = self.image.drives.get(index).filter(|_| late.does_not_run) else {
             return self.drive_event(index, EventKind::NotConfirmed, None, |name| {
                 format!("drive {name} {}", late.text)
             });
         };
-        let causes = explain(&drive.reading(now, RECENT), &self.image, &self.writes).causes;
-        let causes: Vec<String> = causes
-            .iter()
-            .map(|cause| format!("{} ({})", cause.cause, cause.evidence))
-            .collect();
+        let explanation = explain(&drive.reading(now, RECENT), &self.image, &self.writes);
+        let causes = explanation.blocked_by().map(|causes| format!("; blocked by {causes}"));
         self.drive_event(index, EventKind::NotConfirmed, None, |name| {
-            format!("drive {name} {}; blocked by {}", late.text, causes.join(", "))
+            format!("drive {name} {}{}", late.text, causes.unwrap_or_default())
         });
     }
 
@@ -188,9 +233,9 @@ impl Report {
         };
         drive.count_supervision();
         let action = match supervision.action {
-            LeaseAction::Stop => "the drive is stopped".to_string(),
+            LeaseAction::Stop => "the drive is being stopped".to_string(),
             LeaseAction::Hold => "nothing is written".to_string(),
-            LeaseAction::SpeedReference(percent) => format!("the speed reference is set to {percent} %"),
+            LeaseAction::SpeedReference(percent) => format!("the speed reference is being set to {percent} %"),
         };
         let timeout = supervision.timeout;
         self.drive_event(index, EventKind::Supervision, None, |name| {
@@ -203,18 +248,18 @@ impl Report {
             Adopted::Yes => "its lease starts now (supervision.adopt)",
             Adopted::No => {
                 "its lease starts with the first order or heartbeat of a client; set supervision.adopt = true to start it \
-                 with the gateway"
+                 whenever the drive is found running"
             }
         };
         self.drive_event(index, EventKind::Unsupervised, None, |name| {
-            format!("drive {name} runs, and nobody has commanded it since the gateway started; {then}")
+            format!("drive {name} runs, and its supervision knows of no client that has commanded it; {then}")
         });
     }
 
     pub(super) fn bus_up(&mut self, now: Instant) {
         self.diagnosis.figures().port_opened(now);
         self.up = true;
-        self.reason.clear();
+        self.down_reported = false;
         self.window = now;
         self.busy = Duration::ZERO;
         self.image.update_health(|h| {
@@ -230,10 +275,10 @@ impl Report {
     }
 
     /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
-    /// for each reason, not at every try.
+    /// for each loss: why it cannot be opened again then is a reason of the same one, and the state shows it.
     pub(super) fn bus_down(&mut self, why: &str, now: Instant) {
         self.diagnosis.figures().port_lost(now);
-        let news = self.up || self.reason != why;
+        let news = self.up || !self.down_reported;
         let drives = self.image.drives.iter().enumerate();
         let gone: Vec<usize> = drives
             .filter(|(_, drive)| goes_offline(drive))
@@ -249,8 +294,8 @@ impl Report {
             h.reason = Some(why.to_string());
         });
         self.up = false;
+        self.down_reported = true;
         if news {
-            self.reason = why.to_string();
             let name = &self.image.spec.name;
             self.event(
                 EventKind::BusDown,
@@ -374,10 +419,15 @@ impl Report {
         }
         let active = fault.as_bool().then_some(code);
         match self.faults.get_mut(index) {
+            // The code goes before its bit, or is not read at times: the fault is the same.
+            Some(Some(before)) if active == Some(0) && *before != 0 => return false,
             Some(before) if *before != active => *before = active,
             _ => return false,
         }
         match active {
+            Some(0) => self.drive_event(index, EventKind::Fault, None, |name| {
+                format!("drive {name} has a fault; its code is not known")
+            }),
             Some(code) => self.drive_event(index, EventKind::Fault, Some(code), |name| {
                 format!("drive {name} has fault {code}: {}", drive.spec.profile.fault_text(code))
             }),

@@ -1,6 +1,7 @@
 //! Supervision: a gateway that polls keeps a drive's own watchdog content even when nobody commands the drive any more.
 //! So a drive can have a lease, renewed by the orders and heartbeats of a commanding client; when it runs out while the
-//! drive runs, the configured action is written once. Not a safety function. Pure: time is an argument.
+//! drive runs, or its run command is set, the configured action is written once. Not a safety function. Pure: time is an
+//! argument.
 //!
 //! A lease begins when an order reached the wire, and anew when that order ended. An order that waits holds the lease,
 //! no longer than until the order expires; one that was refused, expired or replaced renews nothing. A client that is
@@ -13,13 +14,15 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::command_run::KnownWords;
 use super::news::{Adopted, News};
-use crate::command::{Answer, Refusal};
+use crate::command::{Answer, Outcome, Refusal};
 use crate::drive::profile::Form;
-use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Value};
+use crate::drive::{COMMUNICATION_TIMEOUT, FIELDBUS_FAULT_RESPONSE, ModelPoint, PollClass, Quality, Raw, Value};
 use crate::process_image::{LeaseAction, Reading, Unavailable};
 
 /// How long an action that was not acknowledged waits before it is written again.
 const AGAIN: Duration = Duration::from_secs(1);
+/// Reasons for which one action failed that are told apart; each is told once.
+const MOST_REASONS: usize = 8;
 
 /// The lease of a drive, as a bus that starts anew takes it over.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -36,7 +39,7 @@ enum State {
     Held(Instant),
     /// It ran out while the drive ran, and the action is not acknowledged yet.
     RanOut,
-    /// It ended: the motor stood when it ran out, or the action was acknowledged.
+    /// It ended: the motor stood without a run command when it ran out, or the action was acknowledged.
     Ended,
 }
 
@@ -86,6 +89,14 @@ pub(super) struct Supervision {
     refused: Option<Refusal>,
     /// It was reported that the drive does not say whether it runs.
     blind_reported: bool,
+    /// For how long the drive answered since the lease ran out without showing what is to be done, and until when that is
+    /// reckoned.
+    waited: Option<(Duration, Instant)>,
+    /// An action failed so, which is not told yet.
+    failure: Option<Outcome>,
+    /// Tries of the present action that failed, and the reasons that were told.
+    failures: u32,
+    reasons: Vec<String>,
 }
 
 impl Supervision {
@@ -115,8 +126,14 @@ impl Supervision {
             State::Held(since) => State::Held(since.max(now)),
             _ => State::Held(now),
         });
-        self.refused = None;
-        self.next_try = None;
+        self.begin_anew();
+    }
+
+    /// Another action, or another lease.
+    fn begin_anew(&mut self) {
+        (self.refused, self.next_try, self.waited) = (None, None, None);
+        (self.failure, self.failures) = (None, 0);
+        self.reasons.clear();
     }
 
     /// What is due at `now`.
@@ -147,12 +164,15 @@ impl Supervision {
                 }
                 Demand::None
             }
-            State::Ended | State::RunsUnheard => Demand::None,
+            State::Ended | State::RunsUnheard => {
+                self.tell_failure(news, drive);
+                Demand::None
+            }
             // The action of the lease before, which a client that is back has suspended for good.
             State::Held(_) if self.answer.is_some() => Demand::Withdraw,
             State::Held(since) => {
                 if now.saturating_duration_since(since) >= spec.timeout && !held {
-                    self.runs_out(since, reading, words, news, drive);
+                    self.runs_out(since, reading, words, now, news, drive);
                 }
                 match self.lease.0 {
                     State::RanOut => self.act(reading, now),
@@ -161,6 +181,7 @@ impl Supervision {
             }
             State::RanOut => {
                 self.note_answer(now);
+                self.tell_failure(news, drive);
                 match self.lease.0 {
                     // Suspended: whoever is back decides, if the order reaches the wire.
                     State::RanOut if held && self.answer.is_some() => Demand::Withdraw,
@@ -172,30 +193,55 @@ impl Supervision {
     }
 
     /// The time of the lease, which ran since `since`, is over. Of a drive that does not answer, or was not read since,
-    /// nobody knows whether it runs: its lease stays until it is.
+    /// nobody knows whether it runs: its lease stays until it is. One that answers and does not say so is not waited for
+    /// without end, whatever it says instead.
     fn runs_out(
         &mut self,
         since: Instant,
         reading: &Reading<'_>,
         words: &KnownWords,
+        now: Instant,
         news: &mut Vec<News>,
         drive: usize,
     ) {
-        let Some(running) = self.running(reading, words, news, drive) else {
+        let in_vain = self.waits_in_vain(reading, now);
+        let Some(running) = self.running(reading, words, in_vain, news, drive) else {
+            return;
+        };
+        // A motor may run, or start, by its run command whatever its status shows.
+        let commanded = || is_commanded(reading, words, since, in_vain);
+        let Some(acts) = running.then_some(true).or_else(commanded) else {
             return;
         };
         let read_since = reading.model(ModelPoint::Running).at.is_none_or(|at| at > since);
-        if running {
-            let acts = !matches!(
+        if acts {
+            let holds = matches!(
                 reading.spec.supervision.as_ref().map(|s| &s.action),
                 Some(LeaseAction::Hold)
             );
-            self.lease = Lease(if acts { State::RanOut } else { State::Ended });
-            (self.next_try, self.refused) = (None, None);
+            self.lease = Lease(if holds { State::Ended } else { State::RanOut });
+            self.begin_anew();
             news.push(News::LeaseRanOut(drive));
-        } else if read_since && !may_start(reading, since) {
+        } else if read_since {
             self.lease = Lease(State::Ended);
         }
+    }
+
+    /// Whether the drive answered since the lease ran out for as long as a read of what is to be seen may take. The time in
+    /// which it does not answer is not counted: after it everything is read anew.
+    fn waits_in_vain(&mut self, reading: &Reading<'_>, now: Instant) -> bool {
+        let online = reading.snapshot.link.is_online();
+        let (time, until) = self.waited.unwrap_or((Duration::ZERO, now));
+        let passed = now.saturating_duration_since(until);
+        let time = if online { time + passed } else { time };
+        self.waited = Some((time, now));
+        let points = [ModelPoint::Running, ModelPoint::Run];
+        let mut points = points
+            .iter()
+            .filter_map(|point| reading.spec.profile.model_point(*point));
+        let slow = points.any(|point| point.raw().is_some() && point.class == PollClass::Slow);
+        let patience = reading.stale_after + if slow { reading.slow_cycle } else { Duration::ZERO };
+        online && time >= patience
     }
 
     /// Whether the motor runs. Where the drive answers but does not say, its run command stands for it, and one that
@@ -204,13 +250,14 @@ impl Supervision {
         &mut self,
         reading: &Reading<'_>,
         words: &KnownWords,
+        in_vain: bool,
         news: &mut Vec<News>,
         drive: usize,
     ) -> Option<bool> {
         if let Some(running) = reading.model(ModelPoint::Running).good() {
             return Some(running.as_bool());
         }
-        if !reading.snapshot.link.is_online() || !does_not_say(reading) {
+        if !reading.snapshot.link.is_online() || !(in_vain || does_not_say(reading)) {
             return None;
         }
         if !std::mem::replace(&mut self.blind_reported, true) {
@@ -219,12 +266,7 @@ impl Supervision {
         if let Some(run) = reading.model(ModelPoint::Run).good() {
             return Some(run.as_bool());
         }
-        let raw = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
-        let word = raw.and_then(|raw| Some((raw, words.get(raw.table, raw.address)?)));
-        Some(word.is_none_or(|(raw, word)| match raw.form {
-            Form::Bit { bit, invert } => ((word >> bit) & 1 == 1) != invert,
-            _ => true,
-        }))
+        Some(written_run(reading, words).unwrap_or(true))
     }
 
     /// Takes note of what became of the action that is on its way.
@@ -233,9 +275,33 @@ impl Supervision {
         match answer.try_recv() {
             Err(TryRecvError::Empty) => return,
             Ok(answer) if answer.outcome.is_ok() => self.lease = Lease(State::Ended),
-            Ok(_) | Err(TryRecvError::Closed) => self.next_try = Some(now + AGAIN),
+            Ok(answer) => {
+                self.next_try = Some(now + AGAIN);
+                self.failure = Some(answer.outcome).filter(has_failed);
+            }
+            Err(TryRecvError::Closed) => self.next_try = Some(now + AGAIN),
         }
         self.answer = None;
+    }
+
+    /// Tells of an action that failed, and of one that succeeded behind that.
+    fn tell_failure(&mut self, news: &mut Vec<News>, drive: usize) {
+        if let Some(outcome) = self.failure.take() {
+            self.failures = self.failures.saturating_add(1);
+            let why = outcome.to_string();
+            let is_new = self.reasons.len() < MOST_REASONS && !self.reasons.contains(&why);
+            if is_new {
+                self.reasons.push(why.clone());
+            }
+            let why = is_new.then_some(why);
+            news.push(News::ActionFailed { drive, why });
+        }
+        if self.lease.0 == State::Ended && self.failures > 0 {
+            news.push(News::ActionTaken {
+                drive,
+                failures: std::mem::take(&mut self.failures),
+            });
+        }
     }
 
     /// Writes the action. Nothing reaches a drive that does not answer: it is written when the drive is back.
@@ -303,16 +369,40 @@ fn does_not_say(reading: &Reading<'_>) -> bool {
     }
 }
 
-/// Whether a motor that stands may start without another command: the run command is set in the drive's word, or is not
-/// read yet. Where a drive does not report it, it counts as unset.
-fn may_start(reading: &Reading<'_>, since: Instant) -> bool {
+/// Whether the run command is set in the drive's word, as it was read since the last order or, where it is waited for in
+/// vain or not reported, as it was last written; none while it is to be read yet. What is not known either counts as unset.
+fn is_commanded(reading: &Reading<'_>, words: &KnownWords, since: Instant, in_vain: bool) -> Option<bool> {
     let sample = reading.model(ModelPoint::Run);
-    if let Some(run) = sample.good() {
-        // What was read before the last order says nothing of what that did.
-        return run.as_bool() || sample.at.is_some_and(|at| at <= since);
+    if let Some(run) = sample.good().filter(|_| sample.at.is_some_and(|at| at > since)) {
+        return Some(run.as_bool());
     }
     let run = reading.spec.profile.model_point(ModelPoint::Run).and_then(|p| p.raw());
-    run.is_some_and(|raw| reading.words(raw.table, raw.address, 1) == Err(Unavailable::Stale))
+    let is_read = |raw: &Raw| {
+        let word = reading.words(raw.table, raw.address, 1);
+        matches!(word, Ok(_) | Err(Unavailable::Stale))
+    };
+    if !in_vain && run.is_some_and(is_read) {
+        return None;
+    }
+    Some(written_run(reading, words).unwrap_or(false))
+}
+
+/// The run command in the drive's word as it is known.
+fn written_run(reading: &Reading<'_>, words: &KnownWords) -> Option<bool> {
+    let raw = reading.spec.profile.model_point(ModelPoint::Run)?.raw()?;
+    let word = words.get(raw.table, raw.address)?;
+    Some(match raw.form {
+        Form::Bit { bit, invert } => ((word >> bit) & 1 == 1) != invert,
+        _ => true,
+    })
+}
+
+/// Whether an action failed that ended so: not where somebody else's order took its place, or the bus starts anew.
+fn has_failed(outcome: &Outcome) -> bool {
+    !matches!(
+        outcome,
+        Outcome::Withdrawn | Outcome::Replaced | Outcome::Purged | Outcome::ShuttingDown
+    )
 }
 
 /// A drive's own response to a silent master, as far as its registers say.

@@ -115,7 +115,10 @@ fn command(target: &Target, settings: Vec<(Setting, String)>) -> Result<String, 
 fn acknowledged(what: &str, write: &WriteOutcome, way: Way) -> String {
     let confirmed = match write.confirmed_ms {
         Some(after) => format!("confirmed after {after:.0} ms"),
-        None => "not confirmed by a read".to_string(),
+        None => match &write.known {
+            Some(known) => format!("not confirmed by a read: {}", printable::line(known)),
+            None => "not confirmed by a read".to_string(),
+        },
     };
     let way = match way {
         Way::Gateway => ", through the gateway",

@@ -24,7 +24,7 @@ pub use background::{
 };
 pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
-pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
+pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
 
@@ -263,6 +263,8 @@ pub enum Outcome {
     Acknowledged(Reply),
     /// The drive refused it.
     Exception(Exception),
+    /// What was answered leaves open what became of it: 05, or a gateway's 0A or 0B.
+    Unknown(Exception),
     /// Refused before it reached the bus.
     Refused(Refusal),
     /// The drive did not answer.
@@ -297,6 +299,7 @@ impl Outcome {
         match self {
             Outcome::Acknowledged(_) => "acknowledged",
             Outcome::Exception(_) => "refused_by_drive",
+            Outcome::Unknown(_) => "unknown",
             Outcome::Refused(refusal) => refusal.code(),
             Outcome::TimedOut => "timeout",
             Outcome::Garbled => "garbled",
@@ -319,6 +322,7 @@ impl Outcome {
         match self {
             Outcome::Acknowledged(_)
             | Outcome::Exception(_)
+            | Outcome::Unknown(_)
             | Outcome::TimedOut
             | Outcome::Garbled
             | Outcome::NotTaken(_)
@@ -327,6 +331,14 @@ impl Outcome {
                 Reach::Queued
             }
             Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
+        }
+    }
+
+    /// How a write ended that was answered with that exception.
+    pub fn of_exception(code: Exception) -> Outcome {
+        match code.leaves_open() {
+            true => Outcome::Unknown(code),
+            false => Outcome::Exception(code),
         }
     }
 
@@ -339,8 +351,10 @@ impl Outcome {
     pub fn exception(&self) -> Option<Exception> {
         match self {
             Outcome::Acknowledged(_) => None,
-            Outcome::Exception(code) if code.0 <= 0x0B => Some(*code),
-            Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => Some(Exception::DEVICE_FAILURE),
+            Outcome::Exception(code) | Outcome::Unknown(code) if code.0 <= 0x0B => Some(*code),
+            Outcome::Exception(_) | Outcome::Unknown(_) | Outcome::Garbled | Outcome::NotTaken(_) => {
+                Some(Exception::DEVICE_FAILURE)
+            }
             Outcome::Refused(refusal) => Some(refusal.exception()),
             Outcome::QueueFull => Some(Exception::BUSY),
             Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
@@ -357,6 +371,12 @@ impl fmt::Display for Outcome {
         match self {
             Outcome::Acknowledged(_) => f.write_str("the drive acknowledged it"),
             Outcome::Exception(code) => write!(f, "the drive refused it with {code}"),
+            Outcome::Unknown(code) => {
+                write!(
+                    f,
+                    "the answer was {code}; whether the drive took the command is not known"
+                )
+            }
             Outcome::Refused(refusal) => refusal.fmt(f),
             Outcome::TimedOut => f.write_str("the drive did not answer; whether it took the command is not known"),
             Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
@@ -479,7 +499,9 @@ mod tests {
             let row = format!("| `{}` | {exception} |", outcome.code());
             assert!(page.contains(&row), "docs/commands.md lacks {row}");
         }
-        assert!(page.contains(&format!("| `{}` |", Outcome::Exception(Exception::BUSY).code())));
+        for with_code in [Outcome::Exception, Outcome::Unknown] {
+            assert!(page.contains(&format!("| `{}` |", with_code(Exception::BUSY).code())));
+        }
         assert_eq!(
             Outcome::Exception(Exception(0x33)).exception(),
             Some(Exception::DEVICE_FAILURE)

@@ -47,7 +47,22 @@ pub struct Pending {
 #[derive(Debug)]
 pub struct Stopping {
     deadline: Instant,
-    report: oneshot::Sender<Vec<String>>,
+    report: oneshot::Sender<Vec<NotStopped>>,
+}
+
+/// A drive that did not get, or did not acknowledge, the stop that the gateway wanted before it ends.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct NotStopped {
+    /// Its name.
+    pub drive: String,
+    /// What became of the stop, in words.
+    pub why: String,
+}
+
+impl std::fmt::Display for NotStopped {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        write!(f, "`{}` {}", self.drive, self.why)
+    }
 }
 
 impl Stopping {
@@ -56,8 +71,8 @@ impl Stopping {
         self.deadline
     }
 
-    /// The bus has done what it can; `missing` are the drives that were not stopped, in words.
-    pub fn report(self, missing: Vec<String>) {
+    /// The bus has done what it can; `missing` are the drives that were not stopped.
+    pub fn report(self, missing: Vec<NotStopped>) {
         // The gateway may have given up waiting.
         let _ = self.report.send(missing);
     }
@@ -431,7 +446,7 @@ impl CommandQueue {
 
     /// The gateway is about to end: from now on only stops get in, since nothing may start a drive again. What waits
     /// is answered, stops apart. The bus stops its drives until `deadline`, and reports those that were not stopped.
-    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<String>> {
+    pub fn begin_shutdown(&self, deadline: Instant, now: Instant) -> oneshot::Receiver<Vec<NotStopped>> {
         let (report, missing) = oneshot::channel();
         self.background().close(&Outcome::ShuttingDown, now);
         let mut pending = self.lock();

@@ -56,9 +56,11 @@ pub struct Ticket {
     accepted: Instant,
     stats: Arc<WriteStats>,
     sender: Option<oneshot::Sender<Answer>>,
-    confirmation: Option<oneshot::Sender<Duration>>,
+    confirmation: Option<oneshot::Sender<Result<Duration, String>>>,
     answered: Option<(Outcome, Duration)>,
     confirmed: Option<Duration>,
+    /// Why no read can show its effect.
+    unseen: Option<String>,
 }
 
 impl Ticket {
@@ -85,6 +87,7 @@ impl Ticket {
             confirmation: None,
             answered: None,
             confirmed: None,
+            unseen: None,
         };
         (ticket, receiver)
     }
@@ -95,9 +98,9 @@ impl Ticket {
         self
     }
 
-    /// Where the time arrives from acceptance to the read that showed the effect. Closed without a time when no read
-    /// showed it, always within the time of the profile after the acknowledgement.
-    pub fn confirmation(&mut self) -> oneshot::Receiver<Duration> {
+    /// Where the time arrives from acceptance to the read that showed the effect, or why no read can show it. Closed without
+    /// either when no read showed it, always within the time of the profile after the acknowledgement.
+    pub fn confirmation(&mut self) -> oneshot::Receiver<Result<Duration, String>> {
         let (sender, receiver) = oneshot::channel();
         self.confirmation = Some(sender);
         receiver
@@ -153,7 +156,10 @@ impl Ticket {
         };
         let (result, text) = match self.confirmed {
             Some(_) => (CONFIRMED, "the drive acknowledged it and shows its effect".to_string()),
-            None => (outcome.code(), outcome.to_string()),
+            None => match &self.unseen {
+                Some(why) => (outcome.code(), format!("{outcome}; {why}")),
+                None => (outcome.code(), outcome.to_string()),
+            },
         };
         let record = AuditRecord {
             time: SystemTime::now(),
@@ -195,8 +201,21 @@ impl Receipt {
         self.0.confirmed = Some(time);
         if let Some(sender) = self.0.confirmation.take() {
             // The client may have gone, or never asked.
-            let _ = sender.send(time);
+            let _ = sender.send(Ok(time));
         }
+    }
+
+    /// No read can show the effect, for that reason.
+    pub fn cannot_be_seen(mut self, why: &str) {
+        self.0.unseen = Some(why.to_string());
+        if let Some(sender) = self.0.confirmation.take() {
+            let _ = sender.send(Err(why.to_string()));
+        }
+    }
+
+    /// Whether no client gave it, but the gateway itself.
+    pub fn is_of_gateway(&self) -> bool {
+        !self.0.origin.kind.is_client()
     }
 
     /// The command in one line.
@@ -242,7 +261,7 @@ pub(super) mod tests {
         assert_eq!(answer.try_recv().unwrap().outcome, acknowledged);
         assert!(stats.audit().parsed().is_empty(), "one line has both");
         receipt.confirm(now + Duration::from_millis(9));
-        assert_eq!(confirmation.try_recv(), Ok(Duration::from_millis(9)));
+        assert_eq!(confirmation.try_recv(), Ok(Ok(Duration::from_millis(9))));
         let record = &stats.audit().parsed()[0];
         assert_eq!(
             (&record["result"], &record["latency_ms"]),

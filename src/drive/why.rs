@@ -44,6 +44,16 @@ pub struct Explanation {
 }
 
 impl Explanation {
+    /// The causes with what shows them, in one line; none where none is known.
+    pub fn blocked_by(&self) -> Option<String> {
+        let cause = |Cause { cause, evidence, .. }: &Cause| match evidence.starts_with(cause.as_str()) {
+            true => evidence.clone(),
+            false => format!("{cause} ({evidence})"),
+        };
+        let causes: Vec<String> = self.causes.iter().map(cause).collect();
+        (!causes.is_empty()).then(|| causes.join(", "))
+    }
+
     /// The causes in one word each, in their order, each once.
     pub fn words(&self) -> Vec<String> {
         let mut words: Vec<String> = Vec::new();
@@ -355,6 +365,11 @@ impl Look<'_> {
             }
             (reads, _) => {
                 let at = reads.and_then(|(_, at)| at);
+                // A fault takes the run command away, which is no other master's doing.
+                let is_fault = found.iter().any(|cause| cause.cause == "fault");
+                if is_fault && taken == Some(RunWish::Run) {
+                    return Vec::new();
+                }
                 let in_the_way = self.order_in_the_way(order, at);
                 in_the_way
                     .or_else(|| reads.map(|_| self.no_order(at)))
@@ -393,17 +408,20 @@ impl Look<'_> {
             (RunWish::Run, Fate::Taken, _) => return None,
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Supervision) => (
                 "supervision",
-                "its lease ran out, and it was stopped".to_string(),
+                format!("its lease ran out, and {}", stopped(order.fate, text)),
                 "let the commanding client renew the lease by orders or heartbeats, then order run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Shutdown) => (
                 "stopped_by_gateway",
-                "the gateway stopped it when it was stopped itself".to_string(),
+                format!("the gateway ended, and {}", stopped(order.fate, text)),
                 "order run again",
             ),
             (RunWish::Stop, Fate::Taken | Fate::Unsure, Giver::Client) => (
                 "stopped_by_order",
-                format!("{who} stopped it"),
+                match order.fate {
+                    Fate::Unsure => format!("a stop of {who} was sent, and not acknowledged: {text}"),
+                    _ => format!("{who} stopped it"),
+                },
                 "order run again if it may run",
             ),
             (RunWish::Reset, Fate::Taken | Fate::Unsure, _) => (
@@ -476,6 +494,14 @@ impl Look<'_> {
         ];
         let untold = told.into_iter().filter(|(_, told)| !told);
         untold.map(|(what, _)| what.to_string()).collect()
+    }
+}
+
+/// What became of a stop of the gateway itself, in words.
+fn stopped(fate: Fate, text: &str) -> String {
+    match fate {
+        Fate::Taken => "it acknowledged the stop".to_string(),
+        _ => format!("a stop was sent, and not acknowledged: {text}"),
     }
 }
 

@@ -160,12 +160,12 @@ impl Reading {
                 self.todo.push_front(block);
                 Next::Pause(BUSY_PAUSE, "the drive is busy".to_string())
             }
-            Outcome::TimedOut | Outcome::Garbled if block.tries < TRIES => {
+            Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) if block.tries < TRIES => {
                 block.tries += 1;
                 self.todo.push_front(block);
                 Next::Go
             }
-            Outcome::Exception(_) | Outcome::TimedOut | Outcome::Garbled if block.count > 1 => {
+            Outcome::Exception(_) | Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) if block.count > 1 => {
                 self.split(block);
                 Next::Go
             }
@@ -173,7 +173,7 @@ impl Reading {
                 self.found.insert(block.start, Err(outcome.to_string()));
                 Next::Go
             }
-            Outcome::TimedOut | Outcome::Garbled => {
+            Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) => {
                 self.found
                     .insert(block.start, Err("the drive did not answer to be believed".to_string()));
                 Next::Go

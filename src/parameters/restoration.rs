@@ -214,7 +214,9 @@ impl Restoration {
             ),
             Outcome::Exception(code) => self.refused(*code, now),
             Outcome::Refused(refusal) => self.stop(refusal.to_string()),
-            Outcome::TimedOut | Outcome::Garbled => self.pause(PAUSE, "the drive does not answer to be believed", now),
+            Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) => {
+                self.pause(PAUSE, "the drive does not answer to be believed", now)
+            }
             Outcome::Interrupted(_) | Outcome::Purged | Outcome::Replaced | Outcome::Withdrawn => {
                 self.pause(BUSY_PAUSE, "something else went first", now)
             }

@@ -9,20 +9,29 @@ use tokio::sync::oneshot;
 
 use crate::command::{Answer, Outcome};
 
+/// What reads showed of an order that was acknowledged; nothing of any other.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Shown {
+    /// Time from acceptance to the read that showed its effect.
+    pub after: Option<Duration>,
+    /// Why no read can show it.
+    pub unseen: Option<String>,
+}
+
 /// An order that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task waits
 /// with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing back.
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
     answer: Arriving<Answer>,
-    confirmation: Arriving<Duration>,
+    confirmation: Arriving<Result<Duration, String>>,
 }
 
 impl Placed {
     pub(super) fn new(
         accepted: Instant,
         answer: oneshot::Receiver<Answer>,
-        confirmation: oneshot::Receiver<Duration>,
+        confirmation: oneshot::Receiver<Result<Duration, String>>,
     ) -> Placed {
         Placed {
             accepted,
@@ -71,9 +80,24 @@ impl Placed {
         now(|cx| self.poll_confirmation(cx))
     }
 
+    /// What is known of the effect by now.
+    pub fn shown(&mut self) -> Shown {
+        match now(|cx| self.confirmation.poll(cx)).flatten() {
+            Some(Ok(after)) => Shown {
+                after: Some(after),
+                unseen: None,
+            },
+            Some(Err(why)) => Shown {
+                after: None,
+                unseen: Some(why),
+            },
+            None => Shown::default(),
+        }
+    }
+
     /// As [`Placed::confirmation`], for whoever waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
-        self.confirmation.poll(cx)
+        self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok))
     }
 }
 
@@ -127,9 +151,15 @@ mod tests {
         assert_eq!(placed.answer().as_ref(), Some(&acknowledged));
         assert_eq!(placed.answer(), Some(acknowledged));
         assert_eq!(placed.confirmation(), None);
-        confirm.send(Duration::from_millis(9)).unwrap();
+        confirm.send(Ok(Duration::from_millis(9))).unwrap();
         let confirmed = Some(Some(Duration::from_millis(9)));
         assert_eq!((placed.confirmation(), placed.confirmation()), (confirmed, confirmed));
+        assert_eq!(placed.shown().after, Some(Duration::from_millis(9)));
+        let (confirm, confirmation) = oneshot::channel();
+        let mut placed = Placed::new(Instant::now(), oneshot::channel().1, confirmation);
+        confirm.send(Err("the bypass is on".to_string())).unwrap();
+        assert_eq!(placed.confirmation(), Some(None));
+        assert_eq!(placed.shown().unseen.as_deref(), Some("the bypass is on"));
     }
 
     #[test]

@@ -59,7 +59,7 @@ fn run_order(record: &AuditRecord, age: Duration) -> Option<RunOrder> {
 fn fate(result: &str) -> Fate {
     match result {
         "acknowledged" | CONFIRMED => Fate::Taken,
-        "timeout" | "garbled" | "interrupted" => Fate::Unsure,
+        "timeout" | "garbled" | "unknown" | "interrupted" => Fate::Unsure,
         "not_allowed" | "not_writable" | "bad_value" | "refused_by_drive" => Fate::Refused,
         _ => Fate::NotSent,
     }

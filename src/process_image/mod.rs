@@ -208,6 +208,7 @@ pub struct DriveImage {
     /// The last heartbeat that the bus has not taken note of.
     heartbeat: Mutex<Option<Instant>>,
     supervisions: AtomicU64,
+    supervision_failures: AtomicU64,
     unsupervised: AtomicBool,
     /// Values of parameters that the gateway wrote since they were read last, and when, by address.
     written: Mutex<BTreeMap<u16, (u16, Instant)>>,
@@ -232,6 +233,7 @@ impl DriveImage {
             turnarounds: Histogram::of(&TURNAROUNDS),
             heartbeat: Mutex::default(),
             supervisions: AtomicU64::new(0),
+            supervision_failures: AtomicU64::new(0),
             unsupervised: AtomicBool::new(false),
             written: Mutex::default(),
         }
@@ -379,22 +381,32 @@ impl DriveImage {
         self.heartbeat.lock().unwrap_or_else(PoisonError::into_inner).is_some()
     }
 
-    /// Notes whether the drive ran without a lease when the gateway started, and no client was heard of since.
+    /// Notes whether the drive runs without a lease, since no client is known to have commanded it.
     pub fn set_unsupervised(&self, unsupervised: bool) {
         self.unsupervised.store(unsupervised, Ordering::Relaxed);
     }
 
-    /// Whether the drive has supervision, but runs without a lease since the gateway started.
+    /// Whether the drive has supervision, but runs without a lease: no client is known to have commanded it.
     pub fn is_unsupervised(&self) -> bool {
         self.unsupervised.load(Ordering::Relaxed)
     }
 
-    /// Counts a lease that ran out while the drive ran.
+    /// Counts a try of the action of a lease, or of the stop of a shutdown, that failed.
+    pub fn count_supervision_failure(&self) {
+        self.supervision_failures.fetch_add(1, Ordering::Relaxed);
+    }
+
+    /// Tries that failed so far.
+    pub fn supervision_failures(&self) -> u64 {
+        self.supervision_failures.load(Ordering::Relaxed)
+    }
+
+    /// Counts a lease that ran out while the drive ran, or had its run command.
     pub fn count_supervision(&self) {
         self.supervisions.fetch_add(1, Ordering::Relaxed);
     }
 
-    /// Leases that ran out while the drive ran, so far.
+    /// Leases that ran out so, so far.
     pub fn supervisions(&self) -> u64 {
         self.supervisions.load(Ordering::Relaxed)
     }

@@ -12,7 +12,7 @@ use serde_json::Value;
 use tempfile::TempDir;
 
 /// The metrics of the public contract; dashboards and alerts of users hang on these names.
-const METRICS: [&str; 51] = [
+const METRICS: [&str; 52] = [
     "drivegate_parameters_changed_total",
     "drivegate_drive_starts_total",
     "drivegate_drive_running_seconds_total",
@@ -24,6 +24,7 @@ const METRICS: [&str; 51] = [
     "drivegate_mqtt_configured",
     "drivegate_recordings_total",
     "drivegate_supervision_actions_total",
+    "drivegate_supervision_failed_total",
     "drivegate_drive_up",
     "drivegate_drive_state",
     "drivegate_drive_sample_age_seconds",

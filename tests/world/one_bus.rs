@@ -197,6 +197,50 @@ fn a_lease_that_runs_out_stops_the_drive_once() {
     assert_eq!(events.filter(|event| event.kind == EventKind::Supervision).count(), 1);
 }
 
+/// Whatever comes in place of the answer whether it runs: the lease acts, and what came of it is told.
+#[test]
+fn a_lease_acts_whatever_the_drive_answers_when_it_is_asked_whether_it_runs() {
+    for fault in ["busy=1", "exception:4=1", "exception:5=1", "exception:8=1"] {
+        let mut rig = ready(&Line {
+            supervision: supervised(LeaseAction::Stop, Duration::from_secs(1)),
+            ..line("vacon-cx", Protocol::ModbusRtu, 19_200, 1)
+        });
+        let mut events = rig.plant.events.subscribe();
+        assert!(rig.set(1, &[("frequency_reference", 20.0), ("run", 1.0)]).is_ok());
+        rig.until_state(1, State::Running);
+        rig.set_faults(FaultPlan::new(fault.parse().unwrap(), 1));
+        rig.run(Duration::from_secs(12));
+        let told: Vec<EventKind> = std::iter::from_fn(|| events.try_recv().ok())
+            .map(|event| event.kind)
+            .collect();
+        let count = |kind: EventKind| told.iter().filter(|told| **told == kind).count();
+        // One that the drive does not say whether it runs, one that the lease ran out.
+        assert_eq!(count(EventKind::Supervision), 2, "{fault}: {told:?}");
+        assert!(
+            (1..=3).contains(&count(EventKind::SupervisionFailed)),
+            "{fault}: {told:?}"
+        );
+        assert_eq!(count(EventKind::Offline), 0, "{fault}: it answers");
+        let failures = rig.plant.buses[0].image.drives[0].supervision_failures();
+        assert!(failures >= 3, "{fault}: {failures} tries are counted");
+        rig.set_faults(FaultPlan::default());
+        rig.until_state(1, State::Ready);
+    }
+}
+
+#[test]
+fn a_drive_for_which_only_a_gateway_answers_is_offline() {
+    for fault in ["exception:10=1", "exception:11=1"] {
+        let mut rig = ready(&nx(115_200, 1));
+        rig.set_faults(FaultPlan::new(fault.parse().unwrap(), 1));
+        rig.until_state(1, State::Offline);
+        let stop = rig.set(1, &[("run", 0.0)]);
+        assert_eq!(stop.code(), "unknown", "{fault}");
+        rig.set_faults(FaultPlan::default());
+        rig.until_state(1, State::Ready);
+    }
+}
+
 #[test]
 fn commands_are_checked_against_the_drive() {
     let mut rig = Rig::of(&nx(115_200, 1));

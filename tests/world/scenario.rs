@@ -86,7 +86,7 @@ const FAMILIES: [(&str, Protocol); 8] = [
     ("teco-7300pa-n2", Protocol::N2),
 ];
 
-const FAULTS: [&str; 15] = [
+const FAULTS: [&str; 17] = [
     "drop",
     "truncate",
     "corrupt",
@@ -99,6 +99,8 @@ const FAULTS: [&str; 15] = [
     "split",
     "busy",
     "exception:4",
+    "exception:5",
+    "exception:11",
     "double",
     "late",
     "corrupt",

@@ -246,8 +246,9 @@ fn exceptions_and_silence_end_it() {
     let mut words = KnownWords::default();
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     let sent = reference(100);
-    let refused = command.answered(&sent, Reply::Exception(Exception::BUSY), &mut words);
-    assert_eq!(refused, Some(Outcome::Exception(Exception::BUSY)));
+    let failed = Exception::DEVICE_FAILURE;
+    let refused = command.answered(&sent, Reply::Exception(failed), &mut words);
+    assert_eq!(refused, Some(Outcome::Exception(failed)));
     let (mut command, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), None);
     assert_eq!(command.failed(&sent, Outcome::TimedOut, 1), Some(Outcome::TimedOut));
@@ -336,7 +337,89 @@ fn a_drive_that_keeps_its_word_to_itself_is_commanded_all_the_same() {
     // A drive that is only busy is not overruled.
     let (mut start, _a) = bench.begin(&[("run", 1.0)], Urgency::Command);
     let busy = start.answered(&read, Reply::Exception(Exception::BUSY), &mut bench.words);
-    assert_eq!(busy, Some(Outcome::Exception(Exception::BUSY)));
+    assert_eq!(busy, None);
+    let next = start.next(&bench.words, &bench.profile, false, bench.now);
+    assert!(matches!(next, Next::Wait(at) if at > bench.now), "{next:?}");
+    bench.now += Duration::from_millis(100);
+    assert_eq!(sends(&bench, &mut start), read, "it is asked again");
+}
+
+/// The drive is too busy for the write of a command, which is tried again: how long after its beginning, and how it ends.
+fn busy(points: &[(&str, f64)], urgency: Urgency, times: usize) -> (Vec<u128>, Outcome) {
+    let mut bench = Bench::new(0);
+    bench.words.learn(Table::Holding, 2000, 1);
+    let (mut run, _a) = bench.begin(points, urgency);
+    let (start, mut tries) = (bench.now, Vec::new());
+    let busy = || Reply::Exception(Exception::BUSY);
+    loop {
+        match run.next(&bench.words, &bench.profile, false, bench.now) {
+            Next::Wait(until) => bench.now = until,
+            Next::Done => return (tries, run.success()),
+            Next::Send(step) => {
+                run.sent(&step);
+                tries.push((bench.now - start).as_millis());
+                let reply = if tries.len() > times { Reply::Written } else { busy() };
+                if let Some(outcome) = run.answered(&step, reply, &mut bench.words) {
+                    return (tries, outcome);
+                }
+            }
+        }
+    }
+}
+
+#[test]
+fn a_drive_that_is_busy_is_written_again_until_the_time_of_the_command_is_over() {
+    let acknowledged = Outcome::Acknowledged(Reply::Written);
+    for (points, urgency) in [
+        (&[("run", 0.0)], Urgency::Stop),
+        (&[("speed_reference", 1.0)], Urgency::Command),
+    ] {
+        assert_eq!(busy(points, urgency, 2), (vec![0, 50, 150], acknowledged.clone()));
+        let (tries, outcome) = busy(points, urgency, usize::MAX);
+        assert_eq!(tries, [0, 50, 150, 350, 750]);
+        assert_eq!(outcome, Outcome::Exception(Exception::BUSY), "it did not take it");
+    }
+    // What was sent before and not answered may have been taken.
+    let mut bench = Bench::new(0);
+    let (mut run, _a) = bench.begin(&[("speed_reference", 1.0)], Urgency::Command);
+    let sent = sends(&bench, &mut run);
+    run.sent(&sent);
+    assert_eq!(run.failed(&sent, Outcome::Unknown(Exception::GATEWAY_TARGET), 1), None);
+    assert!(!run.is_owed());
+    let busy = Reply::Exception(Exception::BUSY);
+    assert_eq!(run.answered(&sent, busy, &mut bench.words), None);
+    assert!(!run.is_owed());
+    bench.now += Duration::from_secs(1);
+    assert_eq!(run.next(&bench.words, &bench.profile, false, bench.now), Next::Done);
+    assert_eq!(run.success(), Outcome::Unknown(Exception::GATEWAY_TARGET));
+}
+
+#[test]
+fn the_end_of_a_pulse_is_tried_again_too_but_not_for_ever() {
+    let mut bench = Bench::new(0);
+    bench.words.learn(Table::Holding, 2000, 0);
+    let (mut reset, _a) = bench.begin(&[("fault_reset", 1.0)], Urgency::Command);
+    let high = sends(&bench, &mut reset);
+    reset.sent(&high);
+    assert_eq!(reset.answered(&high, Reply::Written, &mut bench.words), None);
+    bench.now += Duration::from_secs(2);
+    let (began, mut tries) = (bench.now, 0);
+    let ended = loop {
+        match reset.next(&bench.words, &bench.profile, false, bench.now) {
+            Next::Wait(until) => bench.now = until,
+            Next::Send(step) => {
+                assert_eq!(step, word(0));
+                tries += 1;
+                let busy = Reply::Exception(Exception::BUSY);
+                if let Some(outcome) = reset.answered(&step, busy, &mut bench.words) {
+                    break outcome;
+                }
+            }
+            Next::Done => panic!("the bit is set still"),
+        }
+    };
+    assert_eq!(ended, Outcome::Exception(Exception::BUSY));
+    assert!(tries > 5 && bench.now - began < Duration::from_secs(5), "{tries}");
 }
 
 #[test]

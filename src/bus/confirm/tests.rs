@@ -12,15 +12,21 @@ struct Bench {
     drive: DriveImage,
     stats: Arc<WriteStats>,
     confirmations: Confirmations,
+    /// Of the command that was acknowledged last.
+    confirmation: Option<tokio::sync::oneshot::Receiver<Result<Duration, String>>>,
     now: Instant,
 }
 
 impl Bench {
     fn new() -> Bench {
+        Bench::of("vacon-nx")
+    }
+
+    fn of(profile: &str) -> Bench {
         let spec = DriveSpec {
             access: Access::Control,
             turnaround: Duration::ZERO,
-            ..DriveSpec::new("d", "b", 1, Profiles::built_in().get("vacon-nx").unwrap().clone())
+            ..DriveSpec::new("d", "b", 1, Profiles::built_in().get(profile).unwrap().clone())
         };
         let drive = DriveImage::new(spec, Duration::from_secs(1));
         drive.update(|s| s.link = Link::Online(std::time::SystemTime::now()));
@@ -28,15 +34,17 @@ impl Bench {
             drive,
             stats: Arc::default(),
             confirmations: Confirmations::default(),
+            confirmation: None,
             now: Instant::now(),
         };
         bench.read(2100, &[0]);
         bench
     }
 
-    fn receipt(&self) -> Receipt {
+    fn receipt(&mut self) -> Receipt {
         let origin = Origin::new(SourceKind::Mqtt, "t");
-        let (ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
+        let (mut ticket, _) = Ticket::new(origin, "d", "it".to_string(), true, self.now, self.stats.clone());
+        self.confirmation = Some(ticket.confirmation());
         ticket.acknowledge(Outcome::Acknowledged(Reply::Written), self.now)
     }
 
@@ -338,4 +346,39 @@ proptest! {
         prop_assert!(bench.confirmations.is_empty() && reported.len() <= 1);
         prop_assert_eq!(bench.results().len(), 1);
     }
+}
+
+/// An HVX whose bypass is on: its drive stands, and its motor is on the mains.
+#[test]
+fn a_stop_is_not_confirmed_while_the_motor_may_be_fed_past_the_drive() {
+    // Status: ready, running, bypass and fire mode.
+    const RUNS: u16 = 0b0000_0000_0000_0011;
+    const BYPASS: u16 = 1 << 6;
+    const FIRE_MODE: u16 = 1 << 7;
+    for (past, point) in [(BYPASS, "bypass_active"), (FIRE_MODE, "fire_mode_active")] {
+        let mut bench = Bench::of("eaton-hvx");
+        bench.read(2100, &[RUNS, 0]);
+        bench.set("run", Value::Bool(false));
+        let mut confirmation = bench.confirmation.take().unwrap();
+        for _ in 0..600 {
+            bench.read(2100, &[past, 0]);
+        }
+        assert_eq!(bench.results(), ["acknowledged"], "{point}");
+        let why = confirmation.try_recv().unwrap().unwrap_err();
+        assert!(why.contains(point), "{why}");
+        let told = bench.expired();
+        assert!(
+            told.len() == 1 && told[0].contains("not known") && told[0].contains(point),
+            "{told:?}"
+        );
+        let audited = bench.stats.audit().parsed()[0]["text"].to_string();
+        assert!(audited.contains(point), "{audited}");
+    }
+    let mut bench = Bench::of("eaton-hvx");
+    bench.read(2100, &[RUNS, 0]);
+    bench.set("run", Value::Bool(false));
+    bench.read(2100, &[BYPASS, 0]);
+    assert_eq!(bench.results(), [""; 0]);
+    bench.read(2100, &[0, 0]);
+    assert_eq!(bench.results(), ["confirmed"], "it is off in time");
 }

@@ -138,7 +138,7 @@ impl Commands {
 
 fn outcome(ended: Option<&Ended>) -> Outcome {
     match ended {
-        Some(Ended::Reply(Reply::Exception(code))) => Outcome::Exception(*code),
+        Some(Ended::Reply(Reply::Exception(code))) => Outcome::of_exception(*code),
         Some(Ended::Reply(reply)) => Outcome::Acknowledged(reply.clone()),
         Some(Ended::Corrupt(_)) => Outcome::Garbled,
         // Nobody answers a broadcast.

@@ -224,7 +224,8 @@ impl ListenCore {
             return;
         };
         self.report.diagnosis.overheard(index, exchange);
-        let answered = matches!(exchange.ended, Some(Ended::Reply(_)));
+        let no_answer = matches!(&exchange.ended, Some(Ended::Reply(Reply::Exception(code))) if code.is_no_answer());
+        let answered = matches!(exchange.ended, Some(Ended::Reply(_))) && !no_answer;
         // Bytes behind a command that is not known may be its reply.
         let is_known = exchange.request.is_some();
         if let Some(ended) = exchange.ended.as_ref().filter(|_| is_known) {
@@ -252,7 +253,7 @@ impl ListenCore {
                 let recognition = spec.protocol.recognition(&spec.format);
                 image.set_turnaround(replied.saturating_duration_since(exchange.sent + recognition));
             }
-        } else if is_known && exchange.ended == Some(Ended::Silent) {
+        } else if is_known && (no_answer || exchange.ended == Some(Ended::Silent)) {
             known.unanswered = known.unanswered.saturating_add(1);
             if known.unanswered > self.retries {
                 let times = known.unanswered;

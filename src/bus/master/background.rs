@@ -297,6 +297,7 @@ impl Master {
             // The drive did not look at it.
             Ended::Silent | Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => return Outcome::TimedOut,
             Ended::Corrupt(_) => return Outcome::Garbled,
+            Ended::Reply(Reply::Exception(code)) if turn.pdu.is_write() => return Outcome::of_exception(code),
             Ended::Reply(Reply::Exception(code)) => return Outcome::Exception(code),
             Ended::Reply(reply) => reply,
         };

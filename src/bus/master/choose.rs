@@ -375,7 +375,7 @@ impl Master {
         let Some(run) = run.filter(|run| !run.is_late(now)) else {
             return false;
         };
-        if run.is_of_supervision() && !run.has_begun() {
+        if run.is_of_supervision() && run.is_owed() {
             // A client that came back while the line fell silent suspends it.
             let beats = self
                 .bus

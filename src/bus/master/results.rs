@@ -57,14 +57,16 @@ impl Master {
         let mut drive = self.drives.get_mut(turn.drive);
         match &end.ended {
             Ended::Reply(reply) => {
-                if let Some(drive) = &mut drive {
-                    drive.exchanged(end.took);
-                    if !matches!(reply, Reply::Exception(_)) {
-                        drive.late.settled_by(&turn.pdu, now);
+                if !says_no_answer(reply) {
+                    if let Some(drive) = &mut drive {
+                        drive.exchanged(end.took);
+                        if !matches!(reply, Reply::Exception(_)) {
+                            drive.late.settled_by(&turn.pdu, now);
+                        }
                     }
-                }
-                if let Some(probes) = self.probes.get_mut(turn.drive) {
-                    *probes = 0;
+                    if let Some(probes) = self.probes.get_mut(turn.drive) {
+                        *probes = 0;
+                    }
                 }
                 self.last_answered = Some((turn.drive, turn.pdu.clone()));
             }
@@ -153,6 +155,8 @@ impl Master {
         let took = end.took;
         let polled = match end.ended {
             Ended::Reply(_) if heard == Progress::Failed => Polled::Failed,
+            // A gateway in between reaches nobody: its word is no sign of the drive.
+            Ended::Reply(reply) if says_no_answer(&reply) => Polled::Failed,
             Ended::Reply(Reply::Exception(code)) => Polled::Refused(code),
             Ended::Reply(reply) => {
                 self.read(poll.drive, poll.read, reply, end.began, now, news);
@@ -270,8 +274,11 @@ impl Master {
                 self.step_failed(index, slot, &unheard(Session::Identify), &Ended::Silent, end.took, now);
                 return;
             }
-            Ended::Reply(reply) => reply,
+            Ended::Reply(reply) if !leaves_open(&reply, step) => reply,
             ended => {
+                if matches!(&ended, Ended::Reply(reply) if !says_no_answer(reply)) {
+                    self.schedule.seen(index, now);
+                }
                 self.step_failed(index, slot, step, &ended, end.took, now);
                 self.read_back(index, step, now);
                 return;
@@ -317,23 +324,26 @@ impl Master {
             }
             return;
         }
-        let how = match ended {
-            Ended::Corrupt(_) => Outcome::Garbled,
-            _ => Outcome::TimedOut,
+        let (how, silent) = match ended {
+            Ended::Corrupt(_) => (Outcome::Garbled, false),
+            Ended::Reply(reply @ Reply::Exception(code)) if step.pdu.is_write() => {
+                (Outcome::Unknown(*code), says_no_answer(reply))
+            }
+            Ended::Silent | Ended::Reply(_) => (Outcome::TimedOut, true),
         };
-        if slot == Urgency::Stop && *ended == Ended::Silent {
+        if slot == Urgency::Stop && silent {
             drive.vain_stops.not_answered(took);
         }
         let retries = if online { self.retries } else { 0 };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
-            if *ended == Ended::Silent {
+            if silent {
                 drive.vain_stops.in_vain(now);
                 self.schedule.doubted(index);
             }
         }
-        if !online {
+        if !online && (silent || matches!(ended, Ended::Corrupt(_))) {
             self.schedule.probed_in_vain(index, took, now);
         }
     }
@@ -368,6 +378,16 @@ impl Master {
             self.note_write(index, table, &items, now);
         }
     }
+}
+
+/// Whether a gateway in between says that the drive did not answer.
+fn says_no_answer(reply: &Reply) -> bool {
+    matches!(reply, Reply::Exception(code) if code.is_no_answer())
+}
+
+/// Whether the reply to a step of a command leaves open what became of it: as if none had come.
+fn leaves_open(reply: &Reply, step: &Step) -> bool {
+    matches!(reply, Reply::Exception(code) if code.is_no_answer() || (step.pdu.is_write() && code.leaves_open()))
 }
 
 /// A step of a command that the drive did not look at, since it wants this first.

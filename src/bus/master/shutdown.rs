@@ -8,7 +8,7 @@ use tokio::sync::oneshot::error::TryRecvError;
 
 use super::Master;
 use crate::bus::drive_state::FRESH;
-use crate::command::{Answer, Origin, Outcome, SourceKind, Stopping, WriteStats};
+use crate::command::{Answer, NotStopped, Origin, Outcome, SourceKind, Stopping, WriteStats};
 use crate::drive::{ModelPoint, Value};
 use crate::plant::BusHandle;
 use crate::process_image::{Access, OnShutdown};
@@ -30,6 +30,8 @@ struct Stop {
     state: State,
     /// It was ordered, and not acknowledged.
     in_vain: bool,
+    /// What became of it then, for people.
+    last: Option<String>,
 }
 
 #[derive(Debug)]
@@ -57,7 +59,11 @@ impl Stop {
                 outcome: outcome @ Outcome::Refused(_),
                 ..
             }) => State::Refused(outcome.to_string()),
-            Ok(_) | Err(TryRecvError::Closed) => State::Due(now + AGAIN),
+            Ok(answer) => {
+                self.last = Some(answer.outcome.to_string());
+                State::Due(now + AGAIN)
+            }
+            Err(TryRecvError::Closed) => State::Due(now + AGAIN),
         };
         self.in_vain |= matches!(self.state, State::Due(_));
     }
@@ -76,6 +82,7 @@ impl Shutdown {
             drive,
             state: State::Due(now),
             in_vain: false,
+            last: None,
         };
         Shutdown {
             stopping: Some(stopping),
@@ -88,12 +95,14 @@ impl Shutdown {
         let Some(stopping) = self.stopping.take() else { return };
         let name = |index: usize| bus.image.drives.get(index).map_or("?", |d| d.spec.name.as_str());
         let missing = self.stops.iter().filter_map(|stop| {
-            let name = name(stop.drive);
-            match &stop.state {
-                State::Acknowledged => None,
-                State::Refused(why) => Some(format!("`{name}` was not sent its stop command ({why})")),
-                State::Due(_) | State::Ordered(_) => Some(format!("`{name}` did not acknowledge its stop")),
-            }
+            let why = match (&stop.state, &stop.last) {
+                (State::Acknowledged, _) => return None,
+                (State::Refused(why), _) => format!("was not sent its stop command ({why})"),
+                (State::Due(_) | State::Ordered(_), Some(last)) => format!("did not acknowledge its stop ({last})"),
+                (State::Due(_) | State::Ordered(_), None) => "did not acknowledge its stop".to_string(),
+            };
+            let drive = name(stop.drive).to_string();
+            Some(NotStopped { drive, why })
         });
         stopping.report(missing.collect());
         self.stops.clear();

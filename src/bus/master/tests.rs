@@ -31,6 +31,10 @@ struct Registers {
     silent: bool,
     /// How its next write ends.
     next_write: Option<Ended>,
+    /// It answers that to so many writes.
+    to_writes: Option<(u32, Exception)>,
+    /// It answers that to every read.
+    to_reads: Option<Exception>,
 }
 
 impl Registers {
@@ -41,6 +45,16 @@ impl Registers {
         }
         if let Some(ended) = self.next_write.take_if(|_| pdu.is_write()) {
             return ended;
+        }
+        if let Some((left, exception)) = &mut self.to_writes
+            && pdu.is_write()
+            && *left > 0
+        {
+            *left -= 1;
+            return Ended::Reply(Reply::Exception(*exception));
+        }
+        if let (Some(exception), RequestPdu::Read { .. }) = (self.to_reads, pdu) {
+            return Ended::Reply(Reply::Exception(exception));
         }
         let reply = match pdu {
             RequestPdu::Read {
@@ -442,7 +456,11 @@ fn polls_cease_and_every_drive_is_stopped_when_the_gateway_ends() {
         }
         assert!(rig.now < deadline + TIMEOUT * 2);
     };
-    assert_eq!(missing, ["`d8` did not acknowledge its stop"]);
+    assert_eq!(missing.len(), 1);
+    assert!(
+        missing[0].to_string().starts_with("`d8` did not acknowledge its stop"),
+        "{missing:?}"
+    );
     let running: Vec<usize> = (0..20).filter(|drive| rig.runs(*drive)).collect();
     assert_eq!(running, [7]);
     let poll = |turn: &Turn| matches!(turn.purpose, Purpose::Poll(_));
@@ -473,7 +491,11 @@ fn a_drive_that_fell_silent_with_the_shutdown_keeps_no_stop_from_those_that_are_
         }
         assert!(rig.now < deadline + TIMEOUT * 2);
     };
-    assert_eq!(missing, ["`d1` did not acknowledge its stop"]);
+    assert_eq!(missing.len(), 1);
+    assert!(
+        missing[0].to_string().starts_with("`d1` did not acknowledge its stop"),
+        "{missing:?}"
+    );
     assert!(!rig.runs(1));
 }
 
@@ -565,4 +587,102 @@ fn a_reply_to_a_broken_off_exchange_is_waited_for_by_the_bus_that_comes_after() 
     }
     let mut rig = Rig::new(1);
     assert_eq!(rig.master.ended(None, rig.now).quiet_until, Some(rig.now));
+}
+
+/// How an order to the first drive ends that answers its first `times` writes with that exception, and after how many of them.
+fn excepted(run: bool, times: u32, exception: Exception) -> (Outcome, usize) {
+    let mut rig = Rig::new(2);
+    rig.drives[0].holding.insert(2000, u16::from(!run));
+    rig.run(Duration::from_secs(1));
+    let mut answer = rig.switch(0, "client", run);
+    rig.drives[0].to_writes = Some((times, exception));
+    let (from, end) = (rig.wire.len(), rig.now + 2 * DEFAULT_EXPIRY);
+    let outcome = loop {
+        rig.step();
+        if let Some(outcome) = outcome(&mut answer) {
+            break outcome;
+        }
+        assert!(rig.now < end, "{exception}: no answer");
+    };
+    let writes = rig.wire[from..].iter().filter(|(_, turn)| turn.pdu().is_write());
+    (outcome, writes.count())
+}
+
+#[test]
+fn exceptions_that_refuse_nothing_end_no_command_as_refused() {
+    for run in [true, false] {
+        let (outcome, writes) = excepted(run, 3, Exception::BUSY);
+        assert_eq!((outcome.is_ok(), writes), (true, 4), "run={run}");
+        let (outcome, writes) = excepted(run, u32::MAX, Exception::BUSY);
+        assert_eq!(outcome, Outcome::Exception(Exception::BUSY));
+        assert!(writes >= 5, "{writes}");
+        for open in [
+            Exception::ACKNOWLEDGE,
+            Exception::GATEWAY_PATH,
+            Exception::GATEWAY_TARGET,
+        ] {
+            assert!(excepted(run, 1, open).0.is_ok(), "{open}: it is tried again");
+            let (outcome, writes) = excepted(run, u32::MAX, open);
+            assert_eq!((outcome.code(), writes), ("unknown", 2), "{open}");
+            assert!(outcome.to_string().contains("not known"), "{outcome}");
+            assert_eq!(outcome.exception(), Some(open));
+        }
+        let refused = [0x01, 0x02, 0x03, 0x04, 0x07, 0x08, 0x22].map(Exception);
+        for refused in refused {
+            assert_eq!(excepted(run, u32::MAX, refused), (Outcome::Exception(refused), 1));
+        }
+    }
+}
+
+#[test]
+fn a_client_that_is_back_suspends_a_stop_of_its_lease_that_the_drive_was_too_busy_for() {
+    let mut rig = Rig::new(1);
+    let mut run = rig.switch(0, "client", true);
+    rig.run(Duration::from_millis(100));
+    assert!(outcome(&mut run).is_some_and(|o| o.is_ok()));
+    rig.drives[0].to_writes = Some((u32::MAX, Exception::BUSY));
+    rig.run(Duration::from_millis(1000));
+    rig.drives[0].to_writes = None;
+    rig.bus.image.drives[0].renew_lease(rig.now);
+    rig.run(Duration::from_millis(400));
+    assert!(rig.runs(0), "the drive never took it, and its client is back");
+}
+
+#[test]
+fn what_a_gateway_in_between_answers_is_no_sign_of_the_drive() {
+    for exception in [Exception::GATEWAY_PATH, Exception::GATEWAY_TARGET] {
+        let mut rig = Rig::new(2);
+        rig.drives[0].to_reads = Some(exception);
+        rig.run(Duration::from_secs(1));
+        assert!(rig.news.contains(&News::Offline(0)), "{exception}");
+        assert!(!rig.master.schedule.is_online(0), "{exception}");
+        assert!(rig.master.schedule.is_online(1));
+        rig.drives[0].to_reads = None;
+        rig.run(Duration::from_secs(3));
+        assert!(rig.master.schedule.is_online(0), "{exception}: it is back");
+    }
+    // Whatever else it answers shows that it is there, and only what is about the request splits what is read.
+    for code in (1..=9).map(Exception) {
+        let mut rig = Rig::new(1);
+        rig.drives[0].to_reads = Some(code);
+        rig.news.clear();
+        rig.run(Duration::from_secs(3));
+        assert!(rig.master.schedule.is_online(0), "{code}");
+        let unavailable = rig.news.iter().any(|news| matches!(news, News::Unavailable(..)));
+        assert_eq!(unavailable, matches!(code.0, 1..=3), "{code}");
+    }
+}
+
+#[test]
+fn a_slow_request_that_the_drive_is_too_busy_for_is_not_repeated_at_once() {
+    let mut rig = Rig::new(1);
+    rig.drives[0].to_reads = Some(Exception::BUSY);
+    rig.run(Duration::from_secs(2));
+    let (from, begin) = (rig.wire.len(), rig.now);
+    rig.run(Duration::from_secs(10));
+    let slow = |(_, turn): &&(Instant, Turn)| matches!(&turn.purpose, Purpose::Poll(poll) if poll.read.class == PollClass::Slow);
+    let items = rig.bus.image.drives[0].plan.reads.iter();
+    let items = items.filter(|read| read.class == PollClass::Slow).count();
+    let asked = rig.wire[from..].iter().filter(slow).count();
+    assert!(asked <= items * 11, "{asked} of {items} in {:?}", rig.now - begin);
 }

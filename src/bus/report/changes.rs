@@ -127,7 +127,9 @@ impl Report {
             match &by {
                 Some(Some(who)) => text += &format!(": ordered by {who}"),
                 Some(None) if reading.is_set(ModelPoint::Fault) => text += ": it has a fault",
-                Some(None) => text += ", by no order of this gateway: at the drive, by another master or by itself",
+                Some(None) => {
+                    text += ", by no order that this gateway knows of: at the drive, by another master or by itself"
+                }
                 None => {}
             }
             if change.left_out > 0 {

@@ -61,11 +61,13 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
     let image = image(2);
     let now = Instant::now();
     let events = Events::default();
-    let mut report = Report::new(image, &options(), events.clone(), Default::default(), now);
+    let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
     report.bus_up(now);
     report.apply(&News::Online(0), now);
     report.bus_down("unplugged", now);
-    report.bus_down("unplugged", now);
+    report.bus_down("cannot be opened", now);
+    report.bus_down("no such device", now);
+    assert_eq!(image.health().reason.as_deref(), Some("no such device"), "the newest");
     let kinds: Vec<EventKind> = events.recent().iter().map(|event| event.kind).collect();
     let expected = [
         EventKind::BusUp,
@@ -75,6 +77,134 @@ fn a_bus_that_goes_down_is_reported_before_its_drives_and_once() {
         EventKind::Offline,
     ];
     assert_eq!(kinds, expected, "also a drive of which nothing was heard");
+    report.bus_up(now);
+    report.bus_down("cannot be opened", now);
+    let down = events
+        .recent()
+        .iter()
+        .filter(|event| event.kind == EventKind::BusDown)
+        .count();
+    assert_eq!(down, 2, "another loss is another one");
+}
+
+/// Lets the drive show that fault bit and that code, `ms` after the report began.
+fn show_fault(report: &mut Report, image: &BusImage, (fault, code): (bool, u16), now: Instant) {
+    let profile = &image.drives[0].spec.profile;
+    for (point, word) in [
+        (ModelPoint::FaultCode, code),
+        (ModelPoint::Fault, u16::from(fault) << 3),
+    ] {
+        let raw = profile.model_point(point).unwrap().raw().unwrap();
+        let read = image.drives[0]
+            .plan
+            .reads
+            .iter()
+            .find(|read| read.covers(raw.table, raw.address));
+        let read = *read.unwrap();
+        let mut words = image.drives[0]
+            .reading(now, RECENT)
+            .words(read.table, read.start, read.count)
+            .unwrap_or_else(|_| vec![0; usize::from(read.count)]);
+        words[usize::from(raw.address - read.start)] = word;
+        let news = News::Read {
+            drive: 0,
+            read,
+            words,
+            at: now,
+        };
+        report.apply(&news, now);
+    }
+}
+
+#[test]
+fn a_code_that_goes_before_its_bit_is_no_other_fault() {
+    let image = image(1);
+    let mut now = Instant::now();
+    let events = Events::default();
+    let mut report = Report::new(image.clone(), &options(), events.clone(), Default::default(), now);
+    report.apply(&News::Online(0), now);
+    for shown in [
+        (false, 0),
+        (true, 1),
+        (true, 0),
+        (true, 0),
+        (false, 0),
+        (true, 0),
+        (true, 2),
+        (false, 0),
+    ] {
+        now += Duration::from_millis(10);
+        show_fault(&mut report, &image, shown, now);
+    }
+    let recent = events.recent();
+    let faults = recent
+        .iter()
+        .filter(|e| matches!(e.kind, EventKind::Fault | EventKind::FaultEnd));
+    let told: Vec<(EventKind, Option<i64>)> = faults.map(|event| (event.kind, event.fault_code)).collect();
+    let expected = [
+        (EventKind::Fault, Some(1)),
+        (EventKind::FaultEnd, None),
+        (EventKind::Fault, None),
+        (EventKind::Fault, Some(2)),
+        (EventKind::FaultEnd, None),
+    ];
+    assert_eq!(told, expected, "{recent:?}");
+    assert!(recent.iter().all(|event| !event.text.contains("fault 0")), "{recent:?}");
+}
+
+#[test]
+fn supervision_tells_what_it_is_about_to_do_and_what_came_of_it() {
+    let mut image = image(1);
+    let drive = &image.drives[0];
+    let spec = DriveSpec {
+        supervision: Some(crate::process_image::Supervision {
+            timeout: Duration::from_secs(5),
+            action: LeaseAction::Stop,
+            adopt: false,
+        }),
+        ..drive.spec.clone()
+    };
+    let drive = Arc::new(DriveImage::new(spec, Duration::from_secs(1)));
+    image = Arc::new(BusImage::new(image.spec.clone(), vec![drive.clone()]));
+    let now = Instant::now();
+    let events = Events::default();
+    let mut report = Report::new(image, &options(), events.clone(), Default::default(), now);
+    let failed = |why: Option<&str>| News::ActionFailed {
+        drive: 0,
+        why: why.map(str::to_string),
+    };
+    let unseen = Unconfirmed {
+        text: "acknowledged run=false but did not show it within 5s: the motor does not stop".to_string(),
+        does_not_run: false,
+        own: true,
+    };
+    for news in [
+        News::LeaseRanOut(0),
+        failed(Some("the drive refused it with exception 04 (device failure)")),
+        failed(None),
+        News::ActionTaken { drive: 0, failures: 2 },
+        News::NotConfirmed(0, unseen),
+    ] {
+        report.apply(&news, now);
+    }
+    let told: Vec<(EventKind, String)> = events.recent().into_iter().map(|e| (e.kind, e.text)).collect();
+    let kinds: Vec<EventKind> = told.iter().map(|(kind, _)| *kind).collect();
+    let expected = [
+        EventKind::Supervision,
+        EventKind::SupervisionFailed,
+        EventKind::Supervision,
+        EventKind::SupervisionFailed,
+        EventKind::NotConfirmed,
+    ];
+    assert_eq!(kinds, expected, "{told:?}");
+    assert!(told[0].1.ends_with("the drive is being stopped"), "{told:?}");
+    assert!(
+        told[1]
+            .1
+            .contains("the stop failed: the drive refused it with exception 04"),
+        "{told:?}"
+    );
+    assert_eq!((drive.supervisions(), drive.supervision_failures()), (1, 3));
 }
 
 /// A motor that starts and stops: the words of the status register, and who is told to have been the cause.

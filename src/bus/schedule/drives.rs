@@ -24,6 +24,8 @@ const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::f
 
 /// Process data without a fault for that long shows that the line is sound.
 const SOUND_FOR: Duration = Duration::from_secs(2);
+/// Pause before a slow request is tried again that the drive was too busy for.
+const BUSY_PAUSE: Duration = Duration::from_secs(1);
 
 #[derive(Debug, Clone)]
 pub(super) struct Item {
@@ -215,10 +217,10 @@ impl DriveSchedule {
         };
         if !addressed {
             // Busy or failing: the drive is alive, the values age, the poll comes round again.
-            item.due = item.due.max(now);
-            if item.read.class == PollClass::Once {
-                item.due = now + Duration::from_secs(1);
-            }
+            item.due = match item.read.class {
+                PollClass::Fast => item.due.max(now),
+                _ => now + BUSY_PAUSE,
+            };
             return Change::None;
         }
         let Some((low, high)) = Plan::halves(read) else {

@@ -324,6 +324,36 @@ fn every_family_is_written_its_action() {
 }
 
 #[test]
+fn an_action_that_fails_is_told_once_for_each_reason_and_counted_each_time() {
+    let mut bench = Bench::new(LeaseAction::Stop);
+    bench.heartbeat();
+    assert!(bench.after(4_900, true).is_none());
+    let refused = Outcome::Exception(Exception::DEVICE_FAILURE);
+    for failed in [&refused, &refused, &Outcome::TimedOut, &refused, &Outcome::Purged] {
+        let command = bench.after(1_000, true).expect("the stop");
+        command.answer(failed, bench.now);
+        bench.look(10, true);
+    }
+    let command = bench.after(1_000, true).expect("the stop");
+    command.answer(&acknowledged(), bench.now);
+    bench.look(10, true);
+    let failed = |why: Option<&Outcome>| News::ActionFailed {
+        drive: 0,
+        why: why.map(Outcome::to_string),
+    };
+    let taken = News::ActionTaken { drive: 0, failures: 4 };
+    let expected = [
+        News::LeaseRanOut(0),
+        failed(Some(&refused)),
+        failed(None),
+        failed(Some(&Outcome::TimedOut)),
+        failed(None),
+        taken,
+    ];
+    assert_eq!(bench.news, expected, "a client's own stop is no failure");
+}
+
+#[test]
 fn an_action_that_cannot_be_written_is_told_once_and_stays_due() {
     let profiles = Profiles::built_in();
     let mut bench = Bench::of(profiles.get("vacon-cx").unwrap(), LeaseAction::SpeedReference(20.0));
@@ -413,23 +443,41 @@ fn an_action_waits_for_a_drive_that_does_not_answer() {
 }
 
 #[test]
-fn a_motor_that_may_start_by_itself_keeps_its_lease() {
+fn a_motor_that_may_start_by_itself_gets_its_action() {
     let mut bench = Bench::new(LeaseAction::Stop);
     bench.heartbeat();
-    // A fault, with the run command left in the drive's word.
-    for _ in 0..10 {
-        bench.shows(ModelPoint::Run, Value::Bool(true));
-        assert!(bench.after(1_000, false).is_none());
+    // A fault, or a status that never changes, with the run command left in the drive's word.
+    bench.shows(ModelPoint::Run, Value::Bool(true));
+    assert!(bench.after(4_900, false).is_none());
+    bench.shows(ModelPoint::Run, Value::Bool(true));
+    assert!(bench.after(100, false).is_some(), "it may start by it, or run");
+    assert_eq!(bench.reported(), 1);
+    // A family that does not report it: as it was written.
+    let profiles = Profiles::built_in();
+    for (word, acts) in [(Some(1), true), (Some(0), false), (None, false)] {
+        let mut bench = Bench::of(profiles.get("eaton-hvx").unwrap(), LeaseAction::Stop);
+        let raw = bench.image();
+        let raw = raw
+            .spec
+            .profile
+            .model_point(ModelPoint::Run)
+            .and_then(|point| point.raw())
+            .unwrap();
+        assert!(bench.image().spec.profile.model_point(ModelPoint::Run).is_some());
+        bench.heartbeat();
+        if let Some(word) = word {
+            bench.drive.words.learn(raw.table, raw.address, word);
+        }
+        let acted = (0..100).any(|_| bench.after(100, false).is_some());
+        assert_eq!(acted, acts, "{word:?}");
     }
-    assert_eq!(bench.reported(), 0);
-    assert!(bench.after(10, true).is_some(), "it started by it");
     // The run command was taken away.
     let mut bench = Bench::new(LeaseAction::Stop);
     bench.heartbeat();
     bench.shows(ModelPoint::Run, Value::Bool(true));
-    assert!(bench.after(6_000, false).is_none());
+    assert!(bench.after(4_900, false).is_none());
     bench.shows(ModelPoint::Run, Value::Bool(false));
-    assert!(bench.after(10, false).is_none());
+    assert!(bench.after(100, false).is_none());
     assert!(bench.after(10, true).is_none(), "started by someone else");
     assert_eq!(bench.reported(), 0);
 }

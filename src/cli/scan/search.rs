@@ -34,6 +34,8 @@ pub(in crate::cli) struct Heard {
     pub(in crate::cli) cut_echoes: usize,
     /// Stray bytes directly before a reply.
     pub(in crate::cli) stray_before: usize,
+    /// Answers of a gateway by which nobody is at the address.
+    pub(in crate::cli) no_way: usize,
     /// Requests.
     pub(in crate::cli) requests: usize,
 }
@@ -202,6 +204,7 @@ impl<'a> Search<'a> {
             _ => {}
         }
         self.heard.echoes += usize::from(answer.echoed);
+        self.heard.no_way += usize::from(answer.no_way);
         Ok(answer)
     }
 

@@ -26,6 +26,14 @@ pub(in crate::cli) fn nobody_answers(heard: &Heard, port: &str) -> String {
     if let Some(told) = told_by_shape(heard) {
         return format!("no drive answered, but {told}; {port}");
     }
+    if heard.no_way > 0 {
+        return format!(
+            "no drive answered: the gateway at the port did, {} times for {requests} requests, and says by exception 0A or 0B \
+             that it reaches nobody at these addresses; {port}; check baud, format and wiring of the line behind that gateway, \
+             and the power of its drives",
+            heard.no_way
+        );
+    }
     if let Some((setting, count)) = most_garbage(heard) {
         return format!(
             "no drive answered, but {} bytes came that are no valid reply, most of them at {setting} ({count} times): \

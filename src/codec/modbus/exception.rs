@@ -15,6 +15,8 @@ impl Exception {
     pub const VALUE: Exception = Exception(0x03);
     /// 04: the device failed.
     pub const DEVICE_FAILURE: Exception = Exception(0x04);
+    /// 05: the device has taken the request and still works on it.
+    pub const ACKNOWLEDGE: Exception = Exception(0x05);
     /// 06: the device is busy.
     pub const BUSY: Exception = Exception(0x06);
     /// 0x0A: the gateway has no way to that unit.
@@ -38,6 +40,21 @@ impl Exception {
     /// Whether the same request would be refused again: function, address or value, not the state of the drive.
     pub fn is_about_request(self) -> bool {
         matches!(self.0, 0x01..=0x03 | 0x21 | 0x81 | 0x85 | 0x90..=0x92)
+    }
+
+    /// Whether the drive does not look at the request now and may do so later.
+    pub fn is_busy(self) -> bool {
+        self == Exception::BUSY
+    }
+
+    /// Whether a gateway says it in place of a drive that it does not reach: the drive answered nothing.
+    pub fn is_no_answer(self) -> bool {
+        matches!(self, Exception::GATEWAY_PATH | Exception::GATEWAY_TARGET)
+    }
+
+    /// Whether it says nothing of what became of a write: the drive still works on it, or did not answer.
+    pub fn leaves_open(self) -> bool {
+        self == Exception::ACKNOWLEDGE || self.is_no_answer()
     }
 
     /// What the code means, by the Modbus specification and the TECO list (drives.md 5.6).

@@ -318,8 +318,12 @@ fn before_the_end_only_stops_get_in() {
     let stopping = bench.pending.take_stopping().unwrap();
     assert!(bench.pending.take_stopping().is_none(), "once");
     assert_eq!(stopping.deadline(), deadline);
-    stopping.report(vec!["one".to_string()]);
-    assert_eq!(missing.try_recv(), Ok(vec!["one".to_string()]));
+    let one = NotStopped {
+        drive: "one".to_string(),
+        why: "did not acknowledge its stop".to_string(),
+    };
+    stopping.report(vec![one.clone()]);
+    assert_eq!(missing.try_recv(), Ok(vec![one]));
 }
 
 #[test]

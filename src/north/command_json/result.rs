@@ -6,6 +6,7 @@ use serde::Serialize;
 
 use super::Id;
 use crate::command::{Answer, CONFIRMED, milliseconds, milliseconds_or_null};
+use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
 #[derive(Debug, Clone, Serialize)]
@@ -25,6 +26,9 @@ pub(in crate::north) struct CommandResult<'r> {
         skip_serializing_if = "Option::is_none"
     )]
     confirmed: Option<Duration>,
+    /// Why no read can show the effect of an acknowledged command.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    note: Option<String>,
     #[serde(serialize_with = "crate::event::rfc3339")]
     time: SystemTime,
 }
@@ -36,16 +40,15 @@ struct ErrorObject {
 }
 
 impl<'r> CommandResult<'r> {
-    /// The result at `time` of the command with that `id`; `confirmed` is the time from its acceptance to the read that
-    /// showed its effect.
+    /// The result at `time` of the command with that `id`, of which reads showed so much.
     pub(in crate::north) fn new(
         id: Option<&'r Id>,
         drive: &'r str,
         answer: &Answer,
-        confirmed: Option<Duration>,
+        shown: Shown,
         time: SystemTime,
     ) -> CommandResult<'r> {
-        let code = match confirmed {
+        let code = match shown.after {
             Some(_) => CONFIRMED,
             None => answer.outcome.code(),
         };
@@ -57,7 +60,8 @@ impl<'r> CommandResult<'r> {
             result: code,
             error: error.map(|message| ErrorObject { code, message }),
             latency: answer.latency,
-            confirmed,
+            confirmed: shown.after,
+            note: shown.unseen,
             time,
         }
     }

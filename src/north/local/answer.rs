@@ -14,11 +14,11 @@ use crate::codec::{Reply, RequestPdu};
 use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refusal};
 use crate::document::nearest;
 use crate::drive::why::Explanation;
-use crate::drive::{Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
+use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
 use crate::north::command_json::resolve;
 use crate::north::parameters::{Again, How, begin_reading, carry_out, prepare, release, take_up};
 use crate::parameters::{Id, ParameterFile, Wishes};
-use crate::plant::{DriveHandle, Plant, SharedPlant};
+use crate::plant::{DriveHandle, Plant, SharedPlant, Shown};
 use crate::process_image::{Link, Reading, Unavailable, public_points};
 
 /// Most points of one request; a profile has some hundred.
@@ -271,7 +271,7 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
                 origin,
                 now,
             );
-            return Ok(WriteOutcome::new(&answer, None));
+            return Ok(WriteOutcome::new(&answer, Shown::default()));
         }
         drive => drive?,
     };
@@ -285,11 +285,19 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
         Ok(values) => drive.place(Order::Points(values), origin, Authority::Write, DEFAULT_EXPIRY, now),
         Err(refusal) => {
             let answer = drive.refuse(&described(&request.points), refusal, origin, now);
-            return Ok(WriteOutcome::new(&answer, None));
+            return Ok(WriteOutcome::new(&answer, Shown::default()));
         }
     };
     let answer = placed.answered().await;
-    Ok(WriteOutcome::new(&answer, placed.confirmed().await))
+    placed.confirmed().await;
+    let mut shown = placed.shown();
+    let run = ModelPoint::Run.name();
+    let runs = |setting: &Setting| setting.point == run && setting.value == serde_json::Value::Bool(true);
+    if answer.outcome.is_ok() && shown == Shown::default() && request.points.iter().any(runs) {
+        let explanation = drive.why(&drive.reading(Instant::now()));
+        shown.unseen = explanation.blocked_by().map(|causes| format!("blocked by {causes}"));
+    }
+    Ok(WriteOutcome::new(&answer, shown))
 }
 
 fn why(request: &WhyRequest, plant: &Plant) -> Result<Explanation, Failure> {

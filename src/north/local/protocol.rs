@@ -29,6 +29,7 @@ use crate::command::{Answer, CONFIRMED};
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, Quality, Sample};
 use crate::parameters::{Plan, RestoreStage, RestoreStatus, Status};
+use crate::plant::Shown;
 use crate::process_image::{BusSpec, DriveSpec, value_or_null};
 
 /// Version of requests and responses. A field that is added does not change it.
@@ -543,17 +544,21 @@ pub struct WriteOutcome {
     /// From acceptance to the read that showed the effect, ms.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub confirmed_ms: Option<f64>,
+    /// What is known of the effect of a command that no read showed, for people.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub known: Option<String>,
 }
 
 impl WriteOutcome {
-    pub(super) fn new(answer: &Answer, confirmed: Option<Duration>) -> WriteOutcome {
+    pub(super) fn new(answer: &Answer, shown: Shown) -> WriteOutcome {
         let millis = |time: Duration| (time.as_secs_f64() * 1e6).round() / 1e3;
         WriteOutcome {
             ok: answer.outcome.is_ok(),
-            result: confirmed.map_or(answer.outcome.code(), |_| CONFIRMED).to_string(),
+            result: shown.after.map_or(answer.outcome.code(), |_| CONFIRMED).to_string(),
             message: answer.outcome.to_string(),
             latency_ms: millis(answer.latency),
-            confirmed_ms: confirmed.map(millis),
+            confirmed_ms: shown.after.map(millis),
+            known: shown.unseen,
         }
     }
 }

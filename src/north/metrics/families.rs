@@ -190,18 +190,25 @@ fn drives(plant: &Plant, now: Instant, all: &mut Families) {
     let supervision = all.family(
         Kind::Counter,
         "drivegate_supervision_actions_total",
-        "Leases that ran out while the drive ran.",
+        "Leases that ran out while the drive ran or had its run command.",
+    );
+    let failed = all.family(
+        Kind::Counter,
+        "drivegate_supervision_failed_total",
+        "Tries of the action of a lease, or of the stop of a shutdown, that failed.",
     );
     let unsupervised = all.family(
         Kind::Gauge,
         "drivegate_drive_unsupervised",
-        "Whether a drive with supervision runs that no client has commanded since the gateway started: 1, else 0.",
+        "Whether a drive with supervision runs of which no client is known to have commanded it: 1, else 0.",
     );
     for drive in plant.drives() {
         let image = &drive.image;
         let labels = labels_of(image);
         let reading = drive.reading(now);
         all.add(supervision, labels.clone(), SeriesValue::Count(image.supervisions()));
+        let failures = image.supervision_failures();
+        all.add(failed, labels.clone(), SeriesValue::Count(failures));
         if image.spec.supervision.is_some() {
             all.add(unsupervised, labels.clone(), flag(image.is_unsupervised()));
         }

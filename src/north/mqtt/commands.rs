@@ -5,7 +5,7 @@ use std::collections::VecDeque;
 use std::future::poll_fn;
 use std::sync::Arc;
 use std::task::{Context, Poll, Waker};
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use super::outbox::Message;
 use super::payload::Topics;
@@ -14,7 +14,7 @@ use super::request::{self, Incoming};
 use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
 use crate::drive::ModelPoint;
 use crate::north::command_json::{Id, Repetition, SharedMemory, excerpt, unknown_drive};
-use crate::plant::{Placed, Plant};
+use crate::plant::{Placed, Plant, Shown};
 
 /// Limits of the commands that wait for the bus. Only stops can be so many: the queues of the buses accept fewer other
 /// commands.
@@ -75,7 +75,7 @@ pub(super) struct FinishedCommand {
     id: Option<Id>,
     reply: Reply,
     answer: Answer,
-    confirmed: Option<Duration>,
+    shown: Shown,
 }
 
 impl Commands {
@@ -140,12 +140,13 @@ impl Commands {
             let name = excerpt(target.drive.as_bytes());
             let why = unknown_drive(target.drive, plant);
             let answer = plant.refuse_unknown(name.trim_matches('`'), &what(), why, origin, now);
-            return Some(reply.message(request::id(&incoming, target.point), &answer, None, time));
+            return Some(reply.message(request::id(&incoming, target.point), &answer, Shown::default(), time));
         };
         let profile = &drive.image.spec.profile;
         let request = request::read(&incoming, target.point, profile);
-        let refuse =
-            |refusal, id, origin| Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), None, time));
+        let refuse = |refusal, id, origin| {
+            Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), Shown::default(), time))
+        };
         let (points, expiry) = match request.order {
             Err(refusal) => return refuse(refusal, request.id, origin),
             Ok(order) => order,
@@ -212,7 +213,7 @@ impl Commands {
     /// Returns the result of a refused command; any other waits.
     fn follow(&mut self, mut pending: PendingCommand, time: SystemTime) -> Option<Message> {
         match pending.placed.answer().filter(|answer| !answer.outcome.is_ok()) {
-            Some(answer) => Some(self.result(pending.end(answer, None), time)),
+            Some(answer) => Some(self.result(pending.end(answer, Shown::default()), time)),
             None => {
                 self.waiting.push(pending);
                 None
@@ -238,7 +239,7 @@ impl Commands {
     fn poll_finished(&mut self, cx: &mut Context<'_>) -> Poll<FinishedCommand> {
         while let Some(mut pending) = self.waiting.take(|r| r.placed.poll_answer(cx).is_ready()) {
             match pending.placed.answer() {
-                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, None)),
+                Some(answer) if !answer.outcome.is_ok() => return Poll::Ready(pending.end(answer, Shown::default())),
                 _ => self.confirming.push(pending),
             }
         }
@@ -248,8 +249,8 @@ impl Commands {
             full.then(|| self.confirming.take(|_| true)).flatten()
         });
         let finished = next.and_then(|mut pending| {
-            let (answer, confirmed) = (pending.placed.answer()?, pending.placed.confirmation().flatten());
-            Some(pending.end(answer, confirmed))
+            let (answer, shown) = (pending.placed.answer()?, pending.placed.shown());
+            Some(pending.end(answer, shown))
         });
         finished.map_or(Poll::Pending, Poll::Ready)
     }
@@ -258,7 +259,7 @@ impl Commands {
     pub(super) fn result(&mut self, finished: FinishedCommand, time: SystemTime) -> Message {
         let message = finished
             .reply
-            .message(finished.id, &finished.answer, finished.confirmed, time);
+            .message(finished.id, &finished.answer, finished.shown, time);
         self.memory
             .lock()
             .finished(finished.number, &message.payload.as_slice().into());
@@ -272,13 +273,13 @@ impl Commands {
 }
 
 impl PendingCommand {
-    fn end(self, answer: Answer, confirmed: Option<Duration>) -> FinishedCommand {
+    fn end(self, answer: Answer, shown: Shown) -> FinishedCommand {
         FinishedCommand {
             number: self.number,
             id: self.id,
             reply: self.reply,
             answer,
-            confirmed,
+            shown,
         }
     }
 

@@ -1,11 +1,12 @@
 //! Destination and content of the results of commands.
 
-use std::time::{Duration, SystemTime};
+use std::time::SystemTime;
 
 use super::outbox::Message;
 use super::request::Incoming;
 use crate::command::Answer;
 use crate::north::command_json::{CommandResult, Id};
+use crate::plant::Shown;
 
 /// Maximum number of levels of a response topic.
 const LEVELS: usize = 128;
@@ -98,14 +99,8 @@ impl Reply {
     }
 
     /// The one result: `confirmed` if a read showed the effect in time, else the answer of the bus.
-    pub(super) fn message(
-        &self,
-        id: Option<Id>,
-        answer: &Answer,
-        confirmed: Option<Duration>,
-        time: SystemTime,
-    ) -> Message {
-        self.with(CommandResult::new(id.as_ref(), &self.drive, answer, confirmed, time).to_json())
+    pub(super) fn message(&self, id: Option<Id>, answer: &Answer, shown: Shown, time: SystemTime) -> Message {
+        self.with(CommandResult::new(id.as_ref(), &self.drive, answer, shown, time).to_json())
     }
 }
 

@@ -242,7 +242,7 @@ impl Dialogue {
             });
         }
         let answer = match (outcome, frame) {
-            (Outcome::Acknowledged(_) | Outcome::Exception(_), Some(frame)) => Some(frame),
+            (Outcome::Acknowledged(_) | Outcome::Exception(_) | Outcome::Unknown(_), Some(frame)) => Some(frame),
             _ => frame_of(protocol, pending, outcome),
         };
         let Some(answer) = answer else {
@@ -279,7 +279,7 @@ fn frame_of(protocol: Protocol, pending: &Pending, outcome: &Outcome) -> Option<
         Outcome::Exception(code) if protocol == Protocol::N2 => {
             Some(request.refusal(protocol, Refused::Nak(code.n2_code()?)))
         }
-        Outcome::Exception(code) => Some(request.refusal(protocol, Refused::Exception(*code))),
+        Outcome::Exception(code) | Outcome::Unknown(code) => Some(request.refusal(protocol, Refused::Exception(*code))),
         Outcome::Refused(refusal) => Some(request.refusal(protocol, Refused::Exception(refusal.exception()))),
         _ => None,
     }

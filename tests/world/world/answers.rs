@@ -155,6 +155,7 @@ impl World {
             "confirmed",
             "timeout",
             "garbled",
+            "unknown",
             "refused_by_drive",
             "interrupted",
         ];
@@ -190,6 +191,7 @@ impl World {
         match code {
             "acknowledged" | "confirmed" => self.check_done(id, record, code, outcome),
             "expired" => self.check_expired(id, record),
+            "refused_by_drive" => self.check_refused(id, record, outcome),
             _ => {}
         }
         if code == "confirmed" && self.records[id].wish == Wish::Stop {
@@ -216,6 +218,23 @@ impl World {
             troubled || late || !state.running || state.output.abs() < 2.0,
             "order {id}: the stop is confirmed, and the motor turns with {:.1} Hz",
             state.output
+        );
+    }
+
+    /// What the drive was too busy for was tried until its time was over, and an exception that leaves open what became of a
+    /// write is no refusal.
+    fn check_refused(&self, id: usize, record: &Record, outcome: Option<&Outcome>) {
+        let Some(Outcome::Exception(code)) = outcome.filter(|_| record.wish != Wish::RawRead) else {
+            return;
+        };
+        assert!(
+            !matches!(code.0, 0x05 | 0x0A | 0x0B),
+            "order {id} is told to be refused, and the answer was {code}"
+        );
+        assert!(
+            code.0 != 0x06 || self.now >= record.expires,
+            "order {id} was given up {:?} before its time, because the drive was busy",
+            record.expires - self.now
         );
     }
 

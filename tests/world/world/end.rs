@@ -1,5 +1,7 @@
 //! The end of the gateway.
 
+use drivegate::command::NotStopped;
+
 use super::*;
 
 impl World {
@@ -8,7 +10,7 @@ impl World {
         self.stopping = true;
         self.note(|| "the gateway stops".to_string());
         let deadline = self.now + Duration::from_secs(30);
-        let mut reports: Vec<(usize, oneshot::Receiver<Vec<String>>)> = Vec::new();
+        let mut reports: Vec<(usize, oneshot::Receiver<Vec<NotStopped>>)> = Vec::new();
         for (index, bus) in self.buses.iter_mut().enumerate() {
             if bus.open {
                 reports.push((index, bus.handle.queue.begin_shutdown(deadline, self.now)));
@@ -16,7 +18,7 @@ impl World {
                 bus.command_came(self.now);
             }
         }
-        let mut missing: BTreeMap<usize, Vec<String>> = BTreeMap::new();
+        let mut missing: BTreeMap<usize, Vec<NotStopped>> = BTreeMap::new();
         let begun = self.now;
         self.next_incident = None;
         self.next_reload = None;
@@ -49,10 +51,7 @@ impl World {
                     .is_some_and(|drive| drive.answers());
                 if answers && !truth.is_troubled(begun) {
                     assert!(!truth.run, "{} was not stopped with the gateway", spec.name);
-                    assert!(
-                        !missing.iter().any(|text| text.contains(&format!("`{}`", spec.name))),
-                        "{missing:?}"
-                    );
+                    assert!(!missing.iter().any(|missing| missing.drive == spec.name), "{missing:?}");
                 }
             }
         }

@@ -65,8 +65,15 @@ fn a_drive_that_does_not_tell_keeps_its_run_bit_while_its_motor_runs() {
     let mut command = reverse(&bench);
     let read = sends(&bench, &mut command);
     let busy = Reply::Exception(Exception::BUSY);
-    let ended = command.answered(&read, busy, &mut bench.words);
-    assert_eq!(ended, Some(Outcome::Exception(Exception::BUSY)));
+    assert_eq!(command.answered(&read, busy, &mut bench.words), None);
+    let next = command.next(&bench.words, &bench.profile, true, bench.now);
+    assert!(matches!(next, Next::Wait(_)), "{next:?}");
+    bench.now += Duration::from_millis(100);
+    assert_eq!(
+        sends(&bench, &mut command),
+        read,
+        "nothing is written before it has told"
+    );
     for (running, ended) in [(true, Some(Outcome::TimedOut)), (false, None)] {
         bench.running = running;
         let mut command = reverse(&bench);

@@ -20,6 +20,14 @@ impl Bench {
         image.update(|s| s.refuse(raw.table, raw.address, 1, Exception::ADDRESS));
     }
 
+    /// When the client was last heard of.
+    fn heard(&self) -> Instant {
+        match self.drive.supervision.lease.0 {
+            State::Held(since) => since,
+            _ => self.now - Duration::from_secs(7),
+        }
+    }
+
     /// `ms` later its lease is looked at; the action.
     fn later(&mut self, ms: u64) -> Option<Command> {
         self.now += Duration::from_millis(ms);
@@ -57,11 +65,41 @@ fn a_run_command_that_is_known_only_from_a_write_counts() {
 #[test]
 fn a_drive_whose_word_is_only_old_keeps_its_lease_until_it_tells() {
     let mut bench = cx();
-    for _ in 0..10 {
+    for _ in 0..6 {
         assert!(bench.later(1_000).is_none());
     }
     assert_eq!(bench.news, []);
     assert!(bench.after(10, true).is_some());
+    // But not for ever, if it answers and this is not read again, whatever comes instead.
+    let mut bench = cx();
+    bench.look(0, true);
+    bench.heartbeat();
+    let action = (0..100).find_map(|_| bench.later(100));
+    assert!(action.is_some(), "the stop");
+    assert!(bench.now - bench.heard() <= Duration::from_millis(7_200));
+    assert_eq!(bench.news, [News::RunningUnknown(0), News::LeaseRanOut(0)]);
+    // The time in which it answers is what counts: it may come and go.
+    let mut bench = cx();
+    bench.look(0, true);
+    bench.heartbeat();
+    let mut online = Duration::ZERO;
+    while bench.later(100).is_none() {
+        let is_late = bench.now - bench.heard() > Duration::from_secs(5);
+        let comes = bench.image().snapshot().link.is_online();
+        online += if comes && is_late {
+            Duration::from_millis(100)
+        } else {
+            Duration::ZERO
+        };
+        assert!(bench.now - bench.heard() < Duration::from_secs(20));
+        let link = if comes {
+            Link::Offline(SystemTime::now())
+        } else {
+            Link::Online(SystemTime::now())
+        };
+        bench.image().update(|s| s.link = link);
+    }
+    assert!(online >= Duration::from_millis(1_800), "{online:?}");
     // So does one that does not answer at all, though it refused before.
     let mut bench = cx();
     bench.refuses_running();

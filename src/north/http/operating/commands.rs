@@ -1,7 +1,7 @@
 //! Commands and heartbeats over HTTP. The body of a command is that of the MQTT set topics, and so is its result.
 
 use std::sync::Arc;
-use std::time::{Duration, Instant, SystemTime};
+use std::time::{Instant, SystemTime};
 
 use axum::Json;
 use axum::body::Body;
@@ -21,7 +21,7 @@ use crate::drive::model::Kind;
 use crate::north::command_json::{
     self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
 };
-use crate::plant::{DriveHandle, Placed, Plant};
+use crate::plant::{DriveHandle, Placed, Plant, Shown};
 use crate::process_image::Access;
 
 /// The commands that came over HTTP, also to the server that a reload starts in the place of one that ended.
@@ -57,16 +57,10 @@ struct Waiting {
 }
 
 impl CommandReply {
-    fn new(
-        id: Option<&Id>,
-        drive: &str,
-        answer: &Answer,
-        confirmed: Option<Duration>,
-        time: SystemTime,
-    ) -> CommandReply {
+    fn new(id: Option<&Id>, drive: &str, answer: &Answer, shown: Shown, time: SystemTime) -> CommandReply {
         CommandReply {
             status: status(&answer.outcome),
-            body: CommandResult::new(id, drive, answer, confirmed, time).to_json(),
+            body: CommandResult::new(id, drive, answer, shown, time).to_json(),
         }
     }
 }
@@ -87,7 +81,7 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
         Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => StatusCode::CONFLICT,
         Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
-        Outcome::TimedOut | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
+        Outcome::TimedOut | Outcome::Unknown(_) | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
         Outcome::Expired | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull | Outcome::ShuttingDown => {
             StatusCode::SERVICE_UNAVAILABLE
         }
@@ -154,8 +148,9 @@ async fn shared(mut reply: SharedReply) -> Result<CommandReply, Response> {
 impl Waiting {
     async fn finished(mut self) -> CommandReply {
         let answer = self.placed.answered().await;
-        let confirmed = self.placed.confirmed().await;
-        CommandReply::new(self.id.as_ref(), &self.drive, &answer, confirmed, SystemTime::now())
+        self.placed.confirmed().await;
+        let shown = self.placed.shown();
+        CommandReply::new(self.id.as_ref(), &self.drive, &answer, shown, SystemTime::now())
     }
 }
 
@@ -182,7 +177,8 @@ impl Operating {
         time: SystemTime,
     ) -> Progress {
         let (id, origin) = (find_id(payload), operator.origin());
-        let reply = |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, None, time));
+        let reply =
+            |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, Shown::default(), time));
         let Some(drive) = plant.drive(name) else {
             let shown = excerpt(name.as_bytes());
             let why = unknown_drive(name, plant);

@@ -171,7 +171,7 @@ globalThis.Operate = (() => {
   function words(status, json) {
     const ms = (value) => `${Math.round(value)} ms`;
     if (json.result === "confirmed") return `confirmed: the drive shows it, after ${ms(json.confirmed_ms)}`;
-    if (json.result === "acknowledged") return `acknowledged by the drive after ${ms(json.latency_ms)}; no read has shown its effect yet`;
+    if (json.result === "acknowledged") return `acknowledged by the drive after ${ms(json.latency_ms)}; ${json.note || "no read has shown its effect yet"}`;
     if (json.error && json.error.message) return `${json.error.code.replaceAll("_", " ")}: ${json.error.message}`;
     return json.error || `the gateway answered ${status}`;
   }

@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use super::*;
 use crate::north::http::operating::IN_PROGRESS;
 use crate::north::mqtt::fixture;
