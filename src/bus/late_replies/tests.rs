@@ -237,7 +237,7 @@ fn ages_after_a_lost_reply(other: u32) -> Vec<Duration> {
     let (mut late, ms) = (LateReplies::default(), Duration::from_millis);
     let a = read(2100, 11);
     late.given_up(&a, start, start + DEADLINE);
-    let age = |round| {
+    let age = |round: u32| {
         let sent = start + DEADLINE + ms(2) + round * ms(20);
         let at = sent + ms(5);
         let asked_by = late.asked_by(&a, at);
