@@ -14,6 +14,7 @@ use arc_swap::ArcSwap;
 pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
+use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
 use crate::command::{AuditFile, CommandQueue, WriteStats};
@@ -235,11 +236,13 @@ impl Daemon {
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
         let mut leases: BTreeMap<(String, u8), Lease> = BTreeMap::new();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
+        let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             leases.extend(drives.zip(left.leases));
+            learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
@@ -256,6 +259,7 @@ impl Daemon {
             let handover = Handover {
                 leases: bus.drives.iter().map(lease).collect(),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
+                learned: learned.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));

@@ -7,7 +7,7 @@ use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
-use crate::bus::transaction::{Ended, MAY_BE_LATE};
+use crate::bus::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, written};
@@ -318,13 +318,19 @@ impl Master {
             return;
         }
         let how = match ended {
+            Ended::Corrupt(CONNECTION_CLOSED) => Outcome::TimedOut,
             Ended::Corrupt(_) => Outcome::Garbled,
             _ => Outcome::TimedOut,
         };
         if slot == Urgency::Stop && *ended == Ended::Silent {
             drive.vain_stops.not_answered(took);
         }
-        let retries = if online { self.retries } else { 0 };
+        let retries = match *ended {
+            // The request may never have reached the drive, which is no sign of it.
+            Ended::Corrupt(CONNECTION_CLOSED) => self.retries.max(1),
+            _ if online => self.retries,
+            _ => 0,
+        };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);
