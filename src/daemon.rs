@@ -16,6 +16,7 @@ use self::leases::Leases;
 pub use self::pulse::Pulse;
 use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
+use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
 use crate::command::{AuditFile, CommandQueue, NotStopped, WriteStats};
 use crate::config::{BusSettings, Settings};
@@ -236,9 +237,11 @@ impl Daemon {
         // Ports are closed before a changed bus opens one of them. A bus that restarts keeps the leases of its drives.
         let mut leases = Leases::default();
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
+        let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
         for (before, left) in stop_all(removed).await {
+            learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             leases.left(&before, left.leases);
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
@@ -248,6 +251,7 @@ impl Daemon {
             let handover = Handover {
                 leases: leases.of(&bus),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
+                learned: learned.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));

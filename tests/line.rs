@@ -10,6 +10,7 @@
 mod support;
 
 mod line {
+    mod closing;
     mod n2;
     mod port;
     mod rfc2217;

@@ -33,6 +33,34 @@ pub enum Action {
     },
 }
 
+/// What the end of a connection means that a device server closed.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Closed {
+    /// It is connected to again at once: the server has answered by it, or a reply may come by the next one.
+    Reconnect,
+    /// It is connected to again when something is to be asked.
+    ReconnectToAsk,
+    /// The port is lost.
+    Lost,
+}
+
+/// What happened since the port was opened or connected to anew.
+#[derive(Debug, Default)]
+struct Connection {
+    /// It took the place of one by which the server had answered.
+    anew: bool,
+    /// It was made because something is to be asked.
+    to_ask: bool,
+    asked: bool,
+    answered: bool,
+    /// So many before it ended while a request was on the line, and nothing was answered since.
+    vain: u32,
+}
+
+/// So many connections in a row may end in mid-exchange: a server may have a shorter patience with a drive that is off, or
+/// close upon one request, but one that answers nothing is no way to the drives.
+const MOST_IN_VAIN: u32 = 3;
+
 /// What was chosen to go out when the line is clear.
 #[derive(Debug)]
 struct Chosen {
@@ -54,6 +82,7 @@ pub struct BusCore {
     quiet_until: Option<Instant>,
     /// What is on the line.
     asked: Option<Turn>,
+    connection: Connection,
     tap: Option<Tap>,
     /// Empty; kept for its memory.
     news: Vec<News>,
@@ -71,14 +100,19 @@ impl BusCore {
     ) -> BusCore {
         let spec = &bus.image.spec;
         let silence = spec.protocol.silence(options.silence, &spec.format);
+        let mut line = LineState::new(spec.protocol, spec.format, silence, now);
+        if let Some(learned) = before.learned {
+            line.take_over(learned);
+        }
         BusCore {
-            line: LineState::new(spec.protocol, spec.format, silence, now),
+            line,
             master: Master::new(bus.clone(), options, silence, writes.clone(), before, now),
             report: Report::new(bus.image.clone(), options, events, writes, now),
             bus,
             chosen: None,
             quiet_until: before.quiet_until,
             asked: None,
+            connection: Connection::default(),
             tap: None,
             news: Vec::new(),
         }
@@ -87,12 +121,56 @@ impl BusCore {
     /// The port was opened.
     pub fn opened(&mut self, now: Instant) {
         self.line.reset(now);
+        self.connection = Connection::default();
         if let Some(until) = self.quiet_until.take() {
             self.line.leave_alone(until);
         }
         self.master.opened(now);
         self.bus.queue.open();
         self.report.bus_up(now);
+    }
+
+    /// A device server closed the connection, which is no fault of the line where it answers: nothing that is known of the drives
+    /// changes, and whoever waits goes on waiting. What that means for the port.
+    pub fn closed(&mut self) -> Closed {
+        self.line.cut();
+        let Connection {
+            anew,
+            to_ask,
+            asked,
+            answered,
+            vain,
+        } = self.connection;
+        if answered {
+            return Closed::Reconnect;
+        }
+        if asked && !self.line.is_underway() {
+            // Nobody answered, but it was there for as long as a reply may take.
+            return Closed::ReconnectToAsk;
+        }
+        if asked && anew && vain + 1 < MOST_IN_VAIN {
+            self.connection.vain = vain + 1;
+            return Closed::Reconnect;
+        }
+        if !asked && anew && !to_ask {
+            self.connection.to_ask = true;
+            return Closed::ReconnectToAsk;
+        }
+        Closed::Lost
+    }
+
+    /// It was connected to again.
+    pub fn reconnected(&mut self) {
+        let Connection { to_ask, vain, .. } = self.connection;
+        self.connection = Connection {
+            anew: true,
+            to_ask,
+            vain,
+            ..Connection::default()
+        };
+        self.report.reconnected();
+        // What came meanwhile woke nobody.
+        self.command_came();
     }
 
     /// The port is gone or cannot be opened: everything is stale at once, everybody who waits is answered.
@@ -107,7 +185,10 @@ impl BusCore {
     /// that is broken off may still come.
     pub fn ended(&mut self, now: Instant) -> Handover {
         let broken_off = self.asked.as_ref().and(self.line.deadline());
-        self.master.ended(broken_off, now)
+        Handover {
+            learned: Some(self.line.learned()),
+            ..self.master.ended(broken_off, now)
+        }
     }
 
     /// What is to be done now.
@@ -226,6 +307,7 @@ impl BusCore {
         let sending = self.master.sending(&turn, now);
         let late = self.master.take_late();
         self.line.send(request, frame, sending, late, now);
+        self.connection.asked = true;
         self.asked = Some(turn);
         self.line.frame()
     }
@@ -251,6 +333,12 @@ impl BusCore {
     /// An exchange is over.
     fn over(&mut self, mut exchanged: Exchanged, now: Instant) {
         let Some(turn) = self.asked.take() else { return };
+        if matches!(exchanged.ended, Ended::Reply(_)) {
+            self.connection = Connection {
+                answered: true,
+                ..Connection::default()
+            };
+        }
         self.report.exchanged(turn.drive, &exchanged, now);
         let drive = self.known(&turn);
         let heard = exchanged.transaction.seen();

@@ -5,7 +5,7 @@ use std::time::{Duration, Instant, SystemTime};
 
 use super::line_state::Exchanged;
 use super::listener::Exchange as Overheard;
-use super::transaction::{Ended, MAY_BE_LATE};
+use super::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::{Reply, RequestPdu};
 use crate::diagnosis::figures::Sign;
 use crate::diagnosis::hold::{Change, Hold};
@@ -65,6 +65,9 @@ impl LineDiagnosis {
         // A drive may well ignore what a tool asks of it that no codec knows.
         if matches!(transaction.request().pdu, RequestPdu::Other(_)) {
             return;
+        }
+        if let Some(baud) = exchanged.beats {
+            self.figures.beats(baud);
         }
         self.figures.exchange(&Exchange {
             drive,
@@ -190,7 +193,7 @@ fn end(ended: &Ended) -> End {
         Ended::Reply(Reply::Exception(code)) if code.is_no_answer() => End::Silent,
         Ended::Reply(_) => End::Answered,
         Ended::Silent => End::Silent,
-        Ended::Corrupt(why) if *why == MAY_BE_LATE => End::Doubtful,
+        Ended::Corrupt(MAY_BE_LATE | CONNECTION_CLOSED) => End::Doubtful,
         Ended::Corrupt(_) => End::Damaged,
     }
 }

@@ -6,7 +6,7 @@ use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::sync::mpsc::{SyncSender, sync_channel};
 use std::time::{Duration, Instant};
 
-use super::core::{Action, BusCore};
+use super::core::{Action, BusCore, Closed};
 use super::listener::ListenCore;
 use super::master::Handover;
 use super::{BusOptions, Mode};
@@ -221,10 +221,10 @@ impl Worker {
                     }
                     let opened = Instant::now();
                     core.opened(opened);
-                    let why = core.serve(self, &line);
+                    let why = self.stay_connected(&mut core, &mut names, line);
                     pauses.was_open_for(opened.elapsed());
-                    if let Err(lost) = why {
-                        core.lost(&lost.to_string(), Instant::now());
+                    if let Err(why) = why {
+                        core.lost(&why, Instant::now());
                     }
                     Arrival::of(&spec.port)
                 }
@@ -240,6 +240,50 @@ impl Worker {
             }
         }
         core
+    }
+
+    /// Serves an open port until the bus is to stop. A device server that closes its connection after a reply or after a pause
+    /// is no lost port: it is connected to again.
+    ///
+    /// # Errors
+    /// Why the port is lost.
+    fn stay_connected<C: Core>(&self, core: &mut C, names: &mut Names, mut line: C::Line) -> Result<(), String> {
+        loop {
+            let Err(lost) = core.serve(self, &line) else {
+                return Ok(());
+            };
+            let closed = match lost.closed {
+                true => core.closed(),
+                false => Closed::Lost,
+            };
+            // Some servers have but one connection.
+            drop(line);
+            match closed {
+                Closed::Lost => return Err(lost.to_string()),
+                Closed::Reconnect => {}
+                Closed::ReconnectToAsk => core.wait_to_ask(self),
+            }
+            line = match self.connect_anew::<C>(names) {
+                Ok((line, _)) => line,
+                Err(_) if self.stopping() => return Ok(()),
+                Err(error) => return Err(format!("{lost}; {error}")),
+            };
+            core.reconnected();
+        }
+    }
+
+    /// Connects to a device server that closed a connection. One that is still busy with that is tried twice.
+    fn connect_anew<C: Core>(&self, names: &mut Names) -> Opened<C::Line> {
+        let spec = &self.handle.image.spec;
+        let go_on = || !self.stopping();
+        let mut connect = || C::open(names, &spec.port, &spec.format, &self.options.line, &go_on);
+        match connect() {
+            Err(error) if error.is_refused() => {
+                self.rest(REOPEN.0, None);
+                connect()
+            }
+            opened => opened,
+        }
     }
 
     fn stopping(&self) -> bool {
@@ -309,6 +353,26 @@ impl Worker {
         Ok(())
     }
 
+    /// Serves without a connection until something is to be sent, or the bus is to stop.
+    fn wait_to_ask(&self, core: &mut BusCore) {
+        while !self.stopping() {
+            let now = Instant::now();
+            match core.poll(now) {
+                Action::Send => return,
+                Action::Wait { until, commands, .. } => {
+                    let until = until.min(now + BEAT);
+                    if commands {
+                        line::wait_without_port(until, self.handle.queue.wake_fd(), None);
+                        self.handle.queue.clear_wake();
+                        core.command_came();
+                    } else {
+                        line::wait_until(until, Duration::ZERO);
+                    }
+                }
+            }
+        }
+    }
+
     fn only_listen(&self, core: &mut ListenCore, line: &Receiver) -> Result<(), Lost> {
         let mut buffer = [0u8; 512];
         while !self.stopping() {
@@ -346,6 +410,10 @@ trait Core {
     ) -> Opened<Self::Line>;
     fn opened(&mut self, now: Instant);
     fn lost(&mut self, why: &str, now: Instant);
+    fn closed(&mut self) -> Closed;
+    fn reconnected(&mut self);
+    /// Returns when something is to be sent, or the bus is to stop.
+    fn wait_to_ask(&mut self, worker: &Worker);
     fn serve(&mut self, worker: &Worker, line: &Self::Line) -> Result<(), Lost>;
 }
 
@@ -368,6 +436,18 @@ impl Core for BusCore {
 
     fn lost(&mut self, why: &str, now: Instant) {
         BusCore::lost(self, why, now);
+    }
+
+    fn closed(&mut self) -> Closed {
+        BusCore::closed(self)
+    }
+
+    fn reconnected(&mut self) {
+        BusCore::reconnected(self);
+    }
+
+    fn wait_to_ask(&mut self, worker: &Worker) {
+        worker.wait_to_ask(self);
     }
 
     fn serve(&mut self, worker: &Worker, line: &Line) -> Result<(), Lost> {
@@ -395,6 +475,16 @@ impl Core for ListenCore {
     fn lost(&mut self, why: &str, now: Instant) {
         ListenCore::lost(self, why, now);
     }
+
+    fn closed(&mut self) -> Closed {
+        ListenCore::closed(self)
+    }
+
+    fn reconnected(&mut self) {
+        ListenCore::reconnected(self);
+    }
+
+    fn wait_to_ask(&mut self, _: &Worker) {}
 
     fn serve(&mut self, worker: &Worker, line: &Receiver) -> Result<(), Lost> {
         worker.only_listen(self, line)

@@ -4,12 +4,15 @@
 use std::time::{Duration, Instant};
 
 use super::n2_late_replies::N2LateReplies;
-use super::transaction::{Ended, Step, Transaction, is_unlike_its_reply};
+use super::transaction::{CONNECTION_CLOSED, Ended, Step, Transaction, is_unlike_its_reply};
 use crate::codec::{LineFormat, Protocol, Reply, Request};
 use crate::drive::plan::WireTime;
 
 /// A line that never falls silent is spoken on after this time: a stop must get out.
 pub const BABBLE: Duration = Duration::from_millis(500);
+
+/// Baud rates are off by 2 % at most, and times are not exact: what takes less than this share of its time is too early.
+const ALMOST: f64 = 0.9;
 
 /// Replies that are whole before the wire could have carried them show a line without wire time: a simulation, or another
 /// baud rate behind a device server. A single one may be a late reply, or one that came twice, and on a busy machine not all
@@ -59,6 +62,19 @@ pub struct Exchanged {
     pub reply_time: Duration,
     /// How long the line was taken, with the silence behind.
     pub took: Duration,
+    /// The reply was whole before the line could have carried it: the lowest baud rate at which it could have been.
+    pub beats: Option<u32>,
+}
+
+/// What the exchanges on a line have shown of it. It holds for the next connection to the same line, too.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Learned {
+    protocol: Protocol,
+    format: LineFormat,
+    /// The adapter sends back what it is given.
+    echo: bool,
+    /// Weight of the replies that came faster than the wire could carry them.
+    early_weight: u32,
 }
 
 /// A line with its settings.
@@ -71,10 +87,7 @@ pub struct LineState {
     quiet_since: Instant,
     /// Nothing is sent before then: a reply to whoever spoke before may come.
     left_alone: Instant,
-    /// The adapter sends back what it is given.
-    echo: bool,
-    /// Weight of the replies that came faster than the wire could carry them.
-    early_weight: u32,
+    learned: Learned,
     underway: Option<Underway>,
 }
 
@@ -86,6 +99,8 @@ struct Underway {
     earliest: Instant,
     doubtful: bool,
     late: bool,
+    /// The connection that took the request was closed.
+    cut: bool,
 }
 
 impl LineState {
@@ -97,15 +112,44 @@ impl LineState {
             silence,
             quiet_since: now,
             left_alone: now,
-            echo: false,
-            early_weight: 0,
+            learned: Learned {
+                protocol,
+                format,
+                echo: false,
+                early_weight: 0,
+            },
             underway: None,
         }
     }
 
-    /// The port was opened anew.
+    /// The port was opened anew. What was learned of the line is kept: a line without wire time would seem mute for seconds,
+    /// and what does not hold any more is unlearned by the replies.
     pub fn reset(&mut self, now: Instant) {
-        *self = LineState::new(self.protocol, self.format, self.silence, now);
+        let learned = self.learned;
+        *self = LineState {
+            learned,
+            ..LineState::new(self.protocol, self.format, self.silence, now)
+        };
+    }
+
+    /// What the exchanges have shown.
+    pub fn learned(&self) -> Learned {
+        self.learned
+    }
+
+    /// Takes over what was learned of the same line, if it is set up as before.
+    pub fn take_over(&mut self, learned: Learned) {
+        if (learned.protocol, learned.format) == (self.protocol, self.format) {
+            self.learned = learned;
+        }
+    }
+
+    /// The connection was closed. A request that was given to it may be on the wire behind the server, and its reply comes by
+    /// the next connection, if it does: the exchange goes on until its deadline.
+    pub fn cut(&mut self) {
+        if let Some(underway) = &mut self.underway {
+            underway.cut = true;
+        }
     }
 
     /// End of the last character on the line.
@@ -141,14 +185,22 @@ impl LineState {
     pub fn send(&mut self, request: Request, frame: Vec<u8>, sending: Sending, late: N2LateReplies, now: Instant) {
         let wire = WireTime::of(self.protocol, &self.format, &request.pdu);
         let sent = now + self.format.chars(frame.len());
-        // A reply cannot be whole before its own time on the wire is over; baud rates are off by 2 % at most.
+        // A reply cannot be whole before its own time on the wire is over.
         let least = self.format.chars(self.protocol.least_reply_chars(&request.pdu));
-        let earliest = sent + least.mul_f64(0.9);
+        let earliest = sent + least.mul_f64(ALMOST);
         let doubtful = sending.could_be_doubled || !is_unlike_its_reply(&request.pdu);
         let timeout = sending.response_timeout;
-        let mut transaction = Transaction::new(self.protocol, request, frame, sent, timeout, wire.reply, self.echo);
+        let mut transaction = Transaction::new(
+            self.protocol,
+            request,
+            frame,
+            sent,
+            timeout,
+            wire.reply,
+            self.learned.echo,
+        );
         transaction.expect_late(late);
-        if self.early_weight < WITHOUT_WIRE_TIME {
+        if self.learned.early_weight < WITHOUT_WIRE_TIME {
             transaction.ignore_before(sent);
             if doubtful {
                 transaction.doubt_before(earliest);
@@ -162,6 +214,7 @@ impl LineState {
             earliest,
             doubtful,
             late: sending.late_may_come,
+            cut: false,
         });
     }
 
@@ -216,9 +269,16 @@ impl LineState {
             earliest,
             doubtful,
             late,
+            cut,
         } = self.underway.take()?;
-        self.echo = transaction.echoes(&ended).unwrap_or(self.echo);
+        let ended = match ended {
+            Ended::Silent | Ended::Corrupt(_) if cut => Ended::Corrupt(CONNECTION_CLOSED),
+            ended => ended,
+        };
+        self.learned.echo = transaction.echoes(&ended).unwrap_or(self.learned.echo);
         let early = now < earliest;
+        let is_value = matches!(&ended, Ended::Reply(reply) if !matches!(reply, Reply::Exception(_)));
+        let beats = (early && is_value).then(|| self.least_baud(&transaction, now.saturating_duration_since(began)));
         self.weigh(&ended, early, doubtful || late, &transaction);
         let wire = WireTime::of(self.protocol, &self.format, &transaction.request().pdu);
         let reply_time = wire.reply.min(self.format.chars(transaction.seen().len()));
@@ -231,7 +291,15 @@ impl LineState {
             reply_time,
             // A reply that came faster than the wire could carry it frees the line no sooner.
             took: now.max(self.quiet_since).saturating_duration_since(began) + self.silence,
+            beats,
         })
+    }
+
+    /// The baud rate at which request and reply take that time, or little longer.
+    fn least_baud(&self, transaction: &Transaction, took: Duration) -> u32 {
+        let chars = transaction.frame().len() + transaction.seen().len();
+        let at_baud = self.format.chars(chars).mul_f64(ALMOST).as_secs_f64();
+        (f64::from(self.format.baud) * at_baud / took.as_secs_f64().max(1e-6)) as u32
     }
 
     fn weight_of(&self, weight: u32) -> u32 {
@@ -244,7 +312,7 @@ impl LineState {
     /// Weighs what the end of an exchange shows of the wire time. `early`: faster than the wire; `doubtful`: the reply could
     /// be another one's.
     fn weigh(&mut self, ended: &Ended, early: bool, doubtful: bool, transaction: &Transaction) {
-        let believed = self.early_weight >= WITHOUT_WIRE_TIME;
+        let believed = self.learned.early_weight >= WITHOUT_WIRE_TIME;
         let weight = match ended {
             Ended::Reply(Reply::Exception(_)) => 0,
             Ended::Reply(_) if !early => {
@@ -253,7 +321,7 @@ impl LineState {
                     Protocol::N2 => REGULAR_ON_N2,
                     Protocol::ModbusRtu | Protocol::ModbusAscii => 1,
                 };
-                self.early_weight = self.early_weight.saturating_sub(taken_back);
+                self.learned.early_weight = self.learned.early_weight.saturating_sub(taken_back);
                 0
             }
             Ended::Reply(_) if doubtful && believed => WEIGHT_OF_BELIEVED,
@@ -263,7 +331,7 @@ impl LineState {
             Ended::Silent | Ended::Corrupt(_) if transaction.only_doubted() => self.weight_of(WEIGHT_OF_DOUBTED),
             Ended::Silent | Ended::Corrupt(_) => 0,
         };
-        self.early_weight = (self.early_weight + weight).min(MOST_WEIGHT);
+        self.learned.early_weight = (self.learned.early_weight + weight).min(MOST_WEIGHT);
     }
 }
 

@@ -23,7 +23,7 @@ use super::BusOptions;
 use super::command_run::StepPurpose;
 use super::drive_state::DriveState;
 use super::late_replies::{FORGOTTEN_AFTER, LateReplies, look_alike};
-use super::line_state::Sending;
+use super::line_state::{Learned, Sending};
 use super::n2_late_replies::{N2LateReplies, n2_look_alike};
 use super::n2_session::N2Sessions;
 use super::news::News;
@@ -131,6 +131,8 @@ pub struct Handover {
     pub leases: Vec<Lease>,
     /// Until when a reply to what it asked may come; none where no bus spoke on the line before.
     pub quiet_until: Option<Instant>,
+    /// What it learned of the line.
+    pub learned: Option<Learned>,
 }
 
 /// The master of a line.
@@ -262,6 +264,7 @@ impl Master {
         let broken_off = broken_off.map(|deadline| deadline + window);
         Handover {
             leases,
+            learned: None,
             quiet_until: late.chain(self.n2_late.until()).chain(broken_off).chain([now]).max(),
         }
     }

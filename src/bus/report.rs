@@ -13,7 +13,7 @@ use super::line_state::Exchanged;
 use super::news::{Adopted, News};
 use super::supervision::{OwnResponse, own_response};
 use super::tap::{self, Tap};
-use super::transaction::Ended;
+use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::{Exception, Reply, Request, Table};
 use crate::command::WriteStats;
 use crate::drive::{ModelPoint, PlannedRead, PollClass, Value};
@@ -272,6 +272,15 @@ impl Report {
         });
         let text = format!("port {} of bus {} is open", self.image.spec.port, self.image.spec.name);
         self.event(EventKind::BusUp, None, None, text);
+    }
+
+    /// A device server closed its connection after it had answered by it, and was connected to again.
+    pub(super) fn reconnected(&mut self) {
+        self.diagnosis.figures().reconnected();
+        self.image.update_health(|h| {
+            h.opened += 1;
+            h.reconnects += 1;
+        });
     }
 
     /// The drives go offline before the bus is shown to be down: who sees the bus down finds no value good. Reported once
@@ -583,7 +592,7 @@ fn counted(ended: &Ended) -> Counted {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Counted::Exception,
         Ended::Reply(_) => Counted::Ok,
-        Ended::Silent => Counted::Timeout,
+        Ended::Silent | Ended::Corrupt(CONNECTION_CLOSED) => Counted::Timeout,
         Ended::Corrupt(_) => Counted::Corrupt,
     }
 }

@@ -6,7 +6,7 @@
 use std::sync::Arc;
 use std::time::{Duration, Instant, SystemTime};
 
-use super::transaction::Ended;
+use super::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::describe::{self, Kind, Part};
 use crate::codec::{LineFormat, Reply, Request};
 use crate::process_image::{BusImage, Direction, FrameRecord, TapedFrame, Verdict};
@@ -117,7 +117,7 @@ pub(super) fn taped(ended: &Ended) -> Verdict {
     match ended {
         Ended::Reply(Reply::Exception(_)) => Verdict::Exception,
         Ended::Reply(_) => Verdict::Ok,
-        Ended::Silent => Verdict::Timeout,
+        Ended::Silent | Ended::Corrupt(CONNECTION_CLOSED) => Verdict::Timeout,
         Ended::Corrupt(_) => Verdict::Corrupt,
     }
 }

@@ -26,6 +26,9 @@ const WHOLE_AFTER: Duration = Duration::from_millis(20);
 /// Why the answer of an exchange is not believed that may be a late one to an earlier request.
 pub const MAY_BE_LATE: &str = "it may be the late reply to an earlier request";
 
+/// Why an exchange has no answer whose request went to a device server that closed its connection then.
+pub const CONNECTION_CLOSED: &str = "the device server closed the connection, and no reply came by the next one";
+
 /// How an exchange ended.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Ended {

@@ -322,10 +322,18 @@ fn summary(bus: &BusSettings, prediction: &Prediction) -> String {
         demand if demand > 1.0 => format!(" (the cadences ask for {:.0} %)", demand * 100.0),
         _ => String::new(),
     };
+    let behind = match bus.spec.port.starts_with("tcp://") {
+        true => {
+            "  baud        sets nothing at the device server, times are reckoned with it; `drivegate diagnose` says when replies\n              \
+             beat it, and which rate fits\n"
+        }
+        false => "",
+    };
     cycle("fast", prediction.fast_cycle, bus.spec.cycle)
         + &cycle("slow", prediction.slow_cycle, bus.spec.slow_cycle)
         + &format!("  line load   {:.1} %{wanted}\n", prediction.load * 100.0)
         + &shutdown(bus)
+        + behind
 }
 
 /// Memory of trends and the last hour of a line, bytes: all of it, and of the drive with most points.

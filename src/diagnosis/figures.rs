@@ -9,7 +9,7 @@ use super::signature::{self, Shape};
 use crate::codec::describe::{self, Kind};
 use crate::codec::{LineFormat, Protocol, Request};
 
-/// Memory of a drive, at most; a line has about 1.5 KiB beside.
+/// Memory of a drive, at most; a line has 2 KiB beside, at most.
 pub const BYTES_PER_DRIVE: usize = 512;
 /// So many requests in a row without a reply are an absence: the drive is off, not badly connected.
 const ABSENCE: u16 = 12;
@@ -22,6 +22,9 @@ const MOST_IDLE: usize = 300;
 /// Losses of the port that are remembered, and for how long.
 const LOSSES: usize = 8;
 const LOSSES_FOR: Duration = Duration::from_secs(600);
+
+/// Usual baud rates, in their order; a reply that beats them all has no wire behind it.
+pub const BAUDS: [u32; 8] = [2400, 4800, 9600, 19_200, 38_400, 57_600, 115_200, 230_400];
 
 /// How an exchange ended.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -185,6 +188,10 @@ pub struct Figures {
     opened: Option<Instant>,
     answered_since_opened: bool,
     losses: [Option<Instant>; LOSSES],
+    /// Replies that were too early for the configured baud rate, by the lowest of [`BAUDS`] that they fit.
+    early: Window<{ BAUDS.len() + 1 }>,
+    /// Connections that a device server closed, and that were made anew.
+    reconnects: Window<1>,
 }
 
 impl Figures {
@@ -215,6 +222,8 @@ impl Figures {
             opened: None,
             answered_since_opened: false,
             losses: [None; LOSSES],
+            early: Window::new(),
+            reconnects: Window::new(),
         }
     }
 
@@ -234,6 +243,27 @@ impl Figures {
             self.losses.rotate_right(1);
             self.losses[0] = Some(now);
         }
+    }
+
+    /// A device server closed its connection, and it was made anew.
+    pub fn reconnected(&mut self) {
+        self.reconnects.add(0, 1);
+    }
+
+    /// How often that was in the last minute, and in how many steps of it.
+    pub fn reconnects(&self) -> (u32, usize) {
+        let steps = self.reconnects.each(0).filter(|count| *count > 0).count();
+        (self.reconnects.sum(0), steps)
+    }
+
+    /// A reply was too early for the configured baud rate; it could have come at `baud`.
+    pub fn beats(&mut self, baud: u32) {
+        self.early.add(BAUDS.partition_point(|usual| *usual < baud), 1);
+    }
+
+    /// Such replies in the last minute, by the lowest of [`BAUDS`] that they fit; the last ones fit none.
+    pub fn early(&self) -> [u32; BAUDS.len() + 1] {
+        std::array::from_fn(|place| self.early.sum(place))
     }
 
     /// Losses of the port lately.
@@ -525,6 +555,8 @@ impl Figures {
             self.arrivals.roll();
             self.paced.roll();
             self.wrong.roll();
+            self.early.roll();
+            self.reconnects.roll();
             self.running.contrast.fade();
             self.running.age = self.running.age.mul_f32(FADE);
             self.pause.fade();
@@ -563,6 +595,6 @@ mod tests {
     #[test]
     fn a_drive_takes_as_much_memory_as_is_stated() {
         assert!(size_of::<Drive>() <= BYTES_PER_DRIVE, "{}", size_of::<Drive>());
-        assert!(size_of::<Figures>() + MOST_IDLE <= 1536, "{}", size_of::<Figures>());
+        assert!(size_of::<Figures>() + MOST_IDLE <= 2048, "{}", size_of::<Figures>());
     }
 }

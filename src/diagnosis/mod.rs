@@ -53,13 +53,17 @@ pub enum Cause {
     SilenceTooShort,
     /// The port was lost again and again.
     PortResets,
+    /// A device server closes its connection again and again.
+    ConnectionCloses,
+    /// Replies come sooner than the configured baud rate allows.
+    FasterThanBaud,
     /// Errors without a pattern.
     Noise,
 }
 
 impl Cause {
     /// All causes, in the order of the documentation.
-    pub const ALL: [Cause; 14] = [
+    pub const ALL: [Cause; 16] = [
         Cause::AllSilent,
         Cause::OneDrive,
         Cause::FromAddress,
@@ -73,6 +77,8 @@ impl Cause {
         Cause::LatencyTimer,
         Cause::SilenceTooShort,
         Cause::PortResets,
+        Cause::ConnectionCloses,
+        Cause::FasterThanBaud,
         Cause::Noise,
     ];
 
@@ -92,6 +98,8 @@ impl Cause {
             Cause::LatencyTimer => "latency_timer",
             Cause::SilenceTooShort => "silence_too_short",
             Cause::PortResets => "port_resets",
+            Cause::ConnectionCloses => "connection_closes",
+            Cause::FasterThanBaud => "faster_than_baud",
             Cause::Noise => "noise",
         }
     }

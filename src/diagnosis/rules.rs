@@ -3,7 +3,7 @@
 use std::time::{Duration, Instant};
 
 use super::counters::{Contrast, MAINS, STEPS};
-use super::figures::{Figures, Sign};
+use super::figures::{BAUDS, Figures, Sign};
 use super::known::{ENOUGH, FEW, Known, LASTING, SIGNIFICANT, share, stand_out, sums};
 use super::{Cause, Certainty, Finding};
 
@@ -54,6 +54,7 @@ impl Rules<'_> {
     fn all(&mut self) {
         if self.all_silent() {
             self.port_resets();
+            self.connection_closes();
             return;
         }
         self.address_twice();
@@ -67,6 +68,8 @@ impl Rules<'_> {
         self.echo();
         self.latency_timer();
         self.port_resets();
+        self.connection_closes();
+        self.faster_than_baud();
         self.noise();
     }
 
@@ -496,6 +499,48 @@ impl Rules<'_> {
             let evidence = format!("the port was lost {losses} times within 10 minutes");
             self.add(Cause::PortResets, None, Certainty::Certain, evidence);
         }
+    }
+
+    fn connection_closes(&mut self) {
+        let (closed, steps) = self.figures.reconnects();
+        if closed < FEW || steps < LASTING {
+            return;
+        }
+        let answered = self.figures.sum(Sign::Answered);
+        let evidence = format!(
+            "the device server closed the connection {closed} times in the last minute, in which {answered} replies came; it was \
+             connected to again at once each time, and no drive was taken for offline"
+        );
+        self.add(Cause::ConnectionCloses, None, Certainty::Certain, evidence);
+    }
+
+    /// Replies that are whole before the wire could have carried them.
+    fn faster_than_baud(&mut self) {
+        let by_baud = self.figures.early();
+        let early: u32 = by_baud.iter().sum();
+        let answered = self.figures.sum(Sign::Answered);
+        if early < 20 || share(early, answered) < 0.5 || self.steps(&[Sign::Answered]) < LASTING {
+            return;
+        }
+        let mut fit = 0;
+        // A few may be late replies, or have come twice.
+        let place = by_baud.iter().position(|count| {
+            fit += count;
+            fit * 20 >= early * 19
+        });
+        let fits = match place.and_then(|place| BAUDS.get(place)) {
+            Some(baud) => format!("{baud} baud is the lowest usual rate that fits"),
+            None => format!(
+                "no usual rate fits, so that no serial line seems to be behind it; {} comes closest",
+                BAUDS.last().copied().unwrap_or_default()
+            ),
+        };
+        let configured = self.figures.line.format.baud;
+        let evidence = format!(
+            "{early} of {answered} replies in the last minute came sooner than {configured} baud, which is configured, could \
+             carry them; {fits}"
+        );
+        self.add(Cause::FasterThanBaud, None, Certainty::Certain, evidence);
     }
 
     /// Whether errors began about when a drive started, so that it is not known yet whether they are those of running drives.

@@ -19,6 +19,8 @@ impl Cause {
             Cause::LatencyTimer => "the adapter hands replies over in steps of 16 ms",
             Cause::SilenceTooShort => "requests that follow a reply closely are not heard",
             Cause::PortResets => "the adapter goes and comes back",
+            Cause::ConnectionCloses => "the device server closes its connection again and again",
+            Cause::FasterThanBaud => "replies come sooner than the configured baud rate allows",
             Cause::Noise => "errors without a pattern",
         }
     }
@@ -70,6 +72,14 @@ impl Cause {
             Cause::PortResets => {
                 "check the USB cable, plug and hub, and the supply of the adapter; an isolated adapter survives what drives \
                  induce; the log has the reasons"
+            }
+            Cause::ConnectionCloses => {
+                "set the device server to keep its connection: switch off its idle or inactivity timeout, and a mode that closes \
+                 after each request; that no second program connects to it in turn; each new connection takes time from the line"
+            }
+            Cause::FasterThanBaud => {
+                "set baud of the bus to the rate of the line behind the device server: by it the gateway reckons how long a \
+                 request and its reply are on the wire, and what a late reply is"
             }
             Cause::Noise => {
                 "check termination at both ends, the reference conductor, and shield and course of the cable; a lower baud rate \

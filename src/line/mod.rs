@@ -81,10 +81,44 @@ pub enum OpenError {
     },
 }
 
+impl OpenError {
+    /// Whether nobody took the connection, as for a moment at a server that still lets go of the one before.
+    pub fn is_refused(&self) -> bool {
+        use io::ErrorKind::{ConnectionAborted, ConnectionRefused, ConnectionReset};
+        let refused = [ConnectionAborted, ConnectionRefused, ConnectionReset];
+        matches!(self, OpenError::Tcp { reason, .. } if refused.contains(&reason.kind()))
+    }
+}
+
 /// The port is gone: the bus closes it and opens it anew.
 #[derive(Debug, thiserror::Error)]
-#[error("the port is lost: {0}")]
-pub struct Lost(pub String);
+#[error("the port is lost: {why}")]
+pub struct Lost {
+    /// What the system says.
+    pub why: String,
+    /// A device server closed its connection, which some do after each reply or after a pause.
+    pub closed: bool,
+}
+
+impl Lost {
+    /// Of a serial port: an adapter that is unplugged reads end of file.
+    fn of_adapter(self) -> Lost {
+        Lost { closed: false, ..self }
+    }
+
+    fn new(why: impl Into<String>) -> Lost {
+        let (why, closed) = (why.into(), false);
+        Lost { why, closed }
+    }
+
+    fn of(error: rustix::io::Errno) -> Lost {
+        let closed = matches!(error, rustix::io::Errno::CONNRESET | rustix::io::Errno::PIPE);
+        Lost {
+            closed,
+            ..Lost::new(error.to_string())
+        }
+    }
+}
 
 /// What ended a wait.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -190,7 +224,8 @@ impl Line {
     /// When the port is gone or does not take the frame within 100 ms.
     pub fn send(&self, frame: &[u8]) -> Result<(), Lost> {
         match &self.port {
-            Port::Serial(_) | Port::Tcp(_) => write_all(self.fd(), frame),
+            Port::Serial(fd) => write_all(fd.as_fd(), frame).map_err(Lost::of_adapter),
+            Port::Tcp(raw) => write_all(raw.stream.as_fd(), frame),
             Port::Rfc2217(remote) => remote.send(frame),
         }
     }
@@ -201,7 +236,7 @@ impl Line {
     /// When the port is gone (an unplugged adapter reads end of file or EIO), or turns out to be a telnet port.
     pub fn receive(&self, buffer: &mut [u8]) -> Result<usize, Lost> {
         match &self.port {
-            Port::Serial(fd) => read(fd.as_fd(), buffer),
+            Port::Serial(fd) => read(fd.as_fd(), buffer).map_err(Lost::of_adapter),
             Port::Tcp(raw) => {
                 let count = read(raw.stream.as_fd(), buffer)?;
                 raw.look_at(buffer.get(..count).unwrap_or_default())?;
@@ -280,11 +315,11 @@ fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
             Err(rustix::io::Errno::INTR) => {}
             Err(rustix::io::Errno::AGAIN) => {
                 if Instant::now() >= deadline {
-                    return Err(Lost("it takes no more bytes".to_string()));
+                    return Err(Lost::new("it takes no more bytes"));
                 }
                 poll_port(&mut [PollFd::from_borrowed_fd(port, PollFlags::OUT)], deadline)?;
             }
-            Err(error) => return Err(Lost(error.to_string())),
+            Err(error) => return Err(Lost::of(error)),
         }
     }
     Ok(())
@@ -293,10 +328,13 @@ fn write_all(port: BorrowedFd<'_>, mut bytes: &[u8]) -> Result<(), Lost> {
 /// Reads what is there; 0 is nothing.
 fn read(port: BorrowedFd<'_>, buffer: &mut [u8]) -> Result<usize, Lost> {
     match rustix::io::read(port, buffer) {
-        Ok(0) => Err(Lost("it reads end of file".to_string())),
+        Ok(0) => Err(Lost {
+            closed: true,
+            ..Lost::new("it reads end of file")
+        }),
         Ok(count) => Ok(count),
         Err(rustix::io::Errno::AGAIN | rustix::io::Errno::INTR) => Ok(0),
-        Err(error) => Err(Lost(error.to_string())),
+        Err(error) => Err(Lost::of(error)),
     }
 }
 
@@ -312,7 +350,7 @@ pub fn wait_without_port(until: Instant, wake: BorrowedFd<'_>, arrival: Option<&
 }
 
 fn poll_port(fds: &mut [PollFd<'_>], until: Instant) -> Result<bool, Lost> {
-    poll_until(fds, until).map_err(|error| Lost(error.to_string()))
+    poll_until(fds, until).map_err(|error| Lost::new(error.to_string()))
 }
 
 fn connect(names: &mut Names, port: &str, address: &str, go_on: &dyn Fn() -> bool) -> Result<TcpStream, OpenError> {

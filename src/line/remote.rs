@@ -49,9 +49,8 @@ impl Raw {
             None => self.first.set(Some((first, count))),
             Some(false) => self.first.set(None),
             Some(true) => {
-                return Err(Lost(
-                    "the device server speaks telnet on this port; write rfc2217:// instead of tcp://, or the server's raw TCP port"
-                        .to_string(),
+                return Err(Lost::new(
+                    "the device server speaks telnet on this port; write rfc2217:// instead of tcp://, or the server's raw TCP port",
                 ));
             }
         }
@@ -84,7 +83,7 @@ impl Remote {
         let (session, first) = Session::new(settings);
         let session = RefCell::new(session);
         let remote = Remote { stream, session };
-        write_all(remote.stream.as_fd(), &first).map_err(|Lost(why)| failed(why))?;
+        write_all(remote.stream.as_fd(), &first).map_err(|lost| failed(lost.why))?;
         let until = Instant::now() + NEGOTIATION;
         let mut buffer = [0; 512];
         loop {
@@ -106,9 +105,9 @@ impl Remote {
                 }
             }
             let mut fds = [PollFd::from_borrowed_fd(remote.stream.as_fd(), PollFlags::IN)];
-            poll_port(&mut fds, until.min(Instant::now() + STEP)).map_err(|Lost(why)| failed(why))?;
+            poll_port(&mut fds, until.min(Instant::now() + STEP)).map_err(|lost| failed(lost.why))?;
             // What the line said before it was set up is of no use.
-            remote.receive(&mut buffer).map_err(|Lost(why)| failed(why))?;
+            remote.receive(&mut buffer).map_err(|lost| failed(lost.why))?;
         }
         let (took, asked) = (remote.session.borrow().took(), settings.format.to_string());
         let warnings = match took == asked {
@@ -132,7 +131,7 @@ impl Remote {
         let mut session = self.session.borrow_mut();
         let replies = session.take(buffer.get(..count).unwrap_or_default(), &mut data);
         if let State::Refused(why) = session.state() {
-            return Err(Lost((*why).to_string()));
+            return Err(Lost::new(*why));
         }
         write_all(self.stream.as_fd(), &replies)?;
         // The data is never longer than what it was decoded from.

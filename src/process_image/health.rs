@@ -65,6 +65,8 @@ pub struct BusHealth {
     pub foreign: u64,
     /// Times the port was opened.
     pub opened: u64,
+    /// Times that a device server closed its connection after it had answered by it, and was connected to again at once.
+    pub reconnects: u64,
     /// On a line that another master owns: addresses that answer it and have no entry in the configuration; `None` where the
     /// gateway is the master.
     pub unknown: Option<Vec<u8>>,

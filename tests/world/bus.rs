@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use drivegate::bus::BusOptions;
-use drivegate::bus::core::{Action, BusCore};
+use drivegate::bus::core::{Action, BusCore, Closed};
 use drivegate::bus::master::{Handover, Purpose};
 use drivegate::bus::predict::predict;
 use drivegate::codec::wire::Silence;
@@ -88,6 +88,8 @@ pub struct Parts {
     pub flips: f64,
     pub delivery: Delivery,
     pub silence: Silence,
+    /// How many times as fast the line is as its baud rate says.
+    pub wire_speed: u32,
 }
 
 impl Parts {
@@ -113,6 +115,7 @@ impl Parts {
             flips: line.flips,
             delivery: Delivery::Whole,
             silence: Silence::Spec,
+            wire_speed: 1,
             profile,
         }
     }
@@ -140,7 +143,8 @@ impl WorldBus {
         let specs: Vec<DriveSpec> = handle.image.drives.iter().map(|drive| drive.spec.clone()).collect();
         let predicted = predict(&handle.image.spec, parts.silence, &specs);
         let (round, slow_round) = (predicted.fast_cycle, predicted.slow_cycle);
-        let mut rules = LineRules::of(line.protocol, format);
+        let wire_format = LineFormat::new(line.baud * parts.wire_speed, line.format).unwrap();
+        let mut rules = LineRules::of(line.protocol, wire_format);
         rules.turnaround = line.turnaround;
         rules.delivery = parts.delivery;
         let slaves = Slaves::new(parts.drives, Duration::ZERO);
@@ -255,6 +259,24 @@ impl WorldBus {
             self.wire.cut();
             self.core.lost("the adapter is gone", now);
         }
+    }
+
+    /// The device server closes its connection; what is on the line then may be lost. The bus does what its thread would.
+    pub fn close(&mut self, lose_reply: bool, now: Instant) -> Closed {
+        if lose_reply {
+            self.wire.cut();
+        }
+        let closed = self.core.closed();
+        match closed {
+            Closed::Reconnect | Closed::ReconnectToAsk => self.core.reconnected(),
+            Closed::Lost => {
+                self.core.lost("the device server closed the connection", now);
+                self.core.opened(now);
+                (self.asked, self.ended) = (None, None);
+            }
+        }
+        (self.until, self.commands) = (now, true);
+        closed
     }
 
     /// Lets the bus go on as far as it can at `now`.

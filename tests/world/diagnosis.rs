@@ -133,6 +133,10 @@ fn cases() -> Vec<Case> {
             |_, seed| plan("needs-pause:12ms=0.3", seed),
             |_| vec![(Cause::SilenceTooShort, 0)],
         ),
+        Case {
+            parts: |parts| parts.wire_speed = 3,
+            ..case("another baud", nothing, |_| vec![(Cause::FasterThanBaud, 0)])
+        },
         case(
             "silent",
             |_, seed| plan("deaf=1", seed),

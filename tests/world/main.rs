@@ -17,6 +17,7 @@
 
 mod bus;
 mod clients;
+mod connection;
 mod cost;
 mod diagnosis;
 mod drives;

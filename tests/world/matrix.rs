@@ -70,6 +70,7 @@ fn rig(protocol: Protocol, delivery: Delivery, data: &[(u16, u16)]) -> Rig {
         drives: (1..=DRIVES).map(drive).collect(),
         faults: FaultPlan::default(),
         flips: 0.0,
+        wire_speed: 1,
         delivery,
         silence: if protocol == Protocol::N2 {
             Silence::Spec

@@ -8,6 +8,7 @@ use std::time::{Duration, Instant};
 use super::commands::{Commanded, Commands};
 use super::decoder::{Decoder, Exchange, Heard};
 use crate::bus::BusOptions;
+use crate::bus::core::Closed;
 use crate::bus::news::News;
 use crate::bus::report::Report;
 use crate::bus::transaction::Ended;
@@ -51,6 +52,8 @@ pub struct ListenCore {
     /// Reads of process data in this round of the other master, and when it began.
     round: (Vec<(usize, Table, u16)>, Option<Instant>),
     heard: Vec<Heard>,
+    /// Something was heard since the port was opened or connected to anew.
+    heard_any: bool,
 }
 
 impl ListenCore {
@@ -82,12 +85,14 @@ impl ListenCore {
             retries: options.retries,
             round: (Vec::new(), None),
             heard: Vec::new(),
+            heard_any: false,
         }
     }
 
     /// The port was opened.
     pub fn opened(&mut self, now: Instant) {
         self.decoder = decoder(&self.bus);
+        self.heard_any = false;
         for known in &mut self.drives {
             (known.unanswered, known.heard) = (0, now);
         }
@@ -95,6 +100,20 @@ impl ListenCore {
         self.report.bus_up(now);
         self.bus.image.update_health(|health| health.unknown = Some(Vec::new()));
         self.refuse_all(now);
+    }
+
+    /// A device server closed the connection. Where something was heard by it, it is connected to again at once.
+    pub fn closed(&mut self) -> Closed {
+        match std::mem::take(&mut self.heard_any) {
+            true => Closed::Reconnect,
+            false => Closed::Lost,
+        }
+    }
+
+    /// It was connected to again: what was said in between is not known.
+    pub fn reconnected(&mut self) {
+        self.decoder = decoder(&self.bus);
+        self.report.reconnected();
     }
 
     /// The port is gone or cannot be opened.
@@ -116,6 +135,7 @@ impl ListenCore {
 
     /// Bytes came in at `now`.
     pub fn on_bytes(&mut self, bytes: &[u8], now: Instant) {
+        self.heard_any |= !bytes.is_empty();
         let mut heard = std::mem::take(&mut self.heard);
         self.decoder.on_bytes(bytes, now, &mut heard);
         self.take(&mut heard, now);

@@ -7,7 +7,7 @@ use super::{Master, Purpose, Turn, TurnEnd};
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::Admission;
-use crate::bus::transaction::Ended;
+use crate::bus::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Refusal, Urgency, written};
@@ -295,7 +295,9 @@ impl Master {
     fn background_outcome(&mut self, turn: &Turn, end: TurnEnd, now: Instant) -> Outcome {
         let reply = match end.ended {
             // The drive did not look at it.
-            Ended::Silent | Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => return Outcome::TimedOut,
+            Ended::Silent
+            | Ended::Corrupt(CONNECTION_CLOSED)
+            | Ended::Reply(Reply::Exception(Exception::N2_RESTARTED)) => return Outcome::TimedOut,
             Ended::Corrupt(_) => return Outcome::Garbled,
             Ended::Reply(Reply::Exception(code)) if turn.pdu.is_write() => return Outcome::of_exception(code),
             Ended::Reply(Reply::Exception(code)) => return Outcome::Exception(code),

@@ -7,7 +7,7 @@ use crate::bus::command_run::{Step, StepPurpose};
 use crate::bus::n2_session::Progress;
 use crate::bus::news::News;
 use crate::bus::schedule::{Change, Poll, Polled};
-use crate::bus::transaction::{Ended, MAY_BE_LATE};
+use crate::bus::transaction::{CONNECTION_CLOSED, Ended, MAY_BE_LATE};
 use crate::codec::n2::Session;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Outcome, Pace, Urgency, is_range_end, is_reference, written};
@@ -325,6 +325,7 @@ impl Master {
             return;
         }
         let (how, silent) = match ended {
+            Ended::Corrupt(CONNECTION_CLOSED) => (Outcome::TimedOut, false),
             Ended::Corrupt(_) => (Outcome::Garbled, false),
             Ended::Reply(reply @ Reply::Exception(code)) if step.pdu.is_write() => {
                 (Outcome::Unknown(*code), says_no_answer(reply))
@@ -334,7 +335,12 @@ impl Master {
         if slot == Urgency::Stop && silent {
             drive.vain_stops.not_answered(took);
         }
-        let retries = if online { self.retries } else { 0 };
+        let retries = match *ended {
+            // The request may never have reached the drive, which is no sign of it.
+            Ended::Corrupt(CONNECTION_CLOSED) => self.retries.max(1),
+            _ if online => self.retries,
+            _ => 0,
+        };
         let outcome = drive.run(slot).and_then(|run| run.failed(step, how, retries));
         if let Some(outcome) = outcome {
             drive.end(slot, &outcome, image, now);

@@ -234,6 +234,7 @@ pub(super) struct Bus<'b> {
     outcomes: Outcomes,
     foreign_frames: u64,
     opened: u64,
+    reconnects: u64,
     queue_depth: usize,
     /// On a line that another master owns: addresses that answer it and have no entry.
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -286,6 +287,7 @@ impl<'b> Bus<'b> {
             outcomes: Outcomes::new(|outcome| image.drives.iter().map(|d| d.counted(outcome)).sum()),
             foreign_frames: health.foreign,
             opened: health.opened,
+            reconnects: health.reconnects,
             unknown_drives: health.unknown,
             queue_depth: handle.queue.lock().len(),
         }

@@ -332,13 +332,19 @@ fn buses(handles: &[BusHandle], all: &mut Families) {
         "drivegate_bus_queue_depth",
         "Commands and forwarded reads that wait for the bus.",
     );
+    let reconnects = all.family(
+        Kind::Counter,
+        "drivegate_port_reconnects_total",
+        "Times that a device server closed its connection after replies, and was connected to again at once.",
+    );
     let diagnosis = all.family(
         Kind::Gauge,
         "drivegate_line_diagnosis",
         "What is wrong with the line: 1 for each verdict that holds; drive is empty where it is about the whole line.",
     );
-    for (labels, handle, _) in looks {
+    for (labels, handle, health) in looks {
         let image = &handle.image;
+        all.add(reconnects, labels.clone(), SeriesValue::Count(health.reconnects));
         for verdict in &image.diagnosis.load().verdicts {
             let drive = verdict.drive.clone().unwrap_or_default();
             let labels = labels.with_both(("drive", drive.into()), ("verdict", verdict.verdict.name().into()));

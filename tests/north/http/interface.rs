@@ -283,7 +283,7 @@ async fn buses() {
             "name": "line1", "port": "/dev/ttyUSB-line1", "protocol": "modbus-rtu", "baud": 38400, "format": "8N1",
             "state": "up", "tried": true, "since": "…", "drives": 3, "online": 1, "load_ratio": 0.4375,
             "fast": class(10.0, 12.5, 800), "slow": class(1000.0, 1000.0, 10), "transactions": 3, "errors": 1,
-            "outcomes": {"ok": 2, "exception": 0, "timeout": 1, "corrupt": 0}, "foreign_frames": 0, "opened": 1,
+            "outcomes": {"ok": 2, "exception": 0, "timeout": 1, "corrupt": 0}, "foreign_frames": 0, "opened": 1, "reconnects": 0,
             "queue_depth": 0,
         })
     );
