@@ -7,15 +7,18 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use crate::command::{Answer, Outcome};
+use crate::command::{Answer, Outcome, joined};
 
 /// An order that is in the queue of its bus, or was answered already. Nothing here needs a runtime: who has a task waits
 /// with [`Placed::answered`], who has none asks now and then with [`Placed::answer`]. Dropping it takes nothing back.
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
+    /// Of an order that stops and does more: of its stop.
     answer: Arriving<Answer>,
     confirmation: Arriving<Duration>,
+    /// Of its rest.
+    rest: Option<(Arriving<Answer>, Arriving<Duration>)>,
 }
 
 impl Placed {
@@ -28,7 +31,18 @@ impl Placed {
             accepted,
             answer: Arriving::Awaited(answer),
             confirmation: Arriving::Awaited(confirmation),
+            rest: None,
         }
+    }
+
+    /// The same for an order of which that was the stop: the one answer tells what became of both parts.
+    pub(super) fn with_rest(
+        mut self,
+        answer: oneshot::Receiver<Answer>,
+        confirmation: oneshot::Receiver<Duration>,
+    ) -> Placed {
+        self.rest = Some((Arriving::Awaited(answer), Arriving::Awaited(confirmation)));
+        self
     }
 
     /// When the order was taken.
@@ -48,13 +62,22 @@ impl Placed {
 
     /// As [`Placed::answered`], for whoever waits for several things.
     pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
-        self.answer.poll(cx).map(|answer| {
-            // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
-            answer.unwrap_or(Answer {
-                outcome: Outcome::ShuttingDown,
-                latency: Duration::ZERO,
-            })
-        })
+        let stop = answer_of(&mut self.answer, cx);
+        let Some((rest, _)) = &mut self.rest else { return stop };
+        let rest = answer_of(rest, cx);
+        let latency = |part: &Poll<Answer>| match part {
+            Poll::Ready(answer) => answer.latency,
+            Poll::Pending => Duration::ZERO,
+        };
+        let latency = latency(&stop).max(latency(&rest));
+        let outcome = |part: Poll<Answer>| match part {
+            Poll::Ready(answer) => Some(answer.outcome),
+            Poll::Pending => None,
+        };
+        match joined(outcome(stop), outcome(rest)) {
+            Some(outcome) => Poll::Ready(Answer { outcome, latency }),
+            None => Poll::Pending,
+        }
     }
 
     /// Waits further for the read that shows the effect: the time from acceptance to it, or `None` when the order was
@@ -73,8 +96,23 @@ impl Placed {
 
     /// As [`Placed::confirmation`], for whoever waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
-        self.confirmation.poll(cx)
+        let stop = self.confirmation.poll(cx);
+        let Some((_, rest)) = &mut self.rest else { return stop };
+        match (stop, rest.poll(cx)) {
+            (Poll::Ready(stop), Poll::Ready(rest)) => Poll::Ready(stop.zip(rest).map(|(stop, rest)| stop.max(rest))),
+            _ => Poll::Pending,
+        }
     }
+}
+
+fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answer> {
+    arriving.poll(cx).map(|answer| {
+        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        answer.unwrap_or(Answer {
+            outcome: Outcome::ShuttingDown,
+            latency: Duration::ZERO,
+        })
+    })
 }
 
 /// What arrives once, for whoever asks, as often as they ask.
