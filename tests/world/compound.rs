@@ -78,7 +78,7 @@ fn the_stop_goes_first_and_the_rest_behind_it() {
             last.iter()
                 .any(|line| line.contains(&format!("\"command\":\"{command}\"")))
         };
-        assert!(has("run=false") && has("speed_reference=30"), "{last:?}");
+        assert!(has("run=0") && has("speed_reference=30"), "{last:?}");
     }
 }
 

@@ -44,7 +44,7 @@ impl CommandContext {
 /// Translates a write of `values` from `start` on for a drive of that family.
 ///
 /// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored. A word without run
-/// stops the drive, whatever is wrong with the word or the rest.
+/// stops the drive, whatever is wrong with the rest.
 ///
 /// # Errors
 /// An address that is not writable or that the family lacks; else an invalid value.
@@ -57,7 +57,8 @@ pub(crate) fn command(
     understood(profile, start, values, before).or_else(|refusal| {
         let place = COMMAND_WORD.checked_sub(start).map(usize::from);
         let word = place.and_then(|place| values.get(place)).copied();
-        let stop = word.filter(|word| word & RUN == 0);
+        // A word with bits that mean nothing says nothing.
+        let stop = word.filter(|word| word & (RUN | !(RUN | REVERSE | FAULT_RESET)) == 0);
         let (Some(word), Ok(run)) = (stop, writable(profile, ModelPoint::Run)) else {
             return Err(refusal);
         };
