@@ -13,8 +13,8 @@ use tokio::sync::oneshot;
 
 use crate::codec::{RequestPdu, Table, describe};
 use crate::command::{
-    self, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Order, Origin, Outcome, Pace, Refusal,
-    Ticket, Urgency, WriteStats,
+    self, Admitted, Answer, Authority, BackgroundRequest, Change, Command, CommandQueue, Order, Origin, Outcome, Pace,
+    Parts, Refusal, StopEnd, Ticket, Urgency, WriteStats,
 };
 use crate::drive::parameters::RawValue;
 use crate::drive::why::Explanation;
@@ -292,36 +292,140 @@ impl DriveHandle {
     /// before, or answered: refused when it is not admitted, not sent when the bus is down or the drive offline.
     ///
     /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused writes
-    /// are audited and published as an event.
+    /// are audited and published as an event. Of an order that stops and does more, the stop is carried out whatever becomes of
+    /// the rest; it is audited as two.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
+        let reading = self.reading(now);
+        match Parts::of(order.clone(), &self.image.spec.profile) {
+            Parts::Two(stop, rest) if self.may_go(&stop, &reading, authority) => {
+                let what = self.describe(&rest);
+                self.place_parts(stop, (&what, Ok(rest)), origin, authority, expiry, now)
+            }
+            Parts::Two(..) => self.place_one(order, origin, authority, expiry, now),
+            Parts::One(order) => self.place_one(order, origin, authority, expiry, now),
+        }
+    }
+
+    /// As [`DriveHandle::place`] for an order whose stop was understood and whose rest, `what`, is refused.
+    pub fn place_stop(
+        &self,
+        stop: Order,
+        (what, refusal): (&str, Refusal),
+        origin: Origin,
+        authority: Authority,
+        expiry: Duration,
+        now: Instant,
+    ) -> Placed {
+        if !self.may_go(&stop, &self.reading(now), authority) {
+            return self.place_one(stop, origin, authority, expiry, now);
+        }
+        self.place_parts(stop, (what, Err(refusal)), origin, authority, expiry, now)
+    }
+
+    /// Whether a stop goes to the bus.
+    fn may_go(&self, stop: &Order, reading: &Reading<'_>, authority: Authority) -> bool {
+        self.bus_up() && command::admit(stop.clone(), reading, authority).is_ok()
+    }
+
+    fn place_one(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
         let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
-        let name = &self.image.spec.name;
-        let (ticket, answer) = Ticket::new(origin, name, what.clone(), write, now, self.writes.clone());
-        let mut ticket = ticket.with_changes(changes(&reading, &order));
+        let (mut ticket, answer) = self.ticket(&what, changes(&reading, &order), origin, write, now);
         let placed = Placed::new(now, answer, ticket.confirmation());
-        match command::admit(order, &reading, authority) {
-            Err(Refusal::NotKnown(_)) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
-            Err(Refusal::NotKnown(_)) if !reading.snapshot.link.is_online() => ticket.answer(Outcome::Offline, now),
-            Err(refusal) => {
-                // Reads that nothing answers are no commands.
-                if write {
-                    self.publish_refusal(&what, &refusal, ticket.origin(), now);
-                }
-                ticket.answer(Outcome::Refused(refusal), now);
-            }
-            Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
-            // A stop goes to a drive that does not answer too: it may be back.
-            Ok(admitted) if !reading.snapshot.link.is_online() && admitted.urgency != Urgency::Stop => {
-                ticket.answer(Outcome::Offline, now);
-            }
+        match self.judge(order, &reading, authority) {
+            Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
             Ok(admitted) => {
                 let command = Command::new(self.index, admitted, now + expiry, ticket);
                 self.bus.queue.submit(command, now);
             }
         }
         placed
+    }
+
+    /// The stop of an order goes to the bus, and its rest behind it unless it is refused.
+    fn place_parts(
+        &self,
+        stop: Order,
+        (what, rest): (&str, Result<Order, Refusal>),
+        origin: Origin,
+        authority: Authority,
+        expiry: Duration,
+        now: Instant,
+    ) -> Placed {
+        let reading = self.reading(now);
+        let end = StopEnd::default();
+        let sets = changes(&reading, &stop);
+        let (ticket, answer) = self.ticket(&self.describe(&stop), sets, origin.clone(), true, now);
+        let mut ticket = ticket.with_rest(end.clone());
+        let placed = Placed::new(now, answer, ticket.confirmation());
+        // The stop is the other part's, also where a block repeats it.
+        let mut sets = rest
+            .as_ref()
+            .map_or_else(|_| Vec::new(), |order| changes(&reading, order));
+        sets.iter_mut().for_each(|change| change.run = None);
+        let (mut rest_ticket, rest_answer) = self.ticket(what, sets, origin, true, now);
+        let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
+        let stop = match self.judge(stop, &reading, authority) {
+            Ok(admitted) => Command::new(self.index, admitted, now + expiry, ticket),
+            Err(outcome) => {
+                self.turn_away(ticket, what, outcome, true, now);
+                rest_ticket.answer(Outcome::NotStopped, now);
+                return placed;
+            }
+        };
+        let judged = match rest {
+            Ok(order) => self.judge(order, &reading, authority),
+            Err(refusal) => Err(Outcome::Refused(refusal)),
+        };
+        match judged {
+            Ok(admitted) => {
+                let rest = Command::new(self.index, admitted, now + expiry, rest_ticket).behind(end);
+                self.bus.queue.submit_parts(stop, rest, now);
+            }
+            Err(outcome) => {
+                self.bus.queue.submit(stop, now);
+                self.turn_away(rest_ticket, what, outcome, true, now);
+            }
+        }
+        placed
+    }
+
+    fn ticket(
+        &self,
+        what: &str,
+        sets: Vec<Change>,
+        origin: Origin,
+        write: bool,
+        now: Instant,
+    ) -> (Ticket, oneshot::Receiver<Answer>) {
+        let name = &self.image.spec.name;
+        let (ticket, answer) = Ticket::new(origin, name, what.to_string(), write, now, self.writes.clone());
+        (ticket.with_changes(sets), answer)
+    }
+
+    /// What becomes of an order at once: why it is not sent, or that it may be.
+    fn judge(&self, order: Order, reading: &Reading<'_>, authority: Authority) -> Result<Admitted, Outcome> {
+        let online = reading.snapshot.link.is_online();
+        match command::admit(order, reading, authority) {
+            Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
+            Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
+            Err(refusal) => Err(Outcome::Refused(refusal)),
+            Ok(_) if !self.bus_up() => Err(Outcome::BusDown),
+            // A stop goes to a drive that does not answer too: it may be back.
+            Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
+            Ok(admitted) => Ok(admitted),
+        }
+    }
+
+    /// Answers an order that is not sent. Reads that nothing answers are no commands, and no event.
+    fn turn_away(&self, ticket: Ticket, what: &str, outcome: Outcome, write: bool, now: Instant) {
+        if let Outcome::Refused(refusal) = &outcome
+            && write
+        {
+            self.publish_refusal(what, refusal, ticket.origin(), now);
+        }
+        ticket.answer(outcome, now);
     }
 
     /// Asks the drive for something at the lowest rank, at `now`; nothing is sent later than `expiry` from now. What came of

@@ -1,5 +1,6 @@
 //! A command on its way through the line, step by step: control words from the known ones, pulses, safe order. Pure.
 
+mod functions;
 mod known_words;
 mod parameter;
 mod steps;
@@ -10,10 +11,11 @@ use std::time::{Duration, Instant};
 pub use self::known_words::KnownWords;
 pub use self::steps::{Step, StepPurpose};
 
+use self::functions::other;
 use self::parameter::{ParameterRun, Then};
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
-use crate::codec::{Exception, Reply, RequestPdu};
+use crate::codec::{Exception, Reply, RequestPdu, Table};
 use crate::command::{Command, Interruption, Order, Outcome, Receipt, Refusal, SourceKind, Ticket, Urgency};
 use crate::drive::Profile;
 
@@ -89,6 +91,10 @@ pub struct CommandRun {
     /// What the drive last said of its motor.
     running: bool,
     check: Check,
+    /// The drive refused the function by which its present step was written: the other one is tried.
+    by_other_function: bool,
+    /// The register, or coil, of the run command.
+    control: Option<(Table, u16)>,
     /// The drive's own word cannot be read: bits that the command does not set are written as 0.
     blind: bool,
     /// It waited for a late reply since its last step was chosen.
@@ -169,6 +175,8 @@ impl CommandRun {
             reached_the_wire: false,
             running: true,
             check: Check::NotYet,
+            by_other_function: false,
+            control: profile.run_bit().map(|(raw, ..)| (raw.table, raw.address)),
             blind: false,
             held_up: false,
             waits_for_late: false,
@@ -253,9 +261,16 @@ impl CommandRun {
                 blind: self.blind,
                 names_run: self.scope.names_run,
                 running,
+                masks: words.functions.masks(profile),
             };
             match step_of(action, words, profile, known) {
-                Some(step) => return Next::Send(step),
+                Some(mut step) => {
+                    step.pdu = words.functions.form(step.pdu, profile);
+                    if let Some(other) = other(&step.pdu).filter(|_| self.by_other_function) {
+                        step.pdu = other;
+                    }
+                    return Next::Send(step);
+                }
                 // Nothing to take away: the pulse starts at once, without the pause behind. Nothing to change: nothing is
                 // overridden that would have to be released.
                 None => {
@@ -299,16 +314,32 @@ impl CommandRun {
         }
     }
 
-    /// Whether it sets a parameter and the drive just said that its motor stands: the write goes next on the line.
+    /// Whether it sets a parameter and the drive just said that its motor stands, or a bit of settings that the drive just
+    /// told: the write goes next on the line.
     pub fn is_checked(&mut self) -> bool {
-        self.parameter().is_some_and(|run| run.is_checked())
+        let settings = self.check == Check::Read && self.settings().is_some();
+        settings || self.parameter().is_some_and(|run| run.is_checked())
     }
 
-    /// Something else goes on the line: whether the motor runs is asked again before a parameter is written.
+    /// Something else goes on the line: whether the motor runs is asked again before a parameter is written, and what
+    /// other settings a register holds.
     pub fn others_go_first(&mut self) {
+        if self.settings().is_some() {
+            self.check = Check::NotYet;
+        }
         if let Some(run) = self.parameter() {
             run.check_again();
         }
+    }
+
+    /// The register of the present step if that changes one bit of it and leaves other settings as the drive has them.
+    fn settings(&self) -> Option<(Table, u16)> {
+        let raw = match self.actions.front()? {
+            Action::Bits { raw, .. } | Action::PulseLow { raw, .. } | Action::PulseHigh { raw, .. } => raw,
+            _ => return None,
+        };
+        let place = (raw.table, raw.address);
+        (raw.table == Table::Holding && self.control != Some(place)).then_some(place)
     }
 
     /// Whether the drive showed its effect before it was acknowledged.
@@ -384,6 +415,7 @@ impl CommandRun {
     fn pop(&mut self) {
         self.actions.pop_front();
         self.check = Check::NotYet;
+        self.by_other_function = false;
     }
 
     /// Its time ran out, and what is left of it was not cut off yet.
@@ -393,6 +425,13 @@ impl CommandRun {
 
     /// The drive answered the step that [`CommandRun::next`] gave. The outcome, when the command is over.
     pub fn answered(&mut self, step: &Step, reply: Reply, words: &mut KnownWords) -> Option<Outcome> {
+        if reply == Reply::Exception(Exception::FUNCTION) && self.has_another_function(step, words) {
+            return None;
+        }
+        if self.by_other_function && step.pdu.is_write() && reply != Reply::Exception(Exception::FUNCTION) {
+            words.functions.took(&step.pdu);
+            self.by_other_function = false;
+        }
         if self.parameter().is_some() {
             return self.parameter_answered(step, &reply, words);
         }
@@ -460,6 +499,18 @@ impl CommandRun {
         matches!(self.actions.front(), Some(Action::PulseEnd { .. }))
     }
 
+    /// The drive does not know the function of a write. Whether there is another one to try, once; nothing can stop a drive
+    /// that takes only functions 15 and 16 otherwise.
+    fn has_another_function(&mut self, step: &Step, words: &mut KnownWords) -> bool {
+        if matches!(step.pdu, RequestPdu::MaskWrite { .. }) {
+            words.functions.refused(&step.pdu);
+            return true;
+        }
+        let tries = step.purpose == StepPurpose::Execute && other(&step.pdu).is_some() && !self.by_other_function;
+        self.by_other_function |= tries;
+        tries
+    }
+
     fn parameter_answered(&mut self, step: &Step, reply: &Reply, words: &mut KnownWords) -> Option<Outcome> {
         if step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
             words.written(&step.pdu);
@@ -484,6 +535,12 @@ impl CommandRun {
     }
 
     fn word_refused(&mut self, step: &Step, code: Exception, words: &KnownWords) -> Option<Outcome> {
+        if let Some((table, address)) = self.settings()
+            && words.is_reported(table, address)
+        {
+            // It reported its settings before: what was read then is no longer what it has.
+            return Some(Outcome::Exception(code));
+        }
         let kept_back = [Exception::FUNCTION, Exception::ADDRESS, Exception::VALUE].contains(&code);
         let known = matches!(&step.pdu, RequestPdu::Read { table, start, .. } if words.get(*table, *start).is_some());
         if self.goes_on(kept_back && known) {
@@ -525,6 +582,7 @@ impl CommandRun {
                 self.check = Check::InVain;
                 return None;
             }
+            StepPurpose::ReadWord if self.settings().is_some() => return over.then(|| self.without_answer()),
             StepPurpose::ReadWord if self.goes_on(false) => return None,
             StepPurpose::ReadWord if over || self.urgency == Urgency::Stop => {
                 return self.without_word(self.tries.unanswered.clone());

@@ -291,6 +291,17 @@ fn bus_text(bus: &BusSettings, settings: &Settings) -> String {
         + &memory(bus, &settings.recordings)
         + &slots(bus, settings)
         + &raw_writes(bus, settings)
+        + &functions(bus)
+}
+
+/// The functions by which drives that may be commanded are written where they are not the usual ones.
+fn functions(bus: &BusSettings) -> String {
+    let controlled = bus.drives.iter().filter(|drive| drive.access == Access::Control);
+    let line = |drive: &DriveSpec| {
+        let notes = drive.profile.functions.notes();
+        (!notes.is_empty()).then(|| format!("  writes      {}: {}\n", drive.name, notes.join("; ")))
+    };
+    controlled.filter_map(line).collect()
 }
 
 /// Where tools reach the line, one line a slot.

@@ -119,6 +119,7 @@ fn show(profile: &Profile) -> String {
             "addresses",
             format!("{} to {}", profile.addresses.start(), profile.addresses.end()),
         ),
+        ("writes", profile.functions.notes().join("; ")),
         (
             "turnaround",
             format!("{}, for the prediction only", format_duration(profile.turnaround)),

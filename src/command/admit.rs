@@ -510,13 +510,13 @@ fn raw_values(drive: &Reading<'_>, table: Table, items: &[(u16, u16)]) -> Result
     Ok(ranges)
 }
 
-/// Whether a raw write takes the run command away.
+/// Whether a raw write takes the run command away and does nothing else. One of several items is judged as any other
+/// command: its stop was taken out of it before ([`super::Parts`]).
 fn stops(drive: &Reading<'_>, pdu: &RequestPdu) -> bool {
     let profile = &drive.spec.profile;
-    written(pdu).is_some_and(|(table, items)| {
-        items
-            .iter()
-            .any(|(address, value)| profile.is_stop(table, *address, *value))
+    written(pdu).is_some_and(|(table, items)| match items.as_slice() {
+        [(address, value)] => profile.is_stop(table, *address, *value),
+        _ => false,
     })
 }
 

@@ -10,6 +10,7 @@
 mod admit;
 mod audit;
 mod background;
+mod compound;
 mod frequency_range;
 mod parameter;
 mod queue;
@@ -22,6 +23,7 @@ pub(crate) use audit::{SENT, milliseconds, milliseconds_or_null};
 pub use background::{
     BACKGROUND_CAPACITY, BACKGROUND_PER_CLIENT, Background, BackgroundRequest, NO_DRIVE, Pace, PassedOn,
 };
+pub use compound::{Parts, StopEnd, joined, stop_of};
 pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
@@ -210,6 +212,8 @@ pub struct Command {
     pub ticket: Ticket,
     /// Those who wait for the same stop, and until when.
     pub joined: Vec<(Ticket, Instant)>,
+    /// It is the rest of an order whose stop goes before it, and is not sent if that fails.
+    pub behind: Option<StopEnd>,
     /// Younger commands that went before it.
     pub overtaken: usize,
     /// Its number in the queue.
@@ -228,9 +232,16 @@ impl Command {
             expires,
             ticket,
             joined: Vec::new(),
+            behind: None,
             overtaken: 0,
             number: 0,
         }
+    }
+
+    /// The same as the rest of an order, behind its stop.
+    pub fn behind(mut self, stop: StopEnd) -> Command {
+        self.behind = Some(stop);
+        self
     }
 
     /// Answers whoever gave it and all who joined.
@@ -283,6 +294,12 @@ pub enum Outcome {
     NotTaken(String),
     /// It was begun and did not come to its end: whether the drive took it, or a part of it, is not known.
     Interrupted(Interruption),
+    /// The rest of an order whose stop failed; not sent.
+    NotStopped,
+    /// Of an order that stops and does more, the drive acknowledged the stop; what became of the rest.
+    StopOnly(Box<Outcome>),
+    /// Of such an order the stop failed, in that way, and the rest was not sent.
+    StopFailed(Box<Outcome>),
     /// The port is not open.
     BusDown,
     /// The drive is offline.
@@ -309,6 +326,9 @@ impl Outcome {
             Outcome::Withdrawn => "withdrawn",
             Outcome::NotTaken(_) => "not_taken",
             Outcome::Interrupted(_) => "interrupted",
+            Outcome::NotStopped => "not_stopped",
+            Outcome::StopOnly(_) => "stop_only",
+            Outcome::StopFailed(stop) => stop.code(),
             Outcome::BusDown => "bus_down",
             Outcome::Offline => "offline",
             Outcome::QueueFull => "queue_full",
@@ -326,10 +346,15 @@ impl Outcome {
             | Outcome::TimedOut
             | Outcome::Garbled
             | Outcome::NotTaken(_)
-            | Outcome::Interrupted(_) => Reach::Sent,
-            Outcome::Expired | Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::ShuttingDown => {
-                Reach::Queued
-            }
+            | Outcome::Interrupted(_)
+            | Outcome::StopOnly(_) => Reach::Sent,
+            Outcome::StopFailed(stop) => stop.reach(),
+            Outcome::Expired
+            | Outcome::Replaced
+            | Outcome::Purged
+            | Outcome::Withdrawn
+            | Outcome::NotStopped
+            | Outcome::ShuttingDown => Reach::Queued,
             Outcome::Refused(_) | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull => Reach::Refused,
         }
     }
@@ -358,7 +383,13 @@ impl Outcome {
             Outcome::Refused(refusal) => Some(refusal.exception()),
             Outcome::QueueFull => Some(Exception::BUSY),
             Outcome::BusDown | Outcome::ShuttingDown => Some(Exception::GATEWAY_PATH),
-            Outcome::TimedOut | Outcome::Offline | Outcome::Expired => Some(Exception::GATEWAY_TARGET),
+            Outcome::TimedOut | Outcome::Offline | Outcome::Expired | Outcome::NotStopped => {
+                Some(Exception::GATEWAY_TARGET)
+            }
+            // What was not done is what the client must know of; never success, which would be both parts.
+            Outcome::StopOnly(part) | Outcome::StopFailed(part) => {
+                Some(part.exception().unwrap_or(Exception::DEVICE_FAILURE))
+            }
             Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => Some(Exception::BUSY),
             Outcome::Interrupted(Interruption::BusDown | Interruption::ShuttingDown) => Some(Exception::GATEWAY_PATH),
             Outcome::Interrupted(_) => Some(Exception::GATEWAY_TARGET),
@@ -395,6 +426,17 @@ impl fmt::Display for Outcome {
                 };
                 write!(f, "it was begun, then {why}; whether the drive took it is not known")
             }
+            Outcome::NotStopped => f.write_str("the stop of the same order failed; it was not sent"),
+            Outcome::StopOnly(rest) => {
+                let rest = rest
+                    .to_string()
+                    .replace("nothing was written", "nothing else was written");
+                write!(
+                    f,
+                    "the drive acknowledged the stop; the rest was not carried out: {rest}"
+                )
+            }
+            Outcome::StopFailed(stop) => write!(f, "{stop}; the rest of the order was not sent"),
             Outcome::BusDown => f.write_str("the bus is down; it was not sent"),
             Outcome::Offline => f.write_str("the drive is offline; it was not sent"),
             Outcome::QueueFull => write!(f, "{CAPACITY} commands wait already; it was not sent, try again"),
@@ -487,6 +529,7 @@ mod tests {
             Outcome::Withdrawn,
             Outcome::NotTaken(String::new()),
             Outcome::Interrupted(Interruption::Stop),
+            Outcome::NotStopped,
             Outcome::BusDown,
             Outcome::Offline,
             Outcome::QueueFull,
@@ -502,6 +545,10 @@ mod tests {
         for with_code in [Outcome::Exception, Outcome::Unknown] {
             assert!(page.contains(&format!("| `{}` |", with_code(Exception::BUSY).code())));
         }
+        assert!(page.contains(&format!(
+            "| `{}` |",
+            Outcome::StopOnly(Box::new(Outcome::Purged)).code()
+        )));
         assert_eq!(
             Outcome::Exception(Exception(0x33)).exception(),
             Some(Exception::DEVICE_FAILURE)

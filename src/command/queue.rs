@@ -420,6 +420,15 @@ impl CommandQueue {
         self.wake();
     }
 
+    /// Takes the stop of an order and its rest in, with nothing between them, and wakes the bus.
+    pub fn submit_parts(&self, stop: Command, rest: Command, now: Instant) {
+        let mut pending = self.lock();
+        pending.push(stop, now);
+        pending.push(rest, now);
+        drop(pending);
+        self.wake();
+    }
+
     /// Takes a background request in and wakes the bus.
     pub fn submit_background(&self, request: BackgroundRequest, now: Instant) {
         self.background().push(request, now);

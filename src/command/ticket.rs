@@ -7,7 +7,7 @@ use std::time::{Duration, Instant, SystemTime};
 use tokio::sync::oneshot;
 
 use super::audit::{Audit, AuditRecord, Change, Reach, RunOrdered};
-use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind};
+use super::{Answer, CONFIRMED, Origin, Outcome, SourceKind, StopEnd};
 use crate::process_image::{Histogram, HistogramSnapshot};
 
 /// Counters of commands, for the metrics, and the audit.
@@ -61,6 +61,8 @@ pub struct Ticket {
     confirmed: Option<Duration>,
     /// Why no read can show its effect.
     unseen: Option<String>,
+    /// For the rest of the order whose stop this is.
+    stop: Option<StopEnd>,
 }
 
 impl Ticket {
@@ -88,6 +90,7 @@ impl Ticket {
             answered: None,
             confirmed: None,
             unseen: None,
+            stop: None,
         };
         (ticket, receiver)
     }
@@ -95,6 +98,12 @@ impl Ticket {
     /// The values that the command sets, for the audit.
     pub fn with_changes(mut self, changes: Vec<Change>) -> Ticket {
         self.changes = changes;
+        self
+    }
+
+    /// The stop of an order whose rest hears how it ended.
+    pub fn with_rest(mut self, end: StopEnd) -> Ticket {
+        self.stop = Some(end);
         self
     }
 
@@ -129,6 +138,9 @@ impl Ticket {
 
     fn settle(&mut self, outcome: Outcome, now: Instant) {
         let Some(sender) = self.sender.take() else { return };
+        if let Some(end) = &self.stop {
+            end.note(&outcome);
+        }
         let latency = now.saturating_duration_since(self.accepted);
         self.answered = Some((outcome.clone(), latency));
         let answer = Answer { outcome, latency };

@@ -86,11 +86,11 @@ fn stop_of(drive: &DriveSpec) -> Option<(Option<RequestPdu>, RequestPdu)> {
     let (raw, _, invert) = drive.profile.run_bit()?;
     let (table, address) = (raw.table, raw.address);
     Some(match table {
-        Table::Coil | Table::DiscreteInput => (None, RequestPdu::WriteCoil { address, on: invert }),
+        Table::Coil | Table::DiscreteInput => (None, drive.profile.functions.write_coil(address, invert)),
         Table::Input | Table::Holding => {
             let (start, count) = (address, 1);
             let read = RequestPdu::Read { table, start, count };
-            (Some(read), RequestPdu::WriteRegister { address, value: 0 })
+            (Some(read), drive.profile.functions.write_register(address, 0))
         }
     })
 }

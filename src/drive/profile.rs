@@ -54,6 +54,8 @@ pub struct Profile {
     pub simulator: Option<String>,
     /// Address ranges with their limits per request, ascending.
     pub ranges: Vec<AddressRange>,
+    /// The functions by which single items and bits are written.
+    pub functions: WriteFunctions,
     /// All points, in the order of the file.
     pub points: Vec<Point>,
     /// Points that a drive with a new fault is asked for at once.
@@ -101,6 +103,54 @@ pub struct AddressRange {
     pub write_when: String,
     /// Note for the user.
     pub note: String,
+}
+
+/// The functions by which a family is written where there is a choice.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct WriteFunctions {
+    /// One register by function 16, which alone it takes.
+    pub registers_by_16: bool,
+    /// One coil by function 15.
+    pub coils_by_15: bool,
+    /// Bits of a register by function 22.
+    pub mask_write: bool,
+}
+
+impl WriteFunctions {
+    /// The write of one register.
+    pub(crate) fn write_register(self, address: u16, value: u16) -> RequestPdu {
+        match self.registers_by_16 {
+            true => RequestPdu::WriteRegisters {
+                start: address,
+                values: vec![value],
+            },
+            false => RequestPdu::WriteRegister { address, value },
+        }
+    }
+
+    /// The write of one coil.
+    pub(crate) fn write_coil(self, address: u16, on: bool) -> RequestPdu {
+        match self.coils_by_15 {
+            true => RequestPdu::WriteCoils {
+                start: address,
+                bits: vec![on],
+            },
+            false => RequestPdu::WriteCoil { address, on },
+        }
+    }
+
+    /// What differs from the usual, in words; empty where nothing does.
+    pub(crate) fn notes(self) -> Vec<&'static str> {
+        let notes = [
+            (self.registers_by_16, "one register is written by function 16"),
+            (self.coils_by_15, "one coil is written by function 15"),
+            (
+                self.mask_write,
+                "bits of a settings register are written by function 22",
+            ),
+        ];
+        notes.into_iter().filter_map(|(is, text)| is.then_some(text)).collect()
+    }
 }
 
 /// A read whose outcome differs between families; identification never writes.
@@ -327,6 +377,13 @@ impl Profile {
         };
         let stops = |(address, value): &(u16, u16)| self.is_stop(table, *address, *value);
         items.iter().all(|(address, _)| spared(*address)) && !items.iter().any(stops)
+    }
+
+    /// Whether a register holds settings besides a bit: it is not that of the run command, whose other bits nobody else
+    /// changes unnoticed.
+    pub(crate) fn is_settings(&self, table: Table, address: u16) -> bool {
+        let is_run = |(run, ..): (&Raw, u8, bool)| (run.table, run.address) == (table, address);
+        table == Table::Holding && !self.protocols.contains(&Protocol::N2) && !self.run_bit().is_some_and(is_run)
     }
 
     /// Whether a write to that table is released afterwards: an analog output of N2.

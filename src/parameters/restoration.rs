@@ -217,9 +217,13 @@ impl Restoration {
             Outcome::TimedOut | Outcome::Garbled | Outcome::Unknown(_) => {
                 self.pause(PAUSE, "the drive does not answer to be believed", now)
             }
-            Outcome::Interrupted(_) | Outcome::Purged | Outcome::Replaced | Outcome::Withdrawn => {
-                self.pause(BUSY_PAUSE, "something else went first", now)
-            }
+            Outcome::Interrupted(_)
+            | Outcome::Purged
+            | Outcome::Replaced
+            | Outcome::Withdrawn
+            | Outcome::NotStopped
+            | Outcome::StopOnly(_)
+            | Outcome::StopFailed(_) => self.pause(BUSY_PAUSE, "something else went first", now),
             Outcome::Expired | Outcome::QueueFull => self.pause(PAUSE, "the line is busy", now),
             Outcome::Offline => self.pause(PAUSE, "the drive does not answer", now),
             Outcome::BusDown => self.pause(PAUSE, "the bus is down", now),

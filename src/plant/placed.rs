@@ -7,7 +7,7 @@ use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use crate::command::{Answer, Outcome};
+use crate::command::{Answer, Outcome, joined};
 
 /// What reads showed of an order that was acknowledged; nothing of any other.
 #[derive(Debug, Clone, PartialEq, Eq, Default)]
@@ -23,8 +23,11 @@ pub struct Shown {
 #[derive(Debug)]
 pub struct Placed {
     accepted: Instant,
+    /// Of an order that stops and does more: of its stop.
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
+    /// Of its rest.
+    rest: Option<(Arriving<Answer>, Arriving<Result<Duration, String>>)>,
 }
 
 impl Placed {
@@ -37,7 +40,18 @@ impl Placed {
             accepted,
             answer: Arriving::Awaited(answer),
             confirmation: Arriving::Awaited(confirmation),
+            rest: None,
         }
+    }
+
+    /// The same for an order of which that was the stop: the one answer tells what became of both parts.
+    pub(super) fn with_rest(
+        mut self,
+        answer: oneshot::Receiver<Answer>,
+        confirmation: oneshot::Receiver<Result<Duration, String>>,
+    ) -> Placed {
+        self.rest = Some((Arriving::Awaited(answer), Arriving::Awaited(confirmation)));
+        self
     }
 
     /// When the order was taken.
@@ -57,13 +71,22 @@ impl Placed {
 
     /// As [`Placed::answered`], for whoever waits for several things.
     pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
-        self.answer.poll(cx).map(|answer| {
-            // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
-            answer.unwrap_or(Answer {
-                outcome: Outcome::ShuttingDown,
-                latency: Duration::ZERO,
-            })
-        })
+        let stop = answer_of(&mut self.answer, cx);
+        let Some((rest, _)) = &mut self.rest else { return stop };
+        let rest = answer_of(rest, cx);
+        let latency = |part: &Poll<Answer>| match part {
+            Poll::Ready(answer) => answer.latency,
+            Poll::Pending => Duration::ZERO,
+        };
+        let latency = latency(&stop).max(latency(&rest));
+        let outcome = |part: Poll<Answer>| match part {
+            Poll::Ready(answer) => Some(answer.outcome),
+            Poll::Pending => None,
+        };
+        match joined(outcome(stop), outcome(rest)) {
+            Some(outcome) => Poll::Ready(Answer { outcome, latency }),
+            None => Poll::Pending,
+        }
     }
 
     /// Waits further for the read that shows the effect: the time from acceptance to it, or `None` when the order was
@@ -82,7 +105,16 @@ impl Placed {
 
     /// What is known of the effect by now.
     pub fn shown(&mut self) -> Shown {
-        match now(|cx| self.confirmation.poll(cx)).flatten() {
+        let stop = now(|cx| self.confirmation.poll(cx)).flatten();
+        let seen = match &mut self.rest {
+            Some((_, rest)) => match (stop, now(|cx| rest.poll(cx)).flatten()) {
+                (Some(Ok(stop)), Some(Ok(rest))) => Some(Ok(stop.max(rest))),
+                (Some(Err(why)), _) | (_, Some(Err(why))) => Some(Err(why)),
+                _ => None,
+            },
+            None => stop,
+        };
+        match seen {
             Some(Ok(after)) => Shown {
                 after: Some(after),
                 unseen: None,
@@ -97,8 +129,23 @@ impl Placed {
 
     /// As [`Placed::confirmation`], for whoever waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
-        self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok))
+        let stop = self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok));
+        let Some((_, rest)) = &mut self.rest else { return stop };
+        match (stop, rest.poll(cx).map(|seen| seen.and_then(Result::ok))) {
+            (Poll::Ready(stop), Poll::Ready(rest)) => Poll::Ready(stop.zip(rest).map(|(stop, rest)| stop.max(rest))),
+            _ => Poll::Pending,
+        }
     }
+}
+
+fn answer_of(arriving: &mut Arriving<Answer>, cx: &mut Context<'_>) -> Poll<Answer> {
+    arriving.poll(cx).map(|answer| {
+        // The ticket answers even when it is dropped; a lost sender can only mean that the process ends.
+        answer.unwrap_or(Answer {
+            outcome: Outcome::ShuttingDown,
+            latency: Duration::ZERO,
+        })
+    })
 }
 
 /// What arrives once, for whoever asks, as often as they ask.

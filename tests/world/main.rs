@@ -17,6 +17,7 @@
 
 mod bus;
 mod clients;
+mod compound;
 mod connection;
 mod cost;
 mod diagnosis;

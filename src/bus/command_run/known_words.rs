@@ -1,7 +1,8 @@
 //! What is known of a drive's own command words.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
+use super::functions::TakenFunctions;
 use crate::codec::{RequestPdu, Table};
 use crate::command::written;
 
@@ -9,29 +10,45 @@ use crate::command::written;
 ///
 /// Filled by reading the drive's own words and by acknowledged writes, never by assumption.
 #[derive(Debug, Default)]
-pub struct KnownWords(BTreeMap<(Table, u16), u16>);
+pub struct KnownWords {
+    words: BTreeMap<(Table, u16), u16>,
+    /// Those that it was asked for and reported, ever.
+    reported: BTreeSet<(Table, u16)>,
+    /// The functions that it takes, which it keeps when it starts anew.
+    pub(super) functions: TakenFunctions,
+}
 
 impl KnownWords {
-    /// A word that the drive has.
+    /// A word that the drive reports.
     pub fn learn(&mut self, table: Table, address: u16, word: u16) {
         if matches!(table, Table::Holding | Table::Coil) {
-            self.0.insert((table, address), word);
+            self.words.insert((table, address), word);
+            self.reported.insert((table, address));
         }
     }
 
     /// Acknowledged words are known from then on.
     pub fn written(&mut self, sent: &RequestPdu) {
+        if let RequestPdu::MaskWrite { address, .. } = sent {
+            // Its other bits may have been changed since.
+            self.words.remove(&(Table::Holding, *address));
+        }
         for (table, address, word) in written(sent).into_iter().flat_map(|(table, items)| {
             let place = move |(address, word)| (table, address, word);
             items.into_iter().map(place)
         }) {
-            self.learn(table, address, word);
+            self.words.insert((table, address), word);
         }
+    }
+
+    /// Whether the drive reported that word, at any time.
+    pub(super) fn is_reported(&self, table: Table, address: u16) -> bool {
+        self.reported.contains(&(table, address))
     }
 
     /// The word, if it is known.
     pub fn get(&self, table: Table, address: u16) -> Option<u16> {
-        self.0.get(&(table, address)).copied()
+        self.words.get(&(table, address)).copied()
     }
 
     /// Whether the drive is known to have all of that.
@@ -50,6 +67,6 @@ impl KnownWords {
 
     /// The drive may have started anew, or taken an unanswered write: its words are read again before a bit is changed.
     pub fn forget(&mut self) {
-        self.0.clear();
+        self.words.clear();
     }
 }

@@ -90,6 +90,8 @@ pub(super) struct Known {
     pub(super) names_run: bool,
     /// What the drive last said of its motor.
     pub(super) running: bool,
+    /// The drive changes bits of a register by itself.
+    pub(super) masks: bool,
 }
 
 /// A word and the bits of it that change.
@@ -281,12 +283,24 @@ fn bits(
         count: 1,
     };
     let read = Step::new(StepPurpose::ReadWord, read);
+    if profile.is_settings(raw.table, address) && !matches!(action, Action::PulseEnd { .. }) {
+        // What was read earlier is no proof: other bits may have been changed at the drive since.
+        if known.masks {
+            return Some(Step::new(StepPurpose::Execute, mask(address, &changes)));
+        }
+        if known.check == Check::NotYet {
+            return Some(read);
+        }
+    }
     let Some(old) = words.get(Table::Holding, address).or(known.blind.then_some(0)) else {
         return Some(read);
     };
     let set = |word: u16, (bit, on): (u8, bool)| if on { word | (1 << bit) } else { word & !(1 << bit) };
     let value = changes.into_iter().fold(old, set);
-    if only_if_set && value == old {
+    let kept = matches!(action, Action::Bits { .. }) && known.check == Check::Read && {
+        profile.is_settings(raw.table, address) && profile.writes_on_change(raw.table, &[(address, value)])
+    };
+    if (only_if_set || kept) && value == old {
         return None;
     }
     // A run bit that the command does not name may have been taken away elsewhere since the word was read, and to write
@@ -302,6 +316,19 @@ fn bits(
         StepPurpose::Execute,
         RequestPdu::WriteRegister { address, value },
     ))
+}
+
+/// The write that changes these bits, whatever the others are.
+fn mask(address: u16, changes: &[(u8, bool)]) -> RequestPdu {
+    let bits = |on: bool| {
+        let of = changes.iter().filter(|(_, to)| *to == on);
+        of.fold(0u16, |word, (bit, _)| word | (1 << bit))
+    };
+    RequestPdu::MaskWrite {
+        address,
+        and_mask: !(bits(true) | bits(false)),
+        or_mask: bits(true),
+    }
 }
 
 /// The run bit, if it is in the same word, as it is where the motor is to stand.

@@ -11,6 +11,7 @@ use crate::drive::Value;
 use crate::drive::profile::Profiles;
 
 mod elsewhere;
+mod functions;
 mod on_change;
 
 struct Bench {

@@ -8,7 +8,8 @@ use crate::bus::drive_state::{DriveState, Wanted};
 use crate::bus::schedule::{Decision, Poll};
 use crate::codec::RequestPdu;
 use crate::command::{
-    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, Urgency, still_keeps_limits,
+    Chosen, Command, DEFAULT_EXPIRY, FrequencyRange, Interruption, Order, Outcome, Refusal, StopEnd, Urgency,
+    still_keeps_limits,
 };
 
 /// Exchanges of one rank in a row, while a lower one waits, before that has its turn.
@@ -283,6 +284,10 @@ impl Master {
         };
         if !online {
             command.answer(&Outcome::Offline, now);
+            return;
+        }
+        if command.behind.as_ref().is_some_and(StopEnd::has_failed) {
+            command.answer(&Outcome::NotStopped, now);
             return;
         }
         // It was admitted before the drive was held.

@@ -380,6 +380,9 @@ impl Master {
 
     /// What was written is read back soon.
     fn read_back(&mut self, index: usize, step: &Step, now: Instant) {
+        if let RequestPdu::MaskWrite { address, or_mask, .. } = step.pdu {
+            self.note_write(index, Table::Holding, &[(address, or_mask)], now);
+        }
         if let Some((table, items)) = written(&step.pdu) {
             self.note_write(index, table, &items, now);
         }

@@ -140,6 +140,10 @@ impl Snippet<'_> {
             ),
             _ => String::new(),
         };
+        let functions = self.profiles.get(first).map(|profile| profile.functions.notes());
+        let functions = functions.filter(|notes| !notes.is_empty());
+        let functions = functions.map(|notes| format!("# Once it is commanded: {}.\n", notes.join("; ")));
+        let note = note + &functions.unwrap_or_default();
         let turnaround = self.profiles.get(first).map(|profile| profile.turnaround);
         let slower = drive
             .turnaround

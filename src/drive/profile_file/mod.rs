@@ -26,7 +26,7 @@ use crate::codec::{LineFormat, Protocol};
 use crate::document::{self, Document, Finding, Problem, Reader};
 use derived::{check_derived, keep_ends_fresh};
 use points::{check_object, check_target, read_point};
-use ranges::{Offsets, check_overlaps, read_range};
+use ranges::{Offsets, check_overlaps, read_functions, read_range};
 
 const BUILT_IN: [(&str, &str); 8] = [
     ("eaton-hvx-n2.toml", include_str!("../../../profiles/eaton-hvx-n2.toml")),
@@ -265,6 +265,7 @@ fn read_profile(reader: &Reader<'_>, built_in: bool, known: &Profiles) -> Option
         simulator: reader.optional("simulator"),
         on_fault: read_on_fault(reader, &points),
         parameters: parameters::read(reader, &bases, &points, &ranges),
+        functions: read_functions(reader, &ranges),
         ranges,
         points,
         faults,

@@ -1,10 +1,10 @@
-//! `[[range]]` and `address_offset`: what may be read and written together.
+//! `[[range]]`, `[ranges]` and `address_offset`: what may be read and written together, and by which functions.
 
 use std::collections::BTreeMap;
 
-use super::super::profile::AddressRange;
+use super::super::profile::{AddressRange, WriteFunctions};
 use crate::codec::Table;
-use crate::document::Reader;
+use crate::document::{FromNode, Node, Reader, ValueError};
 
 pub(super) fn read_table(reader: &Reader<'_>, key: &str, text: &str) -> Option<Table> {
     let table = Table::from_name(text);
@@ -68,6 +68,50 @@ pub(super) fn read_range(reader: &Reader<'_>, offsets: &Offsets) -> Option<Addre
         write_when,
         note,
     })
+}
+
+/// `[ranges]`: what holds for all ranges of the drive.
+pub(super) fn read_functions(reader: &Reader<'_>, ranges: &[AddressRange]) -> WriteFunctions {
+    let mut functions = WriteFunctions::default();
+    let Some(given) = reader.table("ranges") else {
+        return functions;
+    };
+    let OneOrMore(single) = given.or("single_write", OneOrMore(Vec::new()));
+    for function in &single {
+        let (table, by) = match function {
+            15 => (Table::Coil, &mut functions.coils_by_15),
+            16 => (Table::Holding, &mut functions.registers_by_16),
+            _ => {
+                let what = format!("{function} is no function that writes several items");
+                given.problem("single_write", what, "write 16 (registers), 15 (coils) or [15, 16]");
+                continue;
+            }
+        };
+        *by = true;
+        if !ranges.iter().any(|range| range.table == table && range.write > 0) {
+            let what = format!("no range of table `{table}` can be written");
+            given.problem(
+                "single_write",
+                what,
+                format!("leave out {function}, or set `write` of a range"),
+            );
+        }
+    }
+    functions.mask_write = given.or("mask_write", false);
+    given.finish();
+    functions
+}
+
+/// A number, or a list of them.
+struct OneOrMore(Vec<u8>);
+
+impl FromNode for OneOrMore {
+    const WANTED: &'static str = "a function code, or a list of them";
+
+    fn from_node(node: &Node) -> Result<OneOrMore, ValueError> {
+        let one = u8::from_node(node).map(|one| vec![one]);
+        one.or_else(|_| Vec::from_node(node)).map(OneOrMore)
+    }
 }
 
 /// Checks that an address is in one range only. A file with a base may give other limits to a part of a base's range.

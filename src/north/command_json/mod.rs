@@ -9,5 +9,5 @@ pub(super) use self::memory::REMEMBERED;
 pub(super) use self::memory::{Repetition, SharedMemory, Taken};
 #[cfg(test)]
 pub(super) use self::request::MAX_ID;
-pub(super) use self::request::{Id, MAX_PAYLOAD, Points, check_size, excerpt, find_id, order, resolve, unknown_drive};
+pub(super) use self::request::{Asked, Id, MAX_PAYLOAD, check_size, excerpt, find_id, order, resolve, unknown_drive};
 pub(super) use self::result::CommandResult;

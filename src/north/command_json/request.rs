@@ -10,7 +10,7 @@ use serde::de::{Deserialize, Deserializer, IgnoredAny, MapAccess, Visitor};
 use serde_json::Value as Json;
 use serde_json::value::RawValue;
 
-use crate::command::{DEFAULT_EXPIRY, Refusal};
+use crate::command::{DEFAULT_EXPIRY, Refusal, stop_of};
 use crate::document::nearest;
 use crate::drive::model::Kind;
 use crate::drive::{Profile, Value};
@@ -78,11 +78,43 @@ pub(in crate::north) fn find_id(payload: &[u8]) -> Option<Id> {
     Id::of(id?)
 }
 
+/// What a command asks for.
+#[derive(Debug, Clone, PartialEq)]
+pub(in crate::north) struct Asked {
+    pub(in crate::north) points: Points,
+    pub(in crate::north) expiry: Duration,
+    /// Why all else is refused; `points` are those of its stop then.
+    pub(in crate::north) refused: Option<Refusal>,
+}
+
+impl Asked {
+    /// What is asked for by `points`, where `refused` says what else is not understood.
+    ///
+    /// # Errors
+    /// The refusal, unless there is a stop among the points, which is carried out all the same.
+    pub(in crate::north) fn new(
+        points: Points,
+        expiry: Duration,
+        refused: Option<Refusal>,
+        profile: &Profile,
+    ) -> Result<Asked, Refusal> {
+        let points = match &refused {
+            None => points,
+            Some(refusal) => stop_of(&points, profile).ok_or_else(|| refusal.clone())?,
+        };
+        Ok(Asked {
+            points,
+            expiry,
+            refused,
+        })
+    }
+}
+
 /// The points and the expiry of a command.
 ///
 /// # Errors
 /// The refusal; nothing of the command may be executed.
-pub(in crate::north) fn order(payload: &[u8], profile: &Profile) -> Result<(Points, Duration), Refusal> {
+pub(in crate::north) fn order(payload: &[u8], profile: &Profile) -> Result<Asked, Refusal> {
     points_of(object(payload)?, profile)
 }
 
@@ -99,22 +131,23 @@ pub(in crate::north) fn check_size(size: usize) -> Result<(), Refusal> {
     }
 }
 
-fn points_of(fields: Fields, profile: &Profile) -> Result<(Points, Duration), Refusal> {
+fn points_of(fields: Fields, profile: &Profile) -> Result<Asked, Refusal> {
     let mut expiry = DEFAULT_EXPIRY;
     let mut points = Vec::new();
-    for (name, value) in fields.0 {
-        match name.as_str() {
-            "id" if is_id(&value) => {}
-            "id" => {
-                return Err(Refusal::BadValue(format!(
-                    "`id` is a number or a string of at most {MAX_ID} bytes"
-                )));
-            }
-            "expires_ms" => expiry = request_expiry(&value)?,
-            name => points.push(resolve(profile, name, &value)?),
-        }
+    let twice = |name: String| format!("{} appears twice; nothing was written", excerpt(name.as_bytes()));
+    let mut refused = fields.twice.map(|name| Refusal::BadValue(twice(name)));
+    for (name, value) in fields.all {
+        let understood = match name.as_str() {
+            "id" if is_id(&value) => Ok(()),
+            "id" => Err(Refusal::BadValue(format!(
+                "`id` is a number or a string of at most {MAX_ID} bytes"
+            ))),
+            "expires_ms" => request_expiry(&value).map(|time| expiry = time),
+            name => resolve(profile, name, &value).map(|point| points.push(point)),
+        };
+        refused = refused.or(understood.err());
     }
-    Ok((points, expiry))
+    Asked::new(points, expiry, refused, profile)
 }
 
 fn is_id(value: &Json) -> bool {
@@ -187,9 +220,12 @@ fn object(payload: &[u8]) -> Result<Fields, Refusal> {
     serde_json::from_slice(payload).map_err(|e| Refusal::BadValue(e.to_string()))
 }
 
-/// The fields of an object. A repeated name is an error, since it is ambiguous.
-#[derive(Debug)]
-struct Fields(Vec<(String, Json)>);
+/// The fields of an object, and the first name that is repeated: that is an error, since it is ambiguous.
+#[derive(Debug, Default)]
+struct Fields {
+    all: Vec<(String, Json)>,
+    twice: Option<String>,
+}
 
 impl<'de> Deserialize<'de> for Fields {
     fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Fields, D::Error> {
@@ -207,16 +243,15 @@ impl<'de> Visitor<'de> for FieldsVisitor {
     }
 
     fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<Fields, A::Error> {
-        let mut fields: Vec<(String, Json)> = Vec::new();
+        let mut fields = Fields::default();
         let mut names = BTreeSet::new();
         while let Some((name, value)) = map.next_entry::<String, Json>()? {
             if !names.insert(name.clone()) {
-                let text = format!("{} appears twice; nothing was written", excerpt(name.as_bytes()));
-                return Err(serde::de::Error::custom(text));
+                fields.twice.get_or_insert(name.clone());
             }
-            fields.push((name, value));
+            fields.all.push((name, value));
         }
-        Ok(Fields(fields))
+        Ok(fields)
     }
 }
 

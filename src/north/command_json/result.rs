@@ -5,7 +5,7 @@ use std::time::{Duration, SystemTime};
 use serde::Serialize;
 
 use super::Id;
-use crate::command::{Answer, CONFIRMED, milliseconds, milliseconds_or_null};
+use crate::command::{Answer, CONFIRMED, Outcome, milliseconds, milliseconds_or_null};
 use crate::plant::Shown;
 
 /// The one result of a command: `confirmed` if a read showed the effect in time, else the answer of the bus.
@@ -17,6 +17,9 @@ pub(in crate::north) struct CommandResult<'r> {
     result: &'static str,
     #[serde(skip_serializing_if = "Option::is_none")]
     error: Option<ErrorObject>,
+    /// Of a command whose stop alone was carried out: the code of the rest.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rest: Option<&'static str>,
     #[serde(rename = "latency_ms", serialize_with = "milliseconds")]
     latency: Duration,
     /// From acceptance to the read that showed the effect.
@@ -59,6 +62,10 @@ impl<'r> CommandResult<'r> {
             ok: error.is_none(),
             result: code,
             error: error.map(|message| ErrorObject { code, message }),
+            rest: match &answer.outcome {
+                Outcome::StopOnly(rest) => Some(rest.code()),
+                _ => None,
+            },
             latency: answer.latency,
             confirmed: shown.after,
             note: shown.unseen,

@@ -11,7 +11,7 @@ use super::protocol::{
     WriteOutcome, WriteRequest, port_of,
 };
 use crate::codec::{Reply, RequestPdu};
-use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refusal};
+use crate::command::{self, Authority, DEFAULT_EXPIRY, Order, Origin, Pace, Refusal, stop_of};
 use crate::document::nearest;
 use crate::drive::why::Explanation;
 use crate::drive::{ModelPoint, Point, PollClass, Profile, Quality, Raw, Sample, Source, Value};
@@ -276,14 +276,22 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
         drive => drive?,
     };
     let profile = &drive.image.spec.profile;
-    let values: Result<Vec<(usize, Value)>, Refusal> = request
-        .points
-        .iter()
-        .map(|setting| value_of(profile, setting))
-        .collect();
-    let mut placed = match values {
-        Ok(values) => drive.place(Order::Points(values), origin, Authority::Write, DEFAULT_EXPIRY, now),
-        Err(refusal) => {
+    let (values, refused) = understood(profile, &request.points);
+    let (client, stop) = (Authority::Write, stop_of(&values, profile));
+    let mut placed = match (refused, stop) {
+        (None, _) => drive.place(Order::Points(values), origin, client, DEFAULT_EXPIRY, now),
+        (Some(refusal), Some(stop)) => {
+            let what = described(&request.points);
+            drive.place_stop(
+                Order::Points(stop),
+                (&what, refusal),
+                origin,
+                client,
+                DEFAULT_EXPIRY,
+                now,
+            )
+        }
+        (Some(refusal), None) => {
             let answer = drive.refuse(&described(&request.points), refusal, origin, now);
             return Ok(WriteOutcome::new(&answer, Shown::default()));
         }
@@ -362,6 +370,18 @@ async fn restore(request: &RestoreRequest, shared: &SharedPlant, origin: Origin)
         ))
     };
     Ok(RestoreOutcome::new(&status.ok_or_else(none)?))
+}
+
+/// The points that are understood, and why another one is not.
+fn understood(profile: &Profile, settings: &[Setting]) -> (Vec<(usize, Value)>, Option<Refusal>) {
+    let (mut values, mut refused) = (Vec::new(), None);
+    for setting in settings {
+        match value_of(profile, setting) {
+            Ok(value) => values.push(value),
+            Err(refusal) => refused = refused.or(Some(refusal)),
+        }
+    }
+    (values, refused)
 }
 
 /// The point and its value: as over MQTT, and the text of an enumeration too.

@@ -28,6 +28,8 @@ pub(super) struct ForwardedRequest {
 #[derive(Debug)]
 pub(super) enum BusWork {
     Order(Order),
+    /// The stop of a request whose rest is refused; the refusal is audited.
+    Stop(Order, Refusal),
     /// Nothing, because it is refused; the refusal is audited.
     Refused(Refusal),
     /// A read that is split by object.
@@ -109,6 +111,16 @@ impl ForwardedRequest {
         let mut forwarded = Box::new(self);
         match work {
             BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), now),
+            BusWork::Stop(stop, refusal) => {
+                let what = describe::request(&forwarded.request);
+                let (authority, rest) = (client.rights.authority(), (what.as_str(), refusal));
+                let drive = &forwarded.drive;
+                let placed = drive.place_stop(stop, rest, client.origin(), authority, DEFAULT_EXPIRY, now);
+                Progress::Pending(PendingRequest {
+                    forwarded: Some(forwarded),
+                    placed,
+                })
+            }
             BusWork::Refused(refusal) => {
                 let what = describe::request(&forwarded.request);
                 let answer = forwarded.drive.refuse(&what, refusal, client.origin(), now);

@@ -318,12 +318,20 @@ impl ClientSession {
         let write = self.state.command_words.update(&spec.name, |last| {
             let before = register_map::CommandContext { word: *last, fault };
             let write = register_map::command(&spec.profile, start, values, before)?;
-            let resets = write.word.is_some_and(|word| before.resets(word));
+            let resets = write.refused.is_none() && write.word.is_some_and(|word| before.resets(word));
             *last = write.word.or(*last);
             Ok((write, resets))
         });
         let mut forwarded = ForwardedRequest::new(header, drive, request.clone());
         let work = match write {
+            Ok((
+                CommandWrite {
+                    points,
+                    refused: Some(refusal),
+                    ..
+                },
+                _,
+            )) => BusWork::Stop(Order::Points(points), refusal),
             // A heartbeat alone is not a command: it is answered at once and not audited.
             Ok((CommandWrite { points, .. }, _)) if points.is_empty() => {
                 drive.image.renew_lease(now);

@@ -11,8 +11,7 @@ use super::outbox::Message;
 use super::payload::Topics;
 use super::reply::{Reply, ResponseTopics};
 use super::request::{self, Incoming};
-use crate::command::{Answer, Authority, Order, Origin, Refusal, SourceKind};
-use crate::drive::ModelPoint;
+use crate::command::{Answer, Authority, Order, Origin, Parts, Refusal, SourceKind, stop_of};
 use crate::north::command_json::{Id, Repetition, SharedMemory, excerpt, unknown_drive};
 use crate::plant::{Placed, Plant, Shown};
 
@@ -114,7 +113,7 @@ impl Commands {
 
     /// Processes a message at `now`, which is `time` on the calendar. Returns its result if that is known at once;
     /// otherwise its command is in the queue of the bus. A repeated command is not executed again, but answered with the
-    /// previous result or refused; a stop is always executed. `crowded` says whether too many results wait on a topic: a
+    /// previous result or refused; a stop is always executed, that of a command which does more without the rest. `crowded` says whether too many results wait on a topic: a
     /// command that would be answered there is refused.
     pub(super) fn take(
         &mut self,
@@ -147,47 +146,54 @@ impl Commands {
         let refuse = |refusal, id, origin| {
             Some(reply.message(id, &drive.refuse(&what(), refusal, origin, now), Shown::default(), time))
         };
-        let (points, expiry) = match request.order {
+        let asked = match request.order {
             Err(refusal) => return refuse(refusal, request.id, origin),
-            Ok(order) => order,
+            Ok(asked) => asked,
         };
-        let run = profile.model_index(ModelPoint::Run);
-        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
-        let taken = incoming.taken();
-        let print = self
-            .memory
-            .lock()
-            .fingerprint(&taken, request.id.as_ref().map(Id::text));
-        let stops = drive.stops();
-        if !stop {
+        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        let (mut refused, mut number) = (asked.refused, 0);
+        if refused.is_none() && !only_stops {
+            let taken = incoming.taken();
+            let print = self
+                .memory
+                .lock()
+                .fingerprint(&taken, request.id.as_ref().map(Id::text));
+            let stops = drive.stops();
             let repeated = self.memory.lock().repeated(&taken, print, stops, now);
-            match repeated {
-                None => {}
+            let why = match repeated {
+                None => self.may_take(&reply, request.id.as_ref(), crowded, now).err(),
+                Some(Repetition::Outdated(why)) => Some(repeats(why)),
+                // Its stop is carried out once more, and answered once more.
+                Some(Repetition::Pending | Repetition::Answered(_)) if stop.is_some() => {
+                    Some(repeats("and only its stop is carried out again"))
+                }
                 Some(Repetition::Pending) => return None,
                 Some(Repetition::Answered(previous)) => return Some(reply.with(previous.to_vec())),
-                Some(Repetition::Outdated(why)) => {
-                    let why = format!("it repeats an earlier command, {why}; send it with another `id`");
-                    return refuse(Refusal::NotAllowed(why), request.id, origin);
-                }
-            }
-            if let Err(why) = self.may_take(&reply, request.id.as_ref(), crowded, now) {
-                return refuse(Refusal::NotAllowed(why), request.id, origin);
+            };
+            match why {
+                Some(why) => refused = Some(Refusal::NotAllowed(why)),
+                None => number = self.memory.lock().remember(&taken, print, stops, now),
             }
         }
-        let number = match stop {
-            true => 0,
-            false => self.memory.lock().remember(&taken, print, stops, now),
+        let (client, expiry) = (Authority::Write, asked.expiry);
+        let placed = match (refused, stop) {
+            (None, _) => drive.place(order, origin, client, expiry, now),
+            (Some(refusal), Some(stop)) => {
+                drive.place_stop(Order::Points(stop), (&what(), refusal), origin, client, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, request.id, origin),
         };
         let pending = PendingCommand {
             number,
             id: request.id,
-            placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
+            placed,
             reply,
         };
         self.follow(pending, time)
     }
 
-    /// Whether a command that is no stop may be taken.
+    /// Whether a command that does more than stop may be taken.
     fn may_take(
         &mut self,
         reply: &Reply,
@@ -270,6 +276,10 @@ impl Commands {
     pub(super) fn is_idle(&self) -> bool {
         self.waiting.is_empty() && self.confirming.is_empty()
     }
+}
+
+fn repeats(why: &str) -> String {
+    format!("it repeats an earlier command, {why}; send it with another `id`")
 }
 
 impl PendingCommand {

@@ -7,7 +7,7 @@ use serde_json::Value as Json;
 
 use crate::command::{DEFAULT_EXPIRY, Refusal};
 use crate::drive::Profile;
-use crate::north::command_json::{self, Id, MAX_PAYLOAD, Points, Taken, check_size, excerpt, find_id, resolve};
+use crate::north::command_json::{self, Asked, Id, MAX_PAYLOAD, Taken, check_size, excerpt, find_id, resolve};
 
 /// A message on a set topic.
 #[derive(Debug, Clone, Default)]
@@ -82,7 +82,7 @@ pub(super) struct SetRequest {
     /// The `id`, also if the rest is refused.
     pub(super) id: Option<Id>,
     /// Points and expiry.
-    pub(super) order: Result<(Points, Duration), Refusal>,
+    pub(super) order: Result<Asked, Refusal>,
 }
 
 /// Parses a message on a set topic; `point` is the point of a bare value.
@@ -102,19 +102,24 @@ pub(super) fn id(incoming: &Incoming, point: Option<&str>) -> Option<Id> {
     }
 }
 
-fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<(Points, Duration), Refusal> {
+fn order(incoming: &Incoming, point: Option<&str>, profile: &Profile) -> Result<Asked, Refusal> {
     if incoming.retain {
         return Err(Refusal::NotAllowed(
             "a retained message is never a command; publish it without the retain flag and clear the topic".to_string(),
         ));
     }
     check_size(incoming.oversized.unwrap_or(incoming.payload.len()))?;
-    let (points, expiry) = match point {
-        Some(name) => (vec![resolve(profile, name, &bare(&incoming.payload)?)?], DEFAULT_EXPIRY),
+    let mut asked = match point {
+        Some(name) => {
+            let points = vec![resolve(profile, name, &bare(&incoming.payload)?)?];
+            Asked::new(points, DEFAULT_EXPIRY, None, profile)?
+        }
         None => command_json::order(&incoming.payload, profile)?,
     };
-    let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
-    Ok((points, life.map_or(expiry, |life| life.min(expiry))))
+    if let Some(seconds) = incoming.expiry {
+        asked.expiry = asked.expiry.min(Duration::from_secs(seconds.into()));
+    }
+    Ok(asked)
 }
 
 /// The value of a `set/{point}` message: `true`, `false`, or a number.
@@ -159,7 +164,7 @@ mod tests {
 
     fn set_point(point: &str, payload: &str) -> Result<Value, Refusal> {
         let order = read(&message(payload), Some(point), &profile()).order;
-        order.map(|(points, _)| points[0].1)
+        order.map(|asked| asked.points[0].1)
     }
 
     /// The `id` of a request as JSON.
@@ -176,7 +181,7 @@ mod tests {
     fn an_object_is_one_order() {
         let request = set(r#"{"id": "a-1", "run": true, "speed_reference": 50.5, "expires_ms": 500}"#);
         assert_eq!(request.id.as_ref().map(Id::text), Some("\"a-1\""));
-        let (points, expiry) = request.order.unwrap();
+        let Asked { points, expiry, .. } = request.order.unwrap();
         let index = |name| profile().point_index(name).unwrap();
         let expected = [
             (index("run"), Value::Bool(true)),
@@ -184,9 +189,9 @@ mod tests {
         ];
         assert_eq!(points, expected);
         assert_eq!(expiry, Duration::from_millis(500));
-        let (points, expiry) = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
+        let Asked { points, expiry, .. } = set(r#"{"run": 0, "id": 7}"#).order.unwrap();
         assert_eq!((points[0].1, expiry), (Value::Bool(false), DEFAULT_EXPIRY));
-        assert_eq!(set("{}").order.unwrap().0, [], "refused as an empty command later");
+        assert_eq!(set("{}").order.unwrap().points, [], "refused as an empty command later");
     }
 
     #[test]
@@ -229,6 +234,33 @@ mod tests {
             let (code, message) = code(set(payload));
             assert_eq!(code, wanted, "{payload}: {message}");
             assert!(message.contains(text), "{payload}: {message}");
+        }
+    }
+
+    #[test]
+    fn a_stop_is_understood_whatever_is_wrong_with_the_rest() {
+        let run = profile().point_index("run").unwrap();
+        for (payload, text) in [
+            (r#"{"run": false, "sped_reference": 5}"#, "did you mean"),
+            (r#"{"speed_reference": "5", "run": 0}"#, "remove the quotes"),
+            (r#"{"run": false, "ready": true}"#, "is read-only"),
+            (r#"{"run": false, "expires_ms": 0}"#, "`expires_ms` = 0"),
+            (r#"{"run": false, "id": {}}"#, "`id` is a number or a string"),
+            (
+                r#"{"run": false, "speed_reference": 1, "speed_reference": 2}"#,
+                "appears twice",
+            ),
+        ] {
+            let asked = set(payload).order.expect(payload);
+            assert_eq!(asked.points, [(run, Value::Bool(false))], "{payload}");
+            assert!(asked.refused.unwrap().to_string().contains(text), "{payload}");
+        }
+        for ambiguous in [
+            r#"{"run": false, "run": true}"#,
+            r#"{"run": false"#,
+            r#"{"run": "false"}"#,
+        ] {
+            assert!(set(ambiguous).order.is_err(), "{ambiguous}");
         }
     }
 
@@ -348,7 +380,7 @@ mod tests {
                 expiry: Some(life),
                 ..message(payload)
             };
-            read(&incoming, None, &profile()).order.unwrap().1
+            read(&incoming, None, &profile()).order.unwrap().expiry
         };
         assert_eq!(expiry(r#"{"run": true}"#, 1), Duration::from_secs(1));
         assert_eq!(expiry(r#"{"run": true}"#, 10), DEFAULT_EXPIRY);

@@ -16,6 +16,8 @@ pub(crate) struct CommandWrite {
     pub(crate) word: Option<u16>,
     /// The heartbeat was written.
     pub(crate) heartbeat: bool,
+    /// Why all else is refused; `points` are those of its stop then.
+    pub(crate) refused: Option<Refusal>,
 }
 
 /// What decides whether a write of 0x8100 resets a fault.
@@ -41,7 +43,8 @@ impl CommandContext {
 
 /// Translates a write of `values` from `start` on for a drive of that family.
 ///
-/// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored.
+/// If one write covers both references, the one that is "not available" (0x8000, 0xFFFF) is ignored. A word without run
+/// stops the drive, whatever is wrong with the rest.
 ///
 /// # Errors
 /// An address that is not writable or that the family lacks; else an invalid value.
@@ -51,6 +54,30 @@ pub(crate) fn command(
     values: &[u16],
     before: CommandContext,
 ) -> Result<CommandWrite, Refusal> {
+    understood(profile, start, values, before).or_else(|refusal| {
+        let place = COMMAND_WORD.checked_sub(start).map(usize::from);
+        let word = place.and_then(|place| values.get(place)).copied();
+        // A word with bits that mean nothing says nothing.
+        let stop = word.filter(|word| word & (RUN | !(RUN | REVERSE | FAULT_RESET)) == 0);
+        let (Some(word), Ok(run)) = (stop, writable(profile, ModelPoint::Run)) else {
+            return Err(refusal);
+        };
+        let mut points = vec![(run, Value::Bool(false))];
+        let forward = writable(profile, ModelPoint::Reverse)
+            .ok()
+            .filter(|_| word & REVERSE == 0);
+        points.extend(forward.map(|index| (index, Value::Bool(false))));
+        Ok(CommandWrite {
+            points,
+            // Its reset is not carried out, so the bit is not set by it.
+            word: Some(word & (before.word.unwrap_or_default() | !FAULT_RESET)),
+            heartbeat: false,
+            refused: Some(refusal),
+        })
+    })
+}
+
+fn understood(profile: &Profile, start: u16, values: &[u16], before: CommandContext) -> Result<CommandWrite, Refusal> {
     let both = values.len() > 1 && start <= SPEED_REFERENCE && usize::from(FREQUENCY_REFERENCE - start) < values.len();
     let writes: Vec<(u32, u16)> = (u32::from(start)..).zip(values.iter().copied()).collect();
     let outside = |a: &u32| !(u32::from(COMMAND_WORD)..=u32::from(HEARTBEAT)).contains(a);

@@ -400,18 +400,17 @@ fn refused_command_writes() {
         (&nx(), 0x8200, &[1, 1], address),
         (&nx(), 0xFFFF, &[1, 1], address),
         (&nx(), 0x8100, &[8], value),
-        (&nx(), 0x8100, &[0x8000], value),
+        (&nx(), 0x8100, &[0x8000, 0x8000], value),
         (&nx(), 0x8100, &[0xFFFF, 0x8000, 0xFFFF, 0], value),
         (&nx(), 0x8101, &[0x8000], value),
         (&nx(), 0x8102, &[0xFFFF], value),
         (&nx(), 0x8100, &[1, 0x8000], value),
         (&nx(), 0x8101, &[0x8000, 0xFFFF], value),
         (&nx(), 0x8101, &[5000, 2500], value),
-        (&lacking, 0x8100, &[2], value),
-        (&lacking, 0x8100, &[4], value),
+        (&lacking, 0x8100, &[3], value),
         (&lacking, 0x8102, &[2500], address),
         // The address is wrong and the value too: the address comes first.
-        (&lacking, 0x8100, &[8, 100, 2500], address),
+        (&lacking, 0x8100, &[9, 100, 2500], address),
     ];
     for (profile, start, values, wanted) in table {
         let refusal = command(profile, *start, values, CommandContext::default()).unwrap_err();
@@ -419,6 +418,40 @@ fn refused_command_writes() {
     }
     let word = command(&lacking, 0x8100, &[1, 5000, 0xFFFF], CommandContext::default()).unwrap();
     assert_eq!(named(&lacking, &word), ["run=true", "speed_reference=50"]);
+}
+
+#[test]
+fn a_word_without_run_stops_whatever_is_wrong_with_the_rest() {
+    let mut lacking = nx();
+    for point in [ModelPoint::Reverse, ModelPoint::FrequencyReference] {
+        let index = lacking.model_index(point).unwrap();
+        lacking.points[index].write = false;
+    }
+    let (address, value) = (Exception::ADDRESS, Exception::VALUE);
+    let table: &[(&Profile, u16, &[u16], Exception, &str)] = &[
+        (&nx(), 0x8100, &[0, 0x8000], value, "run=false reverse=false"),
+        (&nx(), 0x8100, &[0, 5000, 2500], value, "run=false reverse=false"),
+        (&nx(), 0x8100, &[0, 0, 0, 0, 0], address, "run=false reverse=false"),
+        (&nx(), 0x80FF, &[9, 0], address, "run=false reverse=false"),
+        (&lacking, 0x8100, &[2], value, "run=false"),
+        (&lacking, 0x8100, &[0, 0x8000, 2500], address, "run=false"),
+    ];
+    for (profile, start, values, exception, points) in table {
+        let write = command(profile, *start, values, before(4, false)).unwrap();
+        assert_eq!(named(profile, &write).join(" "), *points, "{start:04X} {values:04X?}");
+        assert_eq!(
+            write.refused.unwrap().exception(),
+            *exception,
+            "{start:04X} {values:04X?}"
+        );
+    }
+    // A reset that is refused is none: the next one is a change of the bit again.
+    let words = |last, word| {
+        command(&nx(), 0x8100, &[word, 0x8000], before(last, false))
+            .unwrap()
+            .word
+    };
+    assert_eq!((words(0, 4), words(4, 4), words(4, 0)), (Some(0), Some(4), Some(0)));
 }
 
 #[test]

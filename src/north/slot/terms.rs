@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use super::request::{Meaning, Refused, ToolRequest};
 use super::{Slot, SlotAccess};
 use crate::codec::{LineFormat, Protocol, RequestPdu, describe};
-use crate::command::{self, Authority, Order, Origin, Outcome, Refusal, SourceKind, Urgency};
+use crate::command::{self, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, Urgency};
 use crate::drive::plan::WireTime;
 use crate::north::{NorthStats, SlotOutcome};
 use crate::plant::{BusHandle, DriveHandle, Exchange, Placed, Plant, Question, SharedPlant, Target, turn_away};
@@ -130,7 +130,7 @@ impl Tool {
         };
         let plant = self.terms.plant.load();
         let drives = self.asked(&plant, request);
-        pace.is_stop = self.writes() && drives.iter().any(|drive| stops(drive, pdu, now));
+        pace.is_stop = self.writes() && drives.iter().any(|drive| stop_in(drive, pdu, now).is_some());
         pace.stops = drives.iter().map(DriveHandle::stops).sum();
         // What is refused anyway, is at once.
         let admitted = drives
@@ -197,7 +197,7 @@ impl Tool {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
         }
-        if drive.stops() != stops && !self::stops(drive, pdu, now) {
+        if drive.stops() != stops && stop_in(drive, pdu, now).is_none() {
             // A stop came in while it was held.
             let what = describe::request_on(self.protocol(), pdu);
             let plant = self.terms.plant.load();
@@ -244,26 +244,26 @@ impl Tool {
                 );
                 return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
             }
+        }
+        for drive in drives {
+            // Its answer is nobody's: the broadcast has none.
+            if let Some(stop) = stop_in(drive, pdu, now) {
+                drop(drive.place(stop, self.origin.clone(), Authority::Write, EXPIRY, now));
+            }
+        }
+        for drive in drives {
+            let whole = Order::Write(pdu.clone());
+            let only_stops = stop_in(drive, pdu, now).is_some_and(|stop| stop == whole);
             // While its parameters are restored nothing else reaches it but what stops it.
-            if let Some(why) = drive.image.hold.why().filter(|_| !stops(drive, pdu, now)) {
+            if let Some(why) = drive.image.hold.why().filter(|_| !only_stops) {
                 return self.refuse(drive, pdu, Refusal::NotAllowed(why.to_string()), now);
             }
             // Limits hold for each of them.
-            if let Meaning::Write(pdu) = &request.meaning
-                && let Err(refusal) = command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write)
+            if let Meaning::Write(_) = &request.meaning
+                && let Err(refusal) = command::admit(whole, &drive.reading(now), Authority::Write)
             {
                 return self.refuse(drive, pdu, refusal, now);
             }
-        }
-        for drive in drives.iter().filter(|drive| stops(drive, pdu, now)) {
-            // Its answer is nobody's: the broadcast has none.
-            drop(drive.place(
-                Order::Write(pdu.clone()),
-                self.origin.clone(),
-                Authority::Write,
-                EXPIRY,
-                now,
-            ));
         }
         let first = drives.first().filter(|_| !request.is_broadcast(self.protocol()));
         Decision::Wait(self.exchange(case, target(request, first), pdu, true))
@@ -319,10 +319,11 @@ fn target(request: &ToolRequest, drive: Option<&DriveHandle>) -> Target {
     drive.map_or(Target::Address(request.address), |drive| Target::Drive(drive.index))
 }
 
-/// Whether a write that is admitted takes the run command of the drive away.
-fn stops(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> bool {
-    let admitted = command::admit(Order::Write(pdu.clone()), &drive.reading(now), Authority::Write);
-    admitted.is_ok_and(|admitted| admitted.urgency == Urgency::Stop)
+/// The stop of a write that takes the run command of the drive away, if it is admitted: the write itself, or the part of it.
+fn stop_in(drive: &DriveHandle, pdu: &RequestPdu, now: Instant) -> Option<Order> {
+    let (Parts::One(stop) | Parts::Two(stop, _)) = Parts::of(Order::Write(pdu.clone()), &drive.image.spec.profile);
+    let admitted = command::admit(stop.clone(), &drive.reading(now), Authority::Write).ok()?;
+    (admitted.urgency == Urgency::Stop).then_some(stop)
 }
 
 /// What a write takes of the line, with the read that shows its effect.

@@ -47,6 +47,36 @@ async fn one_write_is_one_command() {
 }
 
 #[tokio::test]
+async fn a_stop_in_a_block_is_carried_out_though_the_rest_is_refused() {
+    let rig = Rig::new().await;
+    let mut client = rig.client().await;
+    for (values, exception) in [
+        (&[0, 20_000][..], 3),
+        (&[0, 0x8000], 3),
+        (&[0, 5000, 2500], 3),
+        (&[0, 0x8000, 0xFFFF, 0, 0], 2),
+    ] {
+        assert_eq!(
+            client.ask(1, &write(0x8100, values)).await,
+            [0x90, exception],
+            "{values:?}"
+        );
+        assert_eq!(orders(&rig), ["run=false reverse=false"], "{values:?}");
+    }
+    assert_eq!(client.ask(1, &write(0x8100, &[0, 0x8000, 0xFFFF])).await[0], 16);
+    assert_eq!(client.ask(1, &write(0x8100, &[0, 4000])).await[0], 16);
+    assert_eq!(
+        orders(&rig),
+        [
+            "run=false reverse=false",
+            "run=false reverse=false",
+            "speed_reference=40"
+        ]
+    );
+    rig.end().await;
+}
+
+#[tokio::test]
 async fn fault_reset_is_an_edge_shared_by_all_clients() {
     let rig = Rig::new().await;
     let (mut one, mut other) = (rig.client().await, rig.client().await);
@@ -55,10 +85,10 @@ async fn fault_reset_is_an_edge_shared_by_all_clients() {
     }
     other.ask(1, &words(6, &[0x8100, 0])).await;
     one.ask(1, &words(6, &[0x8100, 5])).await;
-    let (reset, plain) = ("run=false reverse=false fault_reset=true", "run=false reverse=false");
+    let (reset, plain) = ("fault_reset=true", "run=false reverse=false");
     assert_eq!(
         orders(&rig),
-        [reset, plain, plain, "run=true reverse=false fault_reset=true"]
+        [plain, reset, plain, plain, "run=true reverse=false fault_reset=true"]
     );
     rig.end().await;
 }
@@ -75,8 +105,8 @@ async fn every_fault_can_be_reset_by_the_same_word() {
             .update(|s| s.store(Table::Holding, 2100, &[0x0001], Instant::now()));
     }
     client.ask(1, &words(6, &[0x8100, 4])).await;
-    let (reset, plain) = ("run=false reverse=false fault_reset=true", "run=false reverse=false");
-    assert_eq!(orders(&rig), [reset, reset, plain]);
+    let (reset, plain) = ("fault_reset=true", "run=false reverse=false");
+    assert_eq!(orders(&rig), [plain, reset, plain, reset, plain]);
     rig.end().await;
 }
 
@@ -88,8 +118,8 @@ async fn a_fault_reset_that_failed_can_be_repeated() {
     assert_eq!(client.ask(1, &words(6, &[0x8100, 4])).await, [0x86, 0x0B]);
     rig.buses[0].answers(|c| Some(acknowledge(c)));
     assert_eq!(client.ask(1, &words(6, &[0x8100, 4])).await, words(6, &[0x8100, 4]));
-    let reset = "run=false reverse=false fault_reset=true";
-    assert_eq!(orders(&rig), [reset, reset]);
+    let (reset, plain) = ("fault_reset=true", "run=false reverse=false");
+    assert_eq!(orders(&rig), [plain, reset, plain, reset]);
     rig.end().await;
 }
 

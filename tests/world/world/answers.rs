@@ -103,7 +103,8 @@ impl World {
         };
         let Some((first, _)) = &record.answer else {
             // A repeated stop is a command of its own, which may end before the first one is confirmed.
-            let is_second = record.wish.is_stop() && record.sent.is_some() && UNSENT.contains(&code);
+            let without_rest = UNSENT.contains(&code) || code == "stop_only";
+            let is_second = record.wish.is_stop() && record.sent.is_some() && without_rest;
             *left -= u32::from(is_second);
             return is_second;
         };
@@ -158,6 +159,7 @@ impl World {
             "unknown",
             "refused_by_drive",
             "interrupted",
+            "stop_only",
         ];
         // By MQTT the answer comes with the confirmation, long after the order ended.
         let writes = record.wish != Wish::RawRead && self.clients[record.client].habit != Habit::Mqtt;
@@ -183,21 +185,43 @@ impl World {
             !(code == "not_writable" && record.wish.is_stop()),
             "a stop was refused for the registers that it sets"
         );
-        let bare_stop = matches!(record.wish, Wish::Stop | Wish::RawStop);
         assert!(
-            !(code == "offline" && bare_stop),
+            !(code == "offline" && record.wish.is_stop()),
             "a stop was refused because the drive was away: it is the probe"
         );
         match code {
             "acknowledged" | "confirmed" => self.check_done(id, record, code, outcome),
             "expired" => self.check_expired(id, record),
             "refused_by_drive" => self.check_refused(id, record, outcome),
+            "stop_only" => self.check_stop_only(id, record, outcome),
             _ => {}
         }
         if code == "confirmed" && self.records[id].wish == Wish::Stop {
             self.check_stands(id);
         }
         self.figures.confirmed += u64::from(code == "confirmed");
+    }
+
+    /// Of an order that stops and does more only the stop was done: that it was, and that the rest is what the answer says.
+    fn check_stop_only(&self, id: usize, record: &Record, outcome: Option<&Outcome>) {
+        let (profile, truth) = (&self.buses[record.bus].profile, &self.truths[record.bus][record.drive]);
+        let stops = |did: &RequestPdu, _: Option<&Vec<u16>>| run_command(profile, did) == Some(false);
+        assert!(
+            truth.did(record.accepted, stops) || !truth.run,
+            "order {id}: its stop is acknowledged, and none reached the drive"
+        );
+        let rest = match outcome {
+            Some(Outcome::StopOnly(rest)) => rest.code(),
+            _ => return,
+        };
+        assert!(
+            !DONE.contains(&rest),
+            "order {id}: only the stop was done, and the rest too"
+        );
+        assert!(
+            !UNSENT.contains(&rest) || record.sent.is_none(),
+            "order {id}: its rest was sent, and is answered {rest}"
+        );
     }
 
     /// A confirmed stop: the motor does not run, or stands.

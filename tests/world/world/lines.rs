@@ -204,8 +204,6 @@ impl World {
     /// Words that only one order writes: what may go out of it, and in which order.
     pub(super) fn check_unique(&mut self, bus: usize, drive: usize, pdu: &RequestPdu) {
         let now = self.now;
-        let repeated = self.truths[bus][drive].repeated_until.is_some_and(|until| now < until);
-        let again = |record: &Record| repeated && record.wish.is_stop();
         let waiting = self.open.get(&(bus, drive)).into_iter().flatten();
         let profile = &self.buses[bus].profile;
         let is_converted = |id: &usize| {
@@ -220,9 +218,6 @@ impl World {
             return;
         };
         let record = &mut self.records[id];
-        if again(record) {
-            return;
-        }
         if let Some((code, at)) = &record.answer {
             panic!(
                 "order {id} was answered {code} {:?} ago, and goes out: {record:?}",
@@ -235,7 +230,8 @@ impl World {
         );
         let first = record.sent.is_none();
         record.sent.get_or_insert(now);
-        if first && !record.wish.is_stop() {
+        // Of an order that stops and does more these words are the rest, which overtakes nothing.
+        if first {
             let (place, truth) = (record.place, &mut self.truths[bus][drive]);
             assert!(
                 place > truth.last_place,

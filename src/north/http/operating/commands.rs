@@ -15,8 +15,7 @@ use super::super::api::ErrorReply;
 use super::super::body;
 use super::super::routes::{AppState, Reached, no_drive};
 use super::{Operating, Operator};
-use crate::command::{Answer, Authority, Order, Origin, Outcome, Refusal, SourceKind};
-use crate::drive::ModelPoint;
+use crate::command::{Answer, Authority, Order, Origin, Outcome, Parts, Refusal, SourceKind, stop_of};
 use crate::drive::model::Kind;
 use crate::north::command_json::{
     self, CommandResult, Id, MAX_PAYLOAD, Repetition, SharedMemory, Taken, excerpt, find_id, unknown_drive,
@@ -79,7 +78,9 @@ fn status(outcome: &Outcome) -> StatusCode {
         Outcome::Refused(Refusal::NotAllowed(_)) => StatusCode::FORBIDDEN,
         Outcome::Refused(Refusal::UnknownDrive(_)) => StatusCode::NOT_FOUND,
         Outcome::Refused(_) => StatusCode::UNPROCESSABLE_ENTITY,
-        Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn => StatusCode::CONFLICT,
+        Outcome::Replaced | Outcome::Purged | Outcome::Withdrawn | Outcome::NotStopped => StatusCode::CONFLICT,
+        // Of what was not carried out.
+        Outcome::StopOnly(part) | Outcome::StopFailed(part) => status(part),
         Outcome::Exception(_) | Outcome::Garbled | Outcome::NotTaken(_) => StatusCode::BAD_GATEWAY,
         Outcome::TimedOut | Outcome::Unknown(_) | Outcome::Interrupted(_) => StatusCode::GATEWAY_TIMEOUT,
         Outcome::Expired | Outcome::BusDown | Outcome::Offline | Outcome::QueueFull | Outcome::ShuttingDown => {
@@ -166,7 +167,7 @@ impl Operator {
 impl Operating {
     /// Takes a command at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
     /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
-    /// is always executed.
+    /// is always executed, that of a command which does more without the rest.
     fn take(
         &self,
         plant: &Plant,
@@ -187,21 +188,33 @@ impl Operating {
         };
         let profile = &drive.image.spec.profile;
         let refuse = |refusal, origin| reply(&drive.refuse(&excerpt(payload), refusal, origin, now));
-        let (points, expiry) = match command_json::order(payload, profile) {
-            Ok(order) => order,
+        let asked = match command_json::order(payload, profile) {
+            Ok(asked) => asked,
             Err(refusal) => return refuse(refusal, origin),
         };
-        let run = profile.model_index(ModelPoint::Run);
-        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
-        let shared = match stop {
-            true => None,
-            false => match self.remember(&drive, operator, payload, id.as_ref(), now) {
-                Ok(shared) => Some(shared),
-                Err(Known::Reply(reply)) => return Progress::Repeated(reply),
-                Err(Known::Refused(why)) => return refuse(Refusal::NotAllowed(why), origin),
-            },
+        let (stop, order) = (stop_of(&asked.points, profile), Order::Points(asked.points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        let (mut refused, mut shared) = (asked.refused, None);
+        if refused.is_none() && !only_stops {
+            match self.remember(&drive, operator, payload, id.as_ref(), now) {
+                Ok(remembered) => shared = Some(remembered),
+                Err(Known::Reply(reply)) if stop.is_none() => return Progress::Repeated(reply),
+                Err(Known::Reply(_)) => {
+                    let why = "it repeats an earlier command, and only its stop is carried out again; send it with another `id`";
+                    refused = Some(Refusal::NotAllowed(why.to_string()));
+                }
+                Err(Known::Refused(why)) => refused = Some(Refusal::NotAllowed(why)),
+            }
+        }
+        let (client, expiry) = (Authority::Write, asked.expiry);
+        let placed = match (refused, stop) {
+            (None, _) => drive.place(order, origin, client, expiry, now),
+            (Some(refusal), Some(stop)) => {
+                let rest = (excerpt(payload), refusal);
+                drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, origin),
         };
-        let placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
         Progress::Placed(Waiting {
             placed,
             drive: name.to_string(),
@@ -210,7 +223,7 @@ impl Operating {
         })
     }
 
-    /// Remembers a command that is no stop.
+    /// Remembers a command that does more than stop.
     ///
     /// # Errors
     /// It is not to be executed.

@@ -4,6 +4,7 @@ use super::super::fixture;
 use super::*;
 use crate::codec::Reply as BusReply;
 use crate::command::{Outcome, Receipt, Urgency};
+use crate::drive::Value;
 use crate::north::command_json::REMEMBERED;
 
 struct Bench {
@@ -580,4 +581,72 @@ fn the_audit_names_the_client_that_the_broker_names() {
     let command = bench.plant.buses[0].queue.lock().pop(Urgency::Read, bench.now).unwrap();
     assert_eq!(command.ticket.origin().who, "alice\\n");
     assert_eq!(command.ticket.client(), "mqtt");
+}
+
+/// The drive acknowledges the stop of a command, and nothing else of it was queued; the result.
+fn stop_alone(bench: &mut Bench, payload: &str) -> Json {
+    assert_eq!(bench.take(set("p1/set", payload)), None, "{payload}");
+    assert_eq!(bench.queued(), 1, "{payload}");
+    let (order, receipt) = bench.take_order().unwrap();
+    let run = bench.plant.drive("p1").unwrap().image.spec.profile.point_index("run");
+    assert_eq!(order, Order::Points(vec![(run.unwrap(), Value::Bool(false))]));
+    drop(receipt);
+    let result = bench.finished().unwrap();
+    assert_eq!((&result["ok"], &result["result"]), (&false.into(), &"stop_only".into()));
+    assert_eq!(bench.finished(), None, "one result");
+    result
+}
+
+#[test]
+fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
+    let mut bench = Bench::new();
+    for (payload, code, text) in [
+        (
+            r#"{"id": 1, "run": false, "speed_reference": 1000}"#,
+            "bad_value",
+            "outside",
+        ),
+        (
+            r#"{"id": 2, "run": false, "sped_reference": 10}"#,
+            "not_writable",
+            "speed_reference",
+        ),
+        (r#"{"id": 3, "run": false, "expires_ms": 0}"#, "bad_value", "expires_ms"),
+    ] {
+        let result = stop_alone(&mut bench, payload);
+        assert_eq!(result["rest"], code, "{result}");
+        let message = result["error"]["message"].as_str().unwrap();
+        assert!(
+            message.starts_with("the drive acknowledged the stop") && message.contains(text),
+            "{message}"
+        );
+    }
+    bench.commands.rules.require_id = true;
+    let result = stop_alone(&mut bench, r#"{"run": false, "speed_reference": 10}"#);
+    assert_eq!(result["rest"], "not_allowed");
+    assert!(result["error"]["message"].as_str().unwrap().contains("require_id"));
+    let audit = bench.plant.writes.audit().parsed();
+    let results: Vec<_> = audit.iter().map(|record| record["result"].as_str().unwrap()).collect();
+    assert_eq!(
+        results.iter().filter(|result| **result == "acknowledged").count(),
+        4,
+        "{results:?}"
+    );
+    assert!(results.contains(&"bad_value") && results.contains(&"not_writable") && results.contains(&"not_allowed"));
+}
+
+#[test]
+fn of_a_repeated_command_that_stops_and_does_more_only_the_stop_is_repeated() {
+    let mut bench = Bench::new();
+    let payload = r#"{"id": 9, "run": false, "speed_reference": 10}"#;
+    assert_eq!(bench.take(set("p1/set", payload)), None);
+    assert_eq!(bench.queued(), 2);
+    drop(bench.take_order().unwrap());
+    assert_eq!(bench.finished(), None, "its rest is to come");
+    assert_eq!(bench.acknowledge()["result"], "acknowledged");
+    for _ in 0..2 {
+        let result = stop_alone(&mut bench, payload);
+        assert_eq!(result["rest"], "not_allowed");
+        assert!(result["error"]["message"].as_str().unwrap().contains("repeats"));
+    }
 }

@@ -13,8 +13,10 @@ use super::super::request::Incoming;
 use super::model::DriveMetrics;
 use super::session::Session;
 use super::wire::{self, Metric, MetricValue, Payload};
-use crate::command::{Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Refusal, SourceKind};
-use crate::drive::{ModelPoint, Profile, Value};
+use crate::command::{
+    Answer, Authority, CONFIRMED, DEFAULT_EXPIRY, Order, Origin, Parts, Refusal, SourceKind, stop_of,
+};
+use crate::drive::{Profile, Value};
 use crate::north::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
 use crate::plant::{Placed, Plant};
 
@@ -120,21 +122,30 @@ impl Orders {
             let answer = drive.refuse(&request.what(), refusal, origin, now);
             Some(Finished::of(device, touched.clone(), &answer, None))
         };
-        let points = match points {
+        let (points, mut refused) = match points {
             Err(refusal) => return refuse(refusal, origin),
             Ok(points) => points,
         };
-        let run = drive.image.spec.profile.model_index(ModelPoint::Run);
-        let stop = points.iter().any(|(i, v)| Some(*i) == run && !v.as_bool());
-        if !stop
+        let profile = &drive.image.spec.profile;
+        let (stop, order) = (stop_of(&points, profile), Order::Points(points));
+        let only_stops = stop.is_some() && matches!(Parts::of(order.clone(), profile), Parts::One(_));
+        if refused.is_none()
+            && !only_stops
             && request.timestamp.is_some()
             && let Err(why) = self.remember(incoming, now)
         {
-            return refuse(Refusal::NotAllowed(why.to_string()), origin);
+            refused = Some(Refusal::NotAllowed(why.to_string()));
         }
         let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
         let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
-        let mut placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
+        let mut placed = match (refused, stop) {
+            (None, _) => drive.place(order, origin, Authority::Write, expiry, now),
+            (Some(refusal), Some(stop)) => {
+                let (what, stop) = (request.what(), Order::Points(stop));
+                drive.place_stop(stop, (&what, refusal), origin, Authority::Write, expiry, now)
+            }
+            (Some(refusal), None) => return refuse(refusal, origin),
+        };
         if let Some(answer) = placed.answer().filter(|answer| !answer.outcome.is_ok()) {
             return Some(Finished::of(device, touched, &answer, None));
         }
@@ -258,11 +269,12 @@ impl Request {
         excerpt(all.join(" ").as_bytes())
     }
 
+    /// The points that are understood, and why another one is not.
     fn points(
         &self,
         profile: &Profile,
         name: impl Fn(usize) -> Option<String>,
-    ) -> Result<Vec<(usize, Value)>, Refusal> {
+    ) -> Result<(Vec<(usize, Value)>, Option<Refusal>), Refusal> {
         let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
         let point = |(metric, place): &(Metric, Option<usize>)| {
             let name = match (&metric.name, place.and_then(&name)) {
@@ -285,7 +297,14 @@ impl Request {
             })?;
             resolve(profile, &name, &value)
         };
-        metrics.iter().map(point).collect()
+        let (mut points, mut refused) = (Vec::new(), None);
+        for metric in metrics {
+            match point(metric) {
+                Ok(point) => points.push(point),
+                Err(refusal) => refused = refused.or(Some(refusal)),
+            }
+        }
+        Ok((points, refused))
     }
 }
 

@@ -156,3 +156,37 @@ fn a_lease_is_renewed_by_the_login_that_commanded_last_only() {
     );
     assert_eq!(drive.commander(), None, "another client");
 }
+
+#[test]
+fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
+    use crate::command::Urgency;
+    let bench = Bench::new();
+    let alice = operator("alice", "alice#1");
+    let bodies = [
+        "{\"run\": false, \"speed_reference\": 1000}",
+        "{\"run\": false, \"sped\": 1}",
+        "{\"id\": 7, \"run\": false, \"speed_reference\": 5}",
+        "{\"id\": 7, \"run\": false, \"speed_reference\": 5}",
+    ];
+    for (body, rest) in bodies.into_iter().zip(["bad_value", "not_writable", "", "not_allowed"]) {
+        let Progress::Placed(mut waiting) = bench.take(&alice, "p1", body) else {
+            panic!("{body}");
+        };
+        while let Some(command) = bench.plant.buses[0].queue.lock().pop(Urgency::Read, bench.now) {
+            command.answer(&Outcome::Acknowledged(crate::codec::Reply::Written), bench.now);
+        }
+        let answer = waiting.placed.answer().unwrap();
+        let code = match &answer.outcome {
+            Outcome::StopOnly(rest) => rest.code(),
+            Outcome::Acknowledged(_) => "",
+            other => panic!("{body}: {other:?}"),
+        };
+        assert_eq!(code, rest, "{body}");
+        let expected = match rest {
+            "" => StatusCode::OK,
+            "not_allowed" => StatusCode::FORBIDDEN,
+            _ => StatusCode::UNPROCESSABLE_ENTITY,
+        };
+        assert_eq!(status(&answer.outcome), expected, "{body}");
+    }
+}

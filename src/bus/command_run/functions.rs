@@ -1,0 +1,80 @@
+//! Which functions a drive takes for a write of one item: as its profile says, until the drive itself says otherwise. Pure.
+
+use crate::codec::{Protocol, RequestPdu};
+use crate::drive::Profile;
+
+/// What a drive has shown of the functions that it takes; none where it has shown nothing.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub(super) struct TakenFunctions {
+    /// One register is written by function 16, not 06.
+    registers_by_16: Option<bool>,
+    /// One coil is written by function 15, not 05.
+    coils_by_15: Option<bool>,
+    /// It refused function 22.
+    refuses_22: bool,
+}
+
+impl TakenFunctions {
+    /// The request in the form that the drive takes.
+    pub(super) fn form(self, pdu: RequestPdu, profile: &Profile) -> RequestPdu {
+        let several = match &pdu {
+            RequestPdu::WriteRegister { .. } => self.registers_by_16.unwrap_or(profile.functions.registers_by_16),
+            RequestPdu::WriteCoil { .. } => self.coils_by_15.unwrap_or(profile.functions.coils_by_15),
+            _ => false,
+        };
+        match other(&pdu) {
+            Some(other) if several && !profile.protocols.contains(&Protocol::N2) => other,
+            _ => pdu,
+        }
+    }
+
+    /// Whether bits of a register are written by function 22.
+    pub(super) fn masks(self, profile: &Profile) -> bool {
+        profile.functions.mask_write && !self.refuses_22
+    }
+
+    /// The drive does not know that function.
+    pub(super) fn refused(&mut self, pdu: &RequestPdu) {
+        self.refuses_22 |= matches!(pdu, RequestPdu::MaskWrite { .. });
+    }
+
+    /// The drive took that write of one item after it refused the same by the other function.
+    pub(super) fn took(&mut self, pdu: &RequestPdu) {
+        match pdu {
+            RequestPdu::WriteRegister { .. } => self.registers_by_16 = Some(false),
+            RequestPdu::WriteRegisters { .. } => self.registers_by_16 = Some(true),
+            RequestPdu::WriteCoil { .. } => self.coils_by_15 = Some(false),
+            RequestPdu::WriteCoils { .. } => self.coils_by_15 = Some(true),
+            _ => {}
+        }
+    }
+}
+
+/// The same write of one item by the other function; none for anything else.
+pub(super) fn other(pdu: &RequestPdu) -> Option<RequestPdu> {
+    match pdu {
+        RequestPdu::WriteRegister { address, value } => Some(RequestPdu::WriteRegisters {
+            start: *address,
+            values: vec![*value],
+        }),
+        RequestPdu::WriteCoil { address, on } => Some(RequestPdu::WriteCoils {
+            start: *address,
+            bits: vec![*on],
+        }),
+        RequestPdu::WriteRegisters { start, values } => match values.as_slice() {
+            [value] => Some(RequestPdu::WriteRegister {
+                address: *start,
+                value: *value,
+            }),
+            _ => None,
+        },
+        RequestPdu::WriteCoils { start, bits } => match bits.as_slice() {
+            [on] => Some(RequestPdu::WriteCoil {
+                address: *start,
+                on: *on,
+            }),
+            _ => None,
+        },
+        _ => None,
+    }
+}

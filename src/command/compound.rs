@@ -1,0 +1,221 @@
+//! Orders that stop a drive and ask for something else besides: the stop goes on its own, with the rights of a stop, and the
+//! rest is judged, queued and answered as an order of its own. Pure.
+
+use std::sync::{Arc, OnceLock};
+
+use super::{Order, Outcome, written};
+use crate::codec::{RequestPdu, Table};
+use crate::drive::{ModelPoint, Profile, Value};
+
+/// An order, its stop taken out.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Parts {
+    /// It stops nothing, or does nothing else.
+    One(Order),
+    /// Its stop, and the rest.
+    Two(Order, Order),
+}
+
+/// What a point is for a stop.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Role {
+    /// It takes the run command away.
+    Stop,
+    /// It sets the run command.
+    Run,
+    /// It takes another command away (direction, reset), as the word of a stop does; alone it is no stop.
+    Clears,
+    Other,
+}
+
+impl Parts {
+    /// Takes the stop out of an order. One that both stops and runs says neither, and is left whole.
+    pub fn of(order: Order, profile: &Profile) -> Parts {
+        match order {
+            Order::Points(values) => of_points(values, profile),
+            Order::Write(pdu) => match stop_in(&pdu, profile) {
+                Some(stop) => Parts::Two(Order::Write(stop), Order::Write(pdu)),
+                None => Parts::One(Order::Write(pdu)),
+            },
+            Order::Read(_) | Order::Parameter(_) => Parts::One(order),
+        }
+    }
+}
+
+/// What an order of points has of a stop: the values that are carried out even if the rest is refused. None where it does not
+/// stop, or says both.
+pub fn stop_of(values: &[(usize, Value)], profile: &Profile) -> Option<Vec<(usize, Value)>> {
+    let role = |(index, value): &(usize, Value)| role(profile, *index, *value);
+    let stops = values.iter().any(|value| role(value) == Role::Stop);
+    let runs = values.iter().any(|value| role(value) == Role::Run);
+    if !stops || runs {
+        return None;
+    }
+    let mut stop: Vec<(usize, Value)> = Vec::new();
+    for value in values {
+        if matches!(role(value), Role::Stop | Role::Clears) && !stop.iter().any(|(index, _)| *index == value.0) {
+            stop.push(*value);
+        }
+    }
+    Some(stop)
+}
+
+fn of_points(values: Vec<(usize, Value)>, profile: &Profile) -> Parts {
+    let Some(stop) = stop_of(&values, profile) else {
+        return Parts::One(Order::Points(values));
+    };
+    let other = |(index, value): &(usize, Value)| role(profile, *index, *value) == Role::Other;
+    let rest: Vec<(usize, Value)> = values.into_iter().filter(other).collect();
+    match rest.is_empty() {
+        true => Parts::One(Order::Points(stop)),
+        false => Parts::Two(Order::Points(stop), Order::Points(rest)),
+    }
+}
+
+fn role(profile: &Profile, index: usize, value: Value) -> Role {
+    // A point may take its commands at another one.
+    let place = profile
+        .points
+        .get(index)
+        .and_then(|point| point.write_to)
+        .unwrap_or(index);
+    let is = |point: ModelPoint| profile.model_index(point) == Some(place);
+    match value.as_f64() {
+        0.0 if is(ModelPoint::Run) => Role::Stop,
+        _ if is(ModelPoint::Run) => Role::Run,
+        0.0 if is(ModelPoint::Reverse) || is(ModelPoint::FaultReset) => Role::Clears,
+        _ => Role::Other,
+    }
+}
+
+/// The write of the control word alone, or of its coil, out of a write of several items that clears the run command.
+fn stop_in(pdu: &RequestPdu, profile: &Profile) -> Option<RequestPdu> {
+    let (table, items) = written(pdu)?;
+    let stops = |(address, value): &&(u16, u16)| profile.is_stop(table, *address, *value);
+    let (address, value) = *items.iter().find(stops).filter(|_| items.len() > 1)?;
+    Some(match table {
+        Table::Coil | Table::DiscreteInput => RequestPdu::WriteCoil {
+            address,
+            on: value != 0,
+        },
+        Table::Holding | Table::Input => RequestPdu::WriteRegister { address, value },
+    })
+}
+
+/// How the stop of a compound order ended, for its rest: behind a stop that failed nothing is sent.
+#[derive(Debug, Clone, Default)]
+pub struct StopEnd(Arc<OnceLock<bool>>);
+
+impl StopEnd {
+    pub(super) fn note(&self, outcome: &Outcome) {
+        // Answered once only.
+        let _ = self.0.set(outcome.is_ok());
+    }
+
+    /// Whether it ended without the drive's acknowledgement.
+    pub fn has_failed(&self) -> bool {
+        self.0.get() == Some(&false)
+    }
+}
+
+/// The one outcome of an order in two parts; `None` while it is not known.
+pub fn joined(stop: Option<Outcome>, rest: Option<Outcome>) -> Option<Outcome> {
+    match (stop?, rest) {
+        (stop, None) if stop.is_ok() => None,
+        (stop, Some(rest)) if stop.is_ok() && rest.is_ok() => Some(stop),
+        (stop, Some(rest)) if stop.is_ok() => Some(Outcome::StopOnly(Box::new(rest))),
+        // The rest is not sent, or was refused before.
+        (stop, _) => Some(Outcome::StopFailed(Box::new(stop))),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::drive::profile::Profiles;
+
+    fn parts(profile: &str, points: &[(&str, f64)]) -> (Vec<String>, Vec<String>) {
+        let profile = Profiles::built_in().get(profile).unwrap().clone();
+        let values = points.iter().map(|(name, value)| {
+            let index = profile.point_index(name).unwrap();
+            (index, Value::Number(*value))
+        });
+        let names = |order: Order| match order {
+            Order::Points(values) => values.iter().map(|(i, _)| profile.points[*i].name.clone()).collect(),
+            _ => Vec::new(),
+        };
+        match Parts::of(Order::Points(values.collect()), &profile) {
+            Parts::One(order) => (names(order), Vec::new()),
+            Parts::Two(stop, rest) => (names(stop), names(rest)),
+        }
+    }
+
+    #[test]
+    fn a_stop_goes_alone_with_what_takes_commands_away() {
+        for profile in ["vacon-nx", "vacon-nx-n2", "vacon-cx", "teco-7300pa", "teco-7300pa-n2"] {
+            let (stop, rest) = parts(profile, &[("speed_reference", 5.0), ("run", 0.0)]);
+            assert_eq!(
+                (stop, rest),
+                (vec!["run".to_string()], vec!["speed_reference".to_string()]),
+                "{profile}"
+            );
+        }
+        let (stop, rest) = parts("vacon-nx", &[("run", 0.0), ("reverse", 0.0), ("fault_reset", 0.0)]);
+        assert_eq!((stop.len(), rest.len()), (3, 0));
+        let (stop, rest) = parts("vacon-nx", &[("run", 0.0), ("reverse", 1.0), ("fault_reset", 1.0)]);
+        assert_eq!(
+            (stop.join(" "), rest.join(" ")),
+            ("run".into(), "reverse fault_reset".into())
+        );
+        let whole: [&[(&str, f64)]; 3] = [
+            &[("run", 1.0), ("speed_reference", 5.0)],
+            &[("run", 1.0), ("run", 0.0)],
+            &[("reverse", 0.0), ("speed_reference", 5.0)],
+        ];
+        for points in whole {
+            assert_eq!(parts("vacon-nx", points).0.len(), 2, "{points:?}");
+        }
+        assert_eq!(
+            parts("vacon-nx", &[("run", 0.0), ("run", 0.0)]).0.len(),
+            1,
+            "said twice"
+        );
+    }
+
+    #[test]
+    fn a_block_with_a_stop_is_sent_behind_its_control_word() {
+        let profile = Profiles::built_in().get("vacon-nx").unwrap().clone();
+        let (raw, ..) = profile.run_bit().unwrap();
+        let block = |word: u16| RequestPdu::WriteRegisters {
+            start: raw.address,
+            values: vec![word, 0, 5000],
+        };
+        let stop = RequestPdu::WriteRegister {
+            address: raw.address,
+            value: 0,
+        };
+        let two = Parts::Two(Order::Write(stop.clone()), Order::Write(block(0)));
+        assert_eq!(Parts::of(Order::Write(block(0)), &profile), two);
+        for whole in [block(1), stop] {
+            let order = Order::Write(whole);
+            assert_eq!(Parts::of(order.clone(), &profile), Parts::One(order));
+        }
+    }
+
+    #[test]
+    fn one_answer_tells_both_parts() {
+        use crate::codec::Reply;
+        let done = || Some(Outcome::Acknowledged(Reply::Written));
+        assert_eq!(joined(None, done()), None);
+        assert_eq!(joined(done(), None), None);
+        assert_eq!(joined(done(), done()), done());
+        let only = joined(done(), Some(Outcome::Purged)).unwrap();
+        assert_eq!((only.code(), only.is_ok()), ("stop_only", false));
+        let failed = joined(Some(Outcome::TimedOut), None).unwrap();
+        assert_eq!((failed.code(), failed.is_ok()), ("timeout", false));
+        assert!(
+            failed.to_string().contains("the rest of the order was not sent"),
+            "{failed}"
+        );
+    }
+}
