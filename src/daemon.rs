@@ -16,7 +16,7 @@ use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::master::Handover;
 use crate::bus::supervision::Lease;
-use crate::command::{AuditFile, CommandQueue, WriteStats};
+use crate::command::{AuditFile, CommandQueue, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::Events;
 use crate::history::{History, Keeper, RecorderTask, Recordings};
@@ -237,7 +237,7 @@ impl Daemon {
         let mut quiet_until: BTreeMap<String, Instant> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
-        for (before, left) in stop_all(removed).await {
+        for (before, left) in at_once(removed, BusTask::make_room).await {
             let drives = before.drives.iter().map(|d| (d.name.clone(), d.address));
             leases.extend(drives.zip(left.leases));
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
@@ -252,13 +252,17 @@ impl Daemon {
                     Lease::default()
                 }
             };
-            task.handle().take_over(&stopped);
+            task.handle().take_over(&stopped, Instant::now());
             let handover = Handover {
                 leases: bus.drives.iter().map(lease).collect(),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
             };
             handovers.insert(bus.spec.name.clone(), handover);
             kept.push((bus, task));
+        }
+        // Stops to drives that are there no more, or are only monitored.
+        for bus in &stopped {
+            bus.queue.close(Outcome::ShuttingDown, Instant::now());
         }
         for (bus, task) in &kept {
             // Without a configured `stale_after`, data as old as three rounds of a slow bus is not stale.
@@ -484,7 +488,7 @@ impl Daemon {
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();
         within(STOP_BUSES, "buses", async {
-            stop_all(buses).await;
+            at_once(buses, BusTask::stop).await;
             if let Some(recorder) = recorder {
                 // A thread of it that panicked has logged that.
                 let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
@@ -546,10 +550,13 @@ impl Daemon {
 }
 
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
-async fn stop_all(buses: Vec<(BusSettings, BusTask)>) -> Vec<(BusSettings, Handover)> {
+async fn at_once<T: Send + 'static>(
+    buses: Vec<(BusSettings, BusTask)>,
+    end: fn(BusTask) -> T,
+) -> Vec<(BusSettings, T)> {
     let stop = |(settings, task): (BusSettings, BusTask)| {
         tracing::info!(bus = %settings.spec.name, "stopping the bus");
-        tokio::task::spawn_blocking(move || (settings, task.stop()))
+        tokio::task::spawn_blocking(move || (settings, end(task)))
     };
     let stopping: Vec<_> = buses.into_iter().map(stop).collect();
     // A bus thread that panicked has ended the process.

@@ -22,7 +22,7 @@ use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, Events, RefusedCommand};
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
-use crate::process_image::{BusImage, DriveImage, Reading};
+use crate::process_image::{Access, BusImage, DriveImage, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::Placed;
@@ -46,21 +46,30 @@ pub struct BusHandle {
 }
 
 impl BusHandle {
-    /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if name and address are.
+    /// Takes over what the stopped buses `before` a reload know of its drives, and the stops that wait there; a drive is the
+    /// same if name and address are.
     /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
     /// that name is outdated.
-    pub fn take_over(&self, before: &[BusHandle]) {
+    pub fn take_over(&self, before: &[BusHandle], now: Instant) {
         for (index, drive) in self.image.drives.iter().enumerate() {
             let same = |image: &Arc<DriveImage>| {
                 (&image.spec.name, image.spec.address) == (&drive.spec.name, drive.spec.address)
             };
-            let known = before.iter().find_map(|bus| {
-                let place = bus.image.drives.iter().position(same)?;
-                let queue = bus.queue.lock();
-                Some((queue.commander(place).cloned(), queue.stops(place)))
-            });
-            let (commander, stops) = known.unwrap_or_else(|| (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)));
+            let known = before
+                .iter()
+                .find_map(|bus| Some((bus, bus.image.drives.iter().position(same)?)));
+            let (commander, stops) = match known {
+                Some((bus, place)) => {
+                    let queue = bus.queue.lock();
+                    (queue.commander(place).cloned(), queue.stops(place))
+                }
+                None => (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)),
+            };
             self.queue.lock().take_over(index, commander, stops);
+            // What is only monitored from now on is sent nothing.
+            if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
+                bus.queue.hand_over(place, &self.queue, index, now);
+            }
         }
     }
 }
@@ -200,6 +209,7 @@ impl BusHandle {
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
         let command = Command::new(drive, admitted, now + expiry, ticket.with_changes(changes));
+        let command = command.asked_of(&spec.profile, now);
         self.queue.submit(command, now);
         Ok(answer)
     }
@@ -283,6 +293,19 @@ impl DriveHandle {
     /// `authority` says what the client may do at all. The order is not sent later than `expiry` from now. Refused writes
     /// are audited and published as an event.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
+        self.place_asked(order, origin, authority, expiry, now, now)
+    }
+
+    /// The same of an order whose head came at `asked`: no stop that came in since is undone by it.
+    pub fn place_asked(
+        &self,
+        order: Order,
+        origin: Origin,
+        authority: Authority,
+        expiry: Duration,
+        asked: Instant,
+        now: Instant,
+    ) -> Placed {
         let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
@@ -300,13 +323,17 @@ impl DriveHandle {
                 }
                 ticket.answer(Outcome::Refused(refusal), now);
             }
-            Ok(_) if !self.bus_up() => ticket.answer(Outcome::BusDown, now),
+            // A stop waits for a bus that is about to open its port.
+            Ok(admitted) if !self.bus_up() && (self.bus.image.is_tried() || admitted.urgency != Urgency::Stop) => {
+                ticket.answer(Outcome::BusDown, now);
+            }
             // A stop goes to a drive that does not answer too: it may be back.
             Ok(admitted) if !reading.snapshot.link.is_online() && admitted.urgency != Urgency::Stop => {
                 ticket.answer(Outcome::Offline, now);
             }
             Ok(admitted) => {
                 let command = Command::new(self.index, admitted, now + expiry, ticket);
+                let command = command.asked_of(&self.image.spec.profile, asked);
                 self.bus.queue.submit(command, now);
             }
         }

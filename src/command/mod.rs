@@ -14,6 +14,7 @@ mod frequency_range;
 mod parameter;
 mod queue;
 mod ticket;
+mod touched;
 
 pub use admit::{Admitted, admit, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
@@ -25,13 +26,14 @@ pub use frequency_range::{FrequencyRange, is_range_end};
 pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, Pending, Stopping};
 pub use ticket::{Receipt, Ticket, WriteStats};
+pub use touched::Touched;
 
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Exception, Reply, RequestPdu};
-use crate::drive::Value;
+use crate::drive::{Profile, Value};
 
 /// Time after which a command is not sent any more, unless it says otherwise.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
@@ -212,6 +214,14 @@ pub struct Command {
     pub overtaken: usize,
     /// Its number in the queue.
     pub number: u64,
+    /// When its head came: what was asked for before a stop came in does not go behind that.
+    pub asked: Option<Instant>,
+    /// The registers that it sets, and on which it rests.
+    pub touched: Touched,
+    /// What a write of a tool has beside that which may write anything, to one drive or to all that hear it.
+    pub passed_on: Option<PassedOn>,
+    /// A stop that another bus had begun before this one took its place.
+    pub was_begun: bool,
 }
 
 impl Command {
@@ -228,11 +238,51 @@ impl Command {
             joined: Vec::new(),
             overtaken: 0,
             number: 0,
+            asked: None,
+            touched: Touched::Anything,
+            passed_on: None,
+            was_begun: false,
+        }
+    }
+
+    /// The same to a drive of that profile, asked for at `asked`.
+    pub fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
+        self.touched = Touched::of(&self.order, &self.ranges, profile);
+        self.asked = Some(asked);
+        self
+    }
+
+    /// The drives that it reaches.
+    pub fn reach(&self) -> &[usize] {
+        match &self.passed_on {
+            Some(passed_on) => &passed_on.reach,
+            None => std::slice::from_ref(&self.drive),
+        }
+    }
+
+    /// Whether it reaches that drive.
+    pub fn reaches(&self, drive: usize) -> bool {
+        self.reach().contains(&drive)
+    }
+
+    /// Whether it takes the run command of that drive away.
+    pub fn stops(&self, drive: usize) -> bool {
+        match &self.passed_on {
+            Some(passed_on) => passed_on.stops.contains(&drive),
+            None => self.urgency == Urgency::Stop && self.drive == drive,
         }
     }
 
     /// Answers whoever gave it and all who joined.
     pub fn answer(self, outcome: &Outcome, now: Instant) {
+        let outcome = &match outcome {
+            Outcome::Expired if self.was_begun => Outcome::Interrupted(Interruption::Expired),
+            Outcome::BusDown if self.was_begun => Outcome::Interrupted(Interruption::BusDown),
+            Outcome::ShuttingDown if self.was_begun => Outcome::Interrupted(Interruption::ShuttingDown),
+            Outcome::Offline if self.was_begun => Outcome::Interrupted(Interruption::Offline),
+            Outcome::Replaced if self.was_begun => Outcome::Interrupted(Interruption::Stop),
+            outcome => outcome.clone(),
+        };
         let joined = self.joined.into_iter().map(|(ticket, _)| ticket);
         let tickets = [self.ticket].into_iter().chain(joined);
         tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));

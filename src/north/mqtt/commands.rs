@@ -154,10 +154,11 @@ impl Commands {
             true => 0,
             false => self.memory.lock().remember(&taken, print, stops, now),
         };
+        let (order, asked) = (Order::Points(points), incoming.asked.unwrap_or(now));
         let pending = PendingCommand {
             number,
             id: request.id,
-            placed: drive.place(Order::Points(points), origin, Authority::Write, expiry, now),
+            placed: drive.place_asked(order, origin, Authority::Write, expiry, asked, now),
             reply,
         };
         self.follow(pending, time)

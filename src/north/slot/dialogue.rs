@@ -34,8 +34,8 @@ struct Pending {
 #[derive(Debug)]
 struct Held {
     request: ToolRequest,
-    /// Stops that its drive had been given when the tool asked.
-    stops: u64,
+    /// When its first byte came.
+    asked: Instant,
     until: Instant,
     deadline: Instant,
 }
@@ -100,7 +100,8 @@ impl Dialogue {
             match said {
                 Said::Request(request) => {
                     any = true;
-                    self.asked_for(request, now);
+                    let asked = self.framing.asked().unwrap_or(now);
+                    self.asked_for(request, asked, now);
                 }
                 Said::Broken => self.tool.count(SlotOutcome::Broken),
             }
@@ -139,7 +140,7 @@ impl Dialogue {
         }
     }
 
-    fn asked_for(&mut self, request: ToolRequest, now: Instant) {
+    fn asked_for(&mut self, request: ToolRequest, asked: Instant, now: Instant) {
         let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + IMPATIENT);
         self.give_up(SlotOutcome::Abandoned);
         let deadline = now + ANSWER_WITHIN;
@@ -151,7 +152,7 @@ impl Dialogue {
             pace.not_before.max(haste.unwrap_or(now))
         };
         let held = Held {
-            stops: pace.stops,
+            asked,
             request,
             until,
             deadline,
@@ -169,12 +170,12 @@ impl Dialogue {
     fn go(&mut self, held: Held, now: Instant) {
         let Held {
             request,
-            stops,
+            asked,
             deadline,
             ..
         } = held;
         self.asked = Some(now);
-        match self.tool.decide(&request, stops, deadline, now) {
+        match self.tool.decide(&request, asked, deadline, now) {
             Decision::Refuse(why) => {
                 self.tool.count(SlotOutcome::Refused);
                 if !request.is_broadcast(self.tool.protocol()) {

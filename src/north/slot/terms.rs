@@ -53,8 +53,6 @@ pub(super) struct Pace {
     pub(super) not_before: Instant,
     /// It stops a drive: it goes at once.
     pub(super) is_stop: bool,
-    /// Stops that its drive was given so far.
-    pub(super) stops: u64,
 }
 
 /// When tools may write next, by bus.
@@ -123,7 +121,6 @@ impl Tool {
         let mut pace = Pace {
             not_before: now,
             is_stop: false,
-            stops: 0,
         };
         let Meaning::Write(pdu) = &request.meaning else {
             return pace;
@@ -131,7 +128,6 @@ impl Tool {
         let plant = self.terms.plant.load();
         let drives = self.asked(&plant, request);
         pace.is_stop = self.writes() && drives.iter().any(|drive| stops(drive, pdu, now));
-        pace.stops = drives.iter().map(DriveHandle::stops).sum();
         // What is refused anyway, is at once.
         let admitted = drives
             .iter()
@@ -158,9 +154,9 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request whose drive had been given so many `stops` when the tool asked. What is given to the bus is in
-    /// its queue when this returns, and is not sent after `deadline`.
-    pub(super) fn decide(&self, request: &ToolRequest, stops: u64, deadline: Instant, now: Instant) -> Decision {
+    /// What becomes of a request whose first byte came at `asked`: behind a stop that came in since it is not sent. What is given
+    /// to the bus is in its queue when this returns, and is not sent after `deadline`.
+    pub(super) fn decide(&self, request: &ToolRequest, asked: Instant, deadline: Instant, now: Instant) -> Decision {
         let plant = self.terms.plant.load();
         let bus = plant
             .buses
@@ -172,6 +168,7 @@ impl Tool {
         let case = Case {
             plant: &plant,
             bus,
+            asked,
             deadline,
             now,
         };
@@ -182,7 +179,7 @@ impl Tool {
                 Decision::Wait(self.exchange(&case, target, pdu, false))
             }
             Meaning::Write(pdu) if !broadcast && drives.len() == 1 => match drives.first() {
-                Some(drive) => self.write(drive, pdu, stops, now),
+                Some(drive) => self.write(drive, pdu, asked, now),
                 None => Decision::Silent,
             },
             Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
@@ -192,33 +189,20 @@ impl Tool {
     }
 
     /// A write to a configured drive: the same checks as those of a Modbus TCP client.
-    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, stops: u64, now: Instant) -> Decision {
+    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, asked: Instant, now: Instant) -> Decision {
         if !self.writes() {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
         }
-        if drive.stops() != stops && !self::stops(drive, pdu, now) {
-            // A stop came in while it was held.
-            let what = describe::request_on(self.protocol(), pdu);
-            let plant = self.terms.plant.load();
-            turn_away(
-                &plant.writes,
-                &drive.image.spec.name,
-                &what,
-                Outcome::Purged,
-                self.origin.clone(),
-                now,
-            );
-            return Decision::Silent;
-        }
         let cost = cost(drive, pdu);
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
         let order = Order::Write(pdu.clone());
-        Decision::Wait(Work::Command(drive.place(
+        Decision::Wait(Work::Command(drive.place_asked(
             order,
             self.origin.clone(),
             Authority::Write,
             EXPIRY,
+            asked,
             now,
         )))
     }
@@ -274,6 +258,7 @@ impl Tool {
             target,
             pdu: pdu.clone(),
             may_write,
+            asked: case.asked,
             expires: case.deadline,
             origin: self.origin.clone(),
         };
@@ -311,6 +296,7 @@ impl Tool {
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,
+    asked: Instant,
     deadline: Instant,
     now: Instant,
 }

@@ -101,8 +101,10 @@ pub(in crate::north::http) async fn command(
     Path(name): Path<String>,
     request: Request,
 ) -> Response {
+    // Passwords are compared, and the body is waited for, behind that.
+    let asked = Instant::now();
     let (parts, body) = request.into_parts();
-    match commanded(&app, &reached, &name, &parts, body).await {
+    match commanded(&app, &reached, &name, &parts, body, asked).await {
         Ok(reply) => reply.into_response(),
         Err(response) => response,
     }
@@ -114,13 +116,15 @@ async fn commanded(
     name: &str,
     parts: &request::Parts,
     body: Body,
+    asked: Instant,
 ) -> Result<CommandReply, Response> {
     let (operating, cookies, address) = (&app.operating, app.cookies(reached), reached.peer.ip());
     let operator = operating.commander(&parts.headers, &cookies, address).await;
     let operator = operator.map_err(IntoResponse::into_response)?;
     let payload = body::read(body, reached, MAX_PAYLOAD).await?;
     let plant = app.plant.load_full();
-    let progress = operating.take(&plant, &operator, name, &payload, Instant::now(), SystemTime::now());
+    let times = (asked, Instant::now(), SystemTime::now());
+    let progress = operating.take(&plant, &operator, name, &payload, times);
     match progress {
         Progress::Known(reply) => Ok(reply),
         Progress::Repeated(reply) => shared(reply).await,
@@ -169,7 +173,7 @@ impl Operator {
 }
 
 impl Operating {
-    /// Takes a command at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
+    /// Takes a command whose head came at `asked`, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
     /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
     /// is always executed.
     fn take(
@@ -178,8 +182,7 @@ impl Operating {
         operator: &Operator,
         name: &str,
         payload: &[u8],
-        now: Instant,
-        time: SystemTime,
+        (asked, now, time): (Instant, Instant, SystemTime),
     ) -> Progress {
         let (id, origin) = (find_id(payload), operator.origin());
         let reply = |answer: &Answer| Progress::Known(CommandReply::new(id.as_ref(), name, answer, None, time));
@@ -205,7 +208,7 @@ impl Operating {
                 Err(Known::Refused(why)) => return refuse(Refusal::NotAllowed(why), origin),
             },
         };
-        let placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
+        let placed = drive.place_asked(Order::Points(points), origin, Authority::Write, expiry, asked, now);
         Progress::Placed(Waiting {
             placed,
             drive: name.to_string(),

@@ -36,14 +36,14 @@ impl Bench {
     /// A reload starts the bus anew.
     fn reload_bus(&mut self) {
         let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
-        self.plant.buses[0].take_over(&stopped);
+        self.plant.buses[0].take_over(&stopped, self.now);
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
     /// One reload removes the bus, a later one adds it again.
     fn remove_and_add(&mut self) {
         self.plant = fixture::plant(&["p1"]);
-        self.plant.buses[0].take_over(&[]);
+        self.plant.buses[0].take_over(&[], self.now);
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
@@ -549,4 +549,17 @@ fn the_audit_names_the_client_that_the_broker_names() {
     let command = bench.plant.buses[0].queue.lock().pop(Urgency::Read, bench.now).unwrap();
     assert_eq!(command.ticket.origin().who, "alice\\n");
     assert_eq!(command.ticket.client(), "mqtt");
+}
+
+#[test]
+fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
+    let mut bench = Bench::new();
+    let mut start = set("p1/set", r#"{"id": 1, "run": true}"#);
+    start.asked = Some(bench.now);
+    bench.now += Duration::from_millis(20);
+    assert_eq!(bench.take(set("p1/set/run", "false")), None);
+    bench.now += Duration::from_millis(20);
+    let result = json(&bench.take(start).unwrap());
+    assert_eq!((&result["ok"], &result["result"]), (&false.into(), &"purged".into()));
+    assert_eq!(bench.queued(), 1, "the stop");
 }

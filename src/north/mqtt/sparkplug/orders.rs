@@ -125,7 +125,8 @@ impl Orders {
         }
         let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
         let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
-        let mut placed = drive.place(Order::Points(points), origin, Authority::Write, expiry, now);
+        let (order, asked) = (Order::Points(points), incoming.asked.unwrap_or(now));
+        let mut placed = drive.place_asked(order, origin, Authority::Write, expiry, asked, now);
         if let Some(answer) = placed.answer().filter(|answer| !answer.outcome.is_ok()) {
             return Some(Finished::of(device, touched, &answer, None));
         }
