@@ -410,7 +410,7 @@ impl fmt::Display for Outcome {
             Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
             Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
             Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
-            Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
+            Outcome::Purged => f.write_str("a stop came in after it was asked for; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
             Outcome::NotTaken(shown) => write!(f, "the drive acknowledged it, but {shown}"),
             Outcome::Interrupted(why) => {

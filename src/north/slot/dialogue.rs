@@ -36,6 +36,8 @@ struct Held {
     request: ToolRequest,
     /// When its first byte came.
     asked: Instant,
+    /// Stops that its drives had been given when it was whole.
+    stops: u64,
     until: Instant,
     deadline: Instant,
 }
@@ -153,6 +155,7 @@ impl Dialogue {
         };
         let held = Held {
             asked,
+            stops: pace.stops,
             request,
             until,
             deadline,
@@ -171,11 +174,12 @@ impl Dialogue {
         let Held {
             request,
             asked,
+            stops,
             deadline,
             ..
         } = held;
         self.asked = Some(now);
-        match self.tool.decide(&request, asked, deadline, now) {
+        match self.tool.decide(&request, (asked, stops), deadline, now) {
             Decision::Refuse(why) => {
                 self.tool.count(SlotOutcome::Refused);
                 if !request.is_broadcast(self.tool.protocol()) {

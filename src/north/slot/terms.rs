@@ -53,6 +53,8 @@ pub(super) struct Pace {
     pub(super) not_before: Instant,
     /// It stops a drive: it goes at once.
     pub(super) is_stop: bool,
+    /// Stops that its drives were given so far.
+    pub(super) stops: u64,
 }
 
 /// When tools may write next, by bus.
@@ -121,12 +123,17 @@ impl Tool {
         let mut pace = Pace {
             not_before: now,
             is_stop: false,
+            stops: 0,
         };
+        if matches!(request.meaning, Meaning::Read(_) | Meaning::Faulty(_)) {
+            return pace;
+        }
+        let plant = self.terms.plant.load();
+        let drives = self.asked(&plant, request);
+        pace.stops = drives.iter().map(DriveHandle::stops).sum();
         let Meaning::Write(pdu) = &request.meaning else {
             return pace;
         };
-        let plant = self.terms.plant.load();
-        let drives = self.asked(&plant, request);
         pace.is_stop = self.writes() && drives.iter().any(|drive| stops(drive, pdu, now));
         // What is refused anyway, is at once.
         let admitted = drives
@@ -154,9 +161,16 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request whose first byte came at `asked`: behind a stop that came in since it is not sent. What is given
-    /// to the bus is in its queue when this returns, and is not sent after `deadline`.
-    pub(super) fn decide(&self, request: &ToolRequest, asked: Instant, deadline: Instant, now: Instant) -> Decision {
+    /// What becomes of a request whose first byte came at `asked`, and whose drives had been given so many `stops` when it was
+    /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
+    /// is not sent after `deadline`.
+    pub(super) fn decide(
+        &self,
+        request: &ToolRequest,
+        (asked, stops): (Instant, u64),
+        deadline: Instant,
+        now: Instant,
+    ) -> Decision {
         let plant = self.terms.plant.load();
         let bus = plant
             .buses
@@ -165,6 +179,10 @@ impl Tool {
         let Some(bus) = bus else { return Decision::Silent };
         let drives = self.asked(&plant, request);
         let broadcast = request.is_broadcast(self.protocol());
+        // A stop that came in while it was held may have come at the same time by the clock.
+        let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
+        let before = asked.checked_sub(Duration::from_nanos(1)).filter(|_| stopped);
+        let asked = before.unwrap_or(asked);
         let case = Case {
             plant: &plant,
             bus,
