@@ -18,7 +18,7 @@ use self::server::{Prepared, ServerSlot, within};
 use crate::bus::BusTask;
 use crate::bus::line_state::Learned;
 use crate::bus::master::Handover;
-use crate::command::{AuditFile, CommandQueue, NotStopped, WriteStats};
+use crate::command::{AuditFile, CommandQueue, NotStopped, Outcome, WriteStats};
 use crate::config::{BusSettings, Settings};
 use crate::event::{Event, EventKind, Events};
 use crate::history::{History, Keeper, RecorderTask, Recordings};
@@ -240,14 +240,14 @@ impl Daemon {
         let mut learned: BTreeMap<String, Learned> = BTreeMap::new();
         self.watch(&kept);
         let stopped: Vec<BusHandle> = removed.iter().map(|(_, task)| task.handle().clone()).collect();
-        for (before, left) in stop_all(removed).await {
+        for (before, left) in at_once(removed, BusTask::make_room).await {
             learned.extend(left.learned.map(|learned| (before.spec.port.clone(), learned)));
             leases.left(&before, left.leases);
             quiet_until.extend(left.quiet_until.map(|until| (before.spec.port.clone(), until)));
         }
         let mut handovers: BTreeMap<String, Handover> = BTreeMap::new();
         for (bus, task) in prepared {
-            task.handle().take_over(&stopped);
+            task.handle().take_over(&stopped, Instant::now());
             let handover = Handover {
                 leases: leases.of(&bus),
                 quiet_until: quiet_until.get(&bus.spec.port).copied(),
@@ -258,6 +258,10 @@ impl Daemon {
         }
         for event in leases.ended(SystemTime::now()) {
             self.events.publish(event);
+        }
+        // Stops to drives that are there no more, or are only monitored.
+        for bus in &stopped {
+            bus.queue.close(Outcome::ShuttingDown, Instant::now());
         }
         for (bus, task) in &kept {
             // Without a configured `stale_after`, data as old as three rounds of a slow bus is not stale.
@@ -501,7 +505,7 @@ impl Daemon {
         let buses = std::mem::take(&mut self.buses);
         let recorder = self.recorder.take();
         within(STOP_BUSES, "buses", async {
-            stop_all(buses).await;
+            at_once(buses, BusTask::stop).await;
             if let Some(recorder) = recorder {
                 // A thread of it that panicked has logged that.
                 let _ = tokio::task::spawn_blocking(move || recorder.stop()).await;
@@ -581,10 +585,13 @@ impl Daemon {
 }
 
 /// Stops buses, all at the same time, away from the runtime: each takes up to a second. What they leave.
-async fn stop_all(buses: Vec<(BusSettings, BusTask)>) -> Vec<(BusSettings, Handover)> {
+async fn at_once<T: Send + 'static>(
+    buses: Vec<(BusSettings, BusTask)>,
+    end: fn(BusTask) -> T,
+) -> Vec<(BusSettings, T)> {
     let stop = |(settings, task): (BusSettings, BusTask)| {
         tracing::info!(bus = %settings.spec.name, "stopping the bus");
-        tokio::task::spawn_blocking(move || (settings, task.stop()))
+        tokio::task::spawn_blocking(move || (settings, end(task)))
     };
     let stopping: Vec<_> = buses.into_iter().map(stop).collect();
     // A bus thread that panicked has ended the process.

@@ -22,7 +22,7 @@ use crate::drive::{ModelPoint, Value};
 use crate::event::{Event, Events, RefusedCommand};
 use crate::history::{History, Recordings};
 use crate::parameters::Vault;
-use crate::process_image::{BusImage, DriveImage, Machine, Reading};
+use crate::process_image::{Access, BusImage, DriveImage, Machine, Reading};
 
 pub use self::exchange::{Exchange, Question, Target};
 pub use self::placed::{Placed, Shown};
@@ -46,22 +46,32 @@ pub struct BusHandle {
 }
 
 impl BusHandle {
-    /// Takes over what the stopped buses `before` a reload know of its drives; a drive is the same if it is the same machine,
-    /// whatever its name.
+    /// Takes over what the stopped buses `before` a reload know of its drives, and the stops that wait there; a drive is the
+    /// same if it is the same machine, whatever its name.
     /// The stops of one that is added are counted from a number that no drive had before: what was remembered of a drive by
     /// that name is outdated.
-    pub fn take_over(&self, before: &[BusHandle]) {
+    pub fn take_over(&self, before: &[BusHandle], now: Instant) {
         for (index, drive) in self.image.drives.iter().enumerate() {
             let machine = self.image.spec.machine(&drive.spec);
             let known = before.iter().find_map(|bus| {
                 let same = |image: &Arc<DriveImage>| bus.image.spec.machine(&image.spec) == machine;
-                let place = bus.image.drives.iter().position(same)?;
-                drive.take_over(bus.image.drives.get(place)?);
-                let queue = bus.queue.lock();
-                Some((queue.commander(place).cloned(), queue.stops(place)))
+                Some((bus, bus.image.drives.iter().position(same)?))
             });
-            let (commander, stops) = known.unwrap_or_else(|| (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)));
+            let (commander, stops) = match known {
+                Some((bus, place)) => {
+                    if let Some(image) = bus.image.drives.get(place) {
+                        drive.take_over(image);
+                    }
+                    let queue = bus.queue.lock();
+                    (queue.commander(place).cloned(), queue.stops(place))
+                }
+                None => (None, ADDED.fetch_add(STOPS_OF_ONE, Ordering::Relaxed)),
+            };
             self.queue.lock().take_over(index, commander, stops);
+            // What is only monitored from now on is sent nothing.
+            if let Some((bus, place)) = known.filter(|_| drive.spec.access == Access::Control) {
+                bus.queue.hand_over(place, &self.queue, index, now);
+            }
         }
     }
 }
@@ -201,6 +211,7 @@ impl BusHandle {
         let what = format!("{}={value}", point.name());
         let (ticket, answer) = Ticket::new(origin, &spec.name, what, true, now, writes.clone());
         let command = Command::new(drive, admitted, now + expiry, ticket.with_changes(changes));
+        let command = command.asked_of(&spec.profile, now);
         self.queue.submit(command, now);
         Ok(answer)
     }
@@ -295,14 +306,27 @@ impl DriveHandle {
     /// are audited and published as an event. Of an order that stops and does more, the stop is carried out whatever becomes of
     /// the rest; it is audited as two.
     pub fn place(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
+        self.place_asked(order, origin, authority, expiry, now, now)
+    }
+
+    /// The same of an order whose head came at `asked`: no stop that came in since is undone by it.
+    pub fn place_asked(
+        &self,
+        order: Order,
+        origin: Origin,
+        authority: Authority,
+        expiry: Duration,
+        asked: Instant,
+        now: Instant,
+    ) -> Placed {
         let reading = self.reading(now);
         match Parts::of(order.clone(), &self.image.spec.profile) {
             Parts::Two(stop, rest) if self.may_go(&stop, &reading, authority) => {
                 let what = self.describe(&rest);
-                self.place_parts(stop, (&what, Ok(rest)), origin, authority, expiry, now)
+                self.place_parts(stop, (&what, Ok(rest)), origin, authority, expiry, (asked, now))
             }
-            Parts::Two(..) => self.place_one(order, origin, authority, expiry, now),
-            Parts::One(order) => self.place_one(order, origin, authority, expiry, now),
+            Parts::Two(..) => self.place_one(order, origin, authority, expiry, asked, now),
+            Parts::One(order) => self.place_one(order, origin, authority, expiry, asked, now),
         }
     }
 
@@ -317,17 +341,30 @@ impl DriveHandle {
         now: Instant,
     ) -> Placed {
         if !self.may_go(&stop, &self.reading(now), authority) {
-            return self.place_one(stop, origin, authority, expiry, now);
+            return self.place_one(stop, origin, authority, expiry, now, now);
         }
-        self.place_parts(stop, (what, Err(refusal)), origin, authority, expiry, now)
+        self.place_parts(stop, (what, Err(refusal)), origin, authority, expiry, (now, now))
     }
 
     /// Whether a stop goes to the bus.
     fn may_go(&self, stop: &Order, reading: &Reading<'_>, authority: Authority) -> bool {
-        self.bus_up() && command::admit(stop.clone(), reading, authority).is_ok()
+        self.takes_stops() && command::admit(stop.clone(), reading, authority).is_ok()
     }
 
-    fn place_one(&self, order: Order, origin: Origin, authority: Authority, expiry: Duration, now: Instant) -> Placed {
+    /// Whether the bus is open, or about to open its port: a stop waits for that.
+    fn takes_stops(&self) -> bool {
+        self.bus_up() || !self.bus.image.is_tried()
+    }
+
+    fn place_one(
+        &self,
+        order: Order,
+        origin: Origin,
+        authority: Authority,
+        expiry: Duration,
+        asked: Instant,
+        now: Instant,
+    ) -> Placed {
         let reading = self.reading(now);
         let write = !matches!(order, Order::Read(_));
         let what = self.describe(&order);
@@ -337,6 +374,7 @@ impl DriveHandle {
             Err(outcome) => self.turn_away(ticket, &what, outcome, write, now),
             Ok(admitted) => {
                 let command = Command::new(self.index, admitted, now + expiry, ticket);
+                let command = command.asked_of(&self.image.spec.profile, asked);
                 self.bus.queue.submit(command, now);
             }
         }
@@ -351,7 +389,7 @@ impl DriveHandle {
         origin: Origin,
         authority: Authority,
         expiry: Duration,
-        now: Instant,
+        (asked, now): (Instant, Instant),
     ) -> Placed {
         let reading = self.reading(now);
         let end = StopEnd::default();
@@ -367,7 +405,9 @@ impl DriveHandle {
         let (mut rest_ticket, rest_answer) = self.ticket(what, sets, origin, true, now);
         let placed = placed.with_rest(rest_answer, rest_ticket.confirmation());
         let stop = match self.judge(stop, &reading, authority) {
-            Ok(admitted) => Command::new(self.index, admitted, now + expiry, ticket),
+            Ok(admitted) => {
+                Command::new(self.index, admitted, now + expiry, ticket).asked_of(&self.image.spec.profile, now)
+            }
             Err(outcome) => {
                 self.turn_away(ticket, what, outcome, true, now);
                 rest_ticket.answer(Outcome::NotStopped, now);
@@ -381,6 +421,7 @@ impl DriveHandle {
         match judged {
             Ok(admitted) => {
                 let rest = Command::new(self.index, admitted, now + expiry, rest_ticket).behind(end);
+                let rest = rest.asked_of(&self.image.spec.profile, asked);
                 self.bus.queue.submit_parts(stop, rest, now);
             }
             Err(outcome) => {
@@ -411,7 +452,9 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
             Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
             Err(refusal) => Err(Outcome::Refused(refusal)),
-            Ok(_) if !self.bus_up() => Err(Outcome::BusDown),
+            Ok(admitted) if !self.bus_up() && !(admitted.urgency == Urgency::Stop && self.takes_stops()) => {
+                Err(Outcome::BusDown)
+            }
             // A stop goes to a drive that does not answer too: it may be back.
             Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
             Ok(admitted) => Ok(admitted),

@@ -16,7 +16,7 @@ use self::parameter::{ParameterRun, Then};
 use self::steps::{Action, Check, Known, actions, names_run, sets_all_bits, step_of, unsendable, write_on_change};
 use super::confirm::{self, Effect};
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{Command, Interruption, Order, Outcome, Receipt, Refusal, SourceKind, Ticket, Urgency};
+use crate::command::{Command, Interruption, Order, Outcome, Receipt, Refusal, SourceKind, Ticket, Touched, Urgency};
 use crate::drive::Profile;
 
 /// Pause before a parameter is read back once more.
@@ -105,6 +105,8 @@ pub struct CommandRun {
     overtaken: u32,
     /// It is acknowledged only when the drive shows its effect.
     reads_back: bool,
+    /// A stop as it was ordered, for a bus that takes the place of this one.
+    stop: Option<Order>,
 }
 
 impl CommandRun {
@@ -118,9 +120,11 @@ impl CommandRun {
             expires,
             ticket,
             joined,
+            was_begun,
             ..
         } = command;
         let effects = confirm::effects(profile, &order);
+        let stop = (urgency == Urgency::Stop).then(|| order.clone());
         let scope = Scope {
             whole: matches!(&order, Order::Points(values) if sets_all_bits(profile, values)),
             names_run: matches!(&order, Order::Points(values) if names_run(profile, values)),
@@ -171,8 +175,8 @@ impl CommandRun {
             cut: unsendable.map(Outcome::Refused),
             only_ends: false,
             reply: Reply::Written,
-            begun: false,
-            reached_the_wire: false,
+            begun: was_begun,
+            reached_the_wire: was_begun,
             running: true,
             check: Check::NotYet,
             by_other_function: false,
@@ -182,7 +186,37 @@ impl CommandRun {
             waits_for_late: false,
             overtaken: 0,
             reads_back,
+            stop,
         }
+    }
+
+    /// The stop of a client that it is, as it was ordered: the bus that takes the place of this one sends it as a whole.
+    ///
+    /// # Errors
+    /// It is none.
+    pub fn into_stop(mut self, drive: usize) -> Result<Command, Box<CommandRun>> {
+        let stop = self.stop.take().filter(|_| self.is_of_client());
+        let Some((order, ticket)) = stop.zip(self.tickets.pop()) else {
+            return Err(Box::new(self));
+        };
+        let expires = self.expires;
+        Ok(Command {
+            drive,
+            order,
+            urgency: Urgency::Stop,
+            reference_only: false,
+            ranges: Vec::new(),
+            expires,
+            ticket,
+            joined: self.tickets.into_iter().map(|ticket| (ticket, expires)).collect(),
+            behind: None,
+            overtaken: 0,
+            number: 0,
+            asked: None,
+            touched: Touched::Anything,
+            passed_on: None,
+            was_begun: self.begun,
+        })
     }
 
     /// Rank of the command.
@@ -428,7 +462,7 @@ impl CommandRun {
         if reply == Reply::Exception(Exception::FUNCTION) && self.has_another_function(step, words) {
             return None;
         }
-        if self.by_other_function && step.pdu.is_write() && reply != Reply::Exception(Exception::FUNCTION) {
+        if self.by_other_function && step.pdu.is_write() && !matches!(reply, Reply::Exception(_)) {
             words.functions.took(&step.pdu);
             self.by_other_function = false;
         }

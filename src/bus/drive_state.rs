@@ -9,7 +9,7 @@ use super::n2_late_replies::N2LateReplies;
 use super::supervision::Supervision;
 use super::vain_stops::VainStops;
 use crate::codec::Reply;
-use crate::command::{Interruption, LastWritten, Outcome, Urgency};
+use crate::command::{Command, Interruption, LastWritten, Outcome, Urgency};
 use crate::drive::ModelPoint;
 use crate::process_image::{DriveImage, Reading};
 
@@ -217,6 +217,12 @@ impl DriveState {
         }
     }
 
+    /// It heard an order that is no begun command: one to several drives, or one that is not decoded.
+    pub(super) fn heard_order(&mut self, now: Instant) {
+        self.stopped = None;
+        self.supervision.renew(now);
+    }
+
     /// Whether a stop was acknowledged after which no command was sent that is neither stop nor reference.
     pub(super) fn was_stopped(&self) -> bool {
         self.stopped.is_some()
@@ -271,6 +277,21 @@ impl DriveState {
     pub(super) fn restarted(&mut self) {
         self.words.forget();
         self.stopped = None;
+    }
+
+    /// The stop of a client that is begun, for the bus that takes the place of this one.
+    pub(super) fn take_stop(&mut self, drive: usize, now: Instant) -> Option<Command> {
+        let run = self.runs.get_mut(slot(Urgency::Stop))?.take()?;
+        if run.is_of_client() && run.reached_the_wire() {
+            self.supervision.renew(now);
+        }
+        match run.into_stop(drive) {
+            Ok(stop) => Some(stop),
+            Err(run) => {
+                self.begin(*run);
+                None
+            }
+        }
     }
 
     /// Everything that was begun is answered; what was acknowledged stays so.

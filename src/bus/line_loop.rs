@@ -108,16 +108,22 @@ impl BusTask {
         &self.handle
     }
 
-    /// Ends the bus after the exchange that is on the line, but within a second; everything that waits is answered. What a
-    /// bus that comes after has to know.
-    pub fn stop(mut self) -> Handover {
+    /// Ends the bus after the exchange that is on the line, but within a second; everything that waits is answered.
+    pub fn stop(mut self) {
+        self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
+        self.halt();
+    }
+
+    /// The same of a bus whose place another one takes: stops wait for that, to be handed over by [`BusHandle::take_over`].
+    /// What it has to know.
+    pub fn make_room(mut self) -> Handover {
+        self.handle.queue.begin_handover(Instant::now());
         self.halt()
     }
 
     fn halt(&mut self) -> Handover {
         self.stop.store(true, Ordering::Relaxed);
         self.begin = None;
-        self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
         self.handle.queue.wake();
         // Never an error: a panic of the bus has ended the process.
         let thread = self.thread.take();
@@ -127,6 +133,9 @@ impl BusTask {
 
 impl Drop for BusTask {
     fn drop(&mut self) {
+        if self.thread.is_some() {
+            self.handle.queue.close(Outcome::ShuttingDown, Instant::now());
+        }
         self.halt();
     }
 }

@@ -153,6 +153,8 @@ pub struct Master {
     turns: Turns,
     /// The background request that has its turn, or is on the line.
     background: Option<Begun>,
+    /// The last one was passed on to drives of the bus as an order.
+    passed_on_last: bool,
     /// Replies that may still come from addresses at which no drive is configured.
     strangers: BTreeMap<u8, LateReplies>,
     shutdown: Option<Shutdown>,
@@ -213,6 +215,7 @@ impl Master {
             last_answered: None,
             turns: Turns::default(),
             background: None,
+            passed_on_last: false,
             strangers: BTreeMap::new(),
             shutdown: None,
             successor: before.quiet_until.is_some(),
@@ -245,6 +248,16 @@ impl Master {
         if let Some(shutdown) = &mut self.shutdown {
             shutdown.end(&self.bus);
         }
+        let mut queue = self.bus.queue.lock();
+        for (index, drive) in self.drives.iter_mut().enumerate() {
+            if queue.is_ending()
+                && let Some(stop) = drive.take_stop(index, now)
+                && let Err(stop) = queue.give_back(stop)
+            {
+                stop.answer(&Outcome::ShuttingDown, now);
+            }
+        }
+        drop(queue);
         let close = |drive: &mut DriveState| {
             drive.close(&Outcome::ShuttingDown, Interruption::ShuttingDown, now);
             drive.supervision.lease()
@@ -274,6 +287,7 @@ impl Master {
     /// # Errors
     /// The time until which nothing does, always after `now`.
     pub fn next(&mut self, now: Instant, news: &mut Vec<News>) -> Result<Turn, Instant> {
+        self.put_back_background(now);
         self.look(now, news);
         let next = self.choose(now);
         if let Some(round) = self.schedule.take_round() {
@@ -331,7 +345,7 @@ impl Master {
             }
         }
         if turn.purpose == Purpose::Background {
-            self.background_sent();
+            self.background_sent(now);
         }
         let mut late = self
             .drives

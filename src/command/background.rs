@@ -10,7 +10,7 @@ use std::time::Instant;
 
 use tokio::sync::oneshot;
 
-use super::{Outcome, Ticket};
+use super::{Command, Order, Outcome, Ticket, Touched, Urgency};
 use crate::codec::RequestPdu;
 
 /// Background requests that may wait on one bus.
@@ -68,11 +68,43 @@ pub struct PassedOn {
     pub address: u8,
     /// It may change anything in whoever hears it.
     pub may_write: bool,
+    /// The drives of the bus that hear it.
+    pub reach: Vec<usize>,
+    /// Those of them whose run command it takes away.
+    pub stops: Vec<usize>,
     /// Where the frame of the reply goes, as the drive sent it.
     pub frame: oneshot::Sender<Vec<u8>>,
 }
 
+impl PassedOn {
+    /// Whether it is an order to drives of the bus, which has its place among their other orders.
+    pub fn is_order(&self) -> bool {
+        self.may_write && !self.reach.is_empty()
+    }
+}
+
 impl BackgroundRequest {
+    /// The command that waits among those of its drives, where it is an order to them.
+    pub fn into_command(self, touched: Touched) -> Command {
+        Command {
+            drive: self.drive,
+            order: Order::Write(self.pdu),
+            urgency: Urgency::Command,
+            reference_only: false,
+            ranges: Vec::new(),
+            expires: self.expires,
+            ticket: self.ticket,
+            joined: Vec::new(),
+            behind: None,
+            overtaken: 0,
+            number: 0,
+            asked: None,
+            touched,
+            passed_on: self.passed_on,
+            was_begun: false,
+        }
+    }
+
     /// Whether the tool for which it is passed on has gone, or asked for something else.
     pub fn is_unwanted(&self) -> bool {
         self.passed_on

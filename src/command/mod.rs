@@ -16,6 +16,7 @@ mod parameter;
 mod queue;
 mod standing;
 mod ticket;
+mod touched;
 
 pub use admit::{Admitted, admit, may_restore, sets_twice, written};
 pub use audit::{AUDIT_KEPT, Audit, AuditFile, AuditFileOptions, AuditRecord, Change, RunOrdered, chain};
@@ -29,13 +30,14 @@ pub use parameter::ParameterOrder;
 pub use queue::{CAPACITY, Chosen, CommandQueue, NotStopped, Pending, Stopping};
 pub use standing::{LastWritten, is_reference, limits_passed, still_keeps_limits};
 pub use ticket::{Receipt, Ticket, WriteStats};
+pub use touched::Touched;
 
 use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use crate::codec::{Exception, Reply, RequestPdu};
-use crate::drive::Value;
+use crate::drive::{Profile, Value};
 
 /// Time after which a command is not sent any more, unless it says otherwise.
 pub const DEFAULT_EXPIRY: Duration = Duration::from_secs(2);
@@ -218,6 +220,14 @@ pub struct Command {
     pub overtaken: usize,
     /// Its number in the queue.
     pub number: u64,
+    /// When its head came: what was asked for before a stop came in does not go behind that.
+    pub asked: Option<Instant>,
+    /// The registers that it sets, and on which it rests.
+    pub touched: Touched,
+    /// What a write of a tool has beside that which may write anything, to one drive or to all that hear it.
+    pub passed_on: Option<PassedOn>,
+    /// A stop that another bus had begun before this one took its place.
+    pub was_begun: bool,
 }
 
 impl Command {
@@ -235,6 +245,38 @@ impl Command {
             behind: None,
             overtaken: 0,
             number: 0,
+            asked: None,
+            touched: Touched::Anything,
+            passed_on: None,
+            was_begun: false,
+        }
+    }
+
+    /// The same to a drive of that profile, asked for at `asked`.
+    pub fn asked_of(mut self, profile: &Profile, asked: Instant) -> Command {
+        self.touched = Touched::of(&self.order, &self.ranges, profile);
+        self.asked = Some(asked);
+        self
+    }
+
+    /// The drives that it reaches.
+    pub fn reach(&self) -> &[usize] {
+        match &self.passed_on {
+            Some(passed_on) => &passed_on.reach,
+            None => std::slice::from_ref(&self.drive),
+        }
+    }
+
+    /// Whether it reaches that drive.
+    pub fn reaches(&self, drive: usize) -> bool {
+        self.reach().contains(&drive)
+    }
+
+    /// Whether it takes the run command of that drive away.
+    pub fn stops(&self, drive: usize) -> bool {
+        match &self.passed_on {
+            Some(passed_on) => passed_on.stops.contains(&drive),
+            None => self.urgency == Urgency::Stop && self.drive == drive,
         }
     }
 
@@ -246,6 +288,14 @@ impl Command {
 
     /// Answers whoever gave it and all who joined.
     pub fn answer(self, outcome: &Outcome, now: Instant) {
+        let outcome = &match outcome {
+            Outcome::Expired if self.was_begun => Outcome::Interrupted(Interruption::Expired),
+            Outcome::BusDown if self.was_begun => Outcome::Interrupted(Interruption::BusDown),
+            Outcome::ShuttingDown if self.was_begun => Outcome::Interrupted(Interruption::ShuttingDown),
+            Outcome::Offline if self.was_begun => Outcome::Interrupted(Interruption::Offline),
+            Outcome::Replaced if self.was_begun => Outcome::Interrupted(Interruption::Stop),
+            outcome => outcome.clone(),
+        };
         let joined = self.joined.into_iter().map(|(ticket, _)| ticket);
         let tickets = [self.ticket].into_iter().chain(joined);
         tickets.for_each(|ticket| ticket.answer(outcome.clone(), now));
@@ -413,7 +463,7 @@ impl fmt::Display for Outcome {
             Outcome::Garbled => f.write_str("the drive's answer was garbled; whether it took the command is not known"),
             Outcome::Expired => f.write_str("its time ran out before its turn came; it was not sent"),
             Outcome::Replaced => f.write_str("a newer one took its place; it was not sent"),
-            Outcome::Purged => f.write_str("a stop removed it from the queue; it was not sent"),
+            Outcome::Purged => f.write_str("a stop came in after it was asked for; it was not sent"),
             Outcome::Withdrawn => f.write_str("a client commands the drive again; it was not sent"),
             Outcome::NotTaken(shown) => write!(f, "the drive acknowledged it, but {shown}"),
             Outcome::Interrupted(why) => {

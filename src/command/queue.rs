@@ -1,5 +1,8 @@
 //! The command queue of a bus: bounded, ordered, with replacing, purging and expiry.
 
+mod handover;
+mod passed_on;
+
 use std::collections::{BTreeMap, VecDeque};
 use std::io;
 use std::os::fd::{AsFd, BorrowedFd, OwnedFd};
@@ -19,8 +22,9 @@ const SERVED_KEPT: usize = 4 * CAPACITY;
 
 /// The waiting commands: pure, time is an argument.
 ///
-/// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. Between
-/// drives the clients take turns, and within a client its drives.
+/// To one drive they go in the order in which they were accepted, from whatever client; only a stop goes ahead. What is
+/// passed on to several drives has its place among the orders of each of them. Between drives the clients take turns, and
+/// within a client its drives.
 #[derive(Debug, Default)]
 pub struct Pending {
     waiting: VecDeque<Command>,
@@ -36,6 +40,12 @@ pub struct Pending {
     numbered: u64,
     /// Stops taken in so far, by drive.
     stops: BTreeMap<usize, u64>,
+    /// When the last of them came in.
+    stopped_at: BTreeMap<usize, Instant>,
+    /// The bus ends and another one takes its place: stops wait for that one.
+    ending: bool,
+    /// The queues that took over the stops of drives, and their places there.
+    heirs: BTreeMap<usize, (Arc<CommandQueue>, usize)>,
     /// The login whose command was the last that a client gave, by drive; without an entry there was none, or its client
     /// has no login.
     commanders: BTreeMap<usize, Arc<str>>,
@@ -94,7 +104,15 @@ impl Pending {
     pub fn push(&mut self, mut command: Command, now: Instant) {
         self.numbered += 1;
         command.number = self.numbered;
-        if let Some(outcome) = &self.closed {
+        if command.urgency == Urgency::Stop
+            && let Some((queue, place)) = self.heirs.get(&command.drive)
+        {
+            command.drive = *place;
+            queue.submit(command, now);
+            return;
+        }
+        let waits = self.ending && command.urgency == Urgency::Stop;
+        if let Some(outcome) = self.closed.as_ref().filter(|_| !waits) {
             command.answer(&outcome.clone(), now);
             return;
         }
@@ -103,7 +121,12 @@ impl Pending {
             return;
         }
         if command.urgency == Urgency::Stop {
+            self.note_stop(command.drive, now);
             self.push_stop(command, now);
+            return;
+        }
+        if self.is_behind_its_stop(&command) {
+            command.answer(&Outcome::Purged, now);
             return;
         }
         if let Some(index) = self.replaced_by(&command)
@@ -132,8 +155,25 @@ impl Pending {
     fn note_commander(&mut self, command: &Command) {
         let origin = command.ticket.origin();
         if command.urgency != Urgency::Read && origin.kind.is_client() {
-            self.set_commander(command.drive, origin.login().cloned());
+            for drive in command.reach() {
+                self.set_commander(*drive, origin.login().cloned());
+            }
         }
+    }
+
+    fn note_stop(&mut self, drive: usize, now: Instant) {
+        *self.stops.entry(drive).or_default() += 1;
+        let at = self.stopped_at.entry(drive).or_insert(now);
+        *at = now.max(*at);
+    }
+
+    /// Whether a stop came in since a command was asked for, which takes longer than to say so: its head came before.
+    fn is_behind_its_stop(&self, command: &Command) -> bool {
+        let stopped = |drive: &usize| {
+            let at = self.stopped_at.get(drive).zip(command.asked);
+            at.is_some_and(|(stopped, asked)| asked < *stopped) && !command.stops(*drive)
+        };
+        command.urgency == Urgency::Command && command.reach().iter().any(stopped)
     }
 
     /// The login that commanded a drive last, unless another client did since.
@@ -159,9 +199,8 @@ impl Pending {
     fn push_stop(&mut self, stop: Command, now: Instant) {
         let drive = stop.drive;
         self.note_commander(&stop);
-        *self.stops.entry(drive).or_default() += 1;
         self.remove(now, &Outcome::Purged, |c| {
-            c.drive == drive && c.urgency == Urgency::Command
+            c.reaches(drive) && c.urgency == Urgency::Command && !c.stops(drive)
         });
         if !self.stopped.contains(&drive) {
             self.stopped.push(drive);
@@ -181,10 +220,15 @@ impl Pending {
         self.waiting.push_back(stop);
     }
 
-    /// The queued reference whose place a newer one takes.
+    /// The queued reference whose place a newer one takes: the last of the same points, unless something behind it sets what
+    /// the newer one sets or rests on, or rests on what that sets.
     fn replaced_by(&self, command: &Command) -> Option<usize> {
-        let same = |c: &Command| c.drive == command.drive && c.reference_only && same_points(&c.order, &command.order);
-        command.reference_only.then(|| self.waiting.iter().position(same))?
+        let to_drive = |c: &Command| c.urgency != Urgency::Read && c.reaches(command.drive);
+        let same = |c: &Command| c.reference_only && same_points(&c.order, &command.order);
+        let ends = |c: &Command| same(c) || !c.touched.commutes(&command.touched);
+        let last = || self.waiting.iter().rposition(|c| to_drive(c) && ends(c));
+        let index = command.reference_only.then(last)??;
+        self.waiting.get(index).is_some_and(same).then_some(index)
     }
 
     /// Whose place a command takes in a full queue: the youngest of the client that has the most, or else, within its own
@@ -226,6 +270,11 @@ impl Pending {
         redundant: impl Fn(usize) -> bool,
     ) -> Option<Chosen> {
         self.expire(now);
+        let pressed = self.pressed();
+        let passed_on = match pressed.is_empty() || rank != Urgency::Command {
+            true => Vec::new(),
+            false => self.passed_on(&mut may),
+        };
         // Drives whose later commands wait: behind an older one, or behind a stop.
         let mut behind: Vec<usize> = self.drives_of(Urgency::Stop);
         let mut stopped: Vec<usize> = Vec::new();
@@ -240,14 +289,15 @@ impl Pending {
                 stopped.push(drive);
             }
             let own = match command.urgency {
-                Urgency::Command if behind.contains(&drive) => continue,
+                Urgency::Command if command.passed_on.is_none() && behind.contains(&drive) => continue,
                 Urgency::Stop if redundant(drive) && !self.may_start(drive) => Urgency::Command,
                 urgency => urgency,
             };
             if command.urgency == Urgency::Command {
-                behind.push(drive);
+                behind.extend(command.reach());
             }
-            if own != rank || !may(command) {
+            let goes = || pressed.contains(&command.number) && passed_on.contains(&command.number);
+            if own != rank || (command.passed_on.is_some() && !goes()) || !may(command) {
                 continue;
             }
             let (client, of_client) = self.served(command);
@@ -297,7 +347,8 @@ impl Pending {
 
     /// Whether a command waits that may start the drive.
     fn may_start(&self, drive: usize) -> bool {
-        let starts = |c: &Command| c.drive == drive && c.urgency == Urgency::Command && !c.reference_only;
+        let command = |c: &Command| c.urgency == Urgency::Command && !c.reference_only;
+        let starts = |c: &Command| c.reaches(drive) && command(c) && !c.stops(drive);
         self.waiting.iter().any(starts)
     }
 
@@ -306,7 +357,7 @@ impl Pending {
         let commands = self
             .waiting
             .iter()
-            .filter(|c| c.drive == drive && c.urgency != Urgency::Read);
+            .filter(|c| c.reaches(drive) && c.urgency != Urgency::Read);
         commands.filter_map(Command::client_waits_until).max()
     }
 
@@ -421,10 +472,17 @@ impl CommandQueue {
     }
 
     /// Takes the stop of an order and its rest in, with nothing between them, and wakes the bus.
-    pub fn submit_parts(&self, stop: Command, rest: Command, now: Instant) {
+    pub fn submit_parts(&self, stop: Command, mut rest: Command, now: Instant) {
         let mut pending = self.lock();
+        let outdated = pending.is_behind_its_stop(&rest);
         pending.push(stop, now);
-        pending.push(rest, now);
+        if outdated {
+            rest.answer(&Outcome::Purged, now);
+        } else {
+            // Its own stop is none that came in since.
+            rest.asked = None;
+            pending.push(rest, now);
+        }
         drop(pending);
         self.wake();
     }
@@ -449,7 +507,10 @@ impl CommandQueue {
     pub fn close(&self, outcome: Outcome, now: Instant) {
         self.background().close(&outcome, now);
         let mut pending = self.lock();
-        pending.remove(now, &outcome, |_| true);
+        // That the port is gone does not matter to stops that another bus sends.
+        let keeps_stops = pending.ending && outcome == Outcome::BusDown;
+        pending.remove(now, &outcome, |c| !keeps_stops || c.urgency != Urgency::Stop);
+        pending.ending = keeps_stops;
         pending.closed = Some(outcome);
     }
 
@@ -470,6 +531,9 @@ impl CommandQueue {
     /// Takes commands again.
     pub fn open(&self) {
         let mut pending = self.lock();
+        if pending.ending {
+            return;
+        }
         pending.closed = None;
         if !pending.stops_only {
             self.background().open();

@@ -52,6 +52,8 @@ pub struct Ticket {
     drive: String,
     what: String,
     changes: Vec<Change>,
+    /// The drives, by name, that it starts or stops beside its own.
+    runs: Vec<(String, bool)>,
     write: bool,
     accepted: Instant,
     stats: Arc<WriteStats>,
@@ -82,6 +84,7 @@ impl Ticket {
             drive: drive.to_string(),
             what,
             changes: Vec::new(),
+            runs: Vec::new(),
             write,
             accepted,
             stats,
@@ -98,6 +101,12 @@ impl Ticket {
     /// The values that the command sets, for the audit.
     pub fn with_changes(mut self, changes: Vec<Change>) -> Ticket {
         self.changes = changes;
+        self
+    }
+
+    /// The drives that it starts or stops, where it goes to several.
+    pub fn with_runs(mut self, runs: Vec<(String, bool)>) -> Ticket {
+        self.runs = runs;
         self
     }
 
@@ -156,9 +165,11 @@ impl Ticket {
     fn note_run(&self, outcome: &Outcome, now: Instant) {
         let run = self.changes.iter().rev().find_map(|change| change.run);
         let may_be_done = outcome.reach() == Reach::Sent && !matches!(outcome, Outcome::Exception(_));
-        if let Some(run) = run.filter(|_| may_be_done) {
+        let runs = self.runs.iter().map(|(drive, run)| (drive.as_str(), *run));
+        let runs = run.map(|run| (self.drive.as_str(), run)).into_iter().chain(runs);
+        for (drive, run) in runs.filter(|_| may_be_done) {
             let who = format!("{} {}", self.origin.kind.name(), self.origin.who);
-            self.stats.audit.ordered(&self.drive, RunOrdered { run, who, at: now });
+            self.stats.audit.ordered(drive, RunOrdered { run, who, at: now });
         }
     }
 

@@ -1,6 +1,7 @@
 //! The north sides: Modbus TCP, MQTT, HTTP, the local socket and the tool slots. They read the process image and queue commands; they never
 //! name the bus.
 
+mod arrivals;
 mod certificate;
 mod command_json;
 mod connection_limit;

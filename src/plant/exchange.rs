@@ -3,13 +3,16 @@
 use std::pin::Pin;
 use std::sync::Arc;
 use std::task::{Context, Poll, ready};
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use tokio::sync::oneshot;
 
-use super::BusHandle;
-use crate::codec::{RequestPdu, describe};
-use crate::command::{Answer, BackgroundRequest, NO_DRIVE, Origin, Outcome, Pace, PassedOn, Ticket, WriteStats};
+use super::{BusHandle, changes};
+use crate::codec::{Protocol, RequestPdu, describe};
+use crate::command::{
+    Answer, BackgroundRequest, NO_DRIVE, Order, Origin, Outcome, Pace, PassedOn, Ticket, Touched, WriteStats, written,
+};
+use crate::process_image::DriveImage;
 
 /// Who on the line is asked.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -29,6 +32,8 @@ pub struct Question {
     pub pdu: RequestPdu,
     /// Whether it may change anything: then it is counted and audited as a command.
     pub may_write: bool,
+    /// When its head came.
+    pub asked: Instant,
     /// Not sent after this.
     pub expires: Instant,
     /// Who asks.
@@ -55,7 +60,7 @@ impl Exchange {
 
 impl BusHandle {
     /// Passes a request on to the line, in the share of background exchanges. When this returns it is in the queue of the bus, or
-    /// answered.
+    /// answered. What may write is an order to every drive that hears it, with its place among their other orders.
     pub fn ask(&self, question: Question, writes: &Arc<WriteStats>, now: Instant) -> Exchange {
         let (spec, drives) = (&self.image.spec, &self.image.drives);
         let (drive, address, name) = match question.target {
@@ -72,7 +77,27 @@ impl BusHandle {
         };
         let what = describe::request_on(spec.protocol, &question.pdu);
         let may_write = question.may_write;
+        let reach: Vec<usize> = match question.target {
+            Target::Drive(index) => vec![index],
+            Target::Address(0) if spec.protocol != Protocol::N2 => (0..drives.len()).collect(),
+            Target::Address(_) => Vec::new(),
+        };
+        let order = Order::Write(question.pdu.clone());
+        let heard = || reach.iter().filter_map(|index| Some((*index, drives.get(*index)?)));
+        let runs = heard().filter(|_| may_write).filter_map(|(_, drive)| {
+            let changes = changes(&drive.reading(now, Duration::ZERO), &order);
+            let run = changes.iter().rev().find_map(|change| change.run)?;
+            Some((drive.spec.name.clone(), run))
+        });
+        let runs: Vec<(String, bool)> = runs.collect();
+        let stops = heard().filter(|(_, drive)| is_stop(drive, &question.pdu));
+        let stops = stops.map(|(index, _)| index).collect();
+        // What is not decoded may write anything. The registers are the same whoever hears it.
+        let touched = heard().next().map_or(Touched::Anything, |(_, drive)| {
+            Touched::of(&order, &[], &drive.spec.profile)
+        });
         let (ticket, answer) = Ticket::new(question.origin, &name, what, may_write, now, writes.clone());
+        let ticket = ticket.with_runs(runs);
         let (sender, frame) = oneshot::channel();
         let request = BackgroundRequest {
             drive,
@@ -83,10 +108,20 @@ impl BusHandle {
             passed_on: Some(PassedOn {
                 address,
                 may_write,
+                reach,
+                stops,
                 frame: sender,
             }),
         };
-        self.queue.submit_background(request, now);
+        self.queue.submit_passed_on(request, touched, question.asked, now);
         Exchange { answer, frame }
     }
+}
+
+/// Whether a write takes the run command of a drive away.
+fn is_stop(drive: &DriveImage, pdu: &RequestPdu) -> bool {
+    written(pdu).is_some_and(|(table, items)| {
+        let mut items = items.iter();
+        items.any(|(address, value)| drive.spec.profile.is_stop(table, *address, *value))
+    })
 }

@@ -460,6 +460,11 @@ impl BusImage {
         self.health.lock().unwrap_or_else(PoisonError::into_inner).up
     }
 
+    /// Whether it was tried to open its port, as a reload starts the bus anew.
+    pub fn is_tried(&self) -> bool {
+        self.health.lock().unwrap_or_else(PoisonError::into_inner).tried
+    }
+
     /// Changes state and figures. Only the bus itself may call this.
     pub fn update_health(&self, change: impl FnOnce(&mut BusHealth)) {
         change(&mut self.health.lock().unwrap_or_else(PoisonError::into_inner));

@@ -185,11 +185,12 @@ impl WorldBus {
 
     /// The bus as a reload starts it anew, with the same drives on the same line.
     pub fn restart(&mut self, index: usize, events: &Events, writes: &Arc<WriteStats>, now: Instant) {
-        self.handle.queue.close(drivegate::command::Outcome::ShuttingDown, now);
+        self.handle.queue.begin_handover(now);
         let before = self.core.ended(now);
         let format = self.handle.image.spec.format;
         let stopped = std::mem::replace(&mut self.handle, handle(index, &self.line, &self.profile, format));
-        self.handle.take_over(&[stopped]);
+        self.handle.take_over(std::slice::from_ref(&stopped), now);
+        stopped.queue.close(drivegate::command::Outcome::ShuttingDown, now);
         let (bus, options) = (self.handle.clone(), &self.options);
         self.core = BusCore::new(bus, options, events.clone(), writes.clone(), &before, now);
         if self.open {

@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use drivegate::codec::{Exception, Protocol, RequestPdu};
-use drivegate::command::{Order, Outcome, Refusal};
+use drivegate::command::{Authority, DEFAULT_EXPIRY, Order, Origin, Outcome, Refusal, SourceKind};
 use drivegate::drive::{ModelPoint, Quality, State, Value};
 use drivegate::event::EventKind;
 use drivegate::process_image::{Access, LeaseAction, Supervision};
@@ -463,4 +463,59 @@ fn a_drive_that_nothing_stops_is_told_each_time_it_comes() {
             );
         }
     }
+}
+
+#[test]
+fn a_stop_that_waits_while_a_reload_starts_the_bus_anew_is_sent() {
+    // At any moment of the exchange before it, and of its own.
+    for steps in 0..12 {
+        let mut rig = ready(&nx(19_200, 2));
+        assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());
+        rig.until_state(1, State::Running);
+        let (stop, also) = (
+            rig.points(1, &[("run", 0.0)]),
+            rig.points(1, &[("run", 0.0), ("speed_reference", 0.0)]),
+        );
+        let (mut stop, mut also) = (rig.place(1, stop), rig.place(1, also));
+        for _ in 0..steps {
+            rig.step(rig.now + Duration::from_millis(1));
+        }
+        let asked = rig.bus.core.asked().cloned();
+        rig.restart_now();
+        let outcome = rig.answered(&mut stop);
+        assert!(outcome.is_ok(), "{steps} {asked:?}: {outcome:?}");
+        let outcome = rig.answered(&mut also);
+        assert!(outcome.is_ok(), "{steps} {asked:?}: {outcome:?}");
+        assert_eq!(rig.word(1, 2000) & 1, 0, "{steps}");
+        rig.until_state(1, State::Ready);
+    }
+}
+
+#[test]
+fn a_stop_is_taken_while_the_bus_ends_and_before_its_port_is_open_again() {
+    let mut rig = ready(&nx(19_200, 1));
+    assert!(rig.set(1, &[("speed_reference", 20.0), ("run", 1.0)]).is_ok());
+    let before = rig.drive(1);
+    let order = rig.points(1, &[("run", 0.0)]);
+    let ends = rig.bus.handle.clone();
+    ends.queue.begin_handover(rig.now);
+    let mut while_it_ends = before.place(
+        order.clone(),
+        Origin::new(SourceKind::Mqtt, "test"),
+        Authority::Write,
+        DEFAULT_EXPIRY,
+        rig.now,
+    );
+    assert_eq!(while_it_ends.answer(), None);
+    rig.restart_now();
+    // Whoever still has the drive as it was.
+    let mut behind = before.place(
+        order,
+        Origin::new(SourceKind::Mqtt, "test"),
+        Authority::Write,
+        DEFAULT_EXPIRY,
+        rig.now,
+    );
+    assert!(rig.answered(&mut while_it_ends).is_ok() && rig.answered(&mut behind).is_ok());
+    assert_eq!(rig.word(1, 2000) & 1, 0);
 }

@@ -158,6 +158,14 @@ impl Rig {
         while self.bus.core.asked().is_some() {
             self.step(self.now + Duration::from_secs(1));
         }
+        self.restart_now();
+    }
+
+    /// The same, whatever is on the line.
+    pub fn restart_now(&mut self) {
+        if self.bus.core.asked().is_some() {
+            self.bus.wire.cut();
+        }
         self.bus.restart(0, &self.plant.events, &self.plant.writes, self.now);
         self.plant.buses = vec![self.bus.handle.clone()];
     }

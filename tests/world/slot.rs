@@ -15,6 +15,8 @@ use drivegate::process_image::Access;
 use drivegate::sim::drive::{DriveOptions, ModelOptions};
 use drivegate::sim::random::Random;
 
+mod order;
+
 use super::bus::{Asked, Parts, Seen};
 use super::rig::{Rig, line, write};
 use super::scenario::Line;

@@ -1,16 +1,23 @@
 //! Background exchanges: when one goes on the line, and what came of it.
 
+use std::collections::BTreeMap;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use super::{Master, Purpose, Turn, TurnEnd};
-use crate::bus::n2_session::Progress;
+use crate::bus::drive_state::DriveState;
+use crate::bus::late_replies::LateReplies;
+use crate::bus::n2_late_replies::N2LateReplies;
+use crate::bus::n2_session::{N2Sessions, Progress};
 use crate::bus::news::News;
 use crate::bus::schedule::Admission;
 use crate::bus::transaction::{CONNECTION_CLOSED, Ended};
 use crate::codec::rtu::LONGEST;
 use crate::codec::{Exception, Reply, RequestPdu, Table};
-use crate::command::{BackgroundRequest, Interruption, NO_DRIVE, Outcome, Pace, Refusal, Urgency, written};
+use crate::command::{
+    BackgroundRequest, Command, Interruption, NO_DRIVE, Order, Outcome, Pace, PassedOn, Pending, Refusal, Touched,
+    Urgency, written,
+};
 use crate::drive::plan::WireTime;
 use crate::drive::{PlannedRead, PollClass};
 use crate::process_image::DriveImage;
@@ -24,7 +31,10 @@ const BROADCAST_PAUSE: Duration = Duration::from_millis(100);
 #[derive(Debug)]
 pub(super) struct Begun {
     request: BackgroundRequest,
-    admission: Admission,
+    /// Whose time it takes; none where it goes as a command.
+    admission: Option<Admission>,
+    /// It is an order to drives of the bus, and waited among their others; the registers that it sets.
+    ordered: Option<Touched>,
     /// Its exchange is on the line, or was.
     sent: bool,
 }
@@ -39,22 +49,80 @@ impl Begun {
     }
 }
 
-/// Whether a request may write to a drive that takes no orders but stops; a broadcast reaches all.
-fn is_held(request: &BackgroundRequest, drives: &[Arc<DriveImage>]) -> bool {
-    let passed_on = request.passed_on.as_ref().filter(|passed_on| passed_on.may_write);
-    let stops = |image: &DriveImage| {
-        let stop = |(table, items): (Table, Vec<(u16, u16)>)| {
-            items
-                .iter()
-                .any(|(address, value)| image.spec.profile.is_stop(table, *address, *value))
+/// Why what is passed on may not go: a drive that it reaches takes no orders but stops.
+fn held(passed_on: &PassedOn, drives: &[Arc<DriveImage>]) -> Option<Outcome> {
+    let reached = passed_on
+        .reach
+        .iter()
+        .filter(|drive| passed_on.may_write && !passed_on.stops.contains(*drive));
+    let why = reached
+        .filter_map(|drive| drives.get(*drive))
+        .find_map(|image| image.hold.why());
+    why.map(|why| Outcome::Refused(Refusal::NotAllowed(why.to_string())))
+}
+
+/// Replies that may still come, to whatever was asked.
+pub(super) struct Late<'m> {
+    pub(super) sessions: &'m mut N2Sessions,
+    pub(super) n2_late: &'m N2LateReplies,
+    pub(super) strangers: &'m mut BTreeMap<u8, LateReplies>,
+}
+
+impl Late<'_> {
+    /// Until when the exchange cannot go, if it cannot now.
+    fn blocks(
+        &mut self,
+        (drive, pdu): (usize, &RequestPdu),
+        passed_on: Option<&PassedOn>,
+        drives: &mut [DriveState],
+        now: Instant,
+    ) -> Option<Instant> {
+        // A poll identifies the drive.
+        if self.sessions.before(drive, Some(Urgency::Read), now).is_some() {
+            return Some(now + super::LOOK_ROUND);
+        }
+        let late = match (passed_on, drives.get_mut(drive)) {
+            (_, Some(drive)) => Some(&mut drive.late),
+            (Some(passed_on), None) => self.strangers.get_mut(&passed_on.address),
+            (None, None) => None,
         };
-        written(&request.pdu).is_some_and(stop)
-    };
-    passed_on.is_some_and(|passed_on| {
-        let reached = |(index, _): &(usize, &Arc<DriveImage>)| *index == request.drive || passed_on.address == 0;
-        let mut reached = drives.iter().enumerate().filter(reached);
-        reached.any(|(_, image)| image.hold.why().is_some() && !stops(image))
-    })
+        let late = late.and_then(|late| late.blocks(pdu, now));
+        late.max(self.n2_late.blocks(pdu, now))
+    }
+
+    /// Whether what is passed on to drives of the bus can go: nothing is begun for any of them.
+    ///
+    /// # Errors
+    /// When it can, if it must wait.
+    pub(super) fn may_pass_on(
+        &mut self,
+        command: &Command,
+        drives: &mut [DriveState],
+        now: Instant,
+    ) -> Result<bool, Instant> {
+        let busy = |drive: &DriveState| drive.is_busy(Urgency::Stop) || drive.is_busy(Urgency::Command);
+        if command.reach().iter().filter_map(|drive| drives.get(*drive)).any(busy) {
+            return Ok(false);
+        }
+        let Order::Write(pdu) = &command.order else {
+            return Ok(true);
+        };
+        match self.blocks((command.drive, pdu), command.passed_on.as_ref(), drives, now) {
+            Some(until) => Err(until),
+            None => Ok(true),
+        }
+    }
+}
+
+/// What is passed on and cannot be sent any more is answered: nobody wants it, or it may not go.
+pub(super) fn drop_in_vain(pending: &mut Pending, drives: &[Arc<DriveImage>], now: Instant) {
+    let unwanted = |passed_on: &PassedOn| passed_on.frame.is_closed();
+    pending.remove(now, &Outcome::Replaced, |c| c.passed_on.as_ref().is_some_and(unwanted));
+    for why in drives.iter().filter_map(|image| image.hold.why()) {
+        let outcome = Outcome::Refused(Refusal::NotAllowed(why.to_string()));
+        let is_held = |passed_on: &PassedOn| held(passed_on, drives).as_ref() == Some(&outcome);
+        pending.remove(now, &outcome, |c| c.passed_on.as_ref().is_some_and(is_held));
+    }
 }
 
 impl Master {
@@ -63,19 +131,128 @@ impl Master {
     /// # Errors
     /// When to look again; none where none waits.
     pub(super) fn background(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
-        // Something of a higher rank went before it: it is chosen anew.
-        if let Some(begun) = self.background.take_if(|begun| !begun.sent) {
-            self.bus.queue.background().put_back(begun.request, now);
-        }
         self.drop_background_in_vain(now);
         let mut again: Option<Instant> = None;
-        for pace in Pace::ALL {
-            match self.begin_background(pace, idle, now) {
-                Ok(turn) => return Ok(turn),
-                Err(at) => again = again.into_iter().chain(at).min(),
+        // Both kinds take turns: they have the same share.
+        for passed_on in [!self.passed_on_last, self.passed_on_last] {
+            let paces = if passed_on { &Pace::ALL[..1] } else { &Pace::ALL[..] };
+            for pace in paces {
+                let begun = match passed_on {
+                    true => self.pass_on(idle, now),
+                    false => self.begin_background(*pace, idle, now),
+                };
+                match begun {
+                    Ok(turn) => {
+                        self.passed_on_last = passed_on;
+                        return Ok(turn);
+                    }
+                    Err(at) => again = again.into_iter().chain(at).min(),
+                }
             }
         }
         Err(again)
+    }
+
+    /// What was chosen and not sent is chosen anew.
+    pub(super) fn put_back_background(&mut self, now: Instant) {
+        let Some(begun) = self.background.take_if(|begun| !begun.sent) else {
+            return;
+        };
+        match begun.ordered {
+            Some(touched) => {
+                let command = begun.request.into_command(touched);
+                self.bus.queue.lock().put_back(command, now);
+            }
+            None => self.bus.queue.background().put_back(begun.request, now),
+        }
+    }
+
+    /// The order that is passed on next to drives of the bus, if it may go where nothing is in a hurry.
+    fn pass_on(&mut self, idle: bool, now: Instant) -> Result<Turn, Option<Instant>> {
+        let queue = self.bus.queue.clone();
+        let mut pending = queue.lock();
+        if pending.is_empty() {
+            return Err(None);
+        }
+        let mut blocked: Option<Instant> = None;
+        let Master {
+            drives,
+            schedule,
+            sessions,
+            n2_late,
+            strangers,
+            ..
+        } = self;
+        let mut late = Late {
+            sessions,
+            n2_late,
+            strangers,
+        };
+        let chosen = pending.next_passed_on(now, |command| {
+            let online = schedule.is_online(command.drive);
+            may_go(command, online, &mut late, drives, now).unwrap_or_else(|until| {
+                blocked = blocked.into_iter().chain([until]).min();
+                false
+            })
+        });
+        let Some((chosen, command)) = chosen.and_then(|chosen| Some((chosen, pending.get(chosen)?))) else {
+            return Err(blocked);
+        };
+        let Order::Write(pdu) = &command.order else {
+            return Err(blocked);
+        };
+        let cost = self.exchange_cost(command.drive, pdu);
+        let admission = self.schedule.admits_background(Pace::Brisk, cost, idle, now);
+        if let Admission::NotBefore(at) = admission {
+            return Err(blocked.into_iter().chain([at]).min());
+        }
+        let command = pending.take(chosen).ok_or(blocked)?;
+        drop(pending);
+        self.begin_passed_on(command, Some(admission), now).ok_or(None)
+    }
+
+    /// Begins what is passed on and was taken from the queue.
+    pub(super) fn begin_passed_on(
+        &mut self,
+        command: Command,
+        admission: Option<Admission>,
+        now: Instant,
+    ) -> Option<Turn> {
+        let held = command.passed_on.as_ref().and_then(|p| held(p, &self.bus.image.drives));
+        let away = command.drive != NO_DRIVE && !self.schedule.is_online(command.drive);
+        let in_vain = held.or(away.then_some(Outcome::Offline));
+        if let Some(outcome) = in_vain {
+            command.answer(&outcome, now);
+            return None;
+        }
+        let Command {
+            drive,
+            order: Order::Write(pdu),
+            expires,
+            ticket,
+            touched,
+            passed_on,
+            ..
+        } = command
+        else {
+            command.answer(&Outcome::Expired, now);
+            return None;
+        };
+        let request = BackgroundRequest {
+            drive,
+            pdu,
+            pace: Pace::Brisk,
+            expires,
+            ticket,
+            passed_on,
+        };
+        let begun = self.background.insert(Begun {
+            request,
+            admission,
+            ordered: Some(touched),
+            sent: false,
+        });
+        Some(begun.turn())
     }
 
     /// What cannot be sent any more is answered: expired, or its drive is away.
@@ -88,11 +265,6 @@ impl Master {
             queue.remove(now, &Outcome::Offline, |r| {
                 r.drive != NO_DRIVE && !schedule.is_online(r.drive)
             });
-            let drives = &bus.image.drives;
-            if let Some(why) = drives.iter().find_map(|image| image.hold.why()) {
-                let held = Outcome::Refused(Refusal::NotAllowed(why.to_string()));
-                queue.remove(now, &held, |r| is_held(r, drives));
-            }
         }
     }
 
@@ -111,19 +283,13 @@ impl Master {
             strangers,
             ..
         } = self;
+        let mut late = Late {
+            sessions,
+            n2_late,
+            strangers,
+        };
         let may = |request: &BackgroundRequest| {
-            // A poll identifies the drive.
-            if sessions.before(request.drive, Some(Urgency::Read), now).is_some() {
-                blocked = blocked.into_iter().chain([now + super::LOOK_ROUND]).min();
-                return false;
-            }
-            let late = match (&request.passed_on, drives.get_mut(request.drive)) {
-                (_, Some(drive)) => Some(&mut drive.late),
-                (Some(passed_on), None) => strangers.get_mut(&passed_on.address),
-                (None, None) => None,
-            };
-            let late = late.and_then(|late| late.blocks(&request.pdu, now));
-            let until = late.max(n2_late.blocks(&request.pdu, now));
+            let until = late.blocks((request.drive, &request.pdu), request.passed_on.as_ref(), drives, now);
             blocked = blocked.into_iter().chain(until).min();
             until.is_none()
         };
@@ -133,7 +299,7 @@ impl Master {
         let Some(request) = waiting.get(number) else {
             return Err(blocked);
         };
-        let cost = self.background_cost(request);
+        let cost = self.exchange_cost(request.drive, &request.pdu);
         let admission = self.schedule.admits_background(pace, cost, idle, now);
         if let Admission::NotBefore(at) = admission {
             return Err(blocked.into_iter().chain([at]).min());
@@ -143,31 +309,45 @@ impl Master {
         };
         let begun = self.background.insert(Begun {
             request,
-            admission,
+            admission: Some(admission),
+            ordered: None,
             sent: false,
         });
         Ok(begun.turn())
     }
 
     /// What the exchange takes, as far as the profile tells.
-    fn background_cost(&self, request: &BackgroundRequest) -> Duration {
+    fn exchange_cost(&self, drive: usize, pdu: &RequestPdu) -> Duration {
         let spec = &self.bus.image.spec;
-        let turnaround = self.bus.image.drives.get(request.drive);
+        let turnaround = self.bus.image.drives.get(drive);
         let turnaround = turnaround.map_or(Duration::ZERO, |drive| drive.spec.turnaround);
-        WireTime::of(spec.protocol, &spec.format, &request.pdu).total(turnaround, self.silence)
+        WireTime::of(spec.protocol, &spec.format, pdu).total(turnaround, self.silence)
     }
 
     /// Whether the background exchange that was chosen may still go.
     pub(super) fn background_is_due(&self, now: Instant) -> bool {
-        self.background
-            .as_ref()
-            .is_some_and(|begun| begun.request.expires > now)
+        let Some(begun) = self.background.as_ref().filter(|begun| begun.request.expires > now) else {
+            return false;
+        };
+        let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
+        orders.is_none_or(|passed_on| {
+            let reach = passed_on.reach.iter();
+            let mut started = reach.filter(|drive| !passed_on.stops.contains(*drive));
+            let pending = self.bus.queue.lock();
+            // A stop that came in while the line fell silent.
+            !started.any(|drive| pending.was_stopped(*drive))
+        })
     }
 
-    /// The background exchange goes onto the line.
-    pub(super) fn background_sent(&mut self) {
-        if let Some(begun) = &mut self.background {
-            begun.sent = true;
+    /// The background exchange goes onto the line. It is an order to every drive that hears it.
+    pub(super) fn background_sent(&mut self, now: Instant) {
+        let Some(begun) = &mut self.background else { return };
+        begun.sent = true;
+        let orders = begun.request.passed_on.as_ref().filter(|_| begun.ordered.is_some());
+        for drive in orders.map_or(&[][..], |passed_on| &passed_on.reach) {
+            if let Some(drive) = self.drives.get_mut(*drive) {
+                drive.heard_order(now);
+            }
         }
     }
 
@@ -190,8 +370,15 @@ impl Master {
             return;
         };
         let answered = matches!(end.ended, Ended::Reply(_));
-        self.schedule
-            .background_done(begun.request.pace, begun.admission, answered, end.took);
+        match begun.admission {
+            Some(admission) => self
+                .schedule
+                .background_done(begun.request.pace, admission, answered, end.took),
+            None => {
+                self.schedule.command_done(Urgency::Command, end.took);
+                self.schedule.background_owes(begun.request.pace, end.took);
+            }
+        }
         if answered {
             self.schedule.seen(index, now);
         }
@@ -245,14 +432,21 @@ impl Master {
 
     /// What may have written anything: nothing that is known of the command words of those who heard it holds.
     fn unchecked_write(&mut self, request: &BackgroundRequest, outcome: &Outcome, now: Instant) {
-        if matches!(outcome, Outcome::Exception(_)) {
-            return;
-        }
-        let broadcast = self.is_broadcast_of(request);
-        for (index, drive) in self.drives.iter_mut().enumerate() {
-            if broadcast || index == request.drive {
-                drive.restarted();
-                self.schedule.read_again(index, now);
+        let reach = request.passed_on.as_ref().map_or(&[][..], |passed_on| &passed_on.reach);
+        let writes = written(&request.pdu);
+        for index in reach.iter().copied() {
+            let Some(drive) = self.drives.get_mut(index) else {
+                continue;
+            };
+            drive.heard_order(now);
+            if matches!(outcome, Outcome::Exception(_)) {
+                continue;
+            }
+            drive.restarted();
+            self.schedule.read_again(index, now);
+            match &writes {
+                Some((table, items)) => self.note_write(index, *table, items, now),
+                None => drive.written.range = Some(now),
             }
         }
     }
@@ -332,5 +526,22 @@ impl Master {
             }
             self.note_write(turn.drive, table, &items, now);
         }
+    }
+}
+
+/// Whether what is passed on, or the stop before it, can go. One drive that is away answers for itself.
+pub(super) fn may_go(
+    command: &Command,
+    online: bool,
+    late: &mut Late<'_>,
+    drives: &mut [DriveState],
+    now: Instant,
+) -> Result<bool, Instant> {
+    match &command.passed_on {
+        Some(_) => late.may_pass_on(command, drives, now),
+        None => match drives.get_mut(command.drive) {
+            Some(drive) => super::choose::may_begin(drive, command, online, now),
+            None => Ok(true),
+        },
     }
 }

@@ -2,6 +2,7 @@
 
 use std::time::{Duration, Instant};
 
+use super::background::{Late, drop_in_vain, may_go};
 use super::{Before, Master, Purpose, Turn};
 use crate::bus::command_run::{CommandRun, Step};
 use crate::bus::drive_state::{DriveState, Wanted};
@@ -225,8 +226,20 @@ impl Master {
             return;
         }
         let Master {
-            drives, schedule, bus, ..
+            drives,
+            schedule,
+            bus,
+            sessions,
+            n2_late,
+            strangers,
+            ..
         } = self;
+        drop_in_vain(&mut pending, &bus.image.drives, now);
+        let mut late = Late {
+            sessions,
+            n2_late,
+            strangers,
+        };
         let stands: Vec<bool> = drives
             .iter()
             .zip(&bus.image.drives)
@@ -238,15 +251,12 @@ impl Master {
             let chosen = pending.next(
                 rank,
                 now,
-                |command| match drives.get_mut(command.drive) {
-                    Some(drive) => match may_begin(drive, command, schedule.is_online(command.drive), now) {
-                        Ok(may) => may,
-                        Err(at) => {
-                            until = Some(until.map_or(at, |before| before.min(at)));
-                            false
-                        }
-                    },
-                    None => true,
+                |command| {
+                    let online = schedule.is_online(command.drive);
+                    may_go(command, online, &mut late, drives, now).unwrap_or_else(|at| {
+                        until = Some(until.map_or(at, |before| before.min(at)));
+                        false
+                    })
                 },
                 redundant,
             );
@@ -269,6 +279,10 @@ impl Master {
         }
         let chosen = commands.queued.get(rank as usize).copied().flatten()?;
         let command = self.bus.queue.lock().take(chosen)?;
+        if command.passed_on.is_some() {
+            self.turns.served(rank, lower_waits);
+            return self.begin_passed_on(command, None, now).map(Ok);
+        }
         self.begin(command, chosen.rank, now);
         // What was begun is decided on anew: it may wait, or another one may go first.
         None
@@ -405,7 +419,12 @@ fn range_changed() -> Refusal {
 ///
 /// # Errors
 /// When it can be, if it must wait.
-fn may_begin(drive: &mut DriveState, command: &Command, online: bool, now: Instant) -> Result<bool, Instant> {
+pub(super) fn may_begin(
+    drive: &mut DriveState,
+    command: &Command,
+    online: bool,
+    now: Instant,
+) -> Result<bool, Instant> {
     // Behind a stop that is begun nothing goes before it is over.
     if drive.is_busy(command.urgency) || (command.urgency == Urgency::Command && drive.is_busy(Urgency::Stop)) {
         return Ok(false);

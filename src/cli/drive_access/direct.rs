@@ -138,7 +138,7 @@ impl Direct {
             polled.iter().all(|index| is_settled(&reading, *index))
         })
         .await;
-        answer(request, &self.daemon.plant(), origin()).await
+        answer(request, &self.daemon.plant(), origin(), Instant::now()).await
     }
 
     /// Closes the port.

@@ -4,10 +4,12 @@ use std::time::Duration;
 use tokio::sync::oneshot::Receiver;
 
 use super::super::ticket::tests::ticket;
-use super::super::{Admitted, Answer, Origin, SourceKind, Ticket, WriteStats};
+use super::super::{Admitted, Answer, Origin, Ticket, Touched, WriteStats};
 use super::*;
+use crate::codec::Table;
 use crate::drive::Value;
 
+mod order;
 mod stops;
 
 const EXPIRY: Duration = Duration::from_secs(2);
@@ -32,6 +34,20 @@ struct Bench {
 
 fn points(points: &[usize]) -> Order {
     Order::Points(points.iter().map(|p| (*p, Value::Bool(true))).collect())
+}
+
+/// Each point is a register of its own.
+fn touched(order: &Order) -> Touched {
+    match order {
+        Order::Points(values) => Touched::These {
+            sets: values
+                .iter()
+                .map(|(point, _)| (Table::Holding, *point as u16))
+                .collect(),
+            rests_on: Vec::new(),
+        },
+        _ => Touched::Anything,
+    }
 }
 
 impl Bench {
@@ -60,7 +76,8 @@ impl Bench {
             reference_only,
             ranges: Vec::new(),
         };
-        let command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
+        let mut command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
+        command.touched = touched(&command.order);
         self.pending.push(command, self.now);
         receiver
     }

@@ -26,12 +26,12 @@ const MAX_POINTS: usize = 1024;
 /// Time for all points that are not polled and have to be read from the drive.
 const FORWARDED: Duration = Duration::from_secs(10);
 
-/// Does what `request` asks for, as `origin`; waits for the drive where that is needed.
-pub async fn answer(request: &Request, shared: &SharedPlant, origin: Origin) -> Outcome {
+/// Does what `request` asks for, which came at `asked`, as `origin`; waits for the drive where that is needed.
+pub async fn answer(request: &Request, shared: &SharedPlant, origin: Origin, asked: Instant) -> Outcome {
     let plant = &*shared.load_full();
     let answered = match request {
         Request::Read(request) => read(request, plant, &origin).await.map(Outcome::Read),
-        Request::Write(request) => write(request, plant, origin).await.map(Outcome::Write),
+        Request::Write(request) => write(request, plant, origin, asked).await.map(Outcome::Write),
         Request::Why(request) => why(request, plant).map(Outcome::Why),
         Request::Record(request) => record(request, plant, &origin).await.map(Outcome::Record),
         Request::Params(request) => params(request, plant, origin).map(Outcome::Params),
@@ -260,7 +260,7 @@ fn why_no_words(reading: &Reading<'_>, raw: &Raw) -> Option<String> {
     }
 }
 
-async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<WriteOutcome, Failure> {
+async fn write(request: &WriteRequest, plant: &Plant, origin: Origin, asked: Instant) -> Result<WriteOutcome, Failure> {
     let now = Instant::now();
     let drive = match drive_of(plant, &request.drive, request.expect.as_ref()) {
         Err(failure) if failure.code == FailureCode::UnknownDrive => {
@@ -279,7 +279,7 @@ async fn write(request: &WriteRequest, plant: &Plant, origin: Origin) -> Result<
     let (values, refused) = understood(profile, &request.points);
     let (client, stop) = (Authority::Write, stop_of(&values, profile));
     let mut placed = match (refused, stop) {
-        (None, _) => drive.place(Order::Points(values), origin, client, DEFAULT_EXPIRY, now),
+        (None, _) => drive.place_asked(Order::Points(values), origin, client, DEFAULT_EXPIRY, asked, now),
         (Some(refusal), Some(stop)) => {
             let what = described(&request.points);
             drive.place_stop(

@@ -16,6 +16,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use futures_util::FutureExt;
 use tokio::io::{AsyncBufReadExt, AsyncReadExt, AsyncWriteExt, BufReader};
 use tokio::net::UnixStream;
 use tokio::task::JoinHandle;
@@ -62,7 +63,7 @@ struct Asked {
 }
 
 impl Asked {
-    async fn answer(&self, request: &Request, origin: Origin) -> Outcome {
+    async fn answer(&self, request: &Request, origin: Origin, came: Instant) -> Outcome {
         let plant = self.plant.load_full();
         let control = self.control.as_ref();
         let answered = match request {
@@ -70,7 +71,7 @@ impl Asked {
                 .await
                 .map(Outcome::Reload),
             Request::Health(asked) => control::health(control, asked, &plant, &self.stats).map(Outcome::Health),
-            of_drive => Ok(answer(of_drive, &self.plant, origin).await),
+            of_drive => Ok(answer(of_drive, &self.plant, origin, came).await),
         };
         answered.unwrap_or_else(Outcome::Error)
     }
@@ -165,12 +166,15 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPerm
     let origin = Origin::new(SourceKind::LocalSocket, format!("uid {}", peer.uid()));
     let (read_half, mut write_half) = stream.split();
     let mut reader = BufReader::new(read_half);
+    // What is found at once may have come since.
+    let mut since = Instant::now();
     loop {
-        let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader));
-        let Some(Ok(Ok(line))) = place.closing().run_until_cancelled(request).await else {
+        let request = timeout(REQUEST_TIMEOUT, next_line(&mut reader, since));
+        let Some(Ok(Ok((line, came)))) = place.closing().run_until_cancelled(request).await else {
             break;
         };
-        place.use_at(Instant::now(), true);
+        since = Instant::now();
+        place.use_at(since, true);
         let (result, goes_on) = match line {
             Line::End => break,
             Line::TooLong => {
@@ -178,7 +182,7 @@ async fn serve(mut stream: UnixStream, asked: Arc<Asked>, permit: ConnectionPerm
                 (Outcome::Error(Failure::new(FailureCode::BadRequest, message)), false)
             }
             Line::Whole(line) => match protocol::parse(&line) {
-                Ok(request) => (asked.answer(&request, origin.clone()).await, true),
+                Ok(request) => (asked.answer(&request, origin.clone(), came).await, true),
                 Err(failure) => (Outcome::Error(failure), true),
             },
         };
@@ -201,12 +205,46 @@ enum Line {
     End,
 }
 
-async fn next_line(reader: &mut (impl AsyncBufReadExt + Unpin)) -> io::Result<Line> {
+/// The next line, and when its first byte came: what is there at once may have come at `since`.
+async fn next_line(reader: &mut (impl AsyncBufReadExt + Unpin), since: Instant) -> io::Result<(Line, Instant)> {
     let mut line = Vec::new();
+    let came = match reader.fill_buf().now_or_never() {
+        Some(there) => there.map(|_| since)?,
+        None => reader.fill_buf().await.map(|_| Instant::now())?,
+    };
     reader.take(MAX_REQUEST as u64).read_until(b'\n', &mut line).await?;
-    Ok(match line.last() {
+    let line = match line.last() {
         Some(b'\n') => Line::Whole(line),
         _ if line.len() == MAX_REQUEST => Line::TooLong,
         _ => Line::End,
-    })
+    };
+    Ok((line, came))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[tokio::test(start_paused = true)]
+    async fn a_request_counts_from_its_first_byte() {
+        let (mut client, server) = tokio::io::duplex(4096);
+        let mut reader = BufReader::new(server);
+        let begun = Instant::now();
+        let reading = tokio::spawn(async move {
+            let first = next_line(&mut reader, begun).await.unwrap();
+            let since = Instant::now();
+            // Both are there at once.
+            let second = next_line(&mut reader, since).await.unwrap();
+            (first.1, since, second.1)
+        });
+        tokio::task::yield_now().await;
+        client.write_all(b"{\"v\"").await.unwrap();
+        tokio::task::yield_now().await;
+        let half = Instant::now();
+        std::thread::sleep(Duration::from_millis(5));
+        client.write_all(b": 1}\n{}\n").await.unwrap();
+        let (first, since, second) = reading.await.unwrap();
+        assert!(begun <= first && first <= half, "when it began");
+        assert_eq!(second, since);
+    }
 }

@@ -64,6 +64,7 @@ pub(super) async fn serve<S: AsyncRead + AsyncWrite + Unpin>(
     let now = Instant::now();
     let mut connection = Connection {
         now,
+        all_read: now,
         stream,
         dialogue: Dialogue::new(session),
         place,
@@ -98,6 +99,8 @@ struct Connection<'p, S> {
     place: &'p Place,
     /// The time as of the last wait; the clock is read once per request.
     now: Instant,
+    /// When nothing was there to be read, last: what is found at once may have come since.
+    all_read: Instant,
     /// Requests since the last yield.
     since_yield: usize,
     idle: Option<Idle>,
@@ -161,8 +164,8 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
                     self.dialogue.finish(answered, self.now.into_std());
                     self.used();
                 }
-                Event::Input(0) => input_end = Some(End::Client),
-                Event::Input(count) => self.dialogue.received(count),
+                Event::Input(0, _) => input_end = Some(End::Client),
+                Event::Input(count, came) => self.dialogue.received(count, came.into_std()),
             }
         }
     }
@@ -189,15 +192,23 @@ impl<S: AsyncRead + AsyncWrite + Unpin> Connection<'_, S> {
         let waits = self.dialogue.is_waiting();
         let (space, waiting) = self.dialogue.parts();
         let reads = reading == Reading::On;
+        let room = space.len();
         if reads && let Some(count) = self.stream.read(space).now_or_never() {
-            return Ok(Event::Input(count?));
+            let (count, came) = (count?, self.all_read);
+            if count < room {
+                self.all_read = Instant::now();
+            }
+            return Ok(Event::Input(count, came));
+        }
+        if reads {
+            self.all_read = Instant::now();
         }
         // A client that waits does not flood the gateway, so it need not yield.
         self.since_yield = 0;
         tokio::select! {
             biased;
             Some(answered) = waiting.next() => Ok(Event::Answer(answered)),
-            count = self.stream.read(space), if reads => Ok(Event::Input(count?)),
+            count = self.stream.read(space), if reads => Ok(Event::Input(count?, Instant::now())),
             () = expired(half_frame_since) => Err(End::HalfFrame),
             timeout = Idle::over(self.idle.as_mut()), if !waits => Err(End::Idle(timeout)),
         }
@@ -269,8 +280,8 @@ enum Reading {
 enum Event {
     /// The bus has answered.
     Answer(AnsweredRequest),
-    /// Number of bytes from the client; 0 at the end of the stream.
-    Input(usize),
+    /// Number of bytes from the client, 0 at the end of the stream; and since when, at the earliest, they were there.
+    Input(usize, Instant),
 }
 
 /// The idle time of the client. The timer is reset only when it fires, not with each request.

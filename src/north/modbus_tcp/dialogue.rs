@@ -9,6 +9,7 @@ use futures_util::stream::{FuturesUnordered, StreamExt};
 use super::forwarded_request::{AnsweredRequest, PendingRequest};
 use super::frame::{self, MAX_FRAME, NotModbus};
 use super::session::ClientSession;
+use crate::north::arrivals::Arrivals;
 
 /// Initial input buffer: two frames, so that a thousand idle clients use little memory.
 const INPUT_FIRST: usize = 2 * MAX_FRAME;
@@ -35,6 +36,8 @@ pub(super) struct Dialogue {
     input: Vec<u8>,
     /// Bytes in `input` that are not processed yet.
     filled: usize,
+    /// When they came.
+    arrivals: Arrivals,
     pub(super) output: Vec<u8>,
 }
 
@@ -45,6 +48,7 @@ impl Dialogue {
             waiting: FuturesUnordered::new(),
             input: vec![0; INPUT_FIRST],
             filled: 0,
+            arrivals: Arrivals::default(),
             output: Vec::new(),
         }
     }
@@ -70,8 +74,9 @@ impl Dialogue {
             .extend(self.session.finish(answered, now, &mut self.output));
     }
 
-    /// The free part of the input buffer was filled with `count` bytes.
-    pub(super) fn received(&mut self, count: usize) {
+    /// The free part of the input buffer was filled with `count` bytes, which came at `at`.
+    pub(super) fn received(&mut self, count: usize, at: Instant) {
+        self.arrivals.came(count, at);
         self.filled = (self.filled + count).min(self.input.len());
         if self.filled == self.input.len() && self.filled < INPUT_MOST {
             // A client that fills the buffer sends batches; with a larger buffer a whole batch is read and answered at
@@ -93,7 +98,10 @@ impl Dialogue {
                 Ok(Some(frame)) => {
                     consumed.bytes += frame.used;
                     consumed.frames += 1;
-                    self.waiting.extend(self.session.take(&frame, now, &mut self.output));
+                    let asked = self.arrivals.first().unwrap_or(now);
+                    self.arrivals.taken(frame.used);
+                    let answer = self.session.take(&frame, asked, now, &mut self.output);
+                    self.waiting.extend(answer);
                 }
                 Ok(None) => break None,
                 Err(misfit) => break Some(misfit),

@@ -107,10 +107,10 @@ impl ForwardedRequest {
     }
 
     /// Queues its command, or the first one of several, before this returns.
-    pub(super) fn send(self, work: BusWork, client: &Client, now: Instant) -> Progress {
+    pub(super) fn send(self, work: BusWork, client: &Client, asked: Instant, now: Instant) -> Progress {
         let mut forwarded = Box::new(self);
         match work {
-            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), now),
+            BusWork::Order(order) => forwarded.place(order, client, client.rights.authority(), asked, now),
             BusWork::Stop(stop, refusal) => {
                 let what = describe::request(&forwarded.request);
                 let (authority, rest) = (client.rights.authority(), (what.as_str(), refusal));
@@ -137,8 +137,18 @@ impl ForwardedRequest {
         }
     }
 
-    fn place(self: Box<Self>, order: Order, client: &Client, authority: Authority, now: Instant) -> Progress {
-        let placed = self.drive.place(order, client.origin(), authority, DEFAULT_EXPIRY, now);
+    fn place(
+        self: Box<Self>,
+        order: Order,
+        client: &Client,
+        authority: Authority,
+        asked: Instant,
+        now: Instant,
+    ) -> Progress {
+        let origin = client.origin();
+        let placed = self
+            .drive
+            .place_asked(order, origin, authority, DEFAULT_EXPIRY, asked, now);
         Progress::Pending(PendingRequest {
             forwarded: Some(self),
             placed,
@@ -155,7 +165,7 @@ impl ForwardedRequest {
                 ReadPart::Known(known) => read.words.extend(known),
                 ReadPart::Object { pdu, skip, take } => {
                     read.asked = (skip, take);
-                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now);
+                    return self.place(Order::Read(pdu), client, Authority::ReadOnly, now, now);
                 }
             }
         }

@@ -68,7 +68,7 @@ impl Offline {
                 for (place, byte) in space.iter_mut().zip(self.backlog.drain(..count)) {
                     *place = byte;
                 }
-                self.dialogue.received(count);
+                self.dialogue.received(count, now);
             }
             self.closed = self.closed || self.dialogue.process(now).1.is_some();
             self.dialogue.collect(now);

@@ -93,9 +93,15 @@ impl ClientSession {
         }
     }
 
-    /// Answers a request into `out`, or returns the pending request. Its command is in the queue when this returns, so
+    /// Answers a request whose first byte came at `asked` into `out`, or returns the pending request. Its command is in the queue when this returns, so
     /// commands reach the bus in the order of their frames.
-    pub(super) fn take(&mut self, frame: &Frame<'_>, now: Instant, out: &mut Vec<u8>) -> Option<PendingRequest> {
+    pub(super) fn take(
+        &mut self,
+        frame: &Frame<'_>,
+        asked: Instant,
+        now: Instant,
+        out: &mut Vec<u8>,
+    ) -> Option<PendingRequest> {
         match self.decide(frame, now) {
             Decision::Reply(request, reply) => self.put(frame.header, &request, &reply, out),
             Decision::Exception(code) if code > Exception::GATEWAY_TARGET => {
@@ -106,7 +112,7 @@ impl ClientSession {
             }
             Decision::Exception(code) => self.put_exception(frame.header, frame.function, code, out),
             Decision::Drive(forwarded, work) => {
-                let step = forwarded.send(work, &self.client, now);
+                let step = forwarded.send(work, &self.client, asked, now);
                 return self.follow(step, now, out);
             }
         }

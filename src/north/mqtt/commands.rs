@@ -178,7 +178,7 @@ impl Commands {
         }
         let (client, expiry) = (Authority::Write, asked.expiry);
         let placed = match (refused, stop) {
-            (None, _) => drive.place(order, origin, client, expiry, now),
+            (None, _) => drive.place_asked(order, origin, client, expiry, incoming.asked.unwrap_or(now), now),
             (Some(refusal), Some(stop)) => {
                 drive.place_stop(Order::Points(stop), (&what(), refusal), origin, client, expiry, now)
             }

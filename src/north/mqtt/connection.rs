@@ -7,8 +7,9 @@
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicUsize, Ordering};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
+use futures_util::FutureExt;
 use rumqttc::mqttbytes::v5::Filter;
 use rumqttc::mqttbytes::{Error as PacketError, QoS};
 use rumqttc::{
@@ -327,8 +328,27 @@ fn mqtt_options(options: &Options, client_id: &str, will: LastWill, tls: Option<
 /// Polls until the first error and reports the events.
 async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, backlog: Arc<Backlog>) {
     let mut accepted = false;
+    // Since when, at the earliest, there was what the next event tells.
+    let mut came = Instant::now();
+    let mut all_polled = came;
     loop {
-        let item = match eventloop.poll().await {
+        let was_read = !eventloop.state.events.is_empty();
+        let event_or_end = {
+            let mut polled = std::pin::pin!(eventloop.poll());
+            match (&mut polled).now_or_never() {
+                Some(polled) => {
+                    came = if was_read { came } else { all_polled };
+                    polled
+                }
+                None => {
+                    let polled = polled.await;
+                    came = Instant::now();
+                    polled
+                }
+            }
+        };
+        all_polled = Instant::now();
+        let item = match event_or_end {
             Ok(Event::Outgoing(Outgoing::Publish(packet))) => {
                 let left = backlog.messages.fetch_sub(1, Ordering::SeqCst).saturating_sub(1);
                 if left <= REQUESTS / 2
@@ -339,7 +359,7 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
                 }
                 (packet != 0).then_some(ConnectionEvent::Sent(packet))
             }
-            Ok(event) => interpret(event),
+            Ok(event) => interpret(event, came),
             Err(error) if accepted => Some(ConnectionEvent::Lost(reason(&error))),
             Err(error) => Some(ConnectionEvent::Lost(refusal(&error))),
         };
@@ -352,7 +372,7 @@ async fn poll(mut eventloop: EventLoop, event: mpsc::Sender<ConnectionEvent>, ba
     }
 }
 
-fn interpret(event: Event) -> Option<ConnectionEvent> {
+fn interpret(event: Event, came: Instant) -> Option<ConnectionEvent> {
     match event {
         Event::Incoming(Packet::ConnAck(ack)) => Some(ConnectionEvent::Connected(BrokerLimits::of(&ack))),
         Event::Incoming(Packet::SubAck(ack)) => {
@@ -369,7 +389,7 @@ fn interpret(event: Event) -> Option<ConnectionEvent> {
             why => ConnectionEvent::Refused(ack.pkid, why),
         }),
         Event::Incoming(Packet::Publish(publish)) => {
-            Incoming::of(publish).map(|message| ConnectionEvent::Message(Box::new(message)))
+            Incoming::of(publish, came).map(|message| ConnectionEvent::Message(Box::new(message)))
         }
         Event::Incoming(_) => Some(ConnectionEvent::Alive),
         // A packet id was about to be used again before its acknowledgement.

@@ -63,7 +63,8 @@ impl Offline {
 
     /// Receives a message. Its command is in the queue of its bus when this returns, unless so many wait that the
     /// broker keeps the message until a later [`Offline::poll`].
-    pub fn receive(&mut self, message: Incoming, now: Instant) {
+    pub fn receive(&mut self, mut message: Incoming, now: Instant) {
+        message.asked.get_or_insert(now);
         self.held.push_back(message);
         self.work(now);
     }

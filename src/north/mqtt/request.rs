@@ -1,6 +1,6 @@
 //! Parses the messages on set topics.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use rumqttc::Publish;
 use serde_json::Value as Json;
@@ -32,11 +32,13 @@ pub struct Incoming {
     pub who: Option<String>,
     /// Number of bytes of a payload that was too long; of it, `payload` has only the `id`.
     pub oversized: Option<usize>,
+    /// When it came; none where it is taken at once.
+    pub asked: Option<Instant>,
 }
 
 impl Incoming {
-    /// A message as it came; `None` if its topic is not UTF-8.
-    pub(super) fn of(publish: Publish) -> Option<Incoming> {
+    /// A message as it came at `asked`; `None` if its topic is not UTF-8.
+    pub(super) fn of(publish: Publish, asked: Instant) -> Option<Incoming> {
         let properties = publish.properties.unwrap_or_default();
         let who = properties.user_properties.into_iter().find(|(name, _)| name == "who");
         let mut incoming = Incoming {
@@ -50,6 +52,7 @@ impl Incoming {
             expiry: properties.message_expiry_interval,
             who: who.map(|(_, who)| who),
             oversized: None,
+            asked: Some(asked),
         };
         if publish.payload.len() <= MAX_PAYLOAD {
             incoming.payload = publish.payload.to_vec();
@@ -362,7 +365,7 @@ mod tests {
     fn of_a_payload_that_is_too_long_the_id_is_kept() {
         let of = |payload: String| {
             let publish = Publish::new("t", rumqttc::mqttbytes::QoS::AtLeastOnce, payload, None);
-            Incoming::of(publish).unwrap()
+            Incoming::of(publish, Instant::now()).unwrap()
         };
         let padding = "x".repeat(300_000);
         let incoming = of(format!(r#"{{"pad": "{padding}", "id": 41}}"#));

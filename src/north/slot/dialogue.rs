@@ -35,7 +35,9 @@ struct Pending {
 #[derive(Debug)]
 struct Held {
     request: ToolRequest,
-    /// Stops that its drive had been given when the tool asked.
+    /// When its first byte came.
+    asked: Instant,
+    /// Stops that its drives had been given when it was whole.
     stops: u64,
     until: Instant,
     deadline: Instant,
@@ -101,7 +103,8 @@ impl Dialogue {
             match said {
                 Said::Request(request) => {
                     any = true;
-                    self.asked_for(request, now);
+                    let asked = self.framing.asked().unwrap_or(now);
+                    self.asked_for(request, asked, now);
                 }
                 Said::Broken => self.tool.count(SlotOutcome::Broken),
             }
@@ -158,7 +161,7 @@ impl Dialogue {
         }
     }
 
-    fn asked_for(&mut self, request: ToolRequest, now: Instant) {
+    fn asked_for(&mut self, request: ToolRequest, asked: Instant, now: Instant) {
         let impatient = self.is_waiting() && self.asked.is_some_and(|at| now < at + IMPATIENT);
         self.give_up(SlotOutcome::Abandoned);
         let deadline = now + ANSWER_WITHIN;
@@ -170,6 +173,7 @@ impl Dialogue {
             pace.not_before.max(haste.unwrap_or(now))
         };
         let held = Held {
+            asked,
             stops: pace.stops,
             request,
             until,
@@ -188,12 +192,13 @@ impl Dialogue {
     fn go(&mut self, held: Held, now: Instant) {
         let Held {
             request,
+            asked,
             stops,
             deadline,
             ..
         } = held;
         self.asked = Some(now);
-        match self.tool.decide(&request, stops, deadline, now) {
+        match self.tool.decide(&request, (asked, stops), deadline, now) {
             Decision::Refuse(why) => {
                 self.tool.count(SlotOutcome::Refused);
                 if !request.is_broadcast(self.tool.protocol()) {

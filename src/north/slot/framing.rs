@@ -9,6 +9,7 @@ use std::time::{Duration, Instant};
 use super::request::ToolRequest;
 use crate::codec::frames::Frames;
 use crate::codec::{LineFormat, Protocol};
+use crate::north::arrivals::Arrivals;
 
 /// Silence behind half a frame after which the rest is not expected any more: longer than the pauses of serial programs and the
 /// delayed acknowledgements of TCP, shorter than tools wait before they ask again.
@@ -28,6 +29,9 @@ pub(super) enum Said {
 pub(super) struct Framing {
     protocol: Protocol,
     frames: Frames,
+    arrivals: Arrivals,
+    /// When the first byte came of what was said last.
+    asked: Option<Instant>,
 }
 
 impl Framing {
@@ -35,18 +39,23 @@ impl Framing {
         Framing {
             protocol,
             frames: Frames::new(protocol, format, HALF_FRAME),
+            arrivals: Arrivals::default(),
+            asked: None,
         }
     }
 
     /// Bytes came in at `now`.
     pub(super) fn add(&mut self, bytes: &[u8], now: Instant) {
         self.frames.add(bytes, now);
+        self.arrivals.came(bytes.len(), now);
     }
 
     /// What the tool said next, as far as that is clear at `now`.
     pub(super) fn next(&mut self, now: Instant) -> Option<Said> {
         loop {
             let piece = self.frames.next(None, now)?;
+            self.asked = self.arrivals.first();
+            self.arrivals.taken(piece.bytes.len());
             if !self.is_blank(&piece.bytes) {
                 return Some(match ToolRequest::of(self.protocol, &piece.bytes) {
                     Some(request) => Said::Request(request),
@@ -54,6 +63,11 @@ impl Framing {
                 });
             }
         }
+    }
+
+    /// When the first byte came of what the tool said last.
+    pub(super) fn asked(&self) -> Option<Instant> {
+        self.asked
     }
 
     /// Between two lines there may be blanks and line feeds.

@@ -53,7 +53,7 @@ pub(super) struct Pace {
     pub(super) not_before: Instant,
     /// It stops a drive: it goes at once.
     pub(super) is_stop: bool,
-    /// Stops that its drive was given so far.
+    /// Stops that its drives were given so far.
     pub(super) stops: u64,
 }
 
@@ -125,13 +125,16 @@ impl Tool {
             is_stop: false,
             stops: 0,
         };
+        if matches!(request.meaning, Meaning::Read(_) | Meaning::Faulty(_)) {
+            return pace;
+        }
+        let plant = self.terms.plant.load();
+        let drives = self.asked(&plant, request);
+        pace.stops = drives.iter().map(DriveHandle::stops).sum();
         let Meaning::Write(pdu) = &request.meaning else {
             return pace;
         };
-        let plant = self.terms.plant.load();
-        let drives = self.asked(&plant, request);
         pace.is_stop = self.writes() && drives.iter().any(|drive| stop_in(drive, pdu, now).is_some());
-        pace.stops = drives.iter().map(DriveHandle::stops).sum();
         // What is refused anyway, is at once.
         let admitted = drives
             .iter()
@@ -158,9 +161,16 @@ impl Tool {
             .collect()
     }
 
-    /// What becomes of a request whose drive had been given so many `stops` when the tool asked. What is given to the bus is in
-    /// its queue when this returns, and is not sent after `deadline`.
-    pub(super) fn decide(&self, request: &ToolRequest, stops: u64, deadline: Instant, now: Instant) -> Decision {
+    /// What becomes of a request whose first byte came at `asked`, and whose drives had been given so many `stops` when it was
+    /// whole: behind a stop that came in since it is not sent. What is given to the bus is in its queue when this returns, and
+    /// is not sent after `deadline`.
+    pub(super) fn decide(
+        &self,
+        request: &ToolRequest,
+        (asked, stops): (Instant, u64),
+        deadline: Instant,
+        now: Instant,
+    ) -> Decision {
         let plant = self.terms.plant.load();
         let bus = plant
             .buses
@@ -169,9 +179,14 @@ impl Tool {
         let Some(bus) = bus else { return Decision::Silent };
         let drives = self.asked(&plant, request);
         let broadcast = request.is_broadcast(self.protocol());
+        // A stop that came in while it was held may have come at the same time by the clock.
+        let stopped = drives.iter().map(DriveHandle::stops).sum::<u64>() != stops;
+        let before = asked.checked_sub(Duration::from_nanos(1)).filter(|_| stopped);
+        let asked = before.unwrap_or(asked);
         let case = Case {
             plant: &plant,
             bus,
+            asked,
             deadline,
             now,
         };
@@ -182,7 +197,7 @@ impl Tool {
                 Decision::Wait(self.exchange(&case, target, pdu, false))
             }
             Meaning::Write(pdu) if !broadcast && drives.len() == 1 => match drives.first() {
-                Some(drive) => self.write(drive, pdu, stops, now),
+                Some(drive) => self.write(drive, pdu, asked, now),
                 None => Decision::Silent,
             },
             Meaning::Read(pdu) | Meaning::Write(pdu) | Meaning::Unchecked(pdu) => {
@@ -192,33 +207,20 @@ impl Tool {
     }
 
     /// A write to a configured drive: the same checks as those of a Modbus TCP client.
-    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, stops: u64, now: Instant) -> Decision {
+    fn write(&self, drive: &DriveHandle, pdu: &RequestPdu, asked: Instant, now: Instant) -> Decision {
         if !self.writes() {
             let text = format!("the slot of bus `{}` has access = \"read\"", self.terms.slot.bus);
             return self.refuse(drive, pdu, Refusal::NotAllowed(text), now);
         }
-        if drive.stops() != stops && stop_in(drive, pdu, now).is_none() {
-            // A stop came in while it was held.
-            let what = describe::request_on(self.protocol(), pdu);
-            let plant = self.terms.plant.load();
-            turn_away(
-                &plant.writes,
-                &drive.image.spec.name,
-                &what,
-                Outcome::Purged,
-                self.origin.clone(),
-                now,
-            );
-            return Decision::Silent;
-        }
         let cost = cost(drive, pdu);
         self.terms.paces.wrote(&self.terms.slot.bus, cost, now);
         let order = Order::Write(pdu.clone());
-        Decision::Wait(Work::Command(drive.place(
+        Decision::Wait(Work::Command(drive.place_asked(
             order,
             self.origin.clone(),
             Authority::Write,
             EXPIRY,
+            asked,
             now,
         )))
     }
@@ -274,6 +276,7 @@ impl Tool {
             target,
             pdu: pdu.clone(),
             may_write,
+            asked: case.asked,
             expires: case.deadline,
             origin: self.origin.clone(),
         };
@@ -311,6 +314,7 @@ impl Tool {
 struct Case<'c> {
     plant: &'c Plant,
     bus: &'c BusHandle,
+    asked: Instant,
     deadline: Instant,
     now: Instant,
 }

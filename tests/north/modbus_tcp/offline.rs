@@ -120,3 +120,36 @@ fn clients_of_one_server_share_the_command_word() {
     assert_eq!(second.len(), 2);
     assert!(bench.pop().is_none(), "the reset was given by the first client");
 }
+
+#[test]
+fn a_start_that_arrives_in_pieces_does_not_run_behind_a_stop() {
+    let mut bench = Bench::of(plant());
+    let mut other = bench
+        .client
+        .beside(([10, 0, 0, 8], 4711).into(), None, Authority::Write);
+    // By the model and raw: the stop comes between the two halves.
+    for start in [&[0x8100, 1][..], &[2000, 1]] {
+        let start = frame(7, 1, &words(6, start));
+        let refused = [0, 7, 0, 0, 0, 3, 1, 0x86, 6];
+        for cut in [1, 6, 11] {
+            assert!(bench.receive(&start[..cut]).is_empty());
+            bench.now += Duration::from_millis(20);
+            assert!(
+                other
+                    .receive(&frame(8, 1, &words(6, &[0x8100, 0])), bench.now)
+                    .is_empty()
+            );
+            bench.serve();
+            assert!(!other.receive(&[], bench.now).is_empty(), "acknowledged");
+            bench.now += Duration::from_millis(20);
+            assert_eq!(bench.receive(&start[cut..]), refused, "{cut}");
+        }
+        // Sent again it is taken; what comes behind in the same piece has its own time.
+        bench.now += Duration::from_millis(20);
+        assert!(bench.receive(&start[..3]).is_empty());
+        bench.now += Duration::from_millis(20);
+        assert!(bench.receive(&start[3..]).is_empty());
+        bench.serve();
+        assert_eq!(bench.receive(&[]), start);
+    }
+}

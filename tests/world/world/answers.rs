@@ -144,6 +144,10 @@ impl World {
         assert!(self.records[id].answer.is_none(), "order {id} was answered twice");
         self.records[id].answer = Some((code.to_string(), now));
         let record = &self.records[id];
+        assert!(
+            self.stopping || !record.wish.is_stop() || code != "shutting_down",
+            "a reload dropped stop {id}"
+        );
         if let Some(open) = self.open.get_mut(&(record.bus, record.drive)) {
             open.retain(|open| *open != id);
             if open.is_empty() {

@@ -96,8 +96,10 @@ pub(in crate::north::http) async fn command(
     Path(name): Path<String>,
     request: Request,
 ) -> Response {
+    // Passwords are compared, and the body is waited for, behind that.
+    let asked = Instant::now();
     let (parts, body) = request.into_parts();
-    match commanded(&app, &reached, &name, &parts, body).await {
+    match commanded(&app, &reached, &name, &parts, body, asked).await {
         Ok(reply) => reply.into_response(),
         Err(response) => response,
     }
@@ -109,13 +111,15 @@ async fn commanded(
     name: &str,
     parts: &request::Parts,
     body: Body,
+    asked: Instant,
 ) -> Result<CommandReply, Response> {
     let (operating, cookies, address) = (&app.operating, app.cookies(reached), reached.peer.ip());
     let operator = operating.commander(&parts.headers, &cookies, address).await;
     let operator = operator.map_err(IntoResponse::into_response)?;
     let payload = body::read(body, reached, MAX_PAYLOAD).await?;
     let plant = app.plant.load_full();
-    let progress = operating.take(&plant, &operator, name, &payload, Instant::now(), SystemTime::now());
+    let times = (asked, Instant::now(), SystemTime::now());
+    let progress = operating.take(&plant, &operator, name, &payload, times);
     match progress {
         Progress::Known(reply) => Ok(reply),
         Progress::Repeated(reply) => shared(reply).await,
@@ -165,7 +169,7 @@ impl Operator {
 }
 
 impl Operating {
-    /// Takes a command at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
+    /// Takes a command whose head came at `asked_at`, at `now`, which is `time` on the calendar: it is in the queue of its bus when this returns, or its
     /// reply is known. A repeated command is not executed again, but has the reply of the first one, or is refused; a stop
     /// is always executed, that of a command which does more without the rest.
     fn take(
@@ -174,8 +178,7 @@ impl Operating {
         operator: &Operator,
         name: &str,
         payload: &[u8],
-        now: Instant,
-        time: SystemTime,
+        (asked_at, now, time): (Instant, Instant, SystemTime),
     ) -> Progress {
         let (id, origin) = (find_id(payload), operator.origin());
         let reply =
@@ -208,7 +211,7 @@ impl Operating {
         }
         let (client, expiry) = (Authority::Write, asked.expiry);
         let placed = match (refused, stop) {
-            (None, _) => drive.place(order, origin, client, expiry, now),
+            (None, _) => drive.place_asked(order, origin, client, expiry, asked_at, now),
             (Some(refusal), Some(stop)) => {
                 let rest = (excerpt(payload), refusal);
                 drive.place_stop(Order::Points(stop), (&rest.0, rest.1), origin, client, expiry, now)

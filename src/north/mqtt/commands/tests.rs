@@ -1,3 +1,5 @@
+use std::time::Duration;
+
 use serde_json::Value as Json;
 
 use super::super::fixture;
@@ -47,14 +49,14 @@ impl Bench {
     /// A reload starts the bus anew.
     fn reload_bus(&mut self) {
         let stopped = std::mem::replace(&mut self.plant.buses, fixture::plant(&["p1"]).buses);
-        self.plant.buses[0].take_over(&stopped);
+        self.plant.buses[0].take_over(&stopped, self.now);
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
     /// One reload removes the bus, a later one adds it again.
     fn remove_and_add(&mut self) {
         self.plant = fixture::plant(&["p1"]);
-        self.plant.buses[0].take_over(&[]);
+        self.plant.buses[0].take_over(&[], self.now);
         fixture::read(&self.plant, "p1", 1, 0, self.now);
     }
 
@@ -649,4 +651,17 @@ fn of_a_repeated_command_that_stops_and_does_more_only_the_stop_is_repeated() {
         assert_eq!(result["rest"], "not_allowed");
         assert!(result["error"]["message"].as_str().unwrap().contains("repeats"));
     }
+}
+
+#[test]
+fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
+    let mut bench = Bench::new();
+    let mut start = set("p1/set", r#"{"id": 1, "run": true}"#);
+    start.asked = Some(bench.now);
+    bench.now += Duration::from_millis(20);
+    assert_eq!(bench.take(set("p1/set/run", "false")), None);
+    bench.now += Duration::from_millis(20);
+    let result = json(&bench.take(start).unwrap());
+    assert_eq!((&result["ok"], &result["result"]), (&false.into(), &"purged".into()));
+    assert_eq!(bench.queued(), 1, "the stop");
 }

@@ -139,7 +139,14 @@ impl Orders {
         let life = incoming.expiry.map(|s| Duration::from_secs(s.into()));
         let expiry = life.map_or(DEFAULT_EXPIRY, |life| life.min(DEFAULT_EXPIRY));
         let mut placed = match (refused, stop) {
-            (None, _) => drive.place(order, origin, Authority::Write, expiry, now),
+            (None, _) => drive.place_asked(
+                order,
+                origin,
+                Authority::Write,
+                expiry,
+                incoming.asked.unwrap_or(now),
+                now,
+            ),
             (Some(refusal), Some(stop)) => {
                 let (what, stop) = (request.what(), Order::Points(stop));
                 drive.place_stop(stop, (&what, refusal), origin, Authority::Write, expiry, now)

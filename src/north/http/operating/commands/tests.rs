@@ -35,8 +35,13 @@ impl Bench {
 
     fn take(&self, operator: &Operator, drive: &str, body: &str) -> Progress {
         let time = SystemTime::UNIX_EPOCH;
-        self.operating
-            .take(&self.plant, operator, drive, body.as_bytes(), self.now, time)
+        self.operating.take(
+            &self.plant,
+            operator,
+            drive,
+            body.as_bytes(),
+            (self.now, self.now, time),
+        )
     }
 
     fn waiting(&self) -> usize {
@@ -189,4 +194,30 @@ fn a_stop_is_carried_out_whatever_becomes_of_the_rest() {
         };
         assert_eq!(status(&answer.outcome), expected, "{body}");
     }
+}
+
+#[test]
+fn a_start_whose_body_comes_late_does_not_run_behind_a_stop() {
+    let mut bench = Bench::new();
+    let (alice, time) = (operator("alice", "alice#1"), SystemTime::UNIX_EPOCH);
+    let asked = bench.now;
+    bench.now += Duration::from_millis(20);
+    let _stop = bench.take(&operator("bob", "bob#2"), "p1", "{\"run\": false}");
+    bench.now += Duration::from_millis(30);
+    let times = (asked, bench.now, time);
+    let outcome = |progress: Progress| match progress {
+        Progress::Placed(mut waiting) => waiting.placed.answer().map(|answer| answer.outcome),
+        _ => panic!("not placed"),
+    };
+    let start = b"{\"run\": true}";
+    let late = bench.operating.take(&bench.plant, &alice, "p1", start, times);
+    assert_eq!(outcome(late), Some(Outcome::Purged));
+    assert_eq!(status(&Outcome::Purged), StatusCode::CONFLICT);
+    let other = bench.operating.take(&bench.plant, &alice, "p2", start, times);
+    assert_eq!(outcome(other), None, "nobody stopped that drive");
+    assert_eq!(
+        outcome(bench.take(&alice, "p1", "{\"run\": true}")),
+        None,
+        "asked for since"
+    );
 }

@@ -231,3 +231,14 @@ fn a_repeated_command_is_refused_and_a_stop_never() {
     fixture::read(&bench.plant, "p1", 1, 0, bench.now);
     assert_eq!(bench.take(&run, "p1"), None);
 }
+
+#[test]
+fn a_start_that_came_before_a_stop_and_is_taken_behind_it_is_not_executed() {
+    let mut bench = bench();
+    let run = |value| vec![named("run", MetricValue::Boolean(value))];
+    let mut start = message(1, run(true));
+    start.asked = Some(bench.now);
+    bench.now += Duration::from_millis(20);
+    assert_eq!(bench.take(&message(2, run(false)), "p1"), None);
+    assert_eq!(bench.take(&start, "p1").unwrap().code, "purged");
+}

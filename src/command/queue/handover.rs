@@ -1,0 +1,77 @@
+//! A reload: another bus takes the place of the one that serves a queue, and the stops that wait in it are handed over.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Instant;
+
+use super::{CommandQueue, Pending};
+use crate::command::{Command, Outcome, Urgency};
+
+impl Pending {
+    /// Whether another bus takes the place of this one.
+    pub fn is_ending(&self) -> bool {
+        self.ending
+    }
+
+    /// A stop that the bus had begun when it ended: the bus that takes its place sends it.
+    ///
+    /// # Errors
+    /// None takes its place.
+    pub fn give_back(&mut self, stop: Command) -> Result<(), Box<Command>> {
+        match self.ending {
+            true => {
+                self.waiting.push_front(stop);
+                Ok(())
+            }
+            false => Err(Box::new(stop)),
+        }
+    }
+
+    /// A stop that was given to the bus before; it was counted there.
+    fn inherit(&mut self, mut stop: Command, now: Instant) {
+        self.numbered += 1;
+        stop.number = self.numbered;
+        match &self.closed {
+            Some(outcome) => stop.answer(&outcome.clone(), now),
+            None => self.push_stop(stop, now),
+        }
+    }
+}
+
+impl CommandQueue {
+    /// The bus is about to end and another one takes its place: stops wait for that, everything else is answered.
+    pub fn begin_handover(&self, now: Instant) {
+        let outcome = Outcome::ShuttingDown;
+        self.background().close(&outcome, now);
+        let mut pending = self.lock();
+        pending.remove(now, &outcome, |c| c.urgency != Urgency::Stop);
+        pending.closed = Some(outcome);
+        pending.ending = true;
+    }
+
+    /// From now on the stops of that drive are those of another queue, in which it has that place: those that wait, and those
+    /// that are still given to this one.
+    pub fn hand_over(&self, drive: usize, heir: &Arc<CommandQueue>, place: usize, now: Instant) {
+        let mut pending = self.lock();
+        let stopped_at = pending.stopped_at.get(&drive).copied();
+        let mut of_heir = heir.lock();
+        if let Some(at) = stopped_at {
+            of_heir.stopped_at.insert(place, at);
+        }
+        let (stops, others): (VecDeque<Command>, _) = std::mem::take(&mut pending.waiting)
+            .into_iter()
+            .partition(|c| c.drive == drive && c.urgency == Urgency::Stop);
+        pending.waiting = others;
+        for mut stop in stops {
+            stop.drive = place;
+            match stop.client_waits_until() {
+                Some(_) => of_heir.inherit(stop, now),
+                // What supervision still wants, the lease knows.
+                None => stop.answer(&Outcome::ShuttingDown, now),
+            }
+        }
+        drop(of_heir);
+        pending.heirs.insert(drive, (heir.clone(), place));
+        heir.wake();
+    }
+}

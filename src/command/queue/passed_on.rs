@@ -1,0 +1,91 @@
+//! What is passed on for a tool to several drives, or unchecked to one: its place among the other orders of each.
+
+use std::time::Instant;
+
+use super::{Chosen, CommandQueue, Pending};
+use crate::command::{BackgroundRequest, Command, Outcome, PassedOn, Touched, Urgency};
+
+impl Pending {
+    /// What is passed on and may go, in its order: nothing older waits for any drive that it reaches. A stop that cannot go now,
+    /// its drive being away, holds up nothing that reaches others.
+    pub(super) fn passed_on(&self, may: &mut impl FnMut(&Command) -> bool) -> Vec<u64> {
+        if self.waiting.iter().all(|c| c.passed_on.is_none()) {
+            return Vec::new();
+        }
+        let stops = self.waiting.iter().filter(|c| c.urgency == Urgency::Stop);
+        let mut first: Vec<usize> = stops.filter(|c| may(c)).map(|c| c.drive).collect();
+        let mut all = Vec::new();
+        for command in self.waiting.iter().filter(|c| c.urgency == Urgency::Command) {
+            let free = command.passed_on.is_some() && command.reach().iter().all(|drive| !first.contains(drive));
+            if free && may(command) {
+                all.push(command.number);
+            }
+            first.extend(command.reach());
+        }
+        all
+    }
+
+    /// What is passed on and goes as a command, since a command waits behind it.
+    pub(super) fn pressed(&self) -> Vec<u64> {
+        let mut waits: Vec<usize> = Vec::new();
+        let mut pressed = Vec::new();
+        for command in self.waiting.iter().rev().filter(|c| c.urgency == Urgency::Command) {
+            let presses = command.reach().iter().any(|drive| waits.contains(drive));
+            if command.passed_on.is_some() && presses {
+                pressed.push(command.number);
+            }
+            if command.passed_on.is_none() || presses {
+                waits.extend(command.reach());
+            }
+        }
+        pressed
+    }
+
+    /// The request that is passed on next to several drives, or to one unchecked, where nothing is in a hurry.
+    pub fn next_passed_on(&mut self, now: Instant, mut may: impl FnMut(&Command) -> bool) -> Option<Chosen> {
+        self.expire(now);
+        let rank = Urgency::Command;
+        let number = self.passed_on(&mut may).first().copied();
+        number.map(|number| Chosen { rank, number })
+    }
+
+    /// The command that was chosen.
+    pub fn get(&self, chosen: Chosen) -> Option<&Command> {
+        self.waiting.iter().find(|c| c.number == chosen.number)
+    }
+
+    /// A command that was taken and not sent waits again, before all others, unless a stop came in for a drive that it reaches.
+    pub fn put_back(&mut self, command: Command, now: Instant) {
+        let outcome = match &self.closed {
+            Some(outcome) => Some(outcome.clone()),
+            None if self.stops_only => Some(Outcome::ShuttingDown),
+            None => {
+                let stopped = |drive: &usize| self.was_stopped(*drive) && !command.stops(*drive);
+                command.reach().iter().any(stopped).then_some(Outcome::Purged)
+            }
+        };
+        match outcome {
+            Some(outcome) => command.answer(&outcome, now),
+            None => self.waiting.push_front(command),
+        }
+    }
+
+    /// Whether a stop came in for that drive since the bus last asked.
+    pub fn was_stopped(&self, drive: usize) -> bool {
+        self.stopped.contains(&drive)
+    }
+}
+
+impl CommandQueue {
+    /// Takes in what is passed on for a tool, asked for at `asked`, and wakes the bus: an order to drives of the bus has its place
+    /// among their other orders, anything else waits with the background requests.
+    pub fn submit_passed_on(&self, request: BackgroundRequest, touched: Touched, asked: Instant, now: Instant) {
+        if request.passed_on.as_ref().is_some_and(PassedOn::is_order) {
+            let mut command = request.into_command(touched);
+            command.asked = Some(asked);
+            self.submit(command, now);
+        } else {
+            self.submit_background(request, now);
+        }
+    }
+}

@@ -1,0 +1,202 @@
+//! One order for each drive: what is passed on to several of them among the others, and what was asked for before a stop.
+
+use super::*;
+use crate::codec::{Reply, RequestPdu};
+use crate::command::{BackgroundRequest, NO_DRIVE, Pace, PassedOn};
+
+const START: u16 = 1;
+const STOP: u16 = 0;
+
+impl Bench {
+    /// A broadcast that a tool passes on to drives 1 and 2.
+    fn broadcast(&mut self, value: u16) -> Receiver<Answer> {
+        let origin = Origin::new(SourceKind::Slot, "tool");
+        let (ticket, receiver) = Ticket::new(origin, "all", String::new(), true, self.now, self.stats.clone());
+        let (frame, wanted) = tokio::sync::oneshot::channel();
+        std::mem::forget(wanted);
+        let request = BackgroundRequest {
+            drive: NO_DRIVE,
+            pdu: RequestPdu::WriteRegister { address: 2000, value },
+            pace: Pace::Brisk,
+            expires: self.now + EXPIRY,
+            ticket,
+            passed_on: Some(PassedOn {
+                address: 0,
+                may_write: true,
+                reach: vec![1, 2],
+                stops: if value == STOP { vec![1, 2] } else { Vec::new() },
+                frame,
+            }),
+        };
+        let mut command = request.into_command(Touched::Anything);
+        command.asked = Some(self.now);
+        self.pending.push(command, self.now);
+        receiver
+    }
+
+    fn run_asked(&mut self, drive: usize, asked: Instant) -> Receiver<Answer> {
+        let (ticket, receiver) = ticket(&self.stats, self.now);
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency: Urgency::Command,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        let mut command = Command::new(drive, admitted, self.now + EXPIRY, ticket);
+        command.asked = Some(asked);
+        self.pending.push(command, self.now);
+        receiver
+    }
+
+    fn passes_on(&mut self) -> bool {
+        self.pending.next_passed_on(self.now, |_| true).is_some()
+    }
+}
+
+fn reference(percent: f64) -> Order {
+    Order::Points(vec![(7, Value::Number(percent))])
+}
+
+#[test]
+fn a_newer_reference_keeps_behind_an_order_that_sets_the_same() {
+    let mut bench = Bench::new();
+    let give = |bench: &mut Bench, order: Order, only: bool| {
+        bench.give((SourceKind::Mqtt, "t"), 1, Urgency::Command, order, only)
+    };
+    let mut first = give(&mut bench, reference(10.0), true);
+    let both = Order::Points(vec![(1, Value::Bool(true)), (7, Value::Number(20.0))]);
+    let _both = give(&mut bench, both.clone(), false);
+    let mut second = give(&mut bench, reference(30.0), true);
+    assert_eq!((outcome(&mut first), outcome(&mut second)), (None, None));
+    // Behind that order the newest takes the place of the one before.
+    let _third = give(&mut bench, reference(40.0), true);
+    assert_eq!(outcome(&mut second), Some(Outcome::Replaced));
+    // What does not touch it changes nothing.
+    let _other = give(&mut bench, points(&[8]), false);
+    let _fourth = give(&mut bench, reference(50.0), true);
+    let sent: Vec<Order> = std::iter::from_fn(|| bench.take()).map(|c| c.order).collect();
+    assert_eq!(sent, [reference(10.0), both, reference(50.0), points(&[8])]);
+}
+
+#[test]
+fn a_newer_reference_keeps_behind_what_it_rests_on() {
+    let range = |sets: &[usize], rests_on: &[usize]| {
+        let items = |points: &[usize]| points.iter().map(|point| (Table::Holding, *point as u16)).collect();
+        Touched::These {
+            sets: items(sets),
+            rests_on: items(rests_on),
+        }
+    };
+    let reference = range(&[7], &[9]);
+    assert!(reference.commutes(&range(&[1], &[])) && reference.commutes(&range(&[1], &[9])));
+    for other in [range(&[7], &[]), range(&[9], &[]), range(&[1], &[7]), Touched::Anything] {
+        assert!(!reference.commutes(&other) && !other.commutes(&reference), "{other:?}");
+    }
+}
+
+#[test]
+fn a_stop_drops_a_broadcast_that_reaches_its_drive_but_for_one_that_stops_it() {
+    let mut bench = Bench::new();
+    let (mut start, mut stops) = (bench.broadcast(START), bench.broadcast(STOP));
+    let _stop = bench.push(2, Urgency::Stop, &[1], false);
+    assert_eq!(outcome(&mut start), Some(Outcome::Purged));
+    assert_eq!(outcome(&mut stops), None);
+    // Held up at the tool meanwhile.
+    let asked = bench.now;
+    bench.now += Duration::from_millis(5);
+    let _stop = bench.push(1, Urgency::Stop, &[1], false);
+    let later = std::mem::replace(&mut bench.now, asked);
+    let mut held = bench.broadcast(START);
+    assert_eq!(outcome(&mut held), Some(Outcome::Purged));
+    bench.now = later;
+    assert_eq!(outcome(&mut bench.broadcast(START)), None);
+}
+
+#[test]
+fn a_broadcast_has_its_place_among_the_orders_of_each_drive() {
+    let mut bench = Bench::new();
+    let _before = bench.push_from("a", 1, &[1]);
+    let _broadcast = bench.broadcast(START);
+    assert!(!bench.passes_on(), "an older order waits for drive 1");
+    let _behind = bench.push_from("a", 2, &[2]);
+    let _beside = bench.push_from("a", 3, &[3]);
+    let order: Vec<usize> = std::iter::from_fn(|| bench.take()).map(|c| c.drive).collect();
+    let place = |drive| order.iter().position(|d| *d == drive);
+    assert!(place(1) < place(NO_DRIVE) && place(NO_DRIVE) < place(2), "{order:?}");
+    assert_eq!(order.len(), 4);
+    // Where nothing waits behind it, it waits for time that is left over.
+    let _broadcast = bench.broadcast(STOP);
+    assert_eq!(bench.pop(), None);
+    assert!(bench.passes_on());
+}
+
+#[test]
+fn a_broadcast_that_was_not_sent_is_not_put_back_behind_a_stop() {
+    let mut bench = Bench::new();
+    let mut broadcast = bench.broadcast(START);
+    let chosen = bench.pending.next_passed_on(bench.now, |_| true).unwrap();
+    let taken = bench.pending.take(chosen).unwrap();
+    bench.pending.put_back(taken, bench.now);
+    assert_eq!(outcome(&mut broadcast), None);
+    let chosen = bench.pending.next_passed_on(bench.now, |_| true).unwrap();
+    let taken = bench.pending.take(chosen).unwrap();
+    let _stop = bench.push(1, Urgency::Stop, &[1], false);
+    bench.pending.put_back(taken, bench.now);
+    assert_eq!(outcome(&mut broadcast), Some(Outcome::Purged));
+}
+
+#[test]
+fn what_was_asked_for_before_a_stop_does_not_go_behind_it() {
+    let mut bench = Bench::new();
+    let asked = bench.now;
+    bench.now += Duration::from_millis(50);
+    let _stop = bench.push(1, Urgency::Stop, &[1], false);
+    assert_eq!(bench.pop(), Some((1, Urgency::Stop)));
+    bench.now += Duration::from_millis(50);
+    assert_eq!(outcome(&mut bench.run_asked(1, asked)), Some(Outcome::Purged));
+    assert_eq!(outcome(&mut bench.run_asked(2, asked)), None, "another drive");
+    let now = bench.now;
+    assert_eq!(outcome(&mut bench.run_asked(1, now)), None, "asked for since");
+}
+
+#[test]
+fn a_stop_waits_for_the_bus_that_takes_the_place_of_its_own() {
+    let stats: Arc<WriteStats> = Arc::default();
+    let now = Instant::now();
+    let give = |queue: &CommandQueue, drive: usize, urgency: Urgency| {
+        let (ticket, receiver) = ticket(&stats, now);
+        let admitted = Admitted {
+            order: points(&[1]),
+            urgency,
+            reference_only: false,
+            ranges: Vec::new(),
+        };
+        queue.submit(Command::new(drive, admitted, now + EXPIRY, ticket), now);
+        receiver
+    };
+    let (old, new) = (CommandQueue::new().unwrap(), Arc::new(CommandQueue::new().unwrap()));
+    let mut waits = give(&old, 3, Urgency::Stop);
+    let mut run = give(&old, 2, Urgency::Command);
+    old.begin_handover(now);
+    assert_eq!(outcome(&mut run), Some(Outcome::ShuttingDown));
+    let (mut late, mut gone) = (give(&old, 2, Urgency::Stop), give(&old, 4, Urgency::Stop));
+    // The port may go, and come, in its last moments.
+    old.close(Outcome::BusDown, now);
+    old.open();
+    old.hand_over(3, &new, 0, now);
+    old.hand_over(2, &new, 1, now);
+    let mut last = give(&old, 2, Urgency::Stop);
+    let mut refused = give(&old, 2, Urgency::Command);
+    assert!(outcome(&mut refused).is_some());
+    old.close(Outcome::ShuttingDown, now);
+    assert_eq!(outcome(&mut gone), Some(Outcome::ShuttingDown), "nobody takes it over");
+    let mut sent = Vec::new();
+    while let Some(stop) = new.lock().pop(Urgency::Read, now) {
+        sent.push(stop.drive);
+        stop.answer(&Outcome::Acknowledged(Reply::Written), now);
+    }
+    assert_eq!(sent, [0, 1]);
+    for answer in [&mut waits, &mut late, &mut last] {
+        assert!(outcome(answer).is_some_and(|outcome| outcome.is_ok()));
+    }
+}
