@@ -440,7 +440,9 @@ impl Run {
     /// It is over: the drive takes orders again, or is held for what was left half done.
     fn over(self) {
         let (done, all) = self.restoration.progress();
-        let name = &self.name;
+        // A reload may have given the drive another name, by which it is resumed.
+        let drive = self.plant.load().drive_at(&self.machine);
+        let name = drive.as_ref().map_or(&self.name, |drive| &drive.image.spec.name);
         let saved = match self.restoration.journal().plan.handling.save {
             Some(_) => ", and was told to keep them",
             None => "",
@@ -473,9 +475,8 @@ impl Run {
             _ => {}
         }
         if let Some(why) = &held {
-            let plant = self.plant.load();
             // Where it is not configured any more, an event told whose journal is left.
-            if let Some(drive) = plant.drive_at(&self.machine) {
+            if let Some(drive) = &drive {
                 let spec = &drive.image.spec;
                 drive.publish(unfinished_event(&spec.bus, Some(&spec.name), why.clone()));
             }
