@@ -195,8 +195,10 @@ impl CommandRun {
     /// # Errors
     /// It is none.
     pub fn into_stop(mut self, drive: usize) -> Result<Command, Box<CommandRun>> {
-        let stop = self.stop.take().filter(|_| self.is_of_client());
-        let Some((order, ticket)) = stop.zip(self.tickets.pop()) else {
+        let Some(order) = self.stop.clone().filter(|_| self.is_of_client()) else {
+            return Err(Box::new(self));
+        };
+        let Some(ticket) = self.tickets.pop() else {
             return Err(Box::new(self));
         };
         let expires = self.expires;

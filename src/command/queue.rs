@@ -210,6 +210,7 @@ impl Pending {
         match self.waiting.iter_mut().find(alike) {
             Some(waiting) if waiting.order == stop.order => {
                 waiting.joined.push((stop.ticket, stop.expires));
+                waiting.joined.extend(stop.joined);
                 return;
             }
             Some(_) => self.remove(now, &Outcome::Replaced, |c| {

@@ -23,7 +23,7 @@ const EARLY_PROBES: [Duration; 3] = [
 const REFUSED_PAUSE: (Duration, Duration) = (Duration::from_secs(2), Duration::from_secs(60));
 
 /// Process data without a fault for that long shows that the line is sound.
-const SOUND_FOR: Duration = Duration::from_secs(2);
+const SOUND_FOR: Duration = Duration::from_secs(10);
 /// Pause before a slow request is tried again that the drive was too busy for.
 const BUSY_PAUSE: Duration = Duration::from_secs(1);
 
@@ -190,7 +190,7 @@ impl DriveSchedule {
             return item.due;
         };
         let sound = troubled + SOUND_FOR;
-        match failed_at <= sound && item.due > failed_at + 2 * SOUND_FOR {
+        match failed_at <= sound && item.due > failed_at + SOUND_FOR {
             true => item.due.min(sound),
             false => item.due,
         }

@@ -12,7 +12,7 @@ const FORGOTTEN: Duration = Duration::from_secs(1);
 /// A slow request that was not answered on a troubled line is tried again after that.
 const MUTE: Duration = Duration::from_secs(4);
 /// The time of a lease, at most, and of a confirmation that is still waited for.
-const COMMANDED: Duration = Duration::from_secs(9);
+const COMMANDED: Duration = Duration::from_secs(11);
 /// Longest pause between two stops of a flood to a drive that does not answer.
 const FLOODED: Duration = Duration::from_secs(2);
 /// Granularity of what is measured.
@@ -40,7 +40,7 @@ impl World {
             .max()
             .unwrap_or_default();
         self.look_until(self.now + longest, |world| world.check_stops(&stops));
-        self.check_back(&online, "drives that answered go on");
+        self.check_back(&online, false, "drives that answered go on");
         let slow = self
             .buses
             .iter()
@@ -50,7 +50,7 @@ impl World {
         let away = PROBED + longest + COMMANDED.max(slow);
         self.look_until(self.now + away, |_| {});
         let all: Vec<_> = self.drives_that_answer().collect();
-        self.check_back(&all, "every drive is back");
+        self.check_back(&all, true, "every drive is back");
         self.check_remains();
         self.check_as_good_as_new();
     }
@@ -153,7 +153,13 @@ impl World {
                     0 => Duration::ZERO,
                     _ => FLOODED,
                 };
-                let within = self.exchange(&self.buses[bus]) * (3 + others) + flooded;
+                // A bus that was just started anew leaves the line alone until no late reply can come.
+                let rests = if self.scenario.reloads {
+                    FORGOTTEN
+                } else {
+                    Duration::ZERO
+                };
+                let within = self.exchange(&self.buses[bus]) * (3 + others) + flooded + rests;
                 stops.push((bus, drive, self.now + within));
             }
         }
@@ -184,8 +190,8 @@ impl World {
         }
     }
 
-    /// The drives answer, their process data is fresh, their state is known.
-    fn check_back(&mut self, drives: &[(usize, usize)], what: &str) {
+    /// The drives answer, their process data is fresh, and their state is known where slow values are back too (`whole`).
+    fn check_back(&mut self, drives: &[(usize, usize)], whole: bool, what: &str) {
         for (bus, drive) in drives {
             let bus = &self.buses[*bus];
             let image = &bus.handle.image.drives[*drive];
