@@ -204,7 +204,7 @@ impl World {
                 age.is_some_and(|age| age <= most),
                 "{what}: the process data of {name} is {age:?} old, {most:?} at most"
             );
-            let refuses = *drive == 0 && bus.line.refuses.is_some();
+            let refuses = !whole || (*drive == 0 && bus.line.refuses.is_some());
             let reading = image.reading(self.now, most.max(Duration::from_secs(1)));
             assert!(
                 refuses || reading.state().is_some(),
