@@ -463,7 +463,7 @@ fn modbus_rtu() {
         row("late:106ms", Timeouts, 0.05),
         row("late:150ms", Timeouts, 0.05),
         row("late:400ms", Timeouts, 0.05),
-        named("always late", "late:110ms=1", Timeouts, 0.005),
+        named("always late", "late:110ms=1", Timeouts, 0.000_5),
         named(
             "late and dropped",
             "late:104ms=0.2,late:107ms=0.2,late:120ms=0.2,drop=0.1",
