@@ -31,9 +31,10 @@ impl VainStops {
     /// A stop failed, none of its exchanges being answered.
     pub(super) fn in_vain(&mut self, now: Instant) {
         let took = std::mem::take(&mut self.took);
-        let pause = (took * PAUSE.0).min(PAUSE.1).max(took);
+        let share = took * PAUSE.0;
+        let pause = share.min(PAUSE.1).max(took);
         if let Some(last) = self.last.replace(now) {
-            let paid = now.saturating_duration_since(last).as_secs_f64() / pause.as_secs_f64().max(1e-6);
+            let paid = now.saturating_duration_since(last).as_secs_f64() / share.as_secs_f64().max(1e-6);
             self.count = (self.count - paid).max(0.0);
         }
         self.count += 1.0;

@@ -344,14 +344,15 @@ fn before_the_end_only_stops_get_in() {
 }
 
 #[test]
-fn expired_commands_are_never_sent() {
+fn expired_commands_are_never_sent_and_a_stop_does_not_expire() {
     let mut bench = Bench::new();
     let mut late = bench.push(1, Urgency::Command, &[1], false);
     let mut stop = bench.push(2, Urgency::Stop, &[1], false);
-    bench.now += EXPIRY;
+    bench.now += 10 * EXPIRY;
+    assert_eq!(bench.pop(), Some((2, Urgency::Stop)));
     assert_eq!(bench.pop(), None);
     assert_eq!(outcome(&mut late), Some(Outcome::Expired));
-    assert_eq!(outcome(&mut stop), Some(Outcome::Expired));
+    assert_eq!(outcome(&mut stop), Some(acknowledged()));
 }
 
 #[test]

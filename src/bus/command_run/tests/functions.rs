@@ -91,7 +91,9 @@ fn a_drive_that_takes_only_function_16_is_stopped_and_remembered() {
     let mut drive = Drive::new(&[6]);
     let run = stop(&bench);
     let (asked, outcome) = drive.carries_out(&mut bench, run);
-    assert_eq!((asked, outcome.is_ok()), (vec![(16, 0), (6, 0)], true));
+    assert!(outcome.is_ok(), "{outcome:?}");
+    let stops = |(function, word): &(u8, u16)| (*function, word & 1);
+    assert_eq!(asked.iter().map(stops).collect::<Vec<_>>(), [(16, 0), (6, 0)]);
 }
 
 #[test]
