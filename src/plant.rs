@@ -452,9 +452,8 @@ impl DriveHandle {
             Err(Refusal::NotKnown(_)) if !self.bus_up() => Err(Outcome::BusDown),
             Err(Refusal::NotKnown(_)) if !online => Err(Outcome::Offline),
             Err(refusal) => Err(Outcome::Refused(refusal)),
-            Ok(admitted) if !self.bus_up() && !(admitted.urgency == Urgency::Stop && self.takes_stops()) => {
-                Err(Outcome::BusDown)
-            }
+            Ok(admitted) if admitted.urgency != Urgency::Stop && !self.bus_up() => Err(Outcome::BusDown),
+            Ok(_) if !self.takes_stops() => Err(Outcome::BusDown),
             // A stop goes to a drive that does not answer too: it may be back.
             Ok(admitted) if !online && admitted.urgency != Urgency::Stop => Err(Outcome::Offline),
             Ok(admitted) => Ok(admitted),

@@ -566,7 +566,7 @@ pub(super) mod tests {
         assert!(why.contains("`pump-1` at address 1 on /dev/ttyUSB0"), "{why}");
         file.remove(&other).unwrap();
         assert_eq!(file.read().unwrap(), Some(own.text(&profile)));
-        assert_eq!(JournalFile::all(folder.path()).unwrap(), [file.clone()]);
+        assert_eq!(JournalFile::all(folder.path()).unwrap(), std::slice::from_ref(&file));
         file.remove(&own.of).unwrap();
         assert_eq!(JournalFile::all(folder.path()).unwrap(), []);
     }

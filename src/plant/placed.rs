@@ -27,7 +27,14 @@ pub struct Placed {
     answer: Arriving<Answer>,
     confirmation: Arriving<Result<Duration, String>>,
     /// Of its rest.
-    rest: Option<(Arriving<Answer>, Arriving<Result<Duration, String>>)>,
+    rest: Option<Box<Rest>>,
+}
+
+/// What arrives of the rest of an order.
+#[derive(Debug)]
+struct Rest {
+    answer: Arriving<Answer>,
+    confirmation: Arriving<Result<Duration, String>>,
 }
 
 impl Placed {
@@ -50,7 +57,10 @@ impl Placed {
         answer: oneshot::Receiver<Answer>,
         confirmation: oneshot::Receiver<Result<Duration, String>>,
     ) -> Placed {
-        self.rest = Some((Arriving::Awaited(answer), Arriving::Awaited(confirmation)));
+        self.rest = Some(Box::new(Rest {
+            answer: Arriving::Awaited(answer),
+            confirmation: Arriving::Awaited(confirmation),
+        }));
         self
     }
 
@@ -72,8 +82,8 @@ impl Placed {
     /// As [`Placed::answered`], for whoever waits for several things.
     pub fn poll_answer(&mut self, cx: &mut Context<'_>) -> Poll<Answer> {
         let stop = answer_of(&mut self.answer, cx);
-        let Some((rest, _)) = &mut self.rest else { return stop };
-        let rest = answer_of(rest, cx);
+        let Some(rest) = &mut self.rest else { return stop };
+        let rest = answer_of(&mut rest.answer, cx);
         let latency = |part: &Poll<Answer>| match part {
             Poll::Ready(answer) => answer.latency,
             Poll::Pending => Duration::ZERO,
@@ -107,7 +117,7 @@ impl Placed {
     pub fn shown(&mut self) -> Shown {
         let stop = now(|cx| self.confirmation.poll(cx)).flatten();
         let seen = match &mut self.rest {
-            Some((_, rest)) => match (stop, now(|cx| rest.poll(cx)).flatten()) {
+            Some(rest) => match (stop, now(|cx| rest.confirmation.poll(cx)).flatten()) {
                 (Some(Ok(stop)), Some(Ok(rest))) => Some(Ok(stop.max(rest))),
                 (Some(Err(why)), _) | (_, Some(Err(why))) => Some(Err(why)),
                 _ => None,
@@ -130,8 +140,8 @@ impl Placed {
     /// As [`Placed::confirmation`], for whoever waits for several things.
     pub fn poll_confirmation(&mut self, cx: &mut Context<'_>) -> Poll<Option<Duration>> {
         let stop = self.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok));
-        let Some((_, rest)) = &mut self.rest else { return stop };
-        match (stop, rest.poll(cx).map(|seen| seen.and_then(Result::ok))) {
+        let Some(rest) = &mut self.rest else { return stop };
+        match (stop, rest.confirmation.poll(cx).map(|seen| seen.and_then(Result::ok))) {
             (Poll::Ready(stop), Poll::Ready(rest)) => Poll::Ready(stop.zip(rest).map(|(stop, rest)| stop.max(rest))),
             _ => Poll::Pending,
         }

@@ -20,6 +20,9 @@ use crate::drive::{Profile, Value};
 use crate::north::command_json::{SharedMemory, Taken, excerpt, resolve, unknown_drive};
 use crate::plant::{Placed, Plant};
 
+/// Points with their values, and why another one is refused.
+type Understood = (Vec<(usize, Value)>, Option<Refusal>);
+
 /// Orders whose result is awaited; the queues of the buses take fewer. The results of further ones are in the audit only.
 const AWAITED: usize = 4096;
 /// Metrics in a command.
@@ -277,11 +280,7 @@ impl Request {
     }
 
     /// The points that are understood, and why another one is not.
-    fn points(
-        &self,
-        profile: &Profile,
-        name: impl Fn(usize) -> Option<String>,
-    ) -> Result<(Vec<(usize, Value)>, Option<Refusal>), Refusal> {
+    fn points(&self, profile: &Profile, name: impl Fn(usize) -> Option<String>) -> Result<Understood, Refusal> {
         let metrics = self.metrics.as_ref().map_err(Clone::clone)?;
         let point = |(metric, place): &(Metric, Option<usize>)| {
             let name = match (&metric.name, place.and_then(&name)) {
